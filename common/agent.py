@@ -1,0 +1,211 @@
+"""The agent's networks: memory, world model, twin Q, policy, temperature.
+
+Shapes: B batch, T time, O observation, A action, H hidden, E embedding, Z = H (+ E) head input.
+Equation numbers in ``learner/losses.py``; here is only what maps inputs to outputs.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+LOG_STD_RANGE = (-20.0, 2.0)  # of the policy's Gaussian before the tanh
+NORMALIZED_CLIP = 10.0  # standard deviations
+STD_FLOOR = 1e-2  # a constant dimension is not blown up
+POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what an actor needs, and all that is broadcast
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """Sizes and switches of the networks; the same in every role of a run."""
+
+    hidden: int = 256
+    """H, units of the GRU."""
+    embedding: int = 256
+    """E, units of the Linear + ReLU before the GRU; 0 feeds the raw input (the paper)."""
+    heads: tuple[int, int] = (400, 300)
+    """Hidden layers of every head."""
+    layer_norm: bool = False
+    """LayerNorm between the embedding's Linear and its ReLU."""
+    shortcut: bool = False
+    """Heads read the current embedding beside the hidden state."""
+    normalize_observations: bool = False
+    """Observations are normalised by the replay server's running statistics."""
+    grounding: bool = True
+    """The world model also predicts the next observation's change and the reward."""
+
+
+class Normalizer(nn.Module):
+    """(o - mean) / std with frozen statistics; a blank frame stays zero."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, obs_dim: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(obs_dim))
+        self.register_buffer("std", torch.ones(obs_dim))
+
+    def forward(self, observation: Tensor, blank: Tensor) -> Tensor:
+        """(..., O) raw and (...) bool -> (..., O)."""
+        normalized = ((observation - self.mean) / self.std).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+        return torch.where(blank.unsqueeze(-1), torch.zeros_like(normalized), normalized)
+
+    def freeze(self, count: int, total: Tensor, total_square: Tensor) -> None:
+        """Take new statistics from sums over ``count`` observations; (O,) float64 each."""
+        if count < 2:
+            return
+        mean = total / count
+        variance = (total_square / count - mean * mean).clamp(min=0.0)
+        self.mean.copy_(mean)
+        self.std.copy_(variance.sqrt().clamp(min=STD_FLOOR))
+
+
+class Remembered(NamedTuple):
+    """What the memory makes of a sequence."""
+
+    hidden: Tensor  # (B, T, H), h_t after (o_t, a_{t-1})
+    embedding: Tensor  # (B, T, E)
+
+
+class Memory(nn.Module):
+    """h_t = GRU(h_{t-1}, e_t), e_t = ReLU(Linear([o_t, a_{t-1}])) or the raw input."""
+
+    def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
+        super().__init__()
+        width = obs_dim + action_dim
+        layers: list[nn.Module] = []
+        if config.embedding:
+            layers = [nn.Linear(width, config.embedding), nn.ReLU()]
+            if config.layer_norm:
+                layers.insert(1, nn.LayerNorm(config.embedding))
+        self.embed = nn.Sequential(*layers)
+        self.embedding_dim = config.embedding or width
+        self.gru = nn.GRU(self.embedding_dim, config.hidden, batch_first=True)
+
+    def forward(self, observation: Tensor, prev_action: Tensor, hidden: Tensor) -> Remembered:
+        """(B, T, O), (B, T, A), (B, H) the state before the first step."""
+        embedding = self.embed(torch.cat([observation, prev_action], dim=-1))
+        sequence, _ = self.gru(embedding, hidden.unsqueeze(0).contiguous())
+        return Remembered(sequence, embedding)
+
+
+def _mlp(inputs: int, hidden: tuple[int, int], outputs: int) -> nn.Sequential:
+    first, second = hidden
+    return nn.Sequential(
+        nn.Linear(inputs, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU(), nn.Linear(second, outputs)
+    )
+
+
+class Prediction(NamedTuple):
+    """One step ahead, from (z_t, a_t)."""
+
+    hidden_change: Tensor  # (B, T, H), of h_{t+1} - h_t
+    observation_change: Tensor  # (B, T, O), of the normalised o_{t+1} - o_t; O = 0 without grounding
+    reward: Tensor  # (B, T), or zeros without grounding
+
+
+class WorldModel(nn.Module):
+    """f(h_t, a_t): predicts the change of the hidden state, and the grounding signals if asked."""
+
+    def __init__(self, inputs: int, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
+        super().__init__()
+        grounded = obs_dim + 1 if config.grounding else 0
+        self.sizes = [config.hidden, obs_dim if config.grounding else 0, 1 if config.grounding else 0]
+        self.net = _mlp(inputs + action_dim, config.heads, config.hidden + grounded)
+
+    def forward(self, features: Tensor, action: Tensor) -> Prediction:
+        """(B, T, Z), (B, T, A)."""
+        out = self.net(torch.cat([features, action.to(features.dtype)], dim=-1))
+        hidden_change, observation_change, reward = out.split(self.sizes, dim=-1)
+        return Prediction(hidden_change, observation_change, reward.sum(-1))
+
+
+class _StackedLinear(nn.Module):
+    """Two Linear layers side by side as one batched product: x (2, N, in) -> (2, N, out)."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        bound = 1.0 / math.sqrt(inputs)  # nn.Linear's own initialisation
+        self.weight = nn.Parameter(torch.empty(2, inputs, outputs).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(2, 1, outputs).uniform_(-bound, bound))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.baddbmm(self.bias, x, self.weight)
+
+
+class TwinQ(nn.Module):
+    """Q_1(h, a) and Q_2(h, a), stacked."""
+
+    def __init__(self, inputs: int, action_dim: int, config: AgentConfig) -> None:
+        super().__init__()
+        first, second = config.heads
+        self.layers = nn.ModuleList(
+            [_StackedLinear(inputs + action_dim, first), _StackedLinear(first, second), _StackedLinear(second, 1)]
+        )
+
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """(B, T, Z), (B, T, A) -> (2, B, T) in float32."""
+        x = torch.cat([features, action.to(features.dtype)], dim=-1)
+        shape = x.shape[:-1]
+        x = x.reshape(1, -1, x.shape[-1]).expand(2, -1, -1)
+        for layer in self.layers[:-1]:
+            x = F.relu(layer(x))
+        return self.layers[-1](x).float().reshape(2, *shape)
+
+
+class Policy(nn.Module):
+    """Squashed Gaussian with a state-dependent standard deviation."""
+
+    def __init__(self, inputs: int, action_dim: int, config: AgentConfig) -> None:
+        super().__init__()
+        self.net = _mlp(inputs, config.heads, 2 * action_dim)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """(..., Z) -> mean and log standard deviation before the tanh, (..., A) each, float32."""
+        mean, log_std = self.net(features).float().chunk(2, dim=-1)
+        return mean, log_std.clamp(*LOG_STD_RANGE)
+
+
+def squashed_sample(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """a = tanh(u), u = mean + std * noise, and its log density; (..., A) -> (..., A), (...).
+
+    log pi(a) = sum log N(u) - log(1 - tanh(u)^2), the latter as 2 (log 2 - u - softplus(-2u)), which
+    does not overflow (SAC, appendix C, in its stable form).
+    """
+    u = mean + log_std.exp() * noise
+    log_normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2.0 * math.pi)
+    log_slope = 2.0 * (math.log(2.0) - u - F.softplus(-2.0 * u))
+    return torch.tanh(u), (log_normal - log_slope).sum(-1)
+
+
+class Agent(nn.Module):
+    """All of it. Actors use ``normalizer``, ``memory`` and ``policy``; the learner everything."""
+
+    def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
+        super().__init__()
+        self.config, self.obs_dim, self.action_dim = config, obs_dim, action_dim
+        self.normalizer = Normalizer(obs_dim)
+        self.memory = Memory(obs_dim, action_dim, config)
+        features = config.hidden + (self.memory.embedding_dim if config.shortcut else 0)
+        self.world_model = WorldModel(features, obs_dim, action_dim, config)
+        self.critic = TwinQ(features, action_dim, config)
+        self.policy = Policy(features, action_dim, config)
+        self.log_alpha = nn.Parameter(torch.zeros(()))
+
+    def features(self, remembered: Remembered) -> Tensor:
+        """What the heads read: h_t, with the current embedding beside it where configured."""
+        if self.config.shortcut:
+            return torch.cat([remembered.hidden, remembered.embedding], dim=-1)
+        return remembered.hidden
+
+    def policy_weights(self) -> dict[str, Tensor]:
+        """What actors need, detached, on the CPU."""
+        return {
+            name: value.detach().cpu().contiguous()
+            for name, value in self.state_dict().items()
+            if name.startswith(POLICY_PARTS)
+        }

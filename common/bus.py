@@ -1,0 +1,260 @@
+"""The bus: one small interface between the roles, over Redis or inside one process.
+
+Every Redis key, R = ``rmc:{run}``:
+
+| key                     | type   | writer   | holds                                                    |
+|-------------------------|--------|----------|----------------------------------------------------------|
+| R:config                | string | launcher | the run's config, JSON                                   |
+| R:epoch:ROLE            | string | ROLE     | INCR at a role's start; the larger epoch wins            |
+| R:actors                | set    | actors   | ids of the actors that said hello                        |
+| R:windows:ACTOR         | stream | actor    | entries ``epoch-seq``, field ``p`` = a wire entry        |
+| R:acks                  | hash   | replay   | ACTOR -> ``epoch seq granted_steps final``               |
+| R:replay                | string | replay   | ``epoch address`` of its socket                          |
+| R:weights               | string | learner  | ``epoch update pieces crc32`` of the newest weights      |
+| R:weights:EPOCH:UPDATE:I| string | learner  | piece I (256 KiB) of a policy, safetensors               |
+| R:evaluate              | string | learner  | ``epoch update pieces crc32`` the evaluator should play  |
+| R:metrics               | stream | all      | records, msgpack, about the last 20 000                  |
+| R:stats                 | hash   | all      | ROLE -> its newest record, msgpack                       |
+| R:stop                  | string | launcher | why the run should end                                   |
+| R:dead                  | stream | replay   | refused entries: actor, id, reason, first 1 KiB; 1 000   |
+"""
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+from common.errors import FencedError, MessageError
+
+
+class EntryId(NamedTuple):
+    """A stream entry's explicit id; ``seq`` 0 is the hello."""
+
+    epoch: int
+    seq: int
+
+
+class Entry(NamedTuple):
+    """One stream entry as read by the replay server."""
+
+    actor: int
+    id: EntryId
+    payload: bytes
+
+
+class Ack(NamedTuple):
+    """What the replay server committed of an actor's stream, and how far the actor may step.
+
+    ``granted_steps`` counts environment steps of the actor in epoch ``id.epoch``. ``final``: the run's
+    total is reached with them, so what is still open at that point should be sent, cut short.
+    """
+
+    id: EntryId
+    granted_steps: int
+    final: bool = False
+
+
+class Version(NamedTuple):
+    """A policy's version; readers take the highest."""
+
+    epoch: int
+    update: int
+
+
+@dataclass(frozen=True)
+class ReplayAddress:
+    """Where the replay server listens: ``unix:PATH`` or ``tcp:HOST:PORT``."""
+
+    epoch: int
+    address: str
+
+
+class Bus(Protocol):
+    """All that crosses between roles, except batches (they have a socket of their own).
+
+    Every method may raise BusUnavailable (retry) and, where it writes, BusFull (wait).
+    """
+
+    def set_config(self, config: bytes) -> None:
+        """Register the run's config."""
+
+    def config(self) -> bytes | None:
+        """The run's config, or None where no run of this name is registered."""
+
+    def take_epoch(self, role: str, floor: int = 0) -> int:
+        """A new epoch of this role, larger than ``floor`` and than any taken before."""
+
+    def current_epoch(self, role: str) -> int:
+        """The newest epoch taken by this role; 0 before the first."""
+
+    def append(self, actor: int, entry_id: EntryId, payload: bytes) -> None:
+        """Add an entry; one that is stored already is left as it is. Raises FencedError."""
+
+    def actors(self) -> list[int]:
+        """Ids of all actors that have appended anything."""
+
+    def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
+        """Up to ``count`` entries of each actor named in ``after``, past the id given, in order."""
+
+    def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
+        """Publish acks and trim what they cover, if ``epoch`` is still the replay's. Raises FencedError."""
+
+    def ack(self, actor: int) -> Ack | None:
+        """The newest ack for an actor."""
+
+    def dead_letter(self, entry: Entry, reason: str) -> None:
+        """Put a refused entry aside."""
+
+    def announce_replay(self, address: ReplayAddress) -> None:
+        """Say where the replay server listens."""
+
+    def replay_address(self) -> ReplayAddress | None:
+        """Where the replay server listens, once it does."""
+
+    def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
+        """Make a policy the newest; ``evaluate`` also asks the evaluator to play it. Raises FencedError."""
+
+    def latest_version(self, evaluate: bool = False) -> Version | None:
+        """The newest policy's version, or of the newest to evaluate."""
+
+    def weights(self, evaluate: bool = False) -> tuple[Version, bytes] | None:
+        """The newest policy, or the newest to evaluate. None if there is none or it was just replaced."""
+
+    def emit(self, role: str, record: Mapping[str, Any]) -> None:
+        """Append a metrics record (flat: str -> int | float | str)."""
+
+    def records(self, after: str) -> tuple[list[dict[str, Any]], str]:
+        """Metrics records past a cursor ("0" = all that is kept), and the next cursor."""
+
+    def stats(self) -> dict[str, dict[str, Any]]:
+        """The newest record of each role."""
+
+    def request_stop(self, reason: str) -> None:
+        """Ask every role to end."""
+
+    def stop_requested(self) -> str | None:
+        """Why the run should end, or None."""
+
+    def clear_stop(self) -> None:
+        """Forget an earlier run's stop, before its roles start again."""
+
+
+class MemoryBus:
+    """The bus of a lockstep run: same promises, one process, no threads."""
+
+    def __init__(self) -> None:
+        self._config: bytes | None = None
+        self._epochs: dict[str, int] = {}
+        self._streams: dict[int, dict[EntryId, bytes]] = {}
+        self._last_ids: dict[int, EntryId] = {}
+        self._acks: dict[int, Ack] = {}
+        self._replay: ReplayAddress | None = None
+        self._weights: dict[bool, tuple[Version, bytes]] = {}
+        self._records: list[dict[str, Any]] = []
+        self._stats: dict[str, dict[str, Any]] = {}
+        self._stop: str | None = None
+        self.dead_letters: list[tuple[Entry, str]] = []
+
+    def set_config(self, config: bytes) -> None:
+        self._config = config
+
+    def config(self) -> bytes | None:
+        return self._config
+
+    def take_epoch(self, role: str, floor: int = 0) -> int:
+        self._epochs[role] = max(self._epochs.get(role, 0), floor) + 1
+        return self._epochs[role]
+
+    def current_epoch(self, role: str) -> int:
+        return self._epochs.get(role, 0)
+
+    def append(self, actor: int, entry_id: EntryId, payload: bytes) -> None:
+        last = self._last_ids.get(actor, EntryId(0, -1))
+        if entry_id <= last:
+            if last.epoch > entry_id.epoch:
+                raise FencedError(f"actor {actor}: epoch {last.epoch} has replaced epoch {entry_id.epoch}")
+            return
+        self._last_ids[actor] = entry_id
+        self._streams.setdefault(actor, {})[entry_id] = payload
+
+    def actors(self) -> list[int]:
+        return sorted(self._last_ids)
+
+    def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
+        found: list[Entry] = []
+        for actor, cursor in after.items():
+            stream = self._streams.get(actor, {})
+            found += [Entry(actor, key, stream[key]) for key in stream if key > cursor][:count]
+        return found
+
+    def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
+        if self.current_epoch("replay") != epoch:
+            raise FencedError(f"replay epoch {epoch} was replaced by {self.current_epoch('replay')}")
+        for actor, ack in acks.items():
+            self._acks[actor] = ack
+            stream = self._streams.get(actor, {})
+            for key in [key for key in stream if key <= ack.id]:
+                del stream[key]
+
+    def ack(self, actor: int) -> Ack | None:
+        return self._acks.get(actor)
+
+    def dead_letter(self, entry: Entry, reason: str) -> None:
+        self.dead_letters.append((entry, reason))
+
+    def announce_replay(self, address: ReplayAddress) -> None:
+        self._replay = address
+
+    def replay_address(self) -> ReplayAddress | None:
+        return self._replay
+
+    def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
+        if version.epoch < self.current_epoch("learner"):
+            raise FencedError(f"learner epoch {version.epoch} was replaced")
+        self._weights[False] = (version, blob)
+        if evaluate:
+            self._weights[True] = (version, blob)
+
+    def latest_version(self, evaluate: bool = False) -> Version | None:
+        return self._weights[evaluate][0] if evaluate in self._weights else None
+
+    def weights(self, evaluate: bool = False) -> tuple[Version, bytes] | None:
+        return self._weights.get(evaluate)
+
+    def emit(self, role: str, record: Mapping[str, Any]) -> None:
+        entry = {"role": role, **record}
+        self._records.append(entry)
+        self._stats[role] = entry
+
+    def records(self, after: str) -> tuple[list[dict[str, Any]], str]:
+        return self._records[int(after) :], str(len(self._records))
+
+    def stats(self) -> dict[str, dict[str, Any]]:
+        return dict(self._stats)
+
+    def request_stop(self, reason: str) -> None:
+        self._stop = reason
+
+    def stop_requested(self) -> str | None:
+        return self._stop
+
+    def clear_stop(self) -> None:
+        self._stop = None
+
+
+PIECE_BYTES = 256 * 1024  # 10 MB blobs collapse redis-py; pieces of this size run at memory speed
+
+
+def split_pieces(blob: bytes) -> list[bytes]:
+    """A blob as pieces of at most 256 KiB, at least one."""
+    return [blob[start : start + PIECE_BYTES] for start in range(0, max(len(blob), 1), PIECE_BYTES)]
+
+
+def join_pieces(pieces: Sequence[bytes | None], crc: int) -> bytes:
+    """The blob again. Raises MessageError where a piece is missing or the CRC-32 differs."""
+    if any(piece is None for piece in pieces):
+        raise MessageError("weights", "a piece is gone: a newer version has replaced this one")
+    blob = b"".join(piece for piece in pieces if piece is not None)
+    if zlib.crc32(blob) != crc:
+        raise MessageError("crc", "weights")
+    return blob

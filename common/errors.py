@@ -1,0 +1,56 @@
+"""Every error that RMC raises on purpose.
+
+RmcError
+├── ConfigError          an option, file or environment the user must change (exit status 2)
+├── MessageError         a message that is not what its header or the run promises
+├── FencedError          a newer process has taken this role's name: end yourself
+├── BusUnavailable       Redis cannot be reached (worth retrying)
+├── BusFull              Redis is out of memory (worth waiting)
+├── AuthenticationError  the other end of a socket does not know the run's secret
+├── CheckpointError      a checkpoint is missing or does not match its manifest
+└── RoleDied             a supervised role ended too often
+"""
+
+
+class RmcError(Exception):
+    """Base class: catching it catches everything raised on purpose."""
+
+
+class ConfigError(RmcError):
+    """Something the user can change. The message is one line: option, value, fix."""
+
+    def __init__(self, field: str, value: object, fix: str) -> None:
+        super().__init__(f"{field}={value!r}: {fix}")
+        self.field, self.value, self.fix = field, value, fix
+
+
+class MessageError(RmcError):
+    """A malformed message; ``reason`` is a short, countable slug, ``detail`` says the rest."""
+
+    def __init__(self, reason: str, detail: str = "") -> None:
+        super().__init__(f"{reason}: {detail}" if detail else reason)
+        self.reason = reason
+
+
+class FencedError(RmcError):
+    """A larger epoch holds this role's name; nothing more of ours will be accepted."""
+
+
+class BusUnavailable(RmcError):
+    """Redis cannot be reached now."""
+
+
+class BusFull(RmcError):
+    """Redis refuses writes because it is out of memory."""
+
+
+class AuthenticationError(RmcError):
+    """The peer failed the mutual challenge."""
+
+
+class CheckpointError(RmcError):
+    """No valid checkpoint, or one that does not match its manifest."""
+
+
+class RoleDied(RmcError):
+    """A role died more often than the supervisor restarts it."""

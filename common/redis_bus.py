@@ -1,0 +1,245 @@
+"""The bus over Redis: unix socket, TCP or TLS; the keys stand in ``common/bus.py``."""
+
+import zlib
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import msgpack
+import redis
+from redis.backoff import ExponentialBackoff
+from redis.retry import Retry
+
+from common.bus import Ack, Entry, EntryId, ReplayAddress, Version, join_pieces, split_pieces
+from common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
+
+METRICS_KEPT = 20_000
+DEAD_LETTERS_KEPT = 1_000
+DEAD_LETTER_BYTES = 1_024
+T = TypeVar("T")
+
+
+class RedisBus:
+    """All roles of one run over one Redis. Not thread-safe: one per thread.
+
+    Redis's own retries are short (a lost reply is repeated, which explicit ids make harmless);
+    an outage longer than that raises BusUnavailable and the role's loop waits.
+    """
+
+    def __init__(self, url: str, run: str) -> None:
+        """``url``: ``unix:///path``, ``redis://host:port`` or ``rediss://…``. Raises ConfigError."""
+        try:
+            self._redis = redis.Redis.from_url(
+                url, retry=Retry(ExponentialBackoff(cap=0.1, base=0.01), retries=3), socket_timeout=10.0
+            )
+        except ValueError as error:
+            raise ConfigError("--redis-url", url.split("@")[-1], f"not a Redis URL ({error})") from None
+        self._prefix = f"rmc:{run}"
+
+    def _key(self, *parts: object) -> str:
+        return ":".join([self._prefix, *map(str, parts)])
+
+    def _call(self, action: Callable[[], T]) -> T:
+        try:
+            return action()
+        except redis.exceptions.OutOfMemoryError as error:
+            raise BusFull(str(error)) from None
+        except (redis.exceptions.ConnectionError, redis.exceptions.TimeoutError, OSError) as error:
+            raise BusUnavailable(str(error)) from None
+
+    def ping(self) -> None:
+        """Raises BusUnavailable where no Redis answers."""
+        self._call(self._redis.ping)
+
+    def set_config(self, config: bytes) -> None:
+        self._call(lambda: self._redis.set(self._key("config"), config))
+
+    def config(self) -> bytes | None:
+        return self._call(lambda: self._redis.get(self._key("config")))
+
+    def take_epoch(self, role: str, floor: int = 0) -> int:
+        key = self._key("epoch", role)
+        epoch = int(self._call(lambda: self._redis.incr(key)))
+        if epoch <= floor:  # Redis lost its data: catch up with what the ring has seen
+            epoch = int(self._call(lambda: self._redis.incrby(key, floor + 1 - epoch)))
+        return epoch
+
+    def current_epoch(self, role: str) -> int:
+        return int(self._call(lambda: self._redis.get(self._key("epoch", role))) or 0)
+
+    def append(self, actor: int, entry_id: EntryId, payload: bytes) -> None:
+        stream = self._key("windows", actor)
+        try:
+            self._call(lambda: self._add_entry(actor, stream, entry_id, payload))
+        except redis.exceptions.ResponseError as error:
+            if "equal or smaller" not in str(error):
+                raise
+            self._check_not_fenced(actor, stream, entry_id)
+
+    def _add_entry(self, actor: int, stream: str, entry_id: EntryId, payload: bytes) -> None:
+        if entry_id.seq == 0:
+            self._redis.sadd(self._key("actors"), actor)
+        self._redis.xadd(stream, {"p": payload}, id=f"{entry_id.epoch}-{entry_id.seq}")
+
+    def _check_not_fenced(self, actor: int, stream: str, entry_id: EntryId) -> None:
+        """A refused id is ours, stored by a retried call, unless a larger epoch wrote since."""
+        last = _entry_id(self._call(lambda: self._redis.xinfo_stream(stream))["last-generated-id"])
+        if last.epoch != entry_id.epoch:
+            raise FencedError(f"actor {actor}: epoch {last.epoch} has replaced epoch {entry_id.epoch}")
+
+    def actors(self) -> list[int]:
+        return sorted(int(actor) for actor in self._call(lambda: self._redis.smembers(self._key("actors"))))
+
+    def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
+        if not after:
+            return []
+        streams = {self._key("windows", actor): f"{cursor.epoch}-{max(cursor.seq, 0)}" for actor, cursor in after.items()}
+        reply = self._call(lambda: self._redis.xread(streams, count=count))
+        return [
+            Entry(int(name.rsplit(b":", 1)[1]), _entry_id(raw_id), fields.get(b"p", b""))
+            for name, entries in _stream_items(reply)
+            for raw_id, fields in entries
+        ]
+
+    def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
+        def transaction(pipe: Any) -> None:
+            held = int(pipe.get(self._key("epoch", "replay")) or 0)
+            if held != epoch:
+                raise FencedError(f"replay epoch {epoch} was replaced by {held}")
+            pipe.multi()
+            for actor, ack in acks.items():
+                pipe.xtrim(self._key("windows", actor), minid=f"{ack.id.epoch}-{ack.id.seq + 1}", approximate=False)
+            pipe.hset(
+                self._key("acks"),
+                mapping={actor: f"{ack.id.epoch} {ack.id.seq} {ack.granted_steps} {int(ack.final)}" for actor, ack in acks.items()},
+            )
+
+        if acks:
+            self._call(lambda: self._redis.transaction(transaction, self._key("epoch", "replay")))
+
+    def ack(self, actor: int) -> Ack | None:
+        raw = self._call(lambda: self._redis.hget(self._key("acks"), str(actor)))
+        if raw is None:
+            return None
+        epoch, seq, granted, final = map(int, raw.split())
+        return Ack(EntryId(epoch, seq), granted, bool(final))
+
+    def dead_letter(self, entry: Entry, reason: str) -> None:
+        fields = {
+            "actor": entry.actor,
+            "id": f"{entry.id.epoch}-{entry.id.seq}",
+            "reason": reason,
+            "head": entry.payload[:DEAD_LETTER_BYTES],
+        }
+        self._call(lambda: self._redis.xadd(self._key("dead"), fields, maxlen=DEAD_LETTERS_KEPT))  # type: ignore[arg-type]
+
+    def announce_replay(self, address: ReplayAddress) -> None:
+        self._call(lambda: self._redis.set(self._key("replay"), f"{address.epoch} {address.address}"))
+
+    def replay_address(self) -> ReplayAddress | None:
+        raw = self._call(lambda: self._redis.get(self._key("replay")))
+        if raw is None:
+            return None
+        epoch, address = raw.decode().split(" ", 1)
+        return ReplayAddress(int(epoch), address)
+
+    def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
+        pieces = split_pieces(blob)
+        head = f"{version.epoch} {version.update} {len(pieces)} {zlib.crc32(blob)}"
+        for index, piece in enumerate(pieces):  # one call each: a pipeline would join them into one blob again
+            key = self._key("weights", version.epoch, version.update, index)
+            self._call(lambda key=key, piece=piece: self._redis.set(key, piece))  # type: ignore[misc]
+        heads = [self._key("weights")] + [self._key("evaluate")] * evaluate
+        before = self._heads()
+
+        def transaction(pipe: Any) -> None:
+            held = int(pipe.get(self._key("epoch", "learner")) or 0)
+            if held > version.epoch:
+                raise FencedError(f"learner epoch {version.epoch} was replaced by {held}")
+            pipe.multi()
+            for key in heads:
+                pipe.set(key, head)
+
+        self._call(lambda: self._redis.transaction(transaction, self._key("epoch", "learner")))
+        self._drop_pieces(before - self._heads())
+
+    def _heads(self) -> set[tuple[Version, int]]:
+        """Versions that a head names, with their number of pieces."""
+        found = [self._head(False), self._head(True)]
+        return {(version, pieces) for version, pieces, _ in filter(None, found)}
+
+    def _head(self, evaluate: bool) -> tuple[Version, int, int] | None:
+        raw = self._call(lambda: self._redis.get(self._key("evaluate" if evaluate else "weights")))
+        if raw is None:
+            return None
+        epoch, update, pieces, crc = map(int, raw.split())
+        return Version(epoch, update), pieces, crc
+
+    def _piece_keys(self, version: Version, pieces: int) -> list[str]:
+        return [self._key("weights", version.epoch, version.update, index) for index in range(pieces)]
+
+    def _drop_pieces(self, versions: set[tuple[Version, int]]) -> None:
+        """Let replaced versions expire rather than vanish, so that a reader amid them can finish."""
+        for version, pieces in versions:
+            for key in self._piece_keys(version, pieces):
+                self._call(lambda key=key: self._redis.expire(key, 5))  # type: ignore[misc]
+
+    def latest_version(self, evaluate: bool = False) -> Version | None:
+        head = self._head(evaluate)
+        return head[0] if head else None
+
+    def weights(self, evaluate: bool = False) -> tuple[Version, bytes] | None:
+        head = self._head(evaluate)
+        if head is None:
+            return None
+        version, count, crc = head
+        pieces = [self._call(lambda key=key: self._redis.get(key)) for key in self._piece_keys(version, count)]  # type: ignore[misc]
+        try:
+            return version, join_pieces(pieces, crc)
+        except MessageError:
+            return None
+
+    def emit(self, role: str, record: Mapping[str, Any]) -> None:
+        packed = msgpack.packb({"role": role, **record}, use_bin_type=True)
+
+        def send() -> None:
+            pipe = self._redis.pipeline(transaction=False)
+            pipe.xadd(self._key("metrics"), {"r": packed}, maxlen=METRICS_KEPT)
+            pipe.hset(self._key("stats"), role, packed)
+            pipe.execute()
+
+        self._call(send)
+
+    def records(self, after: str) -> tuple[list[dict[str, Any]], str]:
+        reply = self._call(lambda: self._redis.xread({self._key("metrics"): after}, count=1000))
+        found = [(raw_id.decode(), fields[b"r"]) for _, entries in _stream_items(reply) for raw_id, fields in entries]
+        records = [msgpack.unpackb(packed, raw=False) for _, packed in found]
+        return records, found[-1][0] if found else after
+
+    def stats(self) -> dict[str, dict[str, Any]]:
+        reply = self._call(lambda: self._redis.hgetall(self._key("stats")))
+        return {role.decode(): msgpack.unpackb(packed, raw=False) for role, packed in reply.items()}
+
+    def request_stop(self, reason: str) -> None:
+        self._call(lambda: self._redis.set(self._key("stop"), reason))
+
+    def stop_requested(self) -> str | None:
+        raw = self._call(lambda: self._redis.get(self._key("stop")))
+        return raw.decode() if raw is not None else None
+
+    def clear_stop(self) -> None:
+        self._call(lambda: self._redis.delete(self._key("stop")))
+
+
+def _entry_id(raw: bytes | str) -> EntryId:
+    text = raw.decode() if isinstance(raw, bytes) else raw
+    epoch, seq = text.split("-")
+    return EntryId(int(epoch), int(seq))
+
+
+def _stream_items(reply: Any) -> list[tuple[bytes, list[tuple[bytes, dict[bytes, bytes]]]]]:
+    """XREAD's reply as pairs, whether the protocol made it a list (RESP2) or a map (RESP3)."""
+    if not reply:
+        return []
+    if isinstance(reply, dict):
+        return [(name, entries[0] if len(entries) == 1 and isinstance(entries[0], list) else entries) for name, entries in reply.items()]
+    return [(name, entries) for name, entries in reply]

@@ -1,0 +1,118 @@
+"""The window: the one definition of what a sequence is, from actor to learner.
+
+Shapes: T = burn_in + train steps; T + 1 observations; O observation, A action, H hidden.
+
+A window is a row of a structured dtype, laid out as ``[burn_in | train | 1 bootstrap]``. Two indices
+say what is real: observations ``first <= t <= last`` and steps ``first <= t < last``. The last
+observation (and the bootstrap one) is real but starts no step. Burn-in is all real or all padding, so
+``first`` is either 0 or ``burn_in``; everything outside is zero. ``hidden`` is the GRU state *before*
+observation ``first`` and ``prev_action`` the action before it.
+
+Integers are signed because torch views them in place (see ``learner/batch.py``).
+"""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+ROW_ALIGNMENT = 64  # bytes: a cache line, so that whole-row gathers run at memory speed
+
+Rows = NDArray[np.void]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class WindowSpec:
+    """Sizes of a window; two roles may talk only if their fingerprints agree."""
+
+    obs_dim: int
+    action_dim: int
+    hidden: int
+    burn_in: int = 10
+    train: int = 15
+
+    @property
+    def steps(self) -> int:
+        """T, the steps of a window: burn-in and trained."""
+        return self.burn_in + self.train
+
+    @property
+    def observations(self) -> int:
+        """T + 1: one more, the bootstrap observation."""
+        return self.steps + 1
+
+    @cached_property
+    def dtype(self) -> np.dtype[np.void]:
+        """The row's structured dtype, padded to 64 bytes."""
+        fields: list[tuple[str, str, tuple[int, ...]]] = [
+            ("serial", "<i8", ()),  # given by the ring; slot = serial mod capacity
+            ("seq", "<i8", ()),  # origin: (actor, epoch, seq, k) names a window once and for all
+            ("weights_update", "<i8", ()),  # the learner's update count of the weights that acted
+            ("actor", "<i4", ()),
+            ("epoch", "<i4", ()),
+            ("k", "<i4", ()),  # place inside its stream entry
+            ("first", "<i4", ()),
+            ("last", "<i4", ()),
+            ("terminated", "<i4", ()),  # 1: step last - 1 ended in a true termination
+            ("new_steps", "<i4", ()),  # trailing steps that no earlier window carried
+            ("new_observations", "<i4", ()),  # trailing observations that no earlier window carried
+            ("initial_priority", "<f4", ()),  # 0: enter with the largest priority seen
+            ("observation", "<f4", (self.observations, self.obs_dim)),  # raw
+            ("action", "<f4", (self.steps, self.action_dim)),  # in [-1, 1]
+            ("prev_action", "<f4", (self.action_dim,)),
+            ("reward", "<f4", (self.steps,)),  # extrinsic
+            ("hidden", "<f4", (self.hidden,)),
+            ("blank", "u1", (self.observations,)),  # 1: a flickered-out frame
+        ]
+        packed = np.dtype(fields)
+        itemsize = -(-packed.itemsize // ROW_ALIGNMENT) * ROW_ALIGNMENT
+        names = list(packed.names or ())
+        offsets = [int(packed.fields[name][1]) for name in names] if packed.fields else []
+        formats = [packed.fields[name][0] for name in names] if packed.fields else []
+        return np.dtype(
+            {"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize}  # type: ignore[call-overload]
+        )
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that change with any field, shape or offset of the dtype."""
+        return hashlib.sha256(repr(self.dtype).encode()).hexdigest()[:16]
+
+    def observation_valid(self, rows: Rows) -> BoolArray:
+        """(B, T + 1): which observations are real."""
+        t = np.arange(self.observations)
+        valid: BoolArray = (rows["first"][:, None] <= t) & (t <= rows["last"][:, None])
+        return valid
+
+    def step_valid(self, rows: Rows) -> BoolArray:
+        """(B, T): which steps are real; the last observation starts none."""
+        t = np.arange(self.steps)
+        valid: BoolArray = (rows["first"][:, None] <= t) & (t < rows["last"][:, None])
+        return valid
+
+    def trained_steps(self, rows: Rows) -> int:
+        """Real trained steps in all rows, what a draw spends of the replay ratio."""
+        return int((rows["last"] - self.burn_in).sum())
+
+
+def first_fault(rows: Rows, spec: WindowSpec) -> str | None:
+    """Why these rows cannot be windows of this run, or None. Checks indices and finiteness."""
+    first, last = rows["first"], rows["last"]
+    if not ((first == 0) | (first == spec.burn_in)).all():
+        return "first is neither 0 nor burn_in"
+    if not ((last > spec.burn_in) & (last <= spec.steps)).all():
+        return "last is outside (burn_in, T]"
+    if not ((rows["new_steps"] >= 0) & (rows["new_steps"] <= last - spec.burn_in)).all():
+        return "new_steps exceeds the trained steps"
+    new = rows["new_observations"]
+    if not ((new >= rows["new_steps"]) & (new <= rows["new_steps"] + 1)).all():
+        return "new_observations is neither new_steps nor one more"
+    for name in ("observation", "action", "prev_action", "reward", "hidden", "initial_priority"):
+        if not np.isfinite(rows[name]).all():
+            return f"{name} is not finite"
+    if (rows["initial_priority"] < 0).any():
+        return "initial_priority is negative"
+    return None

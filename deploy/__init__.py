@@ -1,0 +1,1 @@
+"""Starts, places, supervises and watches the roles; the only package that knows them all."""

@@ -1,0 +1,70 @@
+"""The losses of RMC, one function per equation, and nothing else.
+
+Shapes: B batch, T trained steps (L_t), O observation, A action, H hidden. All tensors float32.
+Notation: h_t memory, a_t action, r_t reward, d_t true termination, m_t mask (1 = real trained step),
+sg stop-gradient. Every loss is a masked mean, sum(m * x) / sum(m).
+Source: arXiv 1908.11494, with the gaps settled in ``docs/algorithm.md``.
+"""
+
+from torch import Tensor
+
+
+def masked_mean(x: Tensor, m: Tensor) -> Tensor:
+    """sum(m * x) / sum(m) over (B, T); 0 where nothing is real."""
+    return (m * x).sum() / m.sum().clamp(min=1.0)
+
+
+def model_error(predicted_change: Tensor, change: Tensor) -> Tensor:
+    """|f(h_t, a_t) - sg(h_{t+1} - h_t)|, mean over H: (B, T, H) twice -> (B, T). L1, as the paper's text says."""
+    return (predicted_change - change.detach()).abs().mean(-1)
+
+
+def model_loss(error: Tensor, d: Tensor, m: Tensor) -> Tensor:
+    """L_model: the error where the episode goes on, so (1 - d_t) is part of the mask."""
+    return masked_mean(error, m * (1.0 - d))
+
+
+def curiosity(error: Tensor, d: Tensor, m: Tensor) -> Tensor:
+    """i_t: the model's own error of the step, without gradient, zero at terminations and padding."""
+    return error.detach() * (1.0 - d) * m
+
+
+def td_target(
+    r: Tensor, i: Tensor, beta: Tensor, gamma: float, d: Tensor, next_q: Tensor, alpha: Tensor, next_log_pi: Tensor
+) -> Tensor:
+    """y_t = r_t + beta i_t + gamma (1 - d_t) (min_j Qbar_j(h_{t+1}, a') - alpha log pi(a'|h_{t+1})).
+
+    ``next_q`` (2, B, T); a' and ``next_log_pi`` (B, T) come from the same sample. No gradient.
+    """
+    soft_value = next_q.min(0).values - alpha * next_log_pi
+    return (r + beta * i + gamma * (1.0 - d) * soft_value).detach()
+
+
+def q_loss(q: Tensor, y: Tensor, importance: Tensor, m: Tensor) -> Tensor:
+    """1/2 sum_j (Q_j(h_t, a_t) - y_t)^2, importance-weighted per window; q (2, B, T), importance (B,)."""
+    squared = 0.5 * (q - y).square().sum(0)
+    return masked_mean(importance.unsqueeze(1) * squared, m)
+
+
+def policy_loss(log_pi: Tensor, q: Tensor, alpha: Tensor, m: Tensor) -> Tensor:
+    """alpha log pi(a|sg(h_t)) - Q(sg(h_t), a), (B, T) each. (The paper prints the sign the other way round.)"""
+    return masked_mean(alpha.detach() * log_pi - q, m)
+
+
+def temperature_loss(log_alpha: Tensor, log_pi: Tensor, target_entropy: float, m: Tensor) -> Tensor:
+    """-log_alpha sg(log pi + target entropy)."""
+    return -log_alpha * masked_mean(log_pi.detach() + target_entropy, m)
+
+
+def grounding_loss(
+    predicted_change: Tensor, observation_change: Tensor, predicted_reward: Tensor, r: Tensor, seen: Tensor, m: Tensor
+) -> Tensor:
+    """L1 of the next observation's change (mean over O, only where ``seen``: neither frame is blank) and of the reward."""
+    observation = masked_mean((predicted_change - observation_change).abs().mean(-1), m * seen)
+    return observation + masked_mean((predicted_reward - r).abs(), m)
+
+
+def priority(td_error: Tensor, eta: float, m: Tensor) -> Tensor:
+    """eta max|td| + (1 - eta) mean|td| over a window's real trained steps; (B, T) -> (B,)."""
+    size = td_error.abs() * m
+    return eta * size.max(1).values + (1.0 - eta) * size.sum(1) / m.sum(1).clamp(min=1.0)
