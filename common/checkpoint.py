@@ -1,0 +1,134 @@
+"""A folder of checkpoints that are whole or absent: temp folder, fsync, rename, SHA-256 manifest.
+
+``checkpoints/000001200/{FILES…, manifest.json}``, one folder an update count; ``checkpoints/best.json`` names
+the best one evaluated, which is kept beside the newest few.
+"""
+
+import fcntl
+import hashlib
+import json
+import logging
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+from common.errors import CheckpointError, ConfigError
+
+log = logging.getLogger(__name__)
+MANIFEST = "manifest.json"
+BEST = "best.json"
+
+
+class CheckpointFolder:
+    """Numbered checkpoints under one folder. ``locked`` writers exclude each other; readers need no lock."""
+
+    def __init__(self, folder: Path, keep: int = 3) -> None:
+        self.folder, self.keep = folder, keep
+        self._lock: int | None = None
+
+    def lock(self) -> None:
+        """Become the one writer. Raises ConfigError where another process is."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._lock = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(
+                "--run-dir", str(self.folder.parent), "another process trains in this folder; stop it first"
+            ) from None
+        for left in self.folder.glob(".tmp-*"):
+            shutil.rmtree(left)
+
+    def unlock(self) -> None:
+        """Let another writer in."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def numbers(self) -> list[int]:
+        """Update counts of the checkpoints here, ascending; not yet verified."""
+        return sorted(int(path.name) for path in self.folder.glob("[0-9]*") if path.name.isdigit())
+
+    def path(self, number: int) -> Path:
+        """Where a checkpoint lies."""
+        return self.folder / f"{number:09d}"
+
+    def save(self, number: int, files: Mapping[str, bytes]) -> Path:
+        """Write a checkpoint so that it is there whole or not at all, then drop the oldest ones."""
+        temporary, final = self.folder / f".tmp-{number:09d}", self.path(number)
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+        manifest = json.dumps({"update": number, "sha256": digests}, indent=1).encode()
+        for name, content in {**files, MANIFEST: manifest}.items():
+            _write(temporary / name, content)
+        _sync_folder(temporary)
+        if final.exists():  # a resumed run repeats this number: the new one replaces the old
+            shutil.rmtree(final)
+        temporary.rename(final)
+        _sync_folder(self.folder)
+        self._prune()
+        return final
+
+    def _prune(self) -> None:
+        best = self.best()
+        for number in self.numbers()[: -self.keep]:
+            if number != best:
+                shutil.rmtree(self.path(number))
+
+    def load(self, number: int) -> dict[str, bytes]:
+        """A checkpoint's files, verified. Raises CheckpointError naming the file at fault."""
+        path = self.path(number)
+        try:
+            manifest = json.loads((path / MANIFEST).read_bytes())
+            digests = dict(manifest["sha256"])
+            files = {name: (path / Path(name).name).read_bytes() for name in digests}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise CheckpointError(f"checkpoint {path}: unreadable ({error})") from None
+        for name, content in files.items():
+            if hashlib.sha256(content).hexdigest() != digests[name]:
+                raise CheckpointError(f"checkpoint {path}: {name} does not match its manifest")
+        return files
+
+    def latest(self) -> tuple[int, dict[str, bytes]] | None:
+        """The newest valid checkpoint; damaged ones are named in the log and passed over."""
+        for number in reversed(self.numbers()):
+            try:
+                return number, self.load(number)
+            except CheckpointError as error:
+                log.warning("%s; falling back to an older one", error)
+        return None
+
+    def mark_best(self, number: int, score: float) -> None:
+        """Record a checkpoint's evaluation if it is there and beats the best so far."""
+        if self.path(number).exists() and score > self._best_record()[1]:
+            temporary = self.folder / f".{BEST}"
+            _write(temporary, json.dumps({"update": number, "eval_return_mean": score}).encode())
+            temporary.rename(self.folder / BEST)
+
+    def best(self) -> int | None:
+        """Number of the best checkpoint evaluated so far, if any."""
+        return self._best_record()[0]
+
+    def _best_record(self) -> tuple[int | None, float]:
+        try:
+            record = json.loads((self.folder / BEST).read_bytes())
+            return int(record["update"]), float(record["eval_return_mean"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return None, float("-inf")
+
+
+def _write(path: Path, content: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,220 @@
+"""The learner role: draw, update, give priorities back, publish weights, checkpoint, resume."""
+
+import io
+import json
+import logging
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from common.agent import Agent, AgentConfig
+from common.bus import Bus, Version
+from common.checkpoint import CheckpointFolder
+from common.errors import CheckpointError
+from common.metrics import Means, Rate
+from common.replay import Draw, Replay, Sample
+from common.window import WindowSpec
+from learner.batch import Batch, view_batch
+from learner.update import JointUpdate, UpdateConfig, Updated
+
+log = logging.getLogger(__name__)
+STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
+METRICS_UPDATES = 20  # updates between looks at the update's metrics: each look waits for the device
+RANK_UPDATES = 500  # updates between looks at the latent's rank (a singular value decomposition)
+
+
+@dataclass(frozen=True)
+class LearnerConfig:
+    """How the learner runs; what it computes is in UpdateConfig."""
+
+    batch_size: int = 64
+    """B, windows in a batch."""
+    publish_updates: int = 20
+    """Updates between broadcasts of the policy."""
+    checkpoint_steps: int = 10_000
+    """Environment steps between checkpoints, each of which the evaluator plays."""
+    keep_checkpoints: int = 3
+    """Newest checkpoints kept, beside the best."""
+    precision: Literal["auto", "bf16", "fp32"] = "auto"
+    """Matrix products in bfloat16 (auto: where this CPU or GPU has instructions for it) or float32."""
+    threads: int = 0
+    """CPU threads of the learner; 0 takes every core that the process may use."""
+
+
+def bf16_is_native(device: torch.device) -> bool:
+    """Whether bfloat16 products are faster than float32 there (AMX or AVX-512 BF16 on a CPU)."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported()
+    return torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
+
+
+class Learner:
+    """Everything that learns. One ``step`` is one update.
+
+    Lives on ``device``; takes up the newest valid checkpoint at once. Raises CheckpointError where
+    checkpoints are there but none is valid.
+    """
+
+    name = "learner"
+
+    def __init__(
+        self,
+        spec: WindowSpec,
+        agent: AgentConfig,
+        update: UpdateConfig,
+        config: LearnerConfig,
+        replay: Replay,
+        bus: Bus,
+        checkpoints: CheckpointFolder,
+        seed: int,
+        device: str = "cpu",
+    ) -> None:
+        self.spec, self.config, self.replay, self.bus, self.checkpoints = spec, config, replay, bus, checkpoints
+        self.device = torch.device(device)
+        self.updates = self.env_steps = 0
+        self.finished = False
+        self._means, self._rate, self._waiting = Means(), Rate(), ""
+        torch.manual_seed(seed)  # the networks' initial weights
+        self.agent = Agent(spec.obs_dim, spec.action_dim, agent).to(self.device)
+        bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_is_native(self.device))
+        self.update = JointUpdate(self.agent, spec.burn_in, update, seed, bf16)
+        self.beta = torch.zeros((), device=self.device)
+        checkpoints.lock()
+        floor = self._resume()
+        self.epoch = bus.take_epoch(self.name, floor)
+        self.publish()
+
+    def step(self) -> bool:
+        """Draw and update once, with all that is due after it."""
+        if self.finished:
+            return False
+        sample = self.replay.sample(self.config.batch_size)
+        self.env_steps = max(self.env_steps, sample.env_steps)
+        if sample.draw is Draw.WAIT:
+            self._waiting = "experience"
+            return False
+        if sample.draw is Draw.FINISHED:
+            self.checkpoint()
+            self.finished = True
+            return True
+        if self.updates == 0:
+            self._freeze_statistics()
+        self._learn(sample)
+        if self.updates % self.config.publish_updates == 0:
+            self.publish()
+        if self.env_steps >= self._next_checkpoint:
+            self.checkpoint()
+        return True
+
+    def _learn(self, sample: Sample) -> None:
+        assert sample.rows is not None and sample.importance is not None
+        self.beta.fill_(self.update.config.beta(self.env_steps))
+        updated = self.update(self._to_device(sample), self.beta)
+        self.updates += 1
+        self.replay.update_priorities(sample.rows["serial"].copy(), updated.priorities.cpu().numpy())
+        self._measure(updated)
+
+    def _to_device(self, sample: Sample) -> Batch:
+        rows = sample.rows
+        assert rows is not None
+        raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1)).to(self.device, non_blocking=True)
+        importance = torch.from_numpy(sample.importance).to(self.device, non_blocking=True)
+        return view_batch(raw, importance, self.spec)
+
+    def _measure(self, updated: Updated) -> None:
+        if self.updates % METRICS_UPDATES == 0:
+            for name, value in updated.metrics.items():
+                self._means.add(name, float(value))
+        if self.updates % RANK_UPDATES == 1:
+            rank, deviation = latent_rank(updated.hidden)
+            self._means.add("latent_rank", rank)
+            self._means.add("latent_deviation", deviation)
+
+    def publish(self, evaluate: bool = False) -> None:
+        """Broadcast the policy with the newest observation statistics frozen into it."""
+        self._freeze_statistics()
+        blob = safetensors.torch.save(self.agent.policy_weights())
+        self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate)
+
+    def _freeze_statistics(self) -> None:
+        if self.agent.config.normalize_observations and self.env_steps > 0:
+            statistics = self.replay.statistics()
+            total, square = torch.from_numpy(statistics.total), torch.from_numpy(statistics.total_square)
+            self.agent.normalizer.freeze(statistics.count, total.to(self.device), square.to(self.device))
+
+    def checkpoint(self) -> None:
+        """Save everything that a resumed learner needs, and ask for an evaluation of it."""
+        self.publish(evaluate=True)
+        state = io.BytesIO()
+        torch.save(self.update.state_dict(), state)
+        progress = {"updates": self.updates, "env_steps": self.env_steps, "epoch": self.epoch, "time": time.time()}
+        files = {
+            STATE: state.getvalue(),
+            POLICY: safetensors.torch.save(self.agent.policy_weights()),
+            PROGRESS: json.dumps(progress).encode(),
+        }
+        self.mark_best()
+        self.checkpoints.save(self.updates, files)
+        self._next_checkpoint = self._after(self.env_steps)
+
+    def mark_best(self) -> None:
+        """Take note of the evaluator's newest result."""
+        played = self.bus.stats().get("evaluator", {})
+        if "eval_return_mean" in played:
+            self.checkpoints.mark_best(int(played["eval_update"]), float(played["eval_return_mean"]))
+
+    def _after(self, env_steps: int) -> int:
+        return (env_steps // self.config.checkpoint_steps + 1) * self.config.checkpoint_steps
+
+    def _resume(self) -> int:
+        """Go on from the newest valid checkpoint; returns the epoch it was written in."""
+        self._next_checkpoint = self.config.checkpoint_steps
+        found = self.checkpoints.latest()
+        if found is None:
+            if self.checkpoints.numbers():
+                raise CheckpointError(f"{self.checkpoints.folder}: no checkpoint is valid; move the folder away")
+            return 0
+        _, files = found
+        progress = json.loads(files[PROGRESS])
+        self.update.load_state_dict(torch.load(io.BytesIO(files[STATE]), map_location=self.device, weights_only=True))
+        self.updates, self.env_steps = progress["updates"], progress["env_steps"]
+        self._next_checkpoint = self._after(self.env_steps)
+        log.info("resumed at update %d, environment step %d", self.updates, self.env_steps)
+        return int(progress["epoch"])
+
+    def waiting_for(self) -> str:
+        return self._waiting
+
+    def metrics(self) -> dict[str, Any]:
+        return {
+            "updates": self.updates,
+            "updates_per_s": self._rate.take(self.updates),
+            "env_steps": self.env_steps,
+            "beta": self.update.config.beta(self.env_steps),
+            "epoch": self.epoch,
+            **self._means.take(),
+        }
+
+    def close(self) -> None:
+        """Save what a resumed run needs, unless the run is finished and saved."""
+        if not self.finished and self.updates > 0:
+            self.checkpoint()
+        self.mark_best()
+        self.checkpoints.unlock()
+
+
+def latent_rank(hidden: Tensor) -> tuple[float, float]:
+    """Effective rank, exp(entropy of the normalised singular values), and mean per-unit standard deviation.
+
+    ``hidden`` (B, T, H). A rank near 1 or a deviation near 0 is a collapsed latent.
+    """
+    flat = hidden.reshape(-1, hidden.shape[-1]).float()
+    flat = flat - flat.mean(0)
+    p = torch.linalg.svdvals(flat)
+    p = p / p.sum().clamp(min=1e-12)
+    entropy = -(p * p.clamp(min=1e-12).log()).sum()
+    return float(entropy.exp()), float(flat.std(0).mean())

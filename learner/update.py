@@ -1,0 +1,221 @@
+"""The joint update: all four losses from the parameters as they stood, one backward, one step.
+
+Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, H hidden, Z head input.
+Nothing here waits for the host: no ``.item()``, no branch on a tensor, static shapes.
+"""
+
+import copy
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from common.agent import Agent, Memory, Remembered, squashed_sample
+from learner import losses
+from learner.batch import Batch
+
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class UpdateConfig:
+    """The algorithm's constants; equations in ``learner/losses.py``."""
+
+    learning_rate: float = 3e-4
+    """Adam's step size for every network."""
+    alpha_learning_rate: float = 3e-4
+    """Adam's step size for the temperature."""
+    gamma: float = 0.99
+    """Discount per environment step."""
+    polyak: float = 0.995
+    """Share of itself that a target network keeps at every update."""
+    clip_norm: float = 40.0
+    """Largest global gradient norm; 0 does not clip (the paper)."""
+    latent_target: Literal["online", "ema"] = "online"
+    """Which memory gives the change that the world model predicts."""
+    target_memory: Literal["online", "ema"] = "online"
+    """Which memory the target critics read."""
+    policy_q: Literal["first", "min"] = "min"
+    """Which critic the policy climbs: Q_1 (the paper) or the smaller of both."""
+    curiosity: float = 0.0
+    """beta_0, weight of the curiosity reward at the start; 0 switches it off."""
+    curiosity_scale: Literal["raw", "std"] = "raw"
+    """Curiosity as it is (the paper), or divided by its running standard deviation."""
+    curiosity_steps: int = 100_000
+    """Environment steps after which beta has decayed to 0, linearly."""
+    eta: float = 0.9
+    """Weight of the largest against the mean absolute TD error in a window's priority."""
+
+    def beta(self, env_steps: int) -> float:
+        """beta after so many environment steps."""
+        return self.curiosity * max(0.0, 1.0 - env_steps / self.curiosity_steps)
+
+
+class Updated(NamedTuple):
+    """What an update gives back, all on the device and without gradient."""
+
+    priorities: Tensor  # (B,)
+    metrics: dict[str, Tensor]  # scalars
+    hidden: Tensor  # (B, L_t + 1, H), for the latent's rank
+
+
+class JointUpdate:
+    """Agent, targets and optimiser, and the update that moves them together (gradient scheme 1).
+
+    Scheme 1: the model's and the critics' losses reach the memory, the policy's does not.
+    """
+
+    def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> None:
+        device = agent.log_alpha.device
+        self.agent, self.burn_in, self.config, self.bf16 = agent, burn_in, config, bf16
+        self.target_critic = _frozen_copy(agent.critic)
+        self.target_memory = _frozen_copy(agent.memory)
+        self.optimizer = _adam(agent, config)
+        self.generator = torch.Generator(device).manual_seed(seed)
+        self.curiosity_variance = torch.ones((), device=device)
+
+    def __call__(self, batch: Batch, beta: Tensor) -> Updated:
+        """One update from a Batch; ``beta`` is a scalar tensor. The order follows the paper's section 3."""
+        agent, c = self.agent, self.config
+        steps = slice(self.burn_in, None)
+        a, r, d = batch.action[:, steps], batch.reward[:, steps], batch.terminated[:, steps]
+        m = batch.step_valid[:, steps].float()
+        alpha = agent.log_alpha.exp().detach()
+        with torch.no_grad():
+            o = agent.normalizer(batch.observation, batch.blank)
+        with self._autocast():
+            # Memory: h_t from the stored state, burned in without gradient
+            memory = self._remember(agent.memory, o, batch)
+            z = agent.features(memory)
+
+            # Prediction, and curiosity from its error
+            target = self._remember_target(o, batch) if "ema" in (c.latent_target, c.target_memory) else memory
+            latent = (target if c.latent_target == "ema" else memory).hidden.detach().float()
+            prediction = agent.world_model(z[:, :-1], a)
+            error = losses.model_error(prediction.hidden_change.float(), latent[:, 1:] - latent[:, :-1])
+            i = self._scaled(losses.curiosity(error, d, m), m)
+
+            # Intuition: one policy sample for every step serves both the target and the policy loss
+            mean, log_std = agent.policy(z.detach())
+            pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean))
+            with torch.no_grad():
+                next_z = (agent.features(target) if c.target_memory == "ema" else z)[:, 1:]
+                next_q = self.target_critic(next_z, pi[:, 1:])
+                y = losses.td_target(r, i, beta, c.gamma, d, next_q, alpha, log_pi[:, 1:])
+            q = agent.critic(z[:, :-1], a)
+            frozen = {name: value.detach() for name, value in agent.critic.named_parameters()}
+            q_pi = functional_call(agent.critic, frozen, (z[:, :-1].detach(), pi[:, :-1]))
+            q_pi = q_pi[0] if c.policy_q == "first" else q_pi.min(0).values
+
+        log_pi = log_pi[:, :-1]
+        parts = {
+            "model_loss": losses.model_loss(error, d, m),
+            "q_loss": losses.q_loss(q, y, batch.importance, m),
+            "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, m),
+            "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
+        }
+        if agent.config.grounding:
+            change, seen = o[:, steps].diff(dim=1), _seen(batch)[:, steps]
+            parts["grounding_loss"] = losses.grounding_loss(
+                prediction.observation_change.float(), change, prediction.reward.float(), r, seen, m
+            )
+        grad_norm = self._step(sum(parts.values(), torch.zeros_like(alpha)))
+
+        td_error = (q.detach() - y).abs().mean(0)
+        metrics = {name: value.detach() for name, value in parts.items()} | {
+            "grad_norm": grad_norm,
+            "alpha": alpha,
+            "entropy": -losses.masked_mean(log_pi.detach(), m),
+            "q_mean": losses.masked_mean(q.detach().mean(0), m),
+            "td_error": losses.masked_mean(td_error, m),
+            "curiosity_mean": losses.masked_mean(i, m),
+            "curiosity_share": beta * i.sum() / (beta * i.sum() + (m * r.abs()).sum()).clamp(min=1e-8),
+        }
+        return Updated(losses.priority(td_error, c.eta, m), metrics, memory.hidden.detach())
+
+    def _autocast(self) -> AbstractContextManager[None]:
+        return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
+
+    def _remember(self, memory: Memory, o: Tensor, batch: Batch) -> Remembered:
+        """(B, L_t + 1, ·) from the stored state; where the burn-in is padding the stored state starts the trained part."""
+        n = self.burn_in
+        hidden = batch.hidden
+        if n:
+            with torch.no_grad():
+                burned = memory(o[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
+            hidden = torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
+        remembered: Remembered = memory(o[:, n:], batch.prev_action[:, n:], hidden)
+        return remembered
+
+    @torch.no_grad()
+    def _remember_target(self, o: Tensor, batch: Batch) -> Remembered:
+        return self._remember(self.target_memory, o, batch)
+
+    def _noise_like(self, x: Tensor) -> Tensor:
+        return torch.randn(x.shape, generator=self.generator, device=x.device)
+
+    def _scaled(self, i: Tensor, m: Tensor) -> Tensor:
+        """Curiosity in units of its running standard deviation, where configured."""
+        if self.config.curiosity_scale == "raw":
+            return i
+        variance = losses.masked_mean((i - losses.masked_mean(i, m)).square(), m)
+        self.curiosity_variance.lerp_(variance, 0.01)
+        return i / self.curiosity_variance.sqrt().clamp(min=1e-6)
+
+    def _step(self, loss: Tensor) -> Tensor:
+        """Backward, clip, Adam, Polyak; returns the gradient's norm before clipping."""
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        limit = self.config.clip_norm or float("inf")
+        norm = nn.utils.clip_grad_norm_(self.agent.parameters(), limit)
+        self.optimizer.step()
+        self._polyak(self.target_critic.parameters(), self.agent.critic.parameters())
+        self._polyak(self.target_memory.parameters(), self.agent.memory.parameters())
+        return norm.detach()
+
+    @torch.no_grad()
+    def _polyak(self, target: Iterable[Tensor], source: Iterable[Tensor]) -> None:
+        torch._foreach_lerp_(list(target), list(source), 1.0 - self.config.polyak)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that an update changes, for a checkpoint."""
+        return {
+            "agent": self.agent.state_dict(),
+            "target_critic": self.target_critic.state_dict(),
+            "target_memory": self.target_memory.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "curiosity_variance": self.curiosity_variance,
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from ``state_dict``, bit for bit."""
+        self.agent.load_state_dict(state["agent"])
+        self.target_critic.load_state_dict(state["target_critic"])
+        self.target_memory.load_state_dict(state["target_memory"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.curiosity_variance.copy_(state["curiosity_variance"])
+        self.generator.set_state(state["generator"].cpu())
+
+
+def _frozen_copy(module: ModuleT) -> ModuleT:
+    return copy.deepcopy(module).requires_grad_(False)
+
+
+def _adam(agent: Agent, config: UpdateConfig) -> torch.optim.Adam:
+    networks = [value for name, value in agent.named_parameters() if name != "log_alpha"]
+    groups = [
+        {"params": networks, "lr": config.learning_rate},
+        {"params": [agent.log_alpha], "lr": config.alpha_learning_rate},
+    ]
+    return torch.optim.Adam(groups, fused=True)
+
+
+def _seen(batch: Batch) -> Tensor:
+    """(B, T) float: neither the step's observation nor the next one is blank."""
+    visible = batch.observation_valid & ~batch.blank
+    return (visible[:, 1:] & visible[:, :-1]).float()
