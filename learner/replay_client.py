@@ -1,0 +1,229 @@
+"""The learner's end of the replay server's socket: two draws asked for ahead, received into fixed buffers.
+
+Frames are those of ``common/wire.py``. A lost connection is found again through the bus; until then draws
+answer WAIT. Statistics travel on a connection of their own, so that they never queue behind batches.
+"""
+
+import hashlib
+import hmac
+import logging
+import os
+import socket
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from common.errors import AuthenticationError, MessageError, RmcError
+from common.replay import Draw, ObservationStatistics, Sample
+from common.window import WindowSpec
+from common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame
+
+log = logging.getLogger(__name__)
+AHEAD = 2  # draws in flight, so that the server gathers while the learner computes
+NONCE_BYTES = 32
+TIMEOUT = 10.0  # seconds until a silent server counts as gone
+RECEIVE_BUFFER = 8 << 20
+
+
+def proof(secret: bytes, side: bytes, challenge: bytes, nonce: bytes) -> bytes:
+    """HMAC-SHA256 with which a side shows that it knows the run's secret."""
+    return hmac.new(secret, side + challenge + nonce, hashlib.sha256).digest()
+
+
+class Connection:
+    """One authenticated connection. Blocking, with a timeout."""
+
+    def __init__(self, address: str, secret: bytes, fingerprint: str, max_body: int) -> None:
+        """``address``: ``unix:PATH`` or ``tcp:HOST:PORT``. Raises OSError, MessageError, AuthenticationError."""
+        self._max_body = max_body
+        self._socket = _connect(address)
+        try:
+            self._authenticate(secret, fingerprint)
+        except BaseException:
+            self.close()
+            raise
+
+    def _authenticate(self, secret: bytes, fingerprint: str) -> None:
+        header, meta = self.receive_small()
+        challenge = meta.get("nonce")
+        if header.kind is not Kind.CHALLENGE or not isinstance(challenge, bytes):
+            raise AuthenticationError("the replay server sent no challenge")
+        nonce = os.urandom(NONCE_BYTES)
+        self.send(Kind.PROOF, {"nonce": nonce, "proof": proof(secret, b"client", challenge, nonce)})
+        header, meta = self.receive_small()
+        if header.kind is Kind.ERROR:
+            raise AuthenticationError(str(meta.get("error")))
+        answer = meta.get("proof")
+        expected = proof(secret, b"server", nonce, challenge)
+        if header.kind is not Kind.WELCOME or not isinstance(answer, bytes) or not hmac.compare_digest(answer, expected):
+            raise AuthenticationError("the replay server does not know this run's secret")
+        if meta.get("fingerprint") != fingerprint:
+            raise MessageError("fingerprint", f"{meta.get('fingerprint')}, this learner has {fingerprint}")
+
+    def send(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...] = ()) -> None:
+        """Send a frame whose body is the parts in order."""
+        self._socket.sendall(b"".join([encode_frame(kind, meta, parts), *parts]))
+
+    def receive(self, body_buffer: memoryview) -> tuple[FrameHeader, dict[str, Any], memoryview]:
+        """The next frame, its body in the buffer given. Raises MessageError, OSError."""
+        header = decode_header(self._exactly(HEADER.size), min(self._max_body, len(body_buffer)))
+        raw_meta = self._exactly(header.meta_length)
+        body = body_buffer[: header.body_length]
+        self._fill(body)
+        return header, decode_meta(raw_meta, body, header), body
+
+    def receive_small(self) -> tuple[FrameHeader, dict[str, Any]]:
+        """The next frame, which has no body."""
+        header, meta, _ = self.receive(memoryview(bytearray()))
+        return header, meta
+
+    def _exactly(self, length: int) -> bytes:
+        raw = bytearray(length)
+        self._fill(memoryview(raw))
+        return bytes(raw)
+
+    def _fill(self, view: memoryview) -> None:
+        while len(view):
+            received = self._socket.recv_into(view)
+            if received == 0:
+                raise ConnectionError("the replay server closed the connection")
+            view = view[received:]
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def _connect(address: str) -> socket.socket:
+    scheme, _, rest = address.partition(":")
+    if scheme == "unix":
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        target: Any = rest
+    else:
+        host, _, port = rest.rpartition(":")
+        connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        target = (host, int(port))
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+    connection.settimeout(TIMEOUT)
+    try:
+        connection.connect(target)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+class ReplayClient:
+    """The Replay protocol over the server's socket.
+
+    ``address`` gives the server's present address, or None while it has none. Raises
+    AuthenticationError for a wrong secret; outages only make draws answer WAIT.
+    """
+
+    def __init__(
+        self, address: Callable[[], str | None], secret: bytes, spec: WindowSpec, batch_size: int, pinned: bool = False
+    ) -> None:
+        self._address, self._secret, self._spec, self._batch_size = address, secret, spec, batch_size
+        body = batch_size * (spec.dtype.itemsize + 4)  # rows, then float32 importance weights
+        self._buffers = [torch.empty(body, dtype=torch.uint8, pin_memory=pinned).numpy() for _ in range(AHEAD)]
+        self._statistics_buffer = np.empty(2 * 8 * spec.obs_dim, np.uint8)
+        self._turn = self._in_flight = self._env_steps = 0
+        self._batches: Connection | None = None
+        self._control: Connection | None = None
+
+    def sample(self, batch_size: int) -> Sample:
+        """The oldest draw asked for; asks for the next. ``rows`` stay valid until the next draw but one."""
+        assert batch_size == self._batch_size, (batch_size, self._batch_size)
+        try:
+            return self._receive_sample()
+        except (OSError, MessageError) as error:
+            log.warning("replay connection lost: %s", error)
+            self._drop()
+            return Sample(Draw.WAIT, None, None, self._env_steps)
+
+    def _receive_sample(self) -> Sample:
+        connection = self._batches = self._batches or self._open()
+        if connection is None:
+            return Sample(Draw.WAIT, None, None, self._env_steps)
+        while self._in_flight < AHEAD:
+            connection.send(Kind.SAMPLE, {"batch_size": self._batch_size})
+            self._in_flight += 1
+        self._turn = (self._turn + 1) % AHEAD
+        header, meta, body = connection.receive(memoryview(self._buffers[self._turn]))
+        self._in_flight -= 1
+        if header.kind is Kind.ERROR:
+            raise MessageError("replay", str(meta.get("error")))
+        self._env_steps = int(meta["env_steps"])
+        if header.kind is not Kind.BATCH:
+            draw = Draw.FINISHED if header.kind is Kind.FINISHED else Draw.WAIT
+            return Sample(draw, None, None, self._env_steps)
+        split = self._batch_size * self._spec.dtype.itemsize
+        if len(body) != split + 4 * self._batch_size:
+            raise MessageError("length", f"{len(body)} bytes for a batch of {self._batch_size}")
+        rows = np.frombuffer(body[:split], self._spec.dtype)
+        return Sample(Draw.BATCH, rows, np.frombuffer(body[split:], np.float32), self._env_steps)
+
+    def _open(self) -> Connection | None:
+        address = self._address()
+        if address is None:
+            return None
+        self._in_flight = 0
+        return Connection(address, self._secret, self._spec.fingerprint, self._buffers[0].nbytes)
+
+    def _drop(self) -> None:
+        for connection in (self._batches, self._control):
+            if connection is not None:
+                connection.close()
+        self._batches = self._control = None
+
+    def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
+        """Send priorities back; lost with a lost connection, as they only steer sampling."""
+        if self._batches is None:
+            return
+        try:
+            parts = (serials.tobytes(), priorities.astype(np.float32).tobytes())
+            self._batches.send(Kind.PRIORITIES, {"count": len(serials)}, parts)
+        except OSError as error:
+            log.warning("replay connection lost: %s", error)
+            self._drop()
+
+    def statistics(self) -> ObservationStatistics:
+        """Running observation statistics; a count of 0 while the server is away."""
+        obs_dim = self._spec.obs_dim
+        try:
+            meta, body = self._ask(Kind.STATISTICS)
+            total, square = np.frombuffer(body, np.float64).reshape(2, obs_dim).copy()
+            return ObservationStatistics(int(meta["count"]), total, square)
+        except (OSError, MessageError, ValueError) as error:
+            log.warning("no statistics from the replay server: %s", error)
+            return ObservationStatistics(0, np.zeros(obs_dim), np.zeros(obs_dim))
+
+    def stats(self) -> dict[str, Any]:
+        """The server's counters. Raises RmcError while it is away."""
+        try:
+            return self._ask(Kind.STATS)[0]
+        except OSError as error:
+            raise RmcError(f"the replay server is away: {error}") from None
+
+    def _ask(self, kind: Kind) -> tuple[dict[str, Any], memoryview]:
+        connection = self._control = self._control or self._open_control()
+        try:
+            connection.send(kind, {})
+            _, meta, body = connection.receive(memoryview(self._statistics_buffer))
+        except (OSError, MessageError):
+            connection.close()
+            self._control = None
+            raise
+        return meta, body
+
+    def _open_control(self) -> Connection:
+        address = self._address()
+        if address is None:
+            raise ConnectionError("the replay server is not up yet")
+        return Connection(address, self._secret, self._spec.fingerprint, self._statistics_buffer.nbytes)
+
+    def close(self) -> None:
+        self._drop()
