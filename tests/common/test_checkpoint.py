@@ -1,0 +1,70 @@
+"""Checkpoints are whole or absent, and damage is seen."""
+
+import pytest
+
+from common.checkpoint import CheckpointFolder
+from common.errors import CheckpointError, ConfigError
+
+FILES = {"state": b"\x00" * 100, "progress.json": b"{}"}
+
+
+def test_round_trip_and_pruning(tmp_path):
+    folder = CheckpointFolder(tmp_path / "checkpoints", keep=2)
+    folder.lock()
+    for number in (10, 20, 30):
+        folder.save(number, {**FILES, "state": bytes([number])})
+    assert folder.numbers() == [20, 30]
+    assert folder.latest() == (30, {"state": b"\x1e", "progress.json": b"{}"})
+
+
+def test_best_is_kept_and_only_beaten_by_better(tmp_path):
+    folder = CheckpointFolder(tmp_path, keep=1)
+    folder.save(1, FILES)
+    folder.mark_best(1, 5.0)
+    folder.save(2, FILES)
+    folder.mark_best(2, 4.0)
+    folder.save(3, FILES)
+    assert (folder.best(), folder.numbers()) == (1, [1, 3])
+
+
+@pytest.mark.parametrize("damage", ["flip", "truncate", "manifest", "missing"])
+def test_damage_is_found_and_an_older_one_used(tmp_path, damage):
+    folder = CheckpointFolder(tmp_path)
+    folder.save(1, FILES)
+    folder.save(2, FILES)
+    target = folder.path(2) / ("manifest.json" if damage == "manifest" else "state")
+    content = bytearray(target.read_bytes())
+    if damage == "missing":
+        target.unlink()
+    else:
+        content[len(content) // 2] ^= 1
+        target.write_bytes(content[:-1] if damage == "truncate" else content)
+    with pytest.raises(CheckpointError, match="000000002"):
+        folder.load(2)
+    found = folder.latest()
+    assert found is not None and found[0] == 1
+
+
+def test_a_half_written_checkpoint_is_not_seen(tmp_path):
+    folder = CheckpointFolder(tmp_path)
+    (tmp_path / ".tmp-000000005").mkdir()
+    folder.lock()
+    assert folder.numbers() == [] and not (tmp_path / ".tmp-000000005").exists()
+
+
+def test_two_writers_exclude_each_other(tmp_path):
+    first, second = CheckpointFolder(tmp_path / "c"), CheckpointFolder(tmp_path / "c")
+    first.lock()
+    with pytest.raises(ConfigError, match="another process"):
+        second.lock()
+    first.unlock()
+    second.lock()
+
+
+def test_manifest_cannot_name_a_file_outside(tmp_path):
+    folder = CheckpointFolder(tmp_path / "c")
+    folder.save(1, FILES)
+    (tmp_path / "outside").write_bytes(b"secret")
+    (folder.path(1) / "manifest.json").write_text('{"sha256": {"../../outside": "00"}}')
+    with pytest.raises(CheckpointError):
+        folder.load(1)

@@ -1,0 +1,34 @@
+"""Random but lawful rows for the learner's tests."""
+
+import numpy as np
+import torch
+
+from common.window import Rows, WindowSpec
+from learner.batch import Batch, view_batch
+
+SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=4, train=5)
+
+
+def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC) -> Rows:
+    """Rows of every shape: padded and real burn-in, full and partial, terminated and not."""
+    rng = np.random.default_rng(seed)
+    rows = np.zeros(count, spec.dtype)
+    rows["serial"] = np.arange(count)
+    rows["first"] = rng.choice([0, spec.burn_in], count)
+    rows["last"] = rng.integers(spec.burn_in + 1, spec.steps + 1, count)
+    rows["terminated"] = rng.integers(0, 2, count)
+    rows["blank"] = rng.uniform(size=rows["blank"].shape) < 0.3
+    for name in ("observation", "action", "prev_action", "reward", "hidden"):
+        rows[name] = rng.uniform(-1.0, 1.0, rows[name].shape)
+    observed, stepped = spec.observation_valid(rows), spec.step_valid(rows)
+    rows["observation"] *= observed[..., None]
+    rows["blank"] *= observed
+    rows["action"] *= stepped[..., None]
+    rows["reward"] *= stepped
+    return rows
+
+
+def to_batch(rows: Rows, spec: WindowSpec = SPEC, importance: np.ndarray | None = None) -> Batch:
+    """Rows as the learner sees them."""
+    weights = np.ones(len(rows), np.float32) if importance is None else importance
+    return view_batch(torch.from_numpy(rows.view("u1").reshape(len(rows), -1)), torch.from_numpy(weights), spec)

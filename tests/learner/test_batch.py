@@ -1,0 +1,42 @@
+"""The batch's views against a plain loop over the rows."""
+
+import numpy as np
+
+from tests.learner.rows import SPEC, random_rows, to_batch
+
+
+def test_fields_match_the_rows():
+    rows = random_rows(16)
+    batch = to_batch(rows)
+    for b, row in enumerate(rows):
+        for t in range(SPEC.observations):
+            real = row["first"] <= t <= row["last"]
+            assert bool(batch.observation_valid[b, t]) == real
+            wanted = row["observation"][t] if real else np.zeros(3)
+            np.testing.assert_array_equal(batch.observation[b, t], wanted)
+            assert bool(batch.blank[b, t]) == bool(real and row["blank"][t])
+        for t in range(SPEC.steps):
+            real = row["first"] <= t < row["last"]
+            assert bool(batch.step_valid[b, t]) == real
+            assert float(batch.reward[b, t]) == (row["reward"][t] if real else 0.0)
+            assert bool(batch.terminated[b, t]) == bool(row["terminated"] and t == row["last"] - 1)
+        np.testing.assert_array_equal(batch.hidden[b], row["hidden"])
+        assert bool(batch.burned_in[b]) == (row["first"] == 0)
+
+
+def test_previous_action_of_the_first_real_step_is_the_stored_one():
+    rows = random_rows(16)
+    batch = to_batch(rows)
+    for b, row in enumerate(rows):
+        first, last = int(row["first"]), int(row["last"])
+        np.testing.assert_array_equal(batch.prev_action[b, first], row["prev_action"])
+        for t in range(first + 1, last + 1):
+            np.testing.assert_array_equal(batch.prev_action[b, t], row["action"][t - 1])
+        assert not batch.prev_action[b, :first].any() and not batch.prev_action[b, last + 1 :].any()
+
+
+def test_row_is_a_multiple_of_a_cache_line_and_the_fingerprint_follows_the_sizes():
+    from common.window import WindowSpec
+
+    assert SPEC.dtype.itemsize % 64 == 0
+    assert SPEC.fingerprint != WindowSpec(4, 2, 8, 4, 5).fingerprint

@@ -1,0 +1,142 @@
+"""Every loss against a slow, plain reference: loops over batch and time, written from the equations."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from common.agent import squashed_sample
+from learner import losses
+
+B, T, H, O, A = 4, 5, 6, 3, 2
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+@pytest.fixture
+def m() -> np.ndarray:
+    mask = np.ones((B, T), np.float32)
+    mask[0, 3:], mask[2, 1:] = 0.0, 0.0
+    return mask
+
+
+@pytest.fixture
+def d() -> np.ndarray:
+    ends = np.zeros((B, T), np.float32)
+    ends[0, 2], ends[3, 4] = 1.0, 1.0
+    return ends
+
+
+def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
+    return [torch.as_tensor(np.asarray(array, np.float32)) for array in arrays]
+
+
+def real_steps(m: np.ndarray) -> list[tuple[int, int]]:
+    return [(b, t) for b in range(B) for t in range(T) if m[b, t]]
+
+
+def test_model_error_and_loss(rng, m, d):
+    f, change = rng.normal(size=(2, B, T, H))
+    expected, count = 0.0, 0
+    for b, t in real_steps(m):
+        if not d[b, t]:
+            expected += sum(abs(f[b, t, u] - change[b, t, u]) for u in range(H)) / H
+            count += 1
+    ft, ct, mt, dt = tensors(f, change, m, d)
+    assert losses.model_loss(losses.model_error(ft, ct), dt, mt).item() == pytest.approx(expected / count, rel=1e-5)
+
+
+def test_model_target_gets_no_gradient(rng):
+    f, change = (torch.randn(B, T, H, requires_grad=True) for _ in range(2))
+    losses.model_error(f, change).sum().backward()
+    assert f.grad is not None and change.grad is None
+
+
+def test_curiosity_is_the_error_without_gradient(rng, m, d):
+    error = torch.rand(B, T, requires_grad=True)
+    i = losses.curiosity(error, *tensors(d, m))
+    for b in range(B):
+        for t in range(T):
+            wanted = error[b, t].item() if m[b, t] and not d[b, t] else 0.0
+            assert i[b, t].item() == pytest.approx(wanted)
+    assert not i.requires_grad
+
+
+def test_td_target(rng, d):
+    r, i, log_pi = rng.normal(size=(3, B, T))
+    q = rng.normal(size=(2, B, T))
+    alpha, beta, gamma = 0.3, 0.2, 0.97
+    rt, it, dt, qt, lt = tensors(r, i, d, q, log_pi)
+    y = losses.td_target(rt, it, torch.tensor(beta), gamma, dt, qt, torch.tensor(alpha), lt)
+    for b in range(B):
+        for t in range(T):
+            soft = min(q[0, b, t], q[1, b, t]) - alpha * log_pi[b, t]
+            wanted = r[b, t] + beta * i[b, t] + (0.0 if d[b, t] else gamma * soft)
+            assert y[b, t].item() == pytest.approx(wanted, rel=1e-5, abs=1e-6)
+
+
+def test_q_loss(rng, m):
+    q, y, w = rng.normal(size=(2, B, T)), rng.normal(size=(B, T)), rng.uniform(0.1, 1.0, size=B)
+    steps = real_steps(m)
+    expected = sum(w[b] * 0.5 * sum((q[j, b, t] - y[b, t]) ** 2 for j in (0, 1)) for b, t in steps) / len(steps)
+    assert losses.q_loss(*tensors(q, y, w, m)).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_policy_and_temperature_loss(rng, m):
+    log_pi, q = rng.normal(size=(2, B, T))
+    alpha, target = 0.4, -2.0
+    steps = real_steps(m)
+    policy = sum(alpha * log_pi[b, t] - q[b, t] for b, t in steps) / len(steps)
+    temperature = -math.log(alpha) * sum(log_pi[b, t] + target for b, t in steps) / len(steps)
+    lt, qt, mt = tensors(log_pi, q, m)
+    log_alpha = torch.tensor(math.log(alpha))
+    assert losses.policy_loss(lt, qt, log_alpha.exp(), mt).item() == pytest.approx(policy, rel=1e-5)
+    assert losses.temperature_loss(log_alpha, lt, target, mt).item() == pytest.approx(temperature, rel=1e-5)
+
+
+def test_temperature_rises_when_entropy_is_too_low():
+    log_alpha = torch.zeros((), requires_grad=True)
+    too_sure = torch.full((1, 1), 5.0)  # log pi far above -target: entropy below the target
+    losses.temperature_loss(log_alpha, too_sure, -2.0, torch.ones(1, 1)).backward()
+    assert log_alpha.grad is not None and log_alpha.grad < 0.0
+
+
+def test_grounding_loss(rng, m):
+    f, change = rng.normal(size=(2, B, T, O))
+    fr, r = rng.normal(size=(2, B, T))
+    seen = (rng.uniform(size=(B, T)) < 0.6).astype(np.float32)
+    visible = [(b, t) for b, t in real_steps(m) if seen[b, t]]
+    o_part = sum(np.abs(f[b, t] - change[b, t]).mean() for b, t in visible) / len(visible)
+    r_part = sum(abs(fr[b, t] - r[b, t]) for b, t in real_steps(m)) / len(real_steps(m))
+    found = losses.grounding_loss(*tensors(f, change, fr, r, seen, m)).item()
+    assert found == pytest.approx(o_part + r_part, rel=1e-5)
+
+
+def test_priority(rng, m):
+    td = rng.normal(size=(B, T))
+    found = losses.priority(*tensors(td)[:1], 0.9, *tensors(m))
+    for b in range(B):
+        sizes = [abs(td[b, t]) for t in range(T) if m[b, t]]
+        assert found[b].item() == pytest.approx(0.9 * max(sizes) + 0.1 * sum(sizes) / len(sizes), rel=1e-5)
+
+
+def test_masked_mean_of_nothing_is_zero():
+    assert losses.masked_mean(torch.ones(2, 3), torch.zeros(2, 3)).item() == 0.0
+
+
+def test_squashed_log_density_against_change_of_variables(rng):
+    mean, log_std, noise = tensors(*rng.normal(size=(3, 50, A)) * 0.8)
+    action, log_pi = squashed_sample(mean, log_std, noise)
+    normal = torch.distributions.Normal(mean.double(), log_std.double().exp())
+    u = torch.atanh(action.double())
+    plain = (normal.log_prob(u) - torch.log(1.0 - action.double() ** 2)).sum(-1)
+    torch.testing.assert_close(log_pi.double(), plain, rtol=1e-4, atol=1e-4)
+
+
+def test_squashed_log_density_is_finite_where_tanh_saturates():
+    _, log_pi = squashed_sample(torch.full((1, 1), 40.0), torch.zeros(1, 1), torch.zeros(1, 1))
+    assert torch.isfinite(log_pi).all()

@@ -1,0 +1,203 @@
+"""The joint update: gradients reach what scheme 1 says, padding reaches nothing, state comes back bit for bit."""
+
+import copy
+import io
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from common.agent import Agent, AgentConfig
+from learner import losses
+from learner.update import JointUpdate, UpdateConfig
+from tests.learner.rows import SPEC, random_rows, to_batch
+
+ROBUST = AgentConfig(
+    hidden=SPEC.hidden, embedding=7, heads=(10, 9), layer_norm=True, shortcut=True, normalize_observations=True
+)
+PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding=False)
+BETA = torch.tensor(0.5)
+
+
+def make(agent: AgentConfig, **options: object) -> JointUpdate:
+    torch.manual_seed(0)
+    network = Agent(SPEC.obs_dim, SPEC.action_dim, agent)
+    network.normalizer.freeze(10, torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
+    return JointUpdate(network, SPEC.burn_in, UpdateConfig(curiosity=0.5, **options), seed=3)  # type: ignore[arg-type]
+
+
+def gradients(update: JointUpdate, keep: str, monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Names of parameters that one loss alone gives a gradient."""
+    silence = {"model_loss", "q_loss", "policy_loss", "temperature_loss", "grounding_loss"} - {keep}
+    for name in silence:
+        original = getattr(losses, name)
+        monkeypatch.setattr(losses, name, lambda *args, original=original: original(*args).detach())
+    update(to_batch(random_rows(8)), BETA)
+    return {name for name, p in update.agent.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
+
+
+def part(update: JointUpdate, *prefixes: str) -> set[str]:
+    return {name for name, _ in update.agent.named_parameters() if name.startswith(prefixes)}
+
+
+@pytest.mark.parametrize("agent", [ROBUST, PAPER], ids=["robust", "paper"])
+@pytest.mark.parametrize(
+    ("loss", "reached"),
+    [
+        ("model_loss", ("memory.", "world_model.")),
+        ("q_loss", ("memory.", "critic.")),
+        ("policy_loss", ("policy.",)),
+        ("temperature_loss", ("log_alpha",)),
+    ],
+)
+def test_scheme_1_gradients_reach_exactly(agent, loss, reached, monkeypatch):
+    update = make(agent)
+    assert gradients(update, loss, monkeypatch) == part(update, *reached)
+
+
+def test_grounding_reaches_memory_and_world_model(monkeypatch):
+    update = make(ROBUST)
+    assert gradients(update, "grounding_loss", monkeypatch) == part(update, "memory.", "world_model.")
+
+
+def test_garbage_in_padding_changes_nothing():
+    rows = random_rows(12)
+    dirty = rows.copy()
+    observed, stepped = SPEC.observation_valid(rows), SPEC.step_valid(rows)
+    dirty["observation"][~observed] = np.nan
+    dirty["blank"][~observed] = 1
+    dirty["action"][~stepped] = np.inf
+    dirty["reward"][~stepped] = np.nan
+    clean_update, dirty_update = make(ROBUST, latent_target="ema"), make(ROBUST, latent_target="ema")
+    clean, dirtied = clean_update(to_batch(rows), BETA), dirty_update(to_batch(dirty), BETA)
+    assert torch.equal(clean.priorities, dirtied.priorities)
+    for name, value in clean.metrics.items():
+        assert torch.equal(value, dirtied.metrics[name]), name
+    assert_same(clean_update.agent.state_dict(), dirty_update.agent.state_dict())
+
+
+def test_padded_burn_in_starts_from_the_stored_state():
+    """A window whose burn-in is padding gives the same h as the trained part alone from its stored state."""
+    rows = random_rows(6)
+    rows["first"] = SPEC.burn_in
+    rows["observation"][:, : SPEC.burn_in] = 0.0
+    batch, update = to_batch(rows), make(PAPER)
+    found = update._remember(update.agent.memory, batch.observation, batch).hidden
+    n = SPEC.burn_in
+    alone = update.agent.memory(batch.observation[:, n:], batch.prev_action[:, n:], batch.hidden).hidden
+    assert torch.equal(found, alone)
+
+
+def test_burn_in_gets_no_gradient():
+    rows = random_rows(6)
+    rows["first"] = 0
+    batch, update = to_batch(rows), make(PAPER)
+    o = batch.observation.clone().requires_grad_()
+    update._remember(update.agent.memory, o, batch).hidden.sum().backward()
+    assert o.grad is not None
+    assert not o.grad[:, : SPEC.burn_in].any() and o.grad[:, SPEC.burn_in :].any()
+
+
+@torch.no_grad()
+def plain_first_losses(reference: Agent, rows: np.ndarray, weights: np.ndarray, noise: Tensor) -> tuple[float, float]:
+    """Model and Q loss by loops over windows and steps, with alpha = 1 and targets equal to the online nets."""
+    model, q_sum, steps, model_steps = 0.0, 0.0, 0, 0
+    for b, row in enumerate(rows):
+        hidden = plain_unroll(reference, row)
+        for t in range(SPEC.burn_in, int(row["last"])):
+            ends = bool(row["terminated"]) and t == row["last"] - 1
+            now, later = hidden[t], hidden[t + 1]
+            action = torch.tensor(row["action"][t])
+            f = reference.world_model(now[None, None], action[None, None]).hidden_change[0, 0]
+            error = float((f - (later - now)).abs().mean())
+            mean, log_std = reference.policy(later)
+            u = mean + log_std.exp() * noise[b, t + 1 - SPEC.burn_in]
+            log_pi = float(torch.distributions.Normal(mean, log_std.exp()).log_prob(u).sum())
+            log_pi -= float(torch.log(1.0 - torch.tanh(u) ** 2).sum())
+            value = float(reference.critic(later[None, None], torch.tanh(u)[None, None]).min()) - log_pi
+            y = float(row["reward"][t]) + (0.0 if ends else 0.5 * error + 0.99 * value)
+            q = reference.critic(now[None, None], action[None, None]).flatten()
+            q_sum += float(weights[b]) * 0.5 * sum((float(q[j]) - y) ** 2 for j in (0, 1))
+            model, model_steps, steps = model + (not ends) * error, model_steps + (not ends), steps + 1
+    return model / model_steps, q_sum / steps
+
+
+@pytest.mark.parametrize("latent", ["online", "ema"])
+def test_metrics_match_a_plain_recomputation(latent):
+    """Model loss and Q loss of the first update, recomputed window by window with plain modules."""
+    update = make(PAPER, latent_target=latent)
+    reference = copy.deepcopy(update.agent)
+    rows = random_rows(5)
+    weights = np.linspace(0.2, 1.0, 5).astype(np.float32)
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.randn((5, SPEC.train + 1, SPEC.action_dim), generator=generator)
+    found = update(to_batch(rows, importance=weights), BETA)
+    model, q = plain_first_losses(reference, rows, weights, noise)
+    assert found.metrics["model_loss"].item() == pytest.approx(model, rel=1e-4)
+    assert found.metrics["q_loss"].item() == pytest.approx(q, rel=1e-4)
+
+
+def plain_unroll(agent: Agent, row: np.void) -> dict[int, Tensor]:
+    """h_t for every real observation, one step at a time, without gradient."""
+    hidden = torch.tensor(row["hidden"])
+    states = {}
+    for t in range(int(row["first"]), int(row["last"]) + 1):
+        previous = row["prev_action"] if t == row["first"] else row["action"][t - 1]
+        o = agent.normalizer(torch.tensor(row["observation"][t]), torch.tensor(bool(row["blank"][t])))
+        x = torch.cat([o, torch.tensor(previous)])
+        hidden = agent.memory.gru(agent.memory.embed(x)[None, None], hidden[None, None])[1].flatten().detach()
+        states[t] = hidden
+    return states
+
+
+def test_policy_climbs_the_critic_it_is_told_to():
+    first, smaller = make(PAPER, policy_q="first"), make(PAPER, policy_q="min")
+    a, b = (u(to_batch(random_rows(8)), BETA).metrics["policy_loss"].item() for u in (first, smaller))
+    assert b > a  # min Q <= Q_1, so the loss is larger
+
+
+def test_targets_follow_by_polyak():
+    update = make(PAPER, polyak=0.9)
+    before = copy.deepcopy(update.target_critic.state_dict())
+    update(to_batch(random_rows(8)), BETA)
+    for name, value in update.target_critic.state_dict().items():
+        online = update.agent.critic.state_dict()[name]
+        torch.testing.assert_close(value, 0.9 * before[name] + 0.1 * online)
+
+
+def test_state_comes_back_bit_for_bit():
+    straight, stopped = make(ROBUST, curiosity_scale="std"), make(ROBUST, curiosity_scale="std")
+    for u in (straight, stopped):
+        for seed in range(3):
+            u(to_batch(random_rows(8, seed)), BETA)
+    file = io.BytesIO()
+    torch.save(stopped.state_dict(), file)
+    file.seek(0)
+    torch.manual_seed(99)
+    resumed = JointUpdate(
+        Agent(SPEC.obs_dim, SPEC.action_dim, ROBUST), SPEC.burn_in, straight.config, seed=1234
+    )
+    resumed.load_state_dict(torch.load(file, weights_only=True))
+    for seed in range(3, 6):
+        a, b = (u(to_batch(random_rows(8, seed)), BETA) for u in (straight, resumed))
+        assert torch.equal(a.priorities, b.priorities)
+    assert_same(straight.agent.state_dict(), resumed.agent.state_dict())
+
+
+def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
+    for name in a:
+        assert torch.equal(a[name], b[name]), name
+
+
+def test_beta_decays_to_zero():
+    config = UpdateConfig(curiosity=0.5, curiosity_steps=100)
+    assert [config.beta(n) for n in (0, 50, 100, 1000)] == [0.5, 0.25, 0.0, 0.0]
+
+
+def test_bf16_stays_near_fp32():
+    plain, half = make(ROBUST), make(ROBUST)
+    half.bf16 = True
+    a, b = (u(to_batch(random_rows(32)), BETA) for u in (plain, half))
+    for name in ("model_loss", "q_loss", "policy_loss", "grounding_loss"):
+        assert b.metrics[name].item() == pytest.approx(a.metrics[name].item(), rel=0.05, abs=0.02), name
