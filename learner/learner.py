@@ -75,7 +75,7 @@ class Learner:
     ) -> None:
         self.spec, self.config, self.replay, self.bus, self.checkpoints = spec, config, replay, bus, checkpoints
         self.device = torch.device(device)
-        self.updates = self.env_steps = 0
+        self.updates = self.env_steps = self.last_checkpoint = 0
         self.finished = False
         self._means, self._rate, self._waiting = Means(), Rate(), ""
         torch.manual_seed(seed)  # the networks' initial weights
@@ -159,6 +159,7 @@ class Learner:
         }
         self.mark_best()
         self.checkpoints.save(self.updates, files)
+        self.last_checkpoint = self.updates
         self._next_checkpoint = self._after(self.env_steps)
 
     def mark_best(self) -> None:
@@ -181,7 +182,8 @@ class Learner:
         _, files = found
         progress = json.loads(files[PROGRESS])
         self.update.load_state_dict(torch.load(io.BytesIO(files[STATE]), map_location=self.device, weights_only=True))
-        self.updates, self.env_steps = progress["updates"], progress["env_steps"]
+        self.updates = self.last_checkpoint = progress["updates"]
+        self.env_steps = progress["env_steps"]
         self._next_checkpoint = self._after(self.env_steps)
         log.info("resumed at update %d, environment step %d", self.updates, self.env_steps)
         return int(progress["epoch"])

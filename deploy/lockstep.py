@@ -1,0 +1,85 @@
+"""Every role in one thread over the in-process bus: same seed, same bits. For debugging and tests."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from actors.actor import Actor
+from actors.evaluator import Evaluator
+from common.bus import Bus, MemoryBus
+from common.checkpoint import CheckpointFolder
+from common.envs import make_env
+from common.metrics import BusyClock
+from common.role import METRICS_PERIOD, Role, StopSignal
+from deploy.presets import RunConfig
+from learner.learner import Learner
+from replay_server.server import ReplayServer
+
+
+class Lockstep:
+    """A whole run, stepped in a fixed order: the learner while the limiter lets it, else the actors.
+
+    Checkpoints drop unfinished episodes and reseed the environments, whether or not the run stops
+    there: only so can stop-and-resume give the same bits for any environment.
+    """
+
+    def __init__(self, config: RunConfig, folder: Path, device: str = "cpu") -> None:
+        spec, self.bus = config.window_spec(), MemoryBus()
+        self.server = ReplayServer(
+            spec, config.replay, folder / "replay", config.seed, config.total_steps, config.actors,
+            config.slack_steps(), self.bus,
+        )  # fmt: skip
+        checkpoints = CheckpointFolder(folder / "checkpoints", config.learner.keep_checkpoints)
+        self.learner = Learner(
+            spec, config.agent, config.update, config.learner, self.server, self.bus, checkpoints, config.seed, device
+        )
+        self.actors = [
+            Actor(index, config.seed, lambda: make_env(config.env), spec, config.agent, config.actor, self.bus)
+            for index in range(config.actors)
+        ]
+        self.evaluator = Evaluator(config.seed, lambda: make_env(config.env), config.agent, config.evaluator, self.bus)
+        self._seen = self.learner.last_checkpoint
+
+    @property
+    def roles(self) -> list[Role]:
+        return [self.learner, self.server, *self.actors, self.evaluator]
+
+    def step(self) -> None:
+        """One update, or one round of collection where none is due."""
+        if not self.learner.step():
+            for actor in self.actors:
+                actor.step()
+            self.server.step()
+        if self.learner.last_checkpoint != self._seen:
+            self._after_checkpoint()
+
+    def _after_checkpoint(self) -> None:
+        self._seen = self.learner.last_checkpoint
+        self.evaluator.step()
+        for actor in self.actors:
+            actor.restart()
+        self.server.step()  # takes the hellos in, so that a resumed run finds the same epochs
+        self.server.checkpoint()
+
+    def close(self) -> None:
+        """Close every role; the learner saves first."""
+        for role in self.roles:
+            role.close()
+
+
+def train(config: RunConfig, folder: Path, watch: Callable[[Bus], None], stop: StopSignal, device: str = "cpu") -> None:
+    """Train until the total is reached or ``stop`` is set; ``watch`` sees the bus about once a second."""
+    run = Lockstep(config, folder, device)
+    clock, due = BusyClock(), 0.0
+    try:
+        while not run.learner.finished and not stop.requested:
+            run.step()
+            clock.busy()
+            if time.monotonic() >= due:
+                due = time.monotonic() + METRICS_PERIOD
+                for role in run.roles:
+                    run.bus.emit(role.name, {"time": time.time(), **role.metrics(), **clock.shares()})
+                watch(run.bus)
+    finally:
+        run.close()
+        watch(run.bus)

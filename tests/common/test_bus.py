@@ -1,0 +1,113 @@
+"""Both buses keep the same promises."""
+
+import os
+import uuid
+
+import pytest
+
+from common.bus import Ack, Bus, Entry, EntryId, MemoryBus, ReplayAddress, Version
+from common.errors import BusUnavailable, ConfigError, FencedError
+from common.redis_bus import RedisBus
+
+
+@pytest.fixture(params=["memory", "redis"])
+def bus(request) -> Bus:
+    if request.param == "memory":
+        return MemoryBus()
+    return RedisBus(request.getfixturevalue("redis_url"), f"test-{uuid.uuid4().hex}")
+
+
+def test_config_and_stop(bus):
+    assert bus.config() is None and bus.stop_requested() is None
+    bus.set_config(b"{}")
+    bus.request_stop("done")
+    assert (bus.config(), bus.stop_requested()) == (b"{}", "done")
+    bus.clear_stop()
+    assert bus.stop_requested() is None
+
+
+def test_epochs_rise_past_the_floor(bus):
+    assert [bus.take_epoch("actor-0"), bus.take_epoch("actor-0"), bus.take_epoch("replay")] == [1, 2, 1]
+    assert bus.take_epoch("actor-0", floor=9) == 10
+    assert bus.take_epoch("actor-0", floor=3) == 11
+    assert bus.current_epoch("actor-0") == 11
+
+
+def test_entries_are_read_in_order_and_trimmed_by_commit(bus):
+    epoch = bus.take_epoch("replay")
+    for seq in range(5):
+        bus.append(3, EntryId(1, seq), b"%d" % seq)
+    assert bus.actors() == [3]
+    assert bus.read({3: EntryId(0, 0)}, 2) == [Entry(3, EntryId(1, 0), b"0"), Entry(3, EntryId(1, 1), b"1")]
+    bus.commit(epoch, {3: Ack(EntryId(1, 2), 77, True)})
+    assert [entry.id.seq for entry in bus.read({3: EntryId(0, 0)}, 10)] == [3, 4]
+    assert bus.ack(3) == Ack(EntryId(1, 2), 77, True) and bus.ack(4) is None
+
+
+def test_a_repeated_append_is_stored_once(bus):
+    for _ in range(3):
+        bus.append(0, EntryId(1, 0), b"hello")
+        bus.append(0, EntryId(1, 1), b"x")
+    assert len(bus.read({0: EntryId(0, 0)}, 10)) == 2
+
+
+def test_an_older_epoch_is_fenced(bus):
+    bus.append(0, EntryId(1, 0), b"")
+    bus.append(0, EntryId(2, 0), b"")
+    with pytest.raises(FencedError):
+        bus.append(0, EntryId(1, 1), b"late")
+
+
+def test_a_replaced_replay_server_cannot_trim(bus):
+    old = bus.take_epoch("replay")
+    bus.append(0, EntryId(1, 0), b"")
+    bus.take_epoch("replay")
+    with pytest.raises(FencedError):
+        bus.commit(old, {0: Ack(EntryId(1, 0), 0)})
+    assert len(bus.read({0: EntryId(0, 0)}, 10)) == 1
+
+
+def test_weights_of_many_pieces(bus):
+    epoch = bus.take_epoch("learner")
+    blob = os.urandom(700_000)
+    assert bus.weights() is None and bus.latest_version() is None
+    bus.publish_weights(Version(epoch, 5), blob)
+    assert bus.weights() == (Version(epoch, 5), blob)
+    assert bus.latest_version(evaluate=True) is None
+    bus.publish_weights(Version(epoch, 6), b"six", evaluate=True)
+    bus.publish_weights(Version(epoch, 7), b"seven")
+    assert (bus.weights(), bus.weights(evaluate=True)) == ((Version(epoch, 7), b"seven"), (Version(epoch, 6), b"six"))
+
+
+def test_a_replaced_learner_cannot_publish(bus):
+    old = bus.take_epoch("learner")
+    new = bus.take_epoch("learner")
+    bus.publish_weights(Version(new, 1), b"new")
+    with pytest.raises(FencedError):
+        bus.publish_weights(Version(old, 99), b"old")
+    assert bus.latest_version() == Version(new, 1)
+
+
+def test_metrics_and_stats(bus):
+    bus.emit("learner", {"updates": 1})
+    bus.emit("learner", {"updates": 2})
+    records, cursor = bus.records("0")
+    assert [record["updates"] for record in records] == [1, 2] and records[0]["role"] == "learner"
+    assert bus.records(cursor)[0] == []
+    assert bus.stats()["learner"]["updates"] == 2
+
+
+def test_replay_address(bus):
+    assert bus.replay_address() is None
+    bus.announce_replay(ReplayAddress(2, "unix:/tmp/a b"))
+    assert bus.replay_address() == ReplayAddress(2, "unix:/tmp/a b")
+
+
+def test_no_redis_there(tmp_path):
+    with pytest.raises(BusUnavailable):
+        RedisBus(f"unix://{tmp_path}/none.sock", "x").ping()
+
+
+def test_a_url_that_is_none():
+    with pytest.raises(ConfigError, match="--redis-url"):
+        RedisBus("http://example", "x")
