@@ -1,0 +1,60 @@
+"""The embedded server: private, portless, gone with its parent."""
+
+import signal
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+import redis
+
+from common.errors import ConfigError
+from deploy.redis_server import RedisServer
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from deploy.redis_server import RedisServer
+server = RedisServer(Path(sys.argv[1]))
+server.start()
+print(server.process.pid, flush=True)
+time.sleep(60)
+"""
+
+
+def test_listens_on_its_socket_only(tmp_path: Path) -> None:
+    with RedisServer(tmp_path) as server:
+        client = redis.Redis.from_url(server.url)
+        assert client.config_get("port")["port"] == "0"
+        assert client.config_get("maxmemory-policy")["maxmemory-policy"] == "noeviction"
+        assert stat.S_IMODE(server.socket.stat().st_mode) == 0o700
+        assert server.process is not None
+        assert not psutil.Process(server.process.pid).net_connections(kind="inet")
+        client.close()
+    assert not server.socket.exists()
+
+
+def test_dies_with_its_parent(tmp_path: Path) -> None:
+    holder = subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert holder.stdout is not None
+    server = psutil.Process(int(holder.stdout.readline()))
+    holder.send_signal(signal.SIGKILL)
+    holder.wait()
+    holder.stdout.close()
+    deadline = time.monotonic() + 5.0
+    while server.is_running() and server.status() != psutil.STATUS_ZOMBIE and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not server.is_running() or server.status() == psutil.STATUS_ZOMBIE
+
+
+def test_long_path_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="107 bytes"):
+        RedisServer(tmp_path / ("x" * 120))
+
+
+def test_failed_start_says_why(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="did not start"):
+        RedisServer(tmp_path, maxmemory=-1).start()
