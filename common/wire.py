@@ -8,6 +8,8 @@ Socket frame  = header "<4sBBHIIQ" (magic, version, kind, 0, len(meta), crc32(me
                 + meta (msgpack map) + body (raw bytes)
 """
 
+import hashlib
+import hmac
 import struct
 import zlib
 from collections.abc import Mapping
@@ -44,6 +46,11 @@ class Kind(IntEnum):
     STATISTICS = 9  # client -> server, and its reply: count, then sum | sum of squares (float64)
     STATS = 10  # client -> server, and its reply: the server's counters
     ERROR = 11  # server -> client: why the connection ends
+
+
+def proof(secret: bytes, side: bytes, challenge: bytes, nonce: bytes) -> bytes:
+    """HMAC-SHA256 with which a side, ``client`` or ``server``, shows the other that it knows the run's secret."""
+    return hmac.new(secret, side + challenge + nonce, hashlib.sha256).digest()
 
 
 def encode_windows(rows: Rows, spec: WindowSpec) -> bytes:
