@@ -52,7 +52,7 @@ class Normalizer(nn.Module):
     def forward(self, observation: Tensor, blank: Tensor) -> Tensor:
         """(..., O) raw and (...) bool -> (..., O)."""
         normalized = ((observation - self.mean) / self.std).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
-        return torch.where(blank.unsqueeze(-1), torch.zeros_like(normalized), normalized)
+        return torch.where(blank.unsqueeze(-1), 0.0, normalized)
 
     def freeze(self, count: int, total: Tensor, total_square: Tensor) -> None:
         """Take new statistics from sums over ``count`` observations; (O,) float64 each."""
@@ -154,7 +154,8 @@ class TwinQ(nn.Module):
         x = x.reshape(1, -1, x.shape[-1]).expand(2, -1, -1)
         for layer in self.layers[:-1]:
             x = F.relu(layer(x))
-        return self.layers[-1](x).float().reshape(2, *shape)
+        q: Tensor = self.layers[-1](x).float().reshape(2, *shape)
+        return q
 
 
 class Policy(nn.Module):

@@ -28,7 +28,7 @@ class RedisBus:
     def __init__(self, url: str, run: str) -> None:
         """``url``: ``unix:///path``, ``redis://host:port`` or ``rediss://…``. Raises ConfigError."""
         try:
-            self._redis = redis.Redis.from_url(
+            self._redis: Any = redis.Redis.from_url(  # Any: its annotations do not know decode_responses
                 url, retry=Retry(ExponentialBackoff(cap=0.1, base=0.01), retries=3), socket_timeout=10.0
             )
         except ValueError as error:
@@ -38,9 +38,9 @@ class RedisBus:
     def _key(self, *parts: object) -> str:
         return ":".join([self._prefix, *map(str, parts)])
 
-    def _call(self, action: Callable[[], T]) -> T:
+    def _call(self, action: Callable[..., T], *args: Any) -> T:
         try:
-            return action()
+            return action(*args)
         except redis.exceptions.OutOfMemoryError as error:
             raise BusFull(str(error)) from None
         except (redis.exceptions.ConnectionError, redis.exceptions.TimeoutError, OSError) as error:
@@ -54,7 +54,8 @@ class RedisBus:
         self._call(lambda: self._redis.set(self._key("config"), config))
 
     def config(self) -> bytes | None:
-        return self._call(lambda: self._redis.get(self._key("config")))
+        raw: bytes | None = self._call(lambda: self._redis.get(self._key("config")))
+        return raw
 
     def take_epoch(self, role: str, floor: int = 0) -> int:
         key = self._key("epoch", role)
@@ -92,7 +93,9 @@ class RedisBus:
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
         if not after:
             return []
-        streams = {self._key("windows", actor): f"{cursor.epoch}-{max(cursor.seq, 0)}" for actor, cursor in after.items()}
+        streams = {
+            self._key("windows", actor): f"{cursor.epoch}-{max(cursor.seq, 0)}" for actor, cursor in after.items()
+        }
         reply = self._call(lambda: self._redis.xread(streams, count=count))
         return [
             Entry(int(name.rsplit(b":", 1)[1]), _entry_id(raw_id), fields.get(b"p", b""))
@@ -110,7 +113,10 @@ class RedisBus:
                 pipe.xtrim(self._key("windows", actor), minid=f"{ack.id.epoch}-{ack.id.seq + 1}", approximate=False)
             pipe.hset(
                 self._key("acks"),
-                mapping={actor: f"{ack.id.epoch} {ack.id.seq} {ack.granted_steps} {int(ack.final)}" for actor, ack in acks.items()},
+                mapping={
+                    actor: f"{ack.id.epoch} {ack.id.seq} {ack.granted_steps} {int(ack.final)}"
+                    for actor, ack in acks.items()
+                },
             )
 
         if acks:
@@ -130,7 +136,7 @@ class RedisBus:
             "reason": reason,
             "head": entry.payload[:DEAD_LETTER_BYTES],
         }
-        self._call(lambda: self._redis.xadd(self._key("dead"), fields, maxlen=DEAD_LETTERS_KEPT))  # type: ignore[arg-type]
+        self._call(lambda: self._redis.xadd(self._key("dead"), fields, maxlen=DEAD_LETTERS_KEPT))
 
     def announce_replay(self, address: ReplayAddress) -> None:
         self._call(lambda: self._redis.set(self._key("replay"), f"{address.epoch} {address.address}"))
@@ -147,7 +153,7 @@ class RedisBus:
         head = f"{version.epoch} {version.update} {len(pieces)} {zlib.crc32(blob)}"
         for index, piece in enumerate(pieces):  # one call each: a pipeline would join them into one blob again
             key = self._key("weights", version.epoch, version.update, index)
-            self._call(lambda key=key, piece=piece: self._redis.set(key, piece))  # type: ignore[misc]
+            self._call(self._redis.set, key, piece)
         heads = [self._key("weights")] + [self._key("evaluate")] * evaluate
         before = self._heads()
 
@@ -181,7 +187,7 @@ class RedisBus:
         """Let replaced versions expire rather than vanish, so that a reader amid them can finish."""
         for version, pieces in versions:
             for key in self._piece_keys(version, pieces):
-                self._call(lambda key=key: self._redis.expire(key, 5))  # type: ignore[misc]
+                self._call(self._redis.expire, key, 5)
 
     def latest_version(self, evaluate: bool = False) -> Version | None:
         head = self._head(evaluate)
@@ -192,7 +198,7 @@ class RedisBus:
         if head is None:
             return None
         version, count, crc = head
-        pieces = [self._call(lambda key=key: self._redis.get(key)) for key in self._piece_keys(version, count)]  # type: ignore[misc]
+        pieces = [self._call(self._redis.get, key) for key in self._piece_keys(version, count)]
         try:
             return version, join_pieces(pieces, crc)
         except MessageError:
@@ -223,7 +229,7 @@ class RedisBus:
         self._call(lambda: self._redis.set(self._key("stop"), reason))
 
     def stop_requested(self) -> str | None:
-        raw = self._call(lambda: self._redis.get(self._key("stop")))
+        raw: bytes | None = self._call(lambda: self._redis.get(self._key("stop")))
         return raw.decode() if raw is not None else None
 
     def clear_stop(self) -> None:
@@ -241,5 +247,5 @@ def _stream_items(reply: Any) -> list[tuple[bytes, list[tuple[bytes, dict[bytes,
     if not reply:
         return []
     if isinstance(reply, dict):
-        return [(name, entries[0] if len(entries) == 1 and isinstance(entries[0], list) else entries) for name, entries in reply.items()]
-    return [(name, entries) for name, entries in reply]
+        return [(name, chunks[0]) for name, chunks in reply.items()]
+    return list(reply)

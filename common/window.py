@@ -72,9 +72,7 @@ class WindowSpec:
         names = list(packed.names or ())
         offsets = [int(packed.fields[name][1]) for name in names] if packed.fields else []
         formats = [packed.fields[name][0] for name in names] if packed.fields else []
-        return np.dtype(
-            {"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize}  # type: ignore[call-overload]
-        )
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
 
     @cached_property
     def fingerprint(self) -> str:

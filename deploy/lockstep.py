@@ -6,6 +6,7 @@ from pathlib import Path
 
 from actors.actor import Actor
 from actors.evaluator import Evaluator
+
 from common.bus import Bus, MemoryBus
 from common.checkpoint import CheckpointFolder
 from common.envs import make_env

@@ -48,8 +48,8 @@ class LearnerConfig:
 def bf16_is_native(device: torch.device) -> bool:
     """Whether bfloat16 products are faster than float32 there (AMX or AVX-512 BF16 on a CPU)."""
     if device.type == "cuda":
-        return torch.cuda.is_bf16_supported()
-    return torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
+        return bool(torch.cuda.is_bf16_supported())
+    return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
 
 
 class Learner:
@@ -111,7 +111,8 @@ class Learner:
         return True
 
     def _learn(self, sample: Sample) -> None:
-        assert sample.rows is not None and sample.importance is not None
+        assert sample.rows is not None
+        assert sample.importance is not None
         self.beta.fill_(self.update.config.beta(self.env_steps))
         updated = self.update(self._to_device(sample), self.beta)
         self.updates += 1

@@ -4,7 +4,6 @@ Frames are those of ``common/wire.py``. A lost connection is found again through
 answer WAIT. Statistics travel on a connection of their own, so that they never queue behind batches.
 """
 
-import hashlib
 import hmac
 import logging
 import os
@@ -19,18 +18,13 @@ from numpy.typing import NDArray
 from common.errors import AuthenticationError, MessageError, RmcError
 from common.replay import Draw, ObservationStatistics, Sample
 from common.window import WindowSpec
-from common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame
+from common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame, proof
 
 log = logging.getLogger(__name__)
 AHEAD = 2  # draws in flight, so that the server gathers while the learner computes
 NONCE_BYTES = 32
 TIMEOUT = 10.0  # seconds until a silent server counts as gone
 RECEIVE_BUFFER = 8 << 20
-
-
-def proof(secret: bytes, side: bytes, challenge: bytes, nonce: bytes) -> bytes:
-    """HMAC-SHA256 with which a side shows that it knows the run's secret."""
-    return hmac.new(secret, side + challenge + nonce, hashlib.sha256).digest()
 
 
 class Connection:
@@ -58,7 +52,8 @@ class Connection:
             raise AuthenticationError(str(meta.get("error")))
         answer = meta.get("proof")
         expected = proof(secret, b"server", nonce, challenge)
-        if header.kind is not Kind.WELCOME or not isinstance(answer, bytes) or not hmac.compare_digest(answer, expected):
+        known = isinstance(answer, bytes) and hmac.compare_digest(answer, expected)
+        if header.kind is not Kind.WELCOME or not known:
             raise AuthenticationError("the replay server does not know this run's secret")
         if meta.get("fingerprint") != fingerprint:
             raise MessageError("fingerprint", f"{meta.get('fingerprint')}, this learner has {fingerprint}")
@@ -128,8 +123,9 @@ class ReplayClient:
     ) -> None:
         self._address, self._secret, self._spec, self._batch_size = address, secret, spec, batch_size
         body = batch_size * (spec.dtype.itemsize + 4)  # rows, then float32 importance weights
-        self._buffers = [torch.empty(body, dtype=torch.uint8, pin_memory=pinned).numpy() for _ in range(AHEAD)]
-        self._statistics_buffer = np.empty(2 * 8 * spec.obs_dim, np.uint8)
+        tensors = [torch.empty(body, dtype=torch.uint8, pin_memory=pinned) for _ in range(AHEAD)]
+        self._buffers = [tensor.numpy().data for tensor in tensors]
+        self._statistics_buffer = memoryview(bytearray(2 * 8 * spec.obs_dim))
         self._turn = self._in_flight = self._env_steps = 0
         self._batches: Connection | None = None
         self._control: Connection | None = None
@@ -152,7 +148,7 @@ class ReplayClient:
             connection.send(Kind.SAMPLE, {"batch_size": self._batch_size})
             self._in_flight += 1
         self._turn = (self._turn + 1) % AHEAD
-        header, meta, body = connection.receive(memoryview(self._buffers[self._turn]))
+        header, meta, body = connection.receive(self._buffers[self._turn])
         self._in_flight -= 1
         if header.kind is Kind.ERROR:
             raise MessageError("replay", str(meta.get("error")))
@@ -212,7 +208,7 @@ class ReplayClient:
         connection = self._control = self._control or self._open_control()
         try:
             connection.send(kind, {})
-            _, meta, body = connection.receive(memoryview(self._statistics_buffer))
+            _, meta, body = connection.receive(self._statistics_buffer)
         except (OSError, MessageError):
             connection.close()
             self._control = None

@@ -79,7 +79,13 @@ class JointUpdate:
         self.curiosity_variance = torch.ones((), device=device)
 
     def __call__(self, batch: Batch, beta: Tensor) -> Updated:
-        """One update from a Batch; ``beta`` is a scalar tensor. The order follows the paper's section 3."""
+        """One update from a Batch; ``beta`` is a scalar tensor."""
+        parts, updated = self.forward(batch, beta)
+        norm = self._step(sum(parts.values(), torch.zeros_like(beta)))
+        return updated._replace(metrics=updated.metrics | {"grad_norm": norm})
+
+    def forward(self, batch: Batch, beta: Tensor) -> tuple[dict[str, Tensor], Updated]:
+        """Every loss from the parameters as they stand, in the order of the paper's section 3."""
         agent, c = self.agent, self.config
         steps = slice(self.burn_in, None)
         a, r, d = batch.action[:, steps], batch.reward[:, steps], batch.terminated[:, steps]
@@ -123,11 +129,9 @@ class JointUpdate:
             parts["grounding_loss"] = losses.grounding_loss(
                 prediction.observation_change.float(), change, prediction.reward.float(), r, seen, m
             )
-        grad_norm = self._step(sum(parts.values(), torch.zeros_like(alpha)))
 
         td_error = (q.detach() - y).abs().mean(0)
         metrics = {name: value.detach() for name, value in parts.items()} | {
-            "grad_norm": grad_norm,
             "alpha": alpha,
             "entropy": -losses.masked_mean(log_pi.detach(), m),
             "q_mean": losses.masked_mean(q.detach().mean(0), m),
@@ -135,13 +139,13 @@ class JointUpdate:
             "curiosity_mean": losses.masked_mean(i, m),
             "curiosity_share": beta * i.sum() / (beta * i.sum() + (m * r.abs()).sum()).clamp(min=1e-8),
         }
-        return Updated(losses.priority(td_error, c.eta, m), metrics, memory.hidden.detach())
+        return parts, Updated(losses.priority(td_error, c.eta, m), metrics, memory.hidden.detach())
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
 
     def _remember(self, memory: Memory, o: Tensor, batch: Batch) -> Remembered:
-        """(B, L_t + 1, ·) from the stored state; where the burn-in is padding the stored state starts the trained part."""
+        """(B, L_t + 1, ·) from the stored state, which starts the trained part itself where the burn-in is padding."""
         n = self.burn_in
         hidden = batch.hidden
         if n:

@@ -18,7 +18,8 @@ def bus(request) -> Bus:
 
 
 def test_config_and_stop(bus):
-    assert bus.config() is None and bus.stop_requested() is None
+    assert bus.config() is None
+    assert bus.stop_requested() is None
     bus.set_config(b"{}")
     bus.request_stop("done")
     assert (bus.config(), bus.stop_requested()) == (b"{}", "done")
@@ -41,7 +42,8 @@ def test_entries_are_read_in_order_and_trimmed_by_commit(bus):
     assert bus.read({3: EntryId(0, 0)}, 2) == [Entry(3, EntryId(1, 0), b"0"), Entry(3, EntryId(1, 1), b"1")]
     bus.commit(epoch, {3: Ack(EntryId(1, 2), 77, True)})
     assert [entry.id.seq for entry in bus.read({3: EntryId(0, 0)}, 10)] == [3, 4]
-    assert bus.ack(3) == Ack(EntryId(1, 2), 77, True) and bus.ack(4) is None
+    assert bus.ack(3) == Ack(EntryId(1, 2), 77, True)
+    assert bus.ack(4) is None
 
 
 def test_a_repeated_append_is_stored_once(bus):
@@ -70,7 +72,8 @@ def test_a_replaced_replay_server_cannot_trim(bus):
 def test_weights_of_many_pieces(bus):
     epoch = bus.take_epoch("learner")
     blob = os.urandom(700_000)
-    assert bus.weights() is None and bus.latest_version() is None
+    assert bus.weights() is None
+    assert bus.latest_version() is None
     bus.publish_weights(Version(epoch, 5), blob)
     assert bus.weights() == (Version(epoch, 5), blob)
     assert bus.latest_version(evaluate=True) is None
@@ -92,7 +95,8 @@ def test_metrics_and_stats(bus):
     bus.emit("learner", {"updates": 1})
     bus.emit("learner", {"updates": 2})
     records, cursor = bus.records("0")
-    assert [record["updates"] for record in records] == [1, 2] and records[0]["role"] == "learner"
+    assert [record["updates"] for record in records] == [1, 2]
+    assert records[0]["role"] == "learner"
     assert bus.records(cursor)[0] == []
     assert bus.stats()["learner"]["updates"] == 2
 

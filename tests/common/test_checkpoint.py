@@ -42,14 +42,16 @@ def test_damage_is_found_and_an_older_one_used(tmp_path, damage):
     with pytest.raises(CheckpointError, match="000000002"):
         folder.load(2)
     found = folder.latest()
-    assert found is not None and found[0] == 1
+    assert found is not None
+    assert found[0] == 1
 
 
 def test_a_half_written_checkpoint_is_not_seen(tmp_path):
     folder = CheckpointFolder(tmp_path)
     (tmp_path / ".tmp-000000005").mkdir()
     folder.lock()
-    assert folder.numbers() == [] and not (tmp_path / ".tmp-000000005").exists()
+    assert folder.numbers() == []
+    assert not (tmp_path / ".tmp-000000005").exists()
 
 
 def test_two_writers_exclude_each_other(tmp_path):

@@ -90,7 +90,13 @@ def test_frame_round_trip():
 
 @pytest.mark.parametrize(
     ("start", "patch", "reason"),
-    [(0, b"NOPE", "version"), (4, b"\x09", "version"), (5, b"\xff", "kind"), (16, b"\xff" * 8, "too-large"), (8, b"\xff" * 4, "too-large")],
+    [
+        (0, b"NOPE", "version"),
+        (4, b"\x09", "version"),
+        (5, b"\xff", "kind"),
+        (16, b"\xff" * 8, "too-large"),
+        (8, b"\xff" * 4, "too-large"),
+    ],
 )
 def test_bad_headers_are_refused_before_anything_is_read(start, patch, reason):
     raw = bytearray(wire.encode_frame(wire.Kind.SAMPLE, {}))[: wire.HEADER.size]

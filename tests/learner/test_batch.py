@@ -32,7 +32,8 @@ def test_previous_action_of_the_first_real_step_is_the_stored_one():
         np.testing.assert_array_equal(batch.prev_action[b, first], row["prev_action"])
         for t in range(first + 1, last + 1):
             np.testing.assert_array_equal(batch.prev_action[b, t], row["action"][t - 1])
-        assert not batch.prev_action[b, :first].any() and not batch.prev_action[b, last + 1 :].any()
+        assert not batch.prev_action[b, :first].any()
+        assert not batch.prev_action[b, last + 1 :].any()
 
 
 def test_row_is_a_multiple_of_a_cache_line_and_the_fingerprint_follows_the_sizes():

@@ -53,7 +53,8 @@ def test_model_error_and_loss(rng, m, d):
 def test_model_target_gets_no_gradient(rng):
     f, change = (torch.randn(B, T, H, requires_grad=True) for _ in range(2))
     losses.model_error(f, change).sum().backward()
-    assert f.grad is not None and change.grad is None
+    assert f.grad is not None
+    assert change.grad is None
 
 
 def test_curiosity_is_the_error_without_gradient(rng, m, d):
@@ -102,7 +103,8 @@ def test_temperature_rises_when_entropy_is_too_low():
     log_alpha = torch.zeros((), requires_grad=True)
     too_sure = torch.full((1, 1), 5.0)  # log pi far above -target: entropy below the target
     losses.temperature_loss(log_alpha, too_sure, -2.0, torch.ones(1, 1)).backward()
-    assert log_alpha.grad is not None and log_alpha.grad < 0.0
+    assert log_alpha.grad is not None
+    assert log_alpha.grad < 0.0
 
 
 def test_grounding_loss(rng, m):
