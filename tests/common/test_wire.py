@@ -1,5 +1,7 @@
 """Messages: what goes in comes out, and whatever else comes in is refused with a countable reason."""
 
+from contextlib import suppress
+
 import msgpack
 import numpy as np
 import pytest
@@ -72,10 +74,8 @@ def test_mutated_entries_never_raise_anything_else(data):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     cut = data.draw(st.integers(0, len(payload)))
     for candidate in (bytes(payload), bytes(payload[:cut])):
-        try:
-            wire.decode_entry(candidate, SPEC)
-        except MessageError as error:
-            assert error.reason
+        with suppress(MessageError):
+            assert (wire.decode_entry(candidate, SPEC)["last"] <= SPEC.steps).all()
 
 
 def test_frame_round_trip():

@@ -9,7 +9,7 @@ import torch
 from common.agent import squashed_sample
 from learner import losses
 
-B, T, H, O, A = 4, 5, 6, 3, 2
+B, T, H, OBS, A = 4, 5, 6, 3, 2
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def test_temperature_rises_when_entropy_is_too_low():
 
 
 def test_grounding_loss(rng, m):
-    f, change = rng.normal(size=(2, B, T, O))
+    f, change = rng.normal(size=(2, B, T, OBS))
     fr, r = rng.normal(size=(2, B, T))
     seen = (rng.uniform(size=(B, T)) < 0.6).astype(np.float32)
     visible = [(b, t) for b, t in real_steps(m) if seen[b, t]]
