@@ -1,0 +1,260 @@
+"""The actor: steps N environments with the newest policy and sends what happens as windows.
+
+Shapes: N environments, O observation, A action, H hidden.
+"""
+
+import hashlib
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from actors.outbox import Outbox
+from actors.policy_runner import PolicyRunner
+from actors.window_builder import WindowBuilder
+from common.agent import AgentConfig
+from common.bus import Ack, Bus, Version
+from common.envs import Env
+from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
+from common.metrics import Means, Rate
+from common.window import WindowSpec
+
+POLL_SECONDS = 0.02  # between looks at the bus while there is nothing to do but wait
+_NOISE = -1  # the place of the policy's noise among the environments' seeds
+
+
+@dataclass(frozen=True)
+class ActorConfig:
+    """How an actor collects."""
+
+    envs_per_actor: int = 4
+    """N, environments of one actor; more of them share one forward pass."""
+    stride: int = 15
+    """Steps between the starts of two windows; as many as are trained means no overlap."""
+    refresh_steps: int = 400
+    """Environment steps of an actor between two looks at the newest weights."""
+    chunk_windows: int = 16
+    """Windows sent in one entry."""
+    chunk_seconds: float = 0.5
+    """A chunk that is not full is sent after so long."""
+    unacked_bytes: int = 64 << 20
+    """Most bytes kept to be sent again; the actor waits when they are reached."""
+
+
+def environment_seed(run_seed: int, actor: int, epoch: int, env: int) -> int:
+    """A seed that no other environment, actor or restart of the run has; 31 bits, as every environment takes."""
+    text = f"{run_seed} {actor} {epoch} {env}".encode()
+    return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "big") >> 33
+
+
+class Actor:
+    """A role: one ``step`` is one step of all its environments, or none of them.
+
+    It steps while its steps of this epoch are below what the replay server granted, so it passes its grant by
+    less than N. An error of the bus leaves it such that the next ``step`` goes on: nothing is lost or done twice.
+    Raises FencedError where a newer actor has taken its place.
+    """
+
+    def __init__(
+        self,
+        index: int,
+        seed: int,
+        make_env: Callable[[], Env],
+        spec: WindowSpec,
+        agent: AgentConfig,
+        config: ActorConfig,
+        bus: Bus,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``clock`` times polls and the chunk's timer; a lockstep run passes one that counts calls."""
+        _check(config, spec)
+        self.name = f"actor-{index}"
+        self._index, self._seed, self._spec, self._config = index, seed, spec, config
+        self._bus, self._clock = bus, clock
+        n = config.envs_per_actor
+        self._envs = [make_env() for _ in range(n)]
+        self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, n)
+        self._observation = np.zeros((n, spec.obs_dim), np.float32)
+        self._reward = np.zeros(n, np.float32)
+        self._blank, self._terminated, self._truncated = (np.zeros(n, np.bool_) for _ in range(3))
+        self._means, self._rate, self._episodes, self._resends = Means(), Rate(), 0, 0
+        self._total_steps = 0
+        self._start_epoch()
+
+    def restart(self) -> None:
+        """Forget unfinished episodes and what was not sent, and begin a new epoch with new seeds and newest weights."""
+        self._resends += self._outbox.resends
+        self._start_epoch()
+
+    def _start_epoch(self) -> None:
+        ack = self._bus.ack(self._index)
+        epoch = self._bus.take_epoch(self.name, floor=ack.id.epoch if ack else 0)
+        self._outbox = Outbox(self._bus, self._index, epoch, self._spec)
+        self._ack: Ack | None = None
+        self._version: Version | None = None
+        self._steps = 0
+        self._refresh_at = self._config.refresh_steps
+        self._next_poll = self._chunk_due = float("-inf")
+        self._waiting_for = "weights"
+        n = self._config.envs_per_actor
+        self._builder = WindowBuilder(self._spec, self._config.stride, n, self._config.chunk_windows + n)
+        self._rng = np.random.default_rng(environment_seed(self._seed, self._index, epoch, _NOISE))
+        self._returns = np.zeros(n)
+        self._lengths = np.zeros(n, np.int64)
+        for env in range(n):
+            self._begin_episode(env, environment_seed(self._seed, self._index, epoch, env))
+        with suppress(BusUnavailable, BusFull):  # the hello; ``step`` tries again
+            self._outbox.send()
+
+    def step(self) -> bool:
+        """One step of all environments; False where weights, credit or acknowledgements are missing."""
+        self._send()
+        if not self._may_step():
+            return False
+        self._step_environments()
+        self._send_when_due()
+        return True
+
+    def waiting_for(self) -> str:
+        return self._waiting_for
+
+    def metrics(self) -> dict[str, Any]:
+        """Flat metrics since the last call; episode means only where an episode ended."""
+        record: dict[str, Any] = {
+            "env_steps": self._steps,
+            "steps_per_s": self._rate.take(self._total_steps),
+            "episodes": self._episodes,
+            "weights_update": self._version.update if self._version else -1,
+            "unacked_entries": len(self._outbox),
+            "resends": self._resends + self._outbox.resends,
+        }
+        return record | self._means.take()
+
+    def close(self) -> None:
+        """Send finished windows if the bus takes them, and close the environments."""
+        with suppress(BusUnavailable, BusFull, FencedError):
+            self._flush()
+        for env in self._envs:
+            env.close()
+
+    # Waiting: weights, credit, acknowledgements
+
+    def _may_step(self) -> bool:
+        if self._version is not None and self._steps >= self._refresh_at:
+            self._refresh_weights()
+        self._waiting_for = self._obstacle()
+        if self._waiting_for and self._clock() >= self._next_poll:
+            self._next_poll = self._clock() + POLL_SECONDS
+            self._look_at_bus()
+            self._waiting_for = self._obstacle()
+        return not self._waiting_for
+
+    def _obstacle(self) -> str:
+        """What is missing for a step; empty if nothing is."""
+        if self._version is None:
+            return "weights"
+        if self._outbox.bytes >= self._config.unacked_bytes:
+            return "acknowledgements"
+        if self._ack is None or self._steps >= self._ack.granted_steps:
+            return "the end" if self._ack and self._ack.final else "credit"
+        return ""
+
+    def _look_at_bus(self) -> None:
+        if self._version is None:
+            self._refresh_weights()
+        self._flush()
+        self._poll_ack()
+        if self._obstacle() == "the end" and self._builder.open:
+            self._cut_episodes()
+
+    def _refresh_weights(self) -> None:
+        self._refresh_at = self._steps + self._config.refresh_steps
+        newest = self._bus.latest_version()
+        if newest is None or newest == self._version:
+            return
+        if self._version is not None and newest.epoch == self._version.epoch:
+            self._means.add("policy_lag", newest.update - self._version.update)
+        if self._version is None or newest > self._version:
+            found = self._bus.weights()
+            if found is not None:
+                self._version, blob = found
+                self._runner.load(blob)
+
+    def _poll_ack(self) -> None:
+        ack = self._bus.ack(self._index)
+        if ack is None and self._ack is not None:
+            self._outbox.send_again()  # Redis has lost its data
+        elif ack is not None and ack.id.epoch == self._outbox.epoch:
+            self._ack = ack
+            self._outbox.acknowledge(ack)
+
+    # Stepping
+
+    def _step_environments(self) -> None:
+        assert self._version is not None
+        now, n = self._builder.now(), len(self._envs)
+        noise = self._rng.standard_normal((n, self._spec.action_dim), np.float32)
+        action, hidden = self._runner.act(*now, noise)
+        if self._version.update == 0:  # the policy has learnt nothing yet
+            action = self._rng.uniform(-1.0, 1.0, action.shape).astype(np.float32)
+        for i, env in enumerate(self._envs):
+            self._observation[i], self._reward[i], self._terminated[i], self._truncated[i], info = env.step(action[i])
+            self._blank[i] = info.get("blank", False)
+        ended = self._builder.add(
+            action, hidden, self._version.update, self._reward, self._observation, self._blank,
+            self._terminated, self._truncated,
+        )  # fmt: skip
+        self._next_poll = float("-inf")
+        self._steps += n
+        self._total_steps += n
+        self._returns += self._reward
+        self._lengths += 1
+        for env_index in np.flatnonzero(ended).tolist():
+            self._end_episode(env_index)
+
+    def _end_episode(self, env: int) -> None:
+        self._episodes += 1
+        self._means.add("episode_return_mean", float(self._returns[env]))
+        self._means.add("episode_length_mean", int(self._lengths[env]))
+        self._begin_episode(env, seed=None)
+
+    def _begin_episode(self, env: int, seed: int | None) -> None:
+        observation, info = self._envs[env].reset(seed=seed)
+        self._builder.begin(env, observation, info.get("blank", False))
+        self._returns[env] = self._lengths[env] = 0
+
+    def _cut_episodes(self) -> None:
+        """The run's last steps are in: send what is open as if its time limit had come."""
+        self._builder.cut()
+        for env in range(len(self._envs)):
+            self._begin_episode(env, seed=None)
+        self._flush()
+
+    # Sending
+
+    def _send_when_due(self) -> None:
+        count, now = self._builder.count, self._clock()
+        if count == 0:
+            self._chunk_due = now + self._config.chunk_seconds
+        elif count >= self._config.chunk_windows or now >= self._chunk_due:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._builder.count:
+            self._outbox.put(self._builder.take())
+        self._send()
+
+    def _send(self) -> None:
+        if self._outbox.send():
+            self._poll_ack()
+
+
+def _check(config: ActorConfig, spec: WindowSpec) -> None:
+    if not 1 <= config.stride <= spec.train:
+        raise ConfigError("--actor.stride", config.stride, f"from 1 to the {spec.train} trained steps of a window")
+    for name in ("envs_per_actor", "refresh_steps", "chunk_windows", "unacked_bytes"):
+        if getattr(config, name) < 1:
+            raise ConfigError(f"--actor.{name.replace('_', '-')}", getattr(config, name), "at least 1")
