@@ -1,0 +1,94 @@
+"""One client's connection: bytes in, frames out, never blocking."""
+
+import socket
+import time
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from common.errors import MessageError
+from common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame
+
+RECEIVE_BYTES = 64 << 10
+STRANGER_META_BYTES = 1024  # all that someone who has not proved anything may make us hold
+
+
+class Frame(NamedTuple):
+    """A frame received whole, its CRC checked."""
+
+    kind: Kind
+    meta: dict[str, Any]
+    body: bytes
+
+
+class Connection:
+    """Buffers of one non-blocking socket. OSError from any method means: it is gone."""
+
+    def __init__(self, connection: socket.socket, challenge: bytes) -> None:
+        connection.setblocking(False)
+        self.socket, self.challenge = connection, challenge
+        self.authenticated = False
+        self.opened = time.monotonic()
+        self._inbox = bytearray()
+        self._outbox: deque[memoryview] = deque()
+        self._lent = False  # the outbox may hold views of the sender's buffers
+
+    @property
+    def sending(self) -> bool:
+        """Whether something is still to be sent; until then nothing more is read from this client."""
+        return bool(self._outbox)
+
+    def receive(self) -> None:
+        """Take what has arrived, at most 64 KiB."""
+        try:
+            received = self.socket.recv(RECEIVE_BYTES)
+        except BlockingIOError:
+            return
+        if not received:
+            raise ConnectionError("closed by the client")
+        self._inbox += received
+
+    def next_frame(self, max_body: int) -> Frame | None:
+        """The next frame that is here whole. Raises MessageError, sizes checked before their bytes are awaited."""
+        if len(self._inbox) < HEADER.size:
+            return None
+        header = decode_header(bytes(self._inbox[: HEADER.size]), max_body)
+        if not self.authenticated and header.meta_length > STRANGER_META_BYTES:
+            raise MessageError("too-large", f"meta {header.meta_length} before authentication")
+        if len(self._inbox) < HEADER.size + header.meta_length + header.body_length:
+            return None
+        return self._take(header)
+
+    def _take(self, header: FrameHeader) -> Frame:
+        split = HEADER.size + header.meta_length
+        end = split + header.body_length
+        raw_meta, body = bytes(self._inbox[HEADER.size : split]), bytes(self._inbox[split:end])
+        del self._inbox[:end]
+        return Frame(header.kind, decode_meta(raw_meta, body, header), body)
+
+    def send(self, kind: Kind, meta: Mapping[str, Any], parts: tuple[memoryview, ...] = ()) -> None:
+        """Send what the kernel takes now and keep the rest, without a copy: see ``own``."""
+        self._outbox += [memoryview(encode_frame(kind, meta, parts)), *(part for part in parts if part.nbytes)]
+        self._lent = True
+        self.flush()
+
+    def flush(self) -> None:
+        """Go on sending."""
+        while self._outbox:
+            try:
+                sent = self.socket.sendmsg(self._outbox)
+            except BlockingIOError:
+                return
+            while self._outbox and sent >= self._outbox[0].nbytes:
+                sent -= self._outbox.popleft().nbytes
+            if self._outbox:
+                self._outbox[0] = self._outbox[0][sent:]
+
+    def own(self) -> None:
+        """Copy what is still unsent, because its buffer is about to be used again."""
+        if self._lent:
+            self._outbox = deque(memoryview(bytes(part)) for part in self._outbox)
+            self._lent = False
+
+    def close(self) -> None:
+        self.socket.close()

@@ -1,0 +1,98 @@
+"""The intake: a bounded round of stream entries, checked, stamped with their origin, as one array of rows."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.bus import Bus, Entry, EntryId
+from common.errors import MessageError
+from common.window import Rows, WindowSpec
+from common.wire import decode_entry, max_entry_bytes
+from replay_server.record import StreamPosition
+
+ROUND_BYTES = 4 << 20  # read at most about this much in a round, so that the learner is served in between
+MAX_ENTRIES = 256  # of one actor in a round
+DISCOVERY_ROUNDS = 100  # rounds between looks for actors beyond those the run was started with
+BEFORE_ALL = EntryId(0, -1)
+
+
+@dataclass(frozen=True)
+class Round:
+    """What one read gave."""
+
+    rows: Rows  # (n,) writable, all but the serial as it will stand in the ring
+    positions: dict[int, StreamPosition]  # of the streams read from, after this round
+
+
+class Intake:
+    """Reads every actor's stream past where the ring is. Refused entries go to the dead letters, counted."""
+
+    def __init__(self, spec: WindowSpec, bus: Bus, actors: int) -> None:
+        self.spec, self.bus = spec, bus
+        self.refused: Counter[str] = Counter()  # dead letters by reason
+        self.gaps = 0  # entries whose number does not follow their predecessor's
+        self._actors = set(range(actors))
+        self._rounds = 0
+        self._entry_bytes = ROUND_BYTES  # the largest entry of the last round that had any
+
+    def read(self, positions: Mapping[int, StreamPosition]) -> Round | None:
+        """The next entries of all streams, or None where there are none."""
+        if self._rounds % DISCOVERY_ROUNDS == 0:
+            self._actors.update(self.bus.actors(), positions)
+        self._rounds += 1
+        cursors = {actor: positions[actor].id if actor in positions else BEFORE_ALL for actor in self._actors}
+        count = ROUND_BYTES // (self._entry_bytes * len(cursors))
+        entries = self.bus.read(cursors, min(max(count, 1), MAX_ENTRIES))
+        if not entries:
+            return None
+        self._entry_bytes = max(len(entry.payload) for entry in entries) + 64
+        return self._round(entries, dict(positions))
+
+    def _round(self, entries: list[Entry], positions: dict[int, StreamPosition]) -> Round:
+        bodies = [self._decode(entry) for entry in entries]
+        good = [entry for entry, body in zip(entries, bodies, strict=True) if body is not None and len(body)]
+        rows = self._stamped(good, [body for body in bodies if body is not None and len(body)])
+        for entry, body, steps in zip(entries, bodies, self._steps(bodies, rows["new_steps"]), strict=True):
+            before = positions.get(entry.actor, StreamPosition(BEFORE_ALL, 0))
+            if entry.id.epoch != before.id.epoch:  # a hello: an actor's new life starts from 0
+                before = StreamPosition(EntryId(entry.id.epoch, -1), 0)
+            self.gaps += entry.id.seq != before.id.seq + 1
+            settled = before.settled_steps + (self._lost_steps(entry) if body is None else steps)
+            positions[entry.actor] = StreamPosition(entry.id, settled)
+        return Round(rows, positions)
+
+    def _decode(self, entry: Entry) -> Rows | None:
+        try:
+            return decode_entry(entry.payload, self.spec)
+        except MessageError as error:
+            self.bus.dead_letter(entry, str(error))
+            self.refused[error.reason] += 1
+            return None
+
+    def _stamped(self, entries: list[Entry], bodies: list[Rows]) -> Rows:
+        """All bodies as one array; the origin comes from the entry ids, whatever the sender wrote."""
+        block = np.dtype((np.void, self.spec.dtype.itemsize))  # copies whole rows rather than fields
+        rows: Rows = np.concatenate([np.empty(0, block), *(body.view(block) for body in bodies)]).view(self.spec.dtype)
+        counts = [len(body) for body in bodies]
+        starts = np.cumsum([0, *counts[:-1]]) if counts else np.zeros(0, np.int64)
+        rows["actor"] = np.repeat([entry.actor for entry in entries], counts)
+        rows["epoch"] = np.repeat([entry.id.epoch for entry in entries], counts)
+        rows["seq"] = np.repeat([entry.id.seq for entry in entries], counts)
+        rows["k"] = np.arange(len(rows)) - np.repeat(starts, counts)
+        return rows
+
+    @staticmethod
+    def _steps(bodies: list[Rows | None], new_steps: NDArray[np.int32]) -> list[int]:
+        """New environment steps of every entry."""
+        ends = np.cumsum([0 if body is None else len(body) for body in bodies])
+        running = np.concatenate([[0], np.cumsum(new_steps)])[ends]
+        steps: list[int] = np.diff(running, prepend=0).tolist()
+        return steps
+
+    def _lost_steps(self, entry: Entry) -> int:
+        """At most how many steps a refused entry carried: its actor counts them, so they must not eat its credit."""
+        size = min(len(entry.payload), max_entry_bytes(self.spec))
+        return size // self.spec.dtype.itemsize * self.spec.train

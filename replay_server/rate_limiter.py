@@ -1,0 +1,52 @@
+"""The rate limiter: ties updates to collection, in both directions. Pure arithmetic, no state.
+
+    draw allowed:  drawn + B L_t <= (inserted - warm-up) * ratio + tolerance   and inserted >= warm-up
+    actors' limit: warm-up + drawn / ratio + slack, at most the run's total
+
+drawn: trained steps drawn; inserted: environment steps. The tolerance is one batch and the slack's worth of
+steps. When the learner waits, the actors' limit is at least ``slack`` above what is inserted; so nobody
+waits for the other for ever where the slack covers the steps that actors may hold back unsent
+(actors * environments * stride).
+"""
+
+from dataclasses import dataclass
+
+from common.replay import Draw
+
+
+@dataclass(frozen=True)
+class RateLimiter:
+    """Steps of the run, and trained steps drawn per environment step inserted."""
+
+    replay_ratio: float
+    warmup_steps: int
+    total_steps: int
+    slack_steps: int
+
+    def draw(self, inserted: int, drawn: int, batch_steps: int) -> Draw:
+        """Whether a batch of at most ``batch_steps`` trained steps may be drawn now.
+
+        Once all steps are in, what the ratio still owes is drawn without the tolerance.
+        """
+        owed = (inserted - self.warmup_steps) * self.replay_ratio - drawn - batch_steps
+        if inserted >= self.total_steps:
+            return Draw.BATCH if owed >= 0 else Draw.FINISHED
+        tolerance = batch_steps + self.slack_steps * self.replay_ratio
+        return Draw.BATCH if inserted >= self.warmup_steps and owed + tolerance >= 0 else Draw.WAIT
+
+    def limit(self, drawn: int) -> int:
+        """Environment steps that all actors together may insert."""
+        return min(self.total_steps, self.warmup_steps + int(drawn / self.replay_ratio) + self.slack_steps)
+
+    def is_final(self, drawn: int) -> bool:
+        """Whether the actors' limit is the end of the run."""
+        return self.limit(drawn) == self.total_steps
+
+    def shares(self, inserted: int, drawn: int, actors: int) -> list[int]:
+        """What each of the actors may insert beyond what it has: equal parts, the rest to the low ids."""
+        each, rest = divmod(max(0, self.limit(drawn) - inserted), actors)
+        return [each + (actor < rest) for actor in range(actors)]
+
+    def ratio(self, inserted: int, drawn: int) -> float:
+        """The ratio held so far, counted from the end of the warm-up."""
+        return drawn / max(1, inserted - self.warmup_steps)

@@ -1,0 +1,122 @@
+"""The commit record: what one commit makes durable, in two alternating copies with a CRC.
+
+Copy = header "<QII" (sequence, length, crc32(sequence + length + payload)) + payload
+Payload = fixed counters | statistics total, square (O float64 each) | streams (n, 4) int64
+The copy with the larger valid sequence is the present state; a torn write only spoils the older one.
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.bus import EntryId
+from common.errors import ConfigError
+
+MAX_STREAMS = 4096
+_HEADER = struct.Struct("<QII")
+_COUNTERS = struct.Struct("<7qdqq")  # the integers of Progress in order, largest priority, statistics count, streams
+_STREAM_BYTES = 4 * 8
+
+
+class StreamPosition(NamedTuple):
+    """How far an actor's stream is in the ring."""
+
+    id: EntryId  # the last entry taken
+    settled_steps: int  # environment steps of epoch ``id.epoch`` that were inserted, or lost with a refused entry
+
+
+@dataclass
+class Progress:
+    """The replay's counters. Mutable: the server changes it, then commits it."""
+
+    obs_dim: int
+    valid_from: int = 0  # the oldest serial that may be sampled
+    next_serial: int = 0
+    env_steps: int = 0  # inserted
+    drawn_steps: int = 0  # trained steps drawn
+    draws: int = 0
+    replay_epoch: int = 0  # the largest that has written here
+    evicted_priorities: int = 0  # priorities that came back too late
+    max_priority: float = 1.0  # the largest seen
+    observations: int = 0  # count of the statistics
+    total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (O,)
+    total_square: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (O,)
+    streams: dict[int, StreamPosition] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.total.size:
+            self.total, self.total_square = np.zeros(self.obs_dim), np.zeros(self.obs_dim)
+
+    @property
+    def windows(self) -> int:
+        """How many windows may be sampled."""
+        return self.next_serial - self.valid_from
+
+    def encode(self) -> bytes:
+        """Raises ConfigError for more than 4096 streams."""
+        if len(self.streams) > MAX_STREAMS:
+            raise ConfigError("--actors", len(self.streams), f"a replay server takes at most {MAX_STREAMS} streams")
+        counters = _COUNTERS.pack(
+            self.valid_from, self.next_serial, self.env_steps, self.drawn_steps, self.draws, self.replay_epoch,
+            self.evicted_priorities, self.max_priority, self.observations, len(self.streams),
+        )  # fmt: skip
+        rows = [(actor, at.id.epoch, at.id.seq, at.settled_steps) for actor, at in self.streams.items()]
+        streams = np.array(rows, np.int64).tobytes()
+        return counters + self.total.tobytes() + self.total_square.tobytes() + streams
+
+
+def decode_progress(payload: bytes, obs_dim: int) -> Progress:
+    """The inverse of ``Progress.encode``, for bytes whose CRC was right."""
+    counters = _COUNTERS.unpack_from(payload)
+    sums = np.frombuffer(payload, np.float64, 2 * obs_dim, _COUNTERS.size).reshape(2, obs_dim).copy()
+    table = np.frombuffer(payload, np.int64, 4 * counters[-1], _COUNTERS.size + sums.nbytes).reshape(-1, 4)
+    positions = {actor: StreamPosition(EntryId(epoch, seq), steps) for actor, epoch, seq, steps in table.tolist()}
+    progress = Progress(obs_dim, *counters[:-1])
+    progress.total, progress.total_square, progress.streams = sums[0], sums[1], positions
+    return progress
+
+
+def record_bytes(obs_dim: int) -> int:
+    """Room for one copy, in whole pages."""
+    size = _HEADER.size + _COUNTERS.size + 16 * obs_dim + MAX_STREAMS * _STREAM_BYTES
+    return -(-size // 4096) * 4096
+
+
+class RecordPair:
+    """Both copies, in a mapped region of ``2 * record_bytes(obs_dim)`` bytes."""
+
+    def __init__(self, region: NDArray[np.uint8], obs_dim: int) -> None:
+        self._obs_dim = obs_dim
+        half = record_bytes(obs_dim)
+        self._copies = [region[:half].data, region[half : 2 * half].data]
+        self._sequence = 0
+
+    def write(self, progress: Progress) -> None:
+        """Replace the older copy."""
+        payload = progress.encode()
+        sequence = self._sequence + 1
+        crc = zlib.crc32(payload, zlib.crc32(struct.pack("<QI", sequence, len(payload))))
+        packed = _HEADER.pack(sequence, len(payload), crc) + payload
+        self._copies[sequence % 2][: len(packed)] = packed
+        self._sequence = sequence
+
+    def read(self) -> Progress | None:
+        """The newest valid copy, or None where both are damaged."""
+        found = [(sequence, payload) for sequence, payload in map(_read_copy, self._copies) if payload is not None]
+        if not found:
+            return None
+        self._sequence, payload = max(found)
+        return decode_progress(payload, self._obs_dim)
+
+
+def _read_copy(copy: memoryview) -> tuple[int, bytes | None]:
+    sequence, length, crc = _HEADER.unpack_from(copy)
+    if length < _COUNTERS.size or length > len(copy) - _HEADER.size:
+        return sequence, None
+    payload = bytes(copy[_HEADER.size : _HEADER.size + length])
+    valid = zlib.crc32(payload, zlib.crc32(struct.pack("<QI", sequence, length))) == crc
+    return sequence, payload if valid else None

@@ -1,0 +1,117 @@
+"""Opening a replay folder: lock it, map ring and priorities, believe only what was committed.
+
+Folder: ``ring`` (identity, commit records, rows), ``priorities`` (float32 per slot, raw, before the
+exponent), ``lock``. The sum tree is never stored: it is rebuilt from the priorities of the valid windows.
+"""
+
+import fcntl
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import ConfigError
+from common.window import WindowSpec
+from replay_server.ring import Ring, reserve
+from replay_server.sum_tree import SumTree, Values
+
+log = logging.getLogger(__name__)
+_CHECK_ROWS = 8192  # serials compared at a time
+
+
+@dataclass
+class ReplayStore:
+    """What a replay folder holds, locked until ``close``."""
+
+    ring: Ring
+    priorities: NDArray[np.float32]  # (capacity,) mapped
+    tree: SumTree
+    lock: int
+    exponent: float
+
+    def leaf_values(self, priorities: NDArray[np.float32]) -> Values:
+        """p ** exponent, what the tree holds."""
+        return priorities.astype(np.float64) ** self.exponent
+
+    def set_priorities(self, slots: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
+        """New raw priorities of (B,) slots, in the map and the tree."""
+        self.priorities[slots] = priorities
+        self.tree.set(slots, self.leaf_values(priorities))
+
+    def flush(self) -> None:
+        """Hand everything to the disk."""
+        self.ring.flush()
+        assert isinstance(self.priorities, np.memmap)
+        self.priorities.flush()
+
+    def close(self) -> None:
+        """Let another process open the folder."""
+        os.close(self.lock)
+
+
+def open_store(folder: Path, spec: WindowSpec, capacity: int, exponent: float) -> ReplayStore:
+    """Create or recover the store in ``folder``.
+
+    Raises ConfigError: held by another process, of other windows or capacity, damaged, or no space.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = _lock(folder)
+    try:
+        ring = Ring(folder / "ring", spec, capacity)
+        _drop_torn_rows(ring)
+        priorities = _map_priorities(folder / "priorities", ring)
+        store = ReplayStore(ring, priorities, SumTree(capacity), lock, exponent)
+        store.tree.rebuild(valid_leaves(store))
+    except BaseException:
+        os.close(lock)
+        raise
+    return store
+
+
+def valid_leaves(store: ReplayStore) -> Values:
+    """(capacity,) what the tree's leaves must be: 0 wherever no window may be sampled."""
+    progress = store.ring.progress
+    leaves = np.zeros(store.ring.capacity)
+    slots = np.arange(progress.valid_from, progress.next_serial) % store.ring.capacity
+    leaves[slots] = store.leaf_values(store.priorities[slots])
+    return leaves
+
+
+def _lock(folder: Path) -> int:
+    lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(lock)
+        raise ConfigError("--run-dir", str(folder), "another replay server holds this folder; stop it first") from None
+    return lock
+
+
+def _drop_torn_rows(ring: Ring) -> None:
+    """A committed row without its serial was lost to a power cut: drop it and all before it."""
+    progress = ring.progress
+    torn = -1
+    for start in range(progress.valid_from, progress.next_serial, _CHECK_ROWS):
+        serials = np.arange(start, min(start + _CHECK_ROWS, progress.next_serial))
+        wrong = serials[ring.rows["serial"][serials % ring.capacity] != serials]
+        torn = int(wrong[-1]) if len(wrong) else torn
+    if torn >= 0:
+        log.warning("replay ring: a crash of the machine tore it; %d windows dropped", torn + 1 - progress.valid_from)
+        progress.valid_from = torn + 1
+        ring.commit()
+
+
+def _map_priorities(path: Path, ring: Ring) -> NDArray[np.float32]:
+    size = 4 * ring.capacity
+    if path.exists() and path.stat().st_size == size:
+        priorities: NDArray[np.float32] = np.memmap(path, np.float32, "r+", shape=(ring.capacity,))
+    else:
+        reserve(path, size, ring.capacity)
+        priorities = np.memmap(path, np.float32, "r+", shape=(ring.capacity,))
+        priorities[:] = ring.progress.max_priority
+    unusable = ~(np.isfinite(priorities) & (priorities >= 0))
+    priorities[unusable] = ring.progress.max_priority
+    return priorities

@@ -1,0 +1,146 @@
+"""The ring: rows of windows on a memory map, and the commits that decide which of them exist.
+
+Every window has a serial; its slot is serial mod capacity. An append (a) commits ``valid_from`` past the
+rows about to be overwritten, (b) writes the rows, (c) commits ``next_serial`` with all other progress.
+Killed anywhere (kill -9 included), the file says exactly which windows are whole: what the process stored
+in the map outlives it in the page cache. A power cut may lose or tear what the kernel had not yet
+written to disk; that is not promised against (``recovery.py`` drops what it can tell is torn).
+"""
+
+import errno
+import os
+import shutil
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import ConfigError
+from common.window import Rows, WindowSpec
+from replay_server.record import Progress, RecordPair, record_bytes
+
+_IDENTITY = struct.Struct("<8s16sQQ")  # magic, fingerprint, capacity, row bytes; then its CRC
+_IDENTITY_BYTES = 4096
+_MAGIC = b"RMCRING1"
+Slots = NDArray[np.int64]
+
+
+class Ring:
+    """``capacity`` rows in one file. ``progress`` is what ``commit`` makes durable.
+
+    Raises ConfigError where the file belongs to other windows or another capacity, is damaged, or
+    where there is no space for it. The caller keeps other processes out.
+    """
+
+    def __init__(self, path: Path, spec: WindowSpec, capacity: int) -> None:
+        self.spec, self.capacity = spec, capacity
+        if not path.exists():
+            _create(path, spec, capacity)
+        _check_identity(path, spec, capacity)
+        start = _rows_start(spec)
+        self._map = np.memmap(path, np.uint8, "r+", shape=(start + capacity * spec.dtype.itemsize,))
+        plain = self._map.view(np.ndarray)
+        self._blocks = plain[start:].view(np.dtype((np.void, spec.dtype.itemsize)))  # whole rows, copied as such
+        self.rows: Rows = self._blocks.view(spec.dtype)
+        self._records = RecordPair(plain[_IDENTITY_BYTES:start], spec.obs_dim)
+        self._written = 0
+        progress = self._records.read()
+        if progress is None:
+            raise _unusable(path, "both commit records are damaged")
+        self.progress = progress
+
+    def write(self, rows: Rows) -> Slots:
+        """Steps (a) and (b): stamp serials into (n,) writable rows and store them; not sampled before ``commit``.
+
+        Returns the slots written. Of more rows than the ring holds only the last are stored.
+        """
+        serials = np.arange(self.progress.next_serial, self.progress.next_serial + len(rows))
+        rows["serial"] = serials
+        valid_from = min(self.progress.next_serial, self.progress.next_serial + len(rows) - self.capacity)
+        if valid_from > self.progress.valid_from:
+            self.progress.valid_from = valid_from
+            self._records.write(self.progress)
+        slots: Slots = serials[-self.capacity :] % self.capacity
+        blocks = rows[-self.capacity :].view(self._blocks.dtype)
+        start = int(slots[0]) if len(slots) else 0
+        fits = min(len(blocks), self.capacity - start)
+        self._blocks[start : start + fits] = blocks[:fits]
+        self._blocks[: len(blocks) - fits] = blocks[fits:]
+        self._written = len(rows)
+        return slots
+
+    def commit(self) -> None:
+        """Step (c): make the rows written and everything in ``progress`` durable at once."""
+        self.progress.next_serial += self._written
+        self._written = 0
+        self.progress.valid_from = max(self.progress.valid_from, self.progress.next_serial - self.capacity)
+        self._records.write(self.progress)
+
+    def gather(self, slots: Slots, out: Rows) -> None:
+        """Copy whole rows (B,) into ``out``."""
+        np.take(self._blocks, slots, out=out.view(self._blocks.dtype), mode="clip")  # clip: unbuffered
+
+    def flush(self) -> None:
+        """Hand everything to the disk."""
+        self._map.flush()
+
+
+def _rows_start(spec: WindowSpec) -> int:
+    return _IDENTITY_BYTES + 2 * record_bytes(spec.obs_dim)
+
+
+def _identity(spec: WindowSpec, capacity: int) -> bytes:
+    packed = _IDENTITY.pack(_MAGIC, spec.fingerprint.encode(), capacity, spec.dtype.itemsize)
+    return packed + struct.pack("<I", zlib.crc32(packed))
+
+
+def _create(path: Path, spec: WindowSpec, capacity: int) -> None:
+    """Under another name first, so that a ring is there whole or not at all."""
+    temporary = path.with_suffix(".tmp")
+    start = _rows_start(spec)
+    reserve(temporary, start + capacity * spec.dtype.itemsize, capacity)
+    head = np.memmap(temporary, np.uint8, "r+", shape=(start,))
+    identity = _identity(spec, capacity)
+    head[: len(identity)] = np.frombuffer(identity, np.uint8)
+    RecordPair(head[_IDENTITY_BYTES:].view(np.ndarray), spec.obs_dim).write(Progress(spec.obs_dim))
+    temporary.rename(path)
+
+
+def reserve(path: Path, size: int, capacity: int) -> None:
+    """A file of ``size`` bytes whose space is taken now: a full disk under a sparse map would be a SIGBUS."""
+    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+    try:
+        if size > shutil.disk_usage(path.parent).free:  # do not fill the disk just to find that out
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(handle, 0, size)
+        else:  # macOS
+            os.ftruncate(handle, size)
+    except OSError as error:
+        path.unlink()
+        fix = f"needs {size / 2**30:.2f} GiB in {path.parent} ({error.strerror}); lower it or choose another --run-dir"
+        raise ConfigError("--replay.capacity", capacity, fix) from None
+    finally:
+        os.close(handle)
+
+
+def _check_identity(path: Path, spec: WindowSpec, capacity: int) -> None:
+    with path.open("rb") as file:
+        raw = file.read(_IDENTITY.size + 4)
+    if len(raw) < _IDENTITY.size + 4 or zlib.crc32(raw[:-4]) != struct.unpack("<I", raw[-4:])[0]:
+        raise _unusable(path, "not a replay ring, or a damaged one")
+    _, fingerprint, found, _ = _IDENTITY.unpack(raw[:-4])
+    if fingerprint != spec.fingerprint.encode():
+        fix = f"its windows are of layout {fingerprint.decode()}, this run's of {spec.fingerprint}; use a new folder"
+        raise ConfigError("--run-dir", str(path), fix)
+    if found != capacity:
+        fix = f"the ring in {path.parent} has {found}; keep that or use a new --run-dir"
+        raise ConfigError("--replay.capacity", capacity, fix)
+    if path.stat().st_size != _rows_start(spec) + capacity * spec.dtype.itemsize:
+        raise _unusable(path, "cut short")
+
+
+def _unusable(path: Path, fault: str) -> ConfigError:
+    return ConfigError("--run-dir", str(path), f"{fault}; delete {path.parent} to start with an empty replay")

@@ -1,0 +1,269 @@
+"""The replay server: streams in, committed ring, prioritized batches out, credit back to the actors.
+
+Shapes: B batch, O observation. One thread does it all; ``step`` takes in one bounded round of entries.
+"""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.bus import Ack, Bus
+from common.errors import ConfigError
+from common.metrics import Means, Rate
+from common.replay import Draw, ObservationStatistics, Sample
+from common.window import Rows, WindowSpec
+from replay_server.intake import Intake, Round
+from replay_server.rate_limiter import RateLimiter
+from replay_server.recovery import open_store
+
+PRIORITY_FLOOR = 1e-6  # so that every window keeps a chance
+REPUBLISH_PERIOD = 5.0  # seconds between repeats of all acks, in case Redis lost its data
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """The replay server's options."""
+
+    capacity: int = 70_000
+    """Windows kept; the oldest make room."""
+    replay_ratio: float = 128.0
+    """Trained steps drawn per new environment step, from the end of the warm-up on."""
+    warmup_steps: int = 5_000
+    """Environment steps before the first draw."""
+    priority_exponent: float = 0.6
+    """How strongly priorities steer sampling; 0 is uniform."""
+    importance_exponent: float = 0.4
+    """How far importance weights undo that; 1 is wholly."""
+
+    def __post_init__(self) -> None:
+        if self.capacity < 1:
+            raise ConfigError("--replay.capacity", self.capacity, "take at least 1 window")
+        if not 0.0 < self.replay_ratio < float("inf"):
+            raise ConfigError("--replay.replay-ratio", self.replay_ratio, "take a positive number, like 128")
+        if self.warmup_steps < 0:
+            raise ConfigError("--replay.warmup-steps", self.warmup_steps, "take 0 or more")
+        if not 0.0 <= self.priority_exponent <= 4.0:
+            raise ConfigError("--replay.priority-exponent", self.priority_exponent, "take 0 (uniform) to 4")
+        if not 0.0 <= self.importance_exponent <= 1.0:
+            raise ConfigError("--replay.importance-exponent", self.importance_exponent, "take 0 (off) to 1")
+
+
+def importance_weights(values: NDArray[np.float64], total: float, windows: int, exponent: float) -> NDArray[np.float32]:
+    """(N P(i))^-exponent / max, P(i) = value / total: (B,) -> (B,)."""
+    weights = (windows * values / total) ** -exponent
+    scaled: NDArray[np.float32] = (weights / weights.max()).astype(np.float32)
+    return scaled
+
+
+def observation_sums(rows: Rows, spec: WindowSpec) -> ObservationStatistics:
+    """Sums over the observations that no earlier window carried and that are not blank; padding is never read."""
+    t, last = np.arange(spec.observations), rows["last"][:, None]
+    new = (t > last - rows["new_observations"][:, None]) & (t <= last) & (rows["blank"] == 0)
+    seen = rows["observation"][new].astype(np.float64)
+    return ObservationStatistics(len(seen), seen.sum(0), np.einsum("no,no->o", seen, seen))
+
+
+class ReplayServer:
+    """The role ``replay``, and the Replay protocol for a learner in the same thread.
+
+    Opens or recovers the ring in ``folder``; ``slack_steps`` is how far actors may run ahead of the ratio
+    and must cover what they may hold back unsent. Raises ConfigError (see ``open_store``), BusUnavailable,
+    and FencedError from ``step`` when a newer replay server has taken over.
+    """
+
+    name = "replay"
+
+    def __init__(
+        self,
+        spec: WindowSpec,
+        config: ReplayConfig,
+        folder: Path,
+        seed: int,
+        total_steps: int,
+        actors: int,
+        slack_steps: int,
+        bus: Bus,
+    ) -> None:
+        self.spec, self.config, self.bus = spec, config, bus
+        self._seed, self._actors, self._slack_steps = seed, actors, slack_steps
+        self._limiter = RateLimiter(config.replay_ratio, config.warmup_steps, total_steps, slack_steps)
+        self._intake = Intake(spec, bus, actors)
+        self._store = open_store(folder, spec, config.capacity, config.priority_exponent)
+        try:
+            self.epoch = bus.take_epoch(self.name, self._store.ring.progress.replay_epoch)
+        except BaseException:
+            self._store.close()
+            raise
+        self._store.ring.progress.replay_epoch = self.epoch
+        self._store.ring.commit()
+        self._published: dict[int, Ack] = {}
+        self._republish_at = 0.0
+        self._buffers = [np.empty(0, spec.dtype)] * 2
+        self._waiting_for, self._waiting_since = "", 0.0  # the learner, at the limiter
+        self._refused_priorities = 0
+        self._means, self._rates = Means(), {name: Rate() for name in ("env_steps", "windows", "draws")}
+
+    # -- in ---------------------------------------------------------------------------------------------
+
+    def step(self) -> bool:
+        """Take in one round of entries: ring, commit, acks. False where there was none."""
+        taken = self._intake.read(self._store.ring.progress.streams)
+        if taken is not None:
+            self._insert(taken)
+        self._publish(at_once=taken is not None)
+        return taken is not None
+
+    def _insert(self, taken: Round) -> None:
+        ring, progress, rows = self._store.ring, self._store.ring.progress, taken.rows
+        sums = observation_sums(rows, self.spec)
+        slots = ring.write(rows)
+        initial = rows["initial_priority"][-ring.capacity :]
+        priorities = np.where(initial > 0, np.maximum(initial, PRIORITY_FLOOR), progress.max_priority)
+        self._store.set_priorities(slots, priorities.astype(np.float32))
+        progress.max_priority = max(progress.max_priority, float(initial.max(initial=0.0)))
+        progress.env_steps += int(rows["new_steps"].sum())
+        progress.observations += sums.count
+        progress.total += sums.total
+        progress.total_square += sums.total_square
+        progress.streams = taken.positions
+        ring.commit()
+        self._measure_lag(rows)
+
+    def _measure_lag(self, rows: Rows) -> None:
+        """Policy lag at insertion: weights versions between those that acted and the newest."""
+        version = self.bus.latest_version() if len(rows) else None
+        if version is not None:
+            lag = version.update - rows["weights_update"]
+            self._means.add("policy_lag_mean", float(lag.mean()))
+            self._means.add("policy_lag_max", float(lag.max()))
+
+    # -- credit -----------------------------------------------------------------------------------------
+
+    def _acks(self) -> dict[int, Ack]:
+        """What every actor seen so far has committed, and how far it may step."""
+        progress = self._store.ring.progress
+        shares = self._limiter.shares(progress.env_steps, progress.drawn_steps, self._actors)
+        final = self._limiter.is_final(progress.drawn_steps)
+        return {
+            actor: Ack(at.id, at.settled_steps + (shares[actor] if actor < self._actors else 0), final)
+            for actor, at in progress.streams.items()
+        }
+
+    def _publish(self, at_once: bool) -> None:
+        """Publish acks that changed. Small changes wait, unless the learner does: then actors need all there is."""
+        now = time.monotonic()
+        repeat = now >= self._republish_at
+        acks = self._acks()
+        if not repeat:
+            acks = {actor: ack for actor, ack in acks.items() if self._published.get(actor) != ack}
+        quantum = max(1, self._slack_steps // (8 * self._actors))
+        at_once = at_once or repeat or bool(self._waiting_for)
+        if acks and (at_once or any(self._grown(actor, ack) >= quantum for actor, ack in acks.items())):
+            self.bus.commit(self.epoch, acks)
+            self._published.update(acks)
+            self._republish_at = now + REPUBLISH_PERIOD if repeat else self._republish_at
+
+    def _grown(self, actor: int, ack: Ack) -> int:
+        before = self._published.get(actor)
+        return ack.granted_steps - (before.granted_steps if before is not None else 0)
+
+    # -- out --------------------------------------------------------------------------------------------
+
+    def sample(self, batch_size: int) -> Sample:
+        """Draw (B,) rows in proportion to priority ** exponent, if the limiter lets it.
+
+        The rows lie in one of two buffers that draws take in turn. A draw depends on the seed, its number
+        and the ring alone.
+        """
+        progress = self._store.ring.progress
+        draw = self._limiter.draw(progress.env_steps, progress.drawn_steps, batch_size * self.spec.train)
+        if draw is Draw.BATCH and progress.windows == 0:
+            draw = Draw.WAIT
+        self._note_waiting(draw)
+        if draw is not Draw.BATCH:
+            return Sample(draw, None, None, progress.env_steps)
+        tree = self._store.tree
+        random = np.random.Generator(np.random.Philox(key=np.array([self._seed, progress.draws], np.uint64)))
+        slots = tree.sample(batch_size, random)
+        rows = self._buffer(batch_size)
+        self._store.ring.gather(slots, rows)
+        progress.draws += 1
+        progress.drawn_steps += self.spec.trained_steps(rows)
+        self._store.ring.commit()
+        weights = importance_weights(tree.values(slots), tree.total, progress.windows, self.config.importance_exponent)
+        return Sample(draw, rows, weights, progress.env_steps)
+
+    def _buffer(self, batch_size: int) -> Rows:
+        self._buffers.reverse()
+        if len(self._buffers[0]) < batch_size:
+            self._buffers[0] = np.empty(batch_size, self.spec.dtype)
+        return self._buffers[0][:batch_size]
+
+    def _note_waiting(self, draw: Draw) -> None:
+        warming_up = self._store.ring.progress.env_steps < self.config.warmup_steps
+        waiting_for = ("warm-up" if warming_up else "env_steps") if draw is Draw.WAIT else ""
+        if waiting_for != self._waiting_for:
+            self._waiting_for, self._waiting_since = waiting_for, time.monotonic()
+
+    def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
+        """New priorities of (B,) windows; those evicted since, and those not finite, are dropped and counted."""
+        progress = self._store.ring.progress
+        present = (serials >= progress.valid_from) & (serials < progress.next_serial)
+        usable = np.isfinite(priorities) & (priorities >= 0)
+        progress.evicted_priorities += int((~present).sum())
+        self._refused_priorities += int((present & ~usable).sum())
+        kept = np.maximum(priorities[present & usable], PRIORITY_FLOOR, dtype=np.float32)
+        self._store.set_priorities(serials[present & usable] % self.config.capacity, kept)
+        progress.max_priority = max(progress.max_priority, float(kept.max(initial=0.0)))
+
+    def statistics(self) -> ObservationStatistics:
+        """Running sums over all observations inserted so far."""
+        progress = self._store.ring.progress
+        return ObservationStatistics(progress.observations, progress.total.copy(), progress.total_square.copy())
+
+    # -- about ------------------------------------------------------------------------------------------
+
+    def stats(self) -> dict[str, Any]:
+        """Counters, flat; who waits at the limiter, for what, since when."""
+        progress, limiter = self._store.ring.progress, self._limiter
+        return {
+            "env_steps": progress.env_steps,
+            "windows": progress.next_serial,
+            "ring_fill": progress.windows / self.config.capacity,
+            "draws": progress.draws,
+            "drawn_steps": progress.drawn_steps,
+            "replay_ratio": limiter.ratio(progress.env_steps, progress.drawn_steps),
+            "credit_steps": max(0, limiter.limit(progress.drawn_steps) - progress.env_steps),
+            "learner_waiting_for": self._waiting_for,
+            "learner_waiting_s": time.monotonic() - self._waiting_since if self._waiting_for else 0.0,
+            "max_priority": progress.max_priority,
+            "evicted_priorities": progress.evicted_priorities,
+            "refused_priorities": self._refused_priorities,
+            "entry_gaps": self._intake.gaps,
+            "dead_letters": self._intake.refused.total(),
+            **{f"dead_letters_{reason}": count for reason, count in self._intake.refused.items()},
+        }
+
+    def metrics(self) -> dict[str, Any]:
+        """``stats`` with rates a second and the policy lag of what was inserted since the last call."""
+        stats = self.stats()
+        rates = {f"{name}_per_s": rate.take(stats[name]) for name, rate in self._rates.items()}
+        return {**stats, **rates, **self._means.take()}
+
+    def waiting_for(self) -> str:
+        """``windows`` from the actors, or ``draws`` by the learner once the actors' credit is spent."""
+        return "draws" if self.stats()["credit_steps"] == 0 else "windows"
+
+    def checkpoint(self) -> None:
+        """Make everything durable: a server opened here afterwards goes on as this one would."""
+        self._store.ring.commit()
+        self._store.flush()
+
+    def close(self) -> None:
+        """Commit and unlock the folder."""
+        self._store.ring.commit()
+        self._store.close()

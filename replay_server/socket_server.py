@@ -1,0 +1,226 @@
+"""The replay server's own socket: batches out and priorities in, by the frames of ``common/wire.py``.
+
+Non-blocking throughout: a client that is silent, slow or lies costs at most its own connection. Both
+sides prove that they know the run's secret before anything else is said:
+
+    server -> CHALLENGE {nonce: c}
+    client -> PROOF {nonce: n, proof: HMAC(secret, "client" + c + n)}
+    server -> WELCOME {proof: HMAC(secret, "server" + n + c), fingerprint}
+
+Requests may be pipelined; each connection's are answered in order. A draw that the limiter holds back is
+answered WAIT at once, and the client asks again.
+"""
+
+import contextlib
+import errno
+import hmac
+import logging
+import os
+import selectors
+import socket
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common.errors import AuthenticationError, ConfigError, MessageError
+from common.replay import Draw, Replay
+from common.window import WindowSpec
+from common.wire import Kind, proof
+from replay_server.connection import Connection, Frame
+
+log = logging.getLogger(__name__)
+NONCE_BYTES = 32
+MAX_CONNECTIONS = 32
+AUTHENTICATION_SECONDS = 5.0
+SEND_BUFFER = 8 << 20  # bytes: a batch should leave in one call
+READ, WRITE = selectors.EVENT_READ, selectors.EVENT_WRITE
+
+
+class SocketServer:
+    """Serves a Replay at ``address``: ``unix:PATH`` or ``tcp:HOST:PORT`` (port 0 takes a free one).
+
+    ``address`` afterwards names the port taken. Raises ConfigError where it cannot be listened on.
+    """
+
+    def __init__(self, server: Replay, spec: WindowSpec, address: str, secret: bytes, max_batch: int) -> None:
+        if not secret:
+            raise ConfigError("secret", "", "the run's secret must not be empty")
+        self._server, self._spec, self._secret, self._max_batch = server, spec, secret, max_batch
+        self._listener, self._path, self.address = _listen(address)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, READ)
+        self._connections: dict[Connection, int] = {}  # and the events each is registered for
+        self.refused: Counter[str] = Counter()  # connections ended for a fault of theirs, by reason
+
+    def poll(self, timeout: float) -> bool:
+        """Serve whoever is ready, waiting up to ``timeout`` seconds for the first; whether there was anyone."""
+        ready = self._selector.select(timeout)
+        for key, events in ready:
+            if key.data is None:
+                self._accept()
+            elif key.data in self._connections:  # not ended earlier in this round
+                self._serve(key.data, events)
+        self._end_strangers()
+        return bool(ready)
+
+    def _accept(self) -> None:
+        try:
+            accepted, _ = self._listener.accept()
+        except OSError:  # it went away again, or we are out of file handles
+            return
+        if len(self._connections) >= MAX_CONNECTIONS:
+            self.refused["too-many"] += 1
+            accepted.close()
+            return
+        accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        if accepted.family != socket.AF_UNIX:
+            accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        connection = Connection(accepted, os.urandom(NONCE_BYTES))
+        self._connections[connection] = READ
+        self._selector.register(accepted, READ, connection)
+        try:
+            connection.send(Kind.CHALLENGE, {"nonce": connection.challenge})
+        except OSError:
+            self._end(connection)
+
+    def _serve(self, connection: Connection, events: int) -> None:
+        try:
+            if events & WRITE:
+                connection.flush()
+            if events & READ:
+                connection.receive()
+            self._handle_frames(connection)
+            self._await(connection, WRITE if connection.sending else READ)
+        except (MessageError, AuthenticationError) as error:
+            reason = error.reason if isinstance(error, MessageError) else "authentication"
+            log.warning("replay socket: a client was refused: %s", error)
+            self._refuse(connection, reason, str(error))
+        except OSError:
+            self._end(connection)
+
+    def _handle_frames(self, connection: Connection) -> None:
+        while not connection.sending:
+            max_body = 12 * self._max_batch if connection.authenticated else 0
+            frame = connection.next_frame(max_body)
+            if frame is None:
+                return
+            if connection.authenticated:
+                self._handle(connection, frame)
+            else:
+                self._authenticate(connection, frame)
+
+    def _await(self, connection: Connection, events: int) -> None:
+        if self._connections[connection] != events:
+            self._connections[connection] = events
+            self._selector.modify(connection.socket, events, connection)
+
+    def _authenticate(self, connection: Connection, frame: Frame) -> None:
+        nonce, given = frame.meta.get("nonce"), frame.meta.get("proof")
+        if frame.kind is not Kind.PROOF or not isinstance(nonce, bytes) or len(nonce) != NONCE_BYTES:
+            raise AuthenticationError("no proof came")
+        expected = proof(self._secret, b"client", connection.challenge, nonce)
+        if not isinstance(given, bytes) or not hmac.compare_digest(given, expected):
+            raise AuthenticationError("the client does not know this run's secret")
+        connection.authenticated = True
+        answer = proof(self._secret, b"server", nonce, connection.challenge)
+        connection.send(Kind.WELCOME, {"proof": answer, "fingerprint": self._spec.fingerprint})
+
+    def _handle(self, connection: Connection, frame: Frame) -> None:
+        if frame.kind is Kind.SAMPLE:
+            self._sample(connection, frame.meta.get("batch_size"))
+        elif frame.kind is Kind.PRIORITIES:
+            self._priorities(frame)
+        elif frame.kind is Kind.STATISTICS:
+            statistics = self._server.statistics()
+            sums = (statistics.total.data.cast("B"), statistics.total_square.data.cast("B"))
+            connection.send(Kind.STATISTICS, {"count": statistics.count}, sums)
+        elif frame.kind is Kind.STATS:
+            connection.send(Kind.STATS, self._server.stats())
+        else:
+            raise MessageError("kind", f"{frame.kind.name} is not a request")
+
+    def _sample(self, connection: Connection, batch_size: Any) -> None:
+        if type(batch_size) is not int or not 1 <= batch_size <= self._max_batch:
+            raise MessageError("batch-size", f"{batch_size!r}, want 1 to {self._max_batch}")
+        for other in self._connections:
+            other.own()  # the draw takes a buffer that another client's batch may still lie in
+        sample = self._server.sample(batch_size)
+        meta = {"env_steps": sample.env_steps}
+        if sample.rows is None or sample.importance is None:
+            connection.send(Kind.FINISHED if sample.draw is Draw.FINISHED else Kind.WAIT, meta)
+        else:
+            parts = (sample.rows.view(np.uint8).data, sample.importance.data.cast("B"))
+            connection.send(Kind.BATCH, meta, parts)
+
+    def _priorities(self, frame: Frame) -> None:
+        count = frame.meta.get("count")
+        if type(count) is not int or count < 0 or len(frame.body) != 12 * count:
+            raise MessageError("length", f"{len(frame.body)} bytes for {count!r} priorities")
+        serials = np.frombuffer(frame.body, np.int64, count)
+        self._server.update_priorities(serials, np.frombuffer(frame.body, np.float32, count, 8 * count))
+
+    def _refuse(self, connection: Connection, reason: str, detail: str) -> None:
+        self.refused[reason] += 1
+        with contextlib.suppress(OSError):  # it may have gone already
+            connection.send(Kind.ERROR, {"error": detail})
+        self._end(connection)
+
+    def _end_strangers(self) -> None:
+        """Who says nothing for long is sent away, so that strangers cannot fill the server."""
+        oldest = time.monotonic() - AUTHENTICATION_SECONDS
+        for connection in list(self._connections):
+            if not connection.authenticated and connection.opened < oldest:
+                self._refuse(connection, "silent", "no proof came in time")
+
+    def _end(self, connection: Connection) -> None:
+        if self._connections.pop(connection, None) is not None:
+            self._selector.unregister(connection.socket)
+            connection.close()
+
+    def close(self) -> None:
+        """End all connections and remove the socket's file."""
+        for connection in list(self._connections):
+            self._end(connection)
+        self._selector.close()
+        self._listener.close()
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
+
+def _listen(address: str) -> tuple[socket.socket, Path | None, str]:
+    """A listening socket, its file if any, and its address with the port taken."""
+    scheme, _, rest = address.partition(":")
+    try:
+        if scheme == "unix":
+            return _listen_unix(Path(rest)), Path(rest), address
+        host, _, port = rest.rpartition(":")
+        if scheme == "tcp" and host and port.isdigit():
+            listener = socket.create_server((host, int(port)), backlog=MAX_CONNECTIONS)
+            listener.setblocking(False)
+            return listener, None, f"tcp:{host}:{listener.getsockname()[1]}"
+    except (OSError, OverflowError) as error:
+        in_use = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
+        fix = "the port is taken; choose another, or 0 for a free one" if in_use else f"cannot listen there ({error})"
+        raise ConfigError("replay address", address, fix) from None
+    raise ConfigError("replay address", address, "want unix:PATH or tcp:HOST:PORT")
+
+
+def _listen_unix(path: Path) -> socket.socket:
+    path.unlink(missing_ok=True)  # a killed server's; the ring's lock keeps a living one's safe
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        mask = os.umask(0o177)
+        try:
+            listener.bind(str(path))
+        finally:
+            os.umask(mask)
+        listener.listen(MAX_CONNECTIONS)
+    except OSError:
+        listener.close()
+        raise
+    listener.setblocking(False)
+    return listener

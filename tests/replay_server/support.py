@@ -1,0 +1,51 @@
+"""What the replay server's tests share: a small window, lawful rows, an actor's end of the bus."""
+
+import numpy as np
+
+from common.bus import Bus, EntryId
+from common.window import Rows, WindowSpec
+from common.wire import encode_hello, encode_windows
+
+SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=4, burn_in=2, train=4)
+
+
+def make_rows(count: int, first_mark: int = 0, spec: WindowSpec = SPEC) -> Rows:
+    """Full windows that each carry ``train`` new steps; reward[0] is a running mark that names the window."""
+    rows = np.zeros(count, spec.dtype)
+    marks = np.arange(first_mark, first_mark + count)
+    rows["last"] = spec.steps
+    rows["new_steps"] = rows["new_observations"] = spec.train
+    phase = np.arange(spec.observations * spec.obs_dim).reshape(spec.observations, spec.obs_dim)
+    rows["observation"] = np.sin(marks[:, None, None] + phase)
+    rows["reward"][:, 0] = marks
+    return rows
+
+
+class Sender:
+    """An actor as the replay server sees it: a hello, then entries in order."""
+
+    def __init__(self, bus: Bus, actor: int = 0, spec: WindowSpec = SPEC) -> None:
+        self.bus, self.actor, self.spec, self.marks = bus, actor, spec, 0
+        self.hello()
+
+    def hello(self) -> None:
+        """Begin a life."""
+        self.epoch, self.seq = self.bus.take_epoch(f"actor-{self.actor}"), 0
+        self.bus.append(self.actor, EntryId(self.epoch, 0), encode_hello(self.spec))
+
+    def send(self, count: int) -> None:
+        """One entry of ``count`` new windows."""
+        self.send_rows(make_rows(count, self.marks, self.spec))
+        self.marks += count
+
+    def send_rows(self, rows: Rows) -> None:
+        self.send_raw(encode_windows(rows, self.spec))
+
+    def send_raw(self, payload: bytes) -> None:
+        self.seq += 1
+        self.bus.append(self.actor, EntryId(self.epoch, self.seq), payload)
+
+    def granted(self) -> int:
+        """Steps that the newest ack allows in this life."""
+        ack = self.bus.ack(self.actor)
+        return ack.granted_steps if ack is not None and ack.id.epoch == self.epoch else 0

@@ -1,0 +1,133 @@
+"""The ring: what was committed is there, whole and once, wherever the process was killed."""
+
+import shutil
+import struct
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.bus import EntryId
+from common.errors import ConfigError
+from common.window import WindowSpec
+from replay_server.record import Progress, StreamPosition, decode_progress, record_bytes
+from replay_server.ring import Ring
+from tests.replay_server.support import SPEC, make_rows
+
+RECORDS_START = 4096
+
+
+def marks(ring: Ring) -> list[int]:
+    """The marks of all windows that may be sampled, by serial, after checking that each is whole."""
+    serials = np.arange(ring.progress.valid_from, ring.progress.next_serial)
+    rows = np.zeros(len(serials), SPEC.dtype)
+    ring.gather(serials % ring.capacity, rows)
+    assert rows["serial"].tolist() == serials.tolist()
+    for row in rows:  # a window's contents follow from its mark
+        (original,) = make_rows(1, int(row["reward"][0]))
+        original["serial"] = row["serial"]
+        assert row.tobytes() == original.tobytes()
+    return [int(mark) for mark in rows["reward"][:, 0]]
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    capacity=st.integers(1, 12),
+    appends=st.lists(st.tuples(st.integers(0, 15), st.sampled_from(["whole", "after rows", "torn record"])), max_size=12),
+)
+def test_killed_anywhere(capacity: int, appends: list[tuple[int, str]]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path, committed = Path(folder) / "ring", 0
+        ring = Ring(path, SPEC, capacity)
+        for count, fate in appends:
+            before = ring.progress.valid_from
+            ring.write(make_rows(count, committed))
+            if fate != "after rows":
+                ring.commit()
+            if fate == "torn record":
+                tear_newest_record(path)
+            if fate == "whole":
+                committed += count
+            else:
+                ring = Ring(path, SPEC, capacity)  # nothing of the old one was flushed or closed
+            progress = ring.progress
+            assert progress.next_serial == committed
+            assert progress.valid_from <= max(before, min(committed, committed + count - capacity), committed - capacity)
+            assert marks(ring) == list(range(progress.valid_from, committed))
+        if all(fate == "whole" for _, fate in appends):
+            assert ring.progress.windows == min(capacity, committed)
+
+
+def tear_newest_record(path: Path) -> None:
+    """As if the process had been killed amid the record's last bytes."""
+    raw = bytearray(path.read_bytes())
+    half = record_bytes(SPEC.obs_dim)
+    newest = max(range(2), key=lambda copy: struct.unpack_from("<Q", raw, RECORDS_START + copy * half)[0])
+    raw[RECORDS_START + newest * half + 30] ^= 0xFF
+    with path.open("r+b") as file:  # in place: the map of the living ring sees it, too
+        file.write(raw)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    numbers=st.lists(st.integers(0, 2**62), min_size=8, max_size=8),
+    streams=st.dictionaries(
+        st.integers(0, 2**31 - 1), st.tuples(st.integers(1, 2**31), st.integers(0, 2**62), st.integers(0, 2**62)), max_size=20
+    ),
+)
+def test_progress_survives_the_round_trip(
+    numbers: list[int], streams: dict[int, tuple[int, int, int]]
+) -> None:
+    *counters, observations = numbers
+    progress = Progress(SPEC.obs_dim, *counters, max_priority=3.5, observations=observations)
+    progress.total += [1.0, 2.0, 3.0]
+    progress.streams = {actor: StreamPosition(EntryId(e, s), n) for actor, (e, s, n) in streams.items()}
+    again = decode_progress(progress.encode(), SPEC.obs_dim)
+    assert again.encode() == progress.encode()
+    assert again.streams == progress.streams
+    assert again.total.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_too_many_streams() -> None:
+    progress = Progress(SPEC.obs_dim)
+    progress.streams = {actor: StreamPosition(EntryId(1, 0), 0) for actor in range(4097)}
+    with pytest.raises(ConfigError, match="--actors=4097"):
+        progress.encode()
+
+
+def test_another_layout_or_capacity_is_named(tmp_path: Path) -> None:
+    Ring(tmp_path / "ring", SPEC, 10)
+    with pytest.raises(ConfigError, match=r"--replay\.capacity=11: the ring in .* has 10"):
+        Ring(tmp_path / "ring", SPEC, 11)
+    other = WindowSpec(obs_dim=4, action_dim=2, hidden=4, burn_in=2, train=4)
+    with pytest.raises(ConfigError, match=f"layout {SPEC.fingerprint}, this run's of {other.fingerprint}"):
+        Ring(tmp_path / "ring", other, 10)
+
+
+@pytest.mark.parametrize("damage", ["identity", "records", "short"])
+def test_damage_is_named(tmp_path: Path, damage: str) -> None:
+    Ring(tmp_path / "ring", SPEC, 10)
+    raw = bytearray((tmp_path / "ring").read_bytes())
+    if damage == "identity":
+        raw[3] ^= 1
+    if damage == "records":
+        raw[RECORDS_START : RECORDS_START + 2 * record_bytes(SPEC.obs_dim)] = bytes(2 * record_bytes(SPEC.obs_dim))
+    (tmp_path / "ring").write_bytes(raw[:-1] if damage == "short" else raw)
+    with pytest.raises(ConfigError, match="--run-dir=.*delete"):
+        Ring(tmp_path / "ring", SPEC, 10)
+
+
+def test_no_space_is_named_and_nothing_is_left(tmp_path: Path) -> None:
+    too_many = 2 * shutil.disk_usage(tmp_path).total // SPEC.dtype.itemsize
+    with pytest.raises(ConfigError, match=r"--replay\.capacity=.*GiB"):
+        Ring(tmp_path / "ring", SPEC, too_many)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_space_is_taken_at_once(tmp_path: Path) -> None:
+    Ring(tmp_path / "ring", SPEC, 5000)
+    status = (tmp_path / "ring").stat()
+    assert status.st_blocks * 512 >= status.st_size > 5000 * SPEC.dtype.itemsize
