@@ -55,7 +55,10 @@ def learner(env_id: str, batch_size: int, pairs: int, seconds: float) -> Row:
     spec = _spec(env_id, run.agent)
     config = LearnerConfig(batch_size=batch_size, checkpoint_steps=ENDLESS)
     torch.set_num_threads(1)
-    with replay_process(spec, ReplayConfig(replay_ratio=1e9, warmup_steps=0)) as bus, tempfile.TemporaryDirectory() as at:
+    with (
+        replay_process(spec, ReplayConfig(replay_ratio=1e9, warmup_steps=0)) as bus,
+        tempfile.TemporaryDirectory() as at,
+    ):
         bus.append(0, EntryId(1, 0), encode_hello(spec))
         _push(bus, spec, 300, 1)
         _wait_for_commit(bus, 300)

@@ -1,5 +1,6 @@
 """Every role in one thread over the in-process bus: same seed, same bits. For debugging and tests."""
 
+import itertools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -34,8 +35,18 @@ class Lockstep:
         self.learner = Learner(
             spec, config.agent, config.update, config.learner, self.server, self.bus, checkpoints, config.seed, device
         )
+        ticks = itertools.count()  # the actors' timers count calls, so that no clock decides anything
         self.actors = [
-            Actor(index, config.seed, lambda: make_env(config.env), spec, config.agent, config.actor, self.bus)
+            Actor(
+                index,
+                config.seed,
+                lambda: make_env(config.env),
+                spec,
+                config.agent,
+                config.actor,
+                self.bus,
+                clock=lambda: float(next(ticks)),
+            )  # fmt: skip
             for index in range(config.actors)
         ]
         self.evaluator = Evaluator(config.seed, lambda: make_env(config.env), config.agent, config.evaluator, self.bus)

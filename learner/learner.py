@@ -3,7 +3,9 @@
 import io
 import json
 import logging
+import pickle
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -14,7 +16,7 @@ from torch import Tensor
 from common.agent import Agent, AgentConfig
 from common.bus import Bus, Version
 from common.checkpoint import CheckpointFolder
-from common.errors import CheckpointError
+from common.errors import BusUnavailable, CheckpointError, FencedError
 from common.metrics import Means, Rate
 from common.replay import Draw, Replay, Sample
 from common.window import WindowSpec
@@ -76,7 +78,7 @@ class Learner:
         self.spec, self.config, self.replay, self.bus, self.checkpoints = spec, config, replay, bus, checkpoints
         self.device = torch.device(device)
         self.updates = self.env_steps = self.last_checkpoint = 0
-        self.finished = False
+        self.finished = self._fenced = False
         self._means, self._rate, self._waiting = Means(), Rate(), ""
         torch.manual_seed(seed)  # the networks' initial weights
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent).to(self.device)
@@ -136,10 +138,14 @@ class Learner:
             self._means.add("latent_deviation", deviation)
 
     def publish(self, evaluate: bool = False) -> None:
-        """Broadcast the policy with the newest observation statistics frozen into it."""
+        """Broadcast the policy with the newest observation statistics frozen into it. Raises FencedError."""
         self._freeze_statistics()
         blob = safetensors.torch.save(self.agent.policy_weights())
-        self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate)
+        try:
+            self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate)
+        except FencedError:
+            self._fenced = True
+            raise
 
     def _freeze_statistics(self) -> None:
         if self.agent.config.normalize_observations and self.env_steps > 0:
@@ -148,8 +154,16 @@ class Learner:
             self.agent.normalizer.freeze(statistics.count, total.to(self.device), square.to(self.device))
 
     def checkpoint(self) -> None:
-        """Save everything that a resumed learner needs, and ask for an evaluation of it."""
+        """Save, broadcast, and ask for an evaluation of what was saved."""
+        self._freeze_statistics()
+        self.save()
+        self.last_checkpoint = self.updates
+        self._next_checkpoint = self._after(self.env_steps)
+        self.mark_best()
         self.publish(evaluate=True)
+
+    def save(self) -> None:
+        """Write everything that a resumed learner needs."""
         state = io.BytesIO()
         torch.save(self.update.state_dict(), state)
         progress = {"updates": self.updates, "env_steps": self.env_steps, "epoch": self.epoch, "time": time.time()}
@@ -158,10 +172,7 @@ class Learner:
             POLICY: safetensors.torch.save(self.agent.policy_weights()),
             PROGRESS: json.dumps(progress).encode(),
         }
-        self.mark_best()
         self.checkpoints.save(self.updates, files)
-        self.last_checkpoint = self.updates
-        self._next_checkpoint = self._after(self.env_steps)
 
     def mark_best(self) -> None:
         """Take note of the evaluator's newest result."""
@@ -180,14 +191,19 @@ class Learner:
             if self.checkpoints.numbers():
                 raise CheckpointError(f"{self.checkpoints.folder}: no checkpoint is valid; move the folder away")
             return 0
-        _, files = found
-        progress = json.loads(files[PROGRESS])
-        self.update.load_state_dict(torch.load(io.BytesIO(files[STATE]), map_location=self.device, weights_only=True))
-        self.updates = self.last_checkpoint = progress["updates"]
-        self.env_steps = progress["env_steps"]
+        number, files = found
+        try:
+            state = torch.load(io.BytesIO(files[STATE]), map_location=self.device, weights_only=True)
+            self.update.load_state_dict(state)
+            progress = json.loads(files[PROGRESS])
+            self.updates = self.last_checkpoint = int(progress["updates"])
+            self.env_steps, epoch = int(progress["env_steps"]), int(progress["epoch"])
+        except (pickle.UnpicklingError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            reason = str(error).strip().splitlines()[0]
+            raise CheckpointError(f"{self.checkpoints.path(number)}: {STATE} is not this run's ({reason})") from None
         self._next_checkpoint = self._after(self.env_steps)
         log.info("resumed at update %d, environment step %d", self.updates, self.env_steps)
-        return int(progress["epoch"])
+        return epoch
 
     def waiting_for(self) -> str:
         return self._waiting
@@ -203,10 +219,11 @@ class Learner:
         }
 
     def close(self) -> None:
-        """Save what a resumed run needs, unless the run is finished and saved."""
-        if not self.finished and self.updates > 0:
-            self.checkpoint()
-        self.mark_best()
+        """Save what a resumed run needs, unless that is done or a newer learner has taken over."""
+        if not self.finished and not self._fenced and self.updates > self.last_checkpoint:
+            self.save()
+        with suppress(BusUnavailable):
+            self.mark_best()
         self.checkpoints.unlock()
 
 

@@ -1,0 +1,166 @@
+"""The learner role against a real replay server in the same thread."""
+
+import io
+import json
+
+import pytest
+import safetensors.torch
+import torch
+
+from common.agent import AgentConfig
+from common.bus import EntryId, MemoryBus
+from common.checkpoint import CheckpointFolder
+from common.errors import CheckpointError, FencedError
+from common.wire import encode_hello, encode_windows
+from learner.learner import Learner, LearnerConfig, latent_rank
+from learner.update import UpdateConfig
+from replay_server.server import ReplayConfig, ReplayServer
+from tests.learner.rows import SPEC, random_rows
+
+AGENT = AgentConfig(hidden=SPEC.hidden, embedding=7, heads=(10, 9), normalize_observations=True)
+CONFIG = LearnerConfig(batch_size=8, publish_updates=4, checkpoint_steps=100, precision="fp32")
+
+
+class Setting:
+    """A replay server fed by hand, and a learner on it."""
+
+    def __init__(self, folder, total_steps=10_000, replay_ratio=2.0):
+        self.bus, self.folder, self.seq = MemoryBus(), folder, 0
+        self.server = ReplayServer(
+            SPEC, ReplayConfig(1000, replay_ratio, warmup_steps=50), folder / "replay", 0, total_steps, 1, 100, self.bus
+        )
+        self.bus.append(0, EntryId(1, 0), encode_hello(SPEC))
+        self.learner = self.start()
+
+    def start(self) -> Learner:
+        checkpoints = CheckpointFolder(self.folder / "checkpoints")
+        return Learner(SPEC, AGENT, UpdateConfig(), CONFIG, self.server, self.bus, checkpoints, seed=1)
+
+    def feed(self, windows: int) -> None:
+        rows = random_rows(windows, self.seq)
+        rows["new_steps"] = rows["last"] - SPEC.burn_in
+        rows["new_observations"] = rows["new_steps"]
+        self.seq += 1
+        self.bus.append(0, EntryId(1, self.seq), encode_windows(rows, SPEC))
+        while self.server.step():
+            pass
+
+
+@pytest.fixture
+def setting(tmp_path):
+    made = Setting(tmp_path)
+    yield made
+    made.learner.close()
+    made.server.close()
+
+
+def test_first_weights_are_out_before_any_experience(setting):
+    assert setting.bus.latest_version() == (1, 0)
+    assert not setting.learner.step()
+    assert setting.learner.waiting_for() == "experience"
+
+
+def test_updates_publish_and_give_priorities_back(setting):
+    setting.feed(60)
+    before = setting.server.stats()["max_priority"]
+    while setting.learner.step():
+        pass
+    assert setting.learner.updates > 8
+    assert setting.bus.latest_version().update == setting.learner.updates // 4 * 4
+    assert setting.server.stats()["max_priority"] != before
+
+
+def test_statistics_are_frozen_into_what_is_published(setting):
+    setting.feed(60)
+    setting.learner.step()
+    setting.learner.publish()
+    weights = safetensors.torch.load(setting.bus.weights()[1])
+    statistics = setting.server.statistics()
+    mean = torch.from_numpy(statistics.total / statistics.count).float()
+    torch.testing.assert_close(weights["normalizer.mean"], mean)
+    assert set(weights) == set(setting.learner.agent.policy_weights())
+
+
+def test_checkpoint_holds_the_policy_and_resumes(setting):
+    setting.feed(60)
+    while setting.learner.step():
+        pass
+    setting.learner.close()
+    number, files = setting.learner.checkpoints.latest()
+    assert number == setting.learner.updates
+    assert json.loads(files["progress.json"])["env_steps"] == setting.learner.env_steps
+    resumed = setting.start()
+    assert (resumed.updates, resumed.env_steps) == (setting.learner.updates, setting.learner.env_steps)
+    assert resumed.epoch == setting.learner.epoch + 1
+    for name, value in setting.learner.agent.state_dict().items():
+        assert torch.equal(value, resumed.agent.state_dict()[name]), name
+    resumed.finished = True
+    resumed.close()
+
+
+def test_no_valid_checkpoint_is_an_error(setting):
+    setting.feed(60)
+    setting.learner.step()
+    setting.learner.close()
+    for path in setting.folder.glob("checkpoints/0*/learner.pt"):
+        path.write_bytes(b"damaged")
+    with pytest.raises(CheckpointError, match="no checkpoint is valid"):
+        setting.start()
+
+
+def test_a_checkpoint_never_executes_code(setting):
+    class Hostile:
+        def __reduce__(self):
+            return (print, ("owned",))
+
+    setting.feed(60)
+    setting.learner.step()
+    setting.learner.close()
+    file = io.BytesIO()
+    torch.save({"agent": Hostile()}, file)
+    number, files = setting.learner.checkpoints.latest()
+    setting.learner.checkpoints.save(number + 1, {**files, "learner.pt": file.getvalue()})
+    with pytest.raises(CheckpointError, match="learner.pt"):
+        setting.start()
+
+
+def test_ends_with_a_checkpoint_once_the_ratio_is_spent(tmp_path):
+    setting = Setting(tmp_path, total_steps=100)
+    setting.feed(60)
+    while not setting.learner.finished:
+        assert setting.learner.step()
+    assert not setting.learner.step()
+    assert setting.learner.checkpoints.numbers()[-1] == setting.learner.updates
+    setting.learner.close()
+    setting.server.close()
+
+
+def test_a_replaced_learner_is_fenced(setting):
+    setting.feed(60)
+    setting.learner.step()
+    setting.learner.step()
+    saved = setting.learner.checkpoints.numbers()
+    setting.bus.take_epoch("learner")
+    with pytest.raises(FencedError):
+        setting.learner.publish()
+    setting.learner.close()
+    assert setting.learner.checkpoints.numbers() == saved
+
+
+def test_best_checkpoint_follows_the_evaluator(setting):
+    setting.feed(60)
+    setting.learner.step()
+    setting.learner.checkpoint()
+    setting.bus.emit("evaluator", {"eval_return_mean": 3.0, "eval_update": setting.learner.updates})
+    setting.learner.mark_best()
+    assert setting.learner.checkpoints.best() == setting.learner.updates
+
+
+def test_latent_rank_sees_a_collapse():
+    torch.manual_seed(0)
+    full, _ = latent_rank(torch.randn(20, 10, 16))
+    one, deviation = latent_rank(torch.randn(20, 10, 1) * torch.ones(16))
+    assert full > 14
+    assert one == pytest.approx(1.0, abs=0.01)
+    assert deviation > 0.5
+    assert latent_rank(torch.ones(4, 5, 16))[1] == 0.0
