@@ -7,7 +7,6 @@ from pathlib import Path
 
 from actors.actor import Actor
 from actors.evaluator import Evaluator
-
 from common.bus import Bus, MemoryBus
 from common.checkpoint import CheckpointFolder
 from common.envs import make_env
@@ -28,9 +27,16 @@ class Lockstep:
     def __init__(self, config: RunConfig, folder: Path, device: str = "cpu") -> None:
         spec, self.bus = config.window_spec(), MemoryBus()
         self.server = ReplayServer(
-            spec, config.replay, folder / "replay", config.seed, config.total_steps, config.actors,
-            config.slack_steps(), self.bus,
-        )  # fmt: skip
+            spec,
+            config.replay,
+            folder / "replay",
+            config.seed,
+            config.total_steps,
+            config.actors,
+            config.slack_steps(),
+            self.bus,
+        )
+        self.server.step()  # publishes what a resumed ring has seen, from which actors take their epochs
         checkpoints = CheckpointFolder(folder / "checkpoints", config.learner.keep_checkpoints)
         self.learner = Learner(
             spec, config.agent, config.update, config.learner, self.server, self.bus, checkpoints, config.seed, device
@@ -46,7 +52,7 @@ class Lockstep:
                 config.actor,
                 self.bus,
                 clock=lambda: float(next(ticks)),
-            )  # fmt: skip
+            )
             for index in range(config.actors)
         ]
         self.evaluator = Evaluator(config.seed, lambda: make_env(config.env), config.agent, config.evaluator, self.bus)

@@ -1,0 +1,65 @@
+"""``rmc``: every command's entry, and how errors reach the user: one line, exit status 2."""
+
+import contextlib
+import io
+import os
+import sys
+
+SINGLE_THREADED = {"actor", "replay", "evaluator"}
+CONFIG_STATUS, FAILED_STATUS = 2, 1
+
+
+def main() -> None:
+    """The entry point."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(words: list[str]) -> int:
+    """Run one command; its exit status."""
+    if words and words[0] in SINGLE_THREADED:  # before numpy and torch are imported, which read these once
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+            os.environ.setdefault(name, "1")
+    if os.getcwd() not in sys.path:  # a user's own environments, last, so that they cannot shadow ours
+        sys.path.append(os.getcwd())
+    from common.errors import ConfigError, RmcError
+
+    try:
+        return _parse_and_run(words)
+    except ConfigError as error:
+        return _complain(str(error), CONFIG_STATUS)
+    except RmcError as error:
+        if words[0] not in ("train", "evaluate", "stats"):
+            raise  # a role: the supervisor shows its traceback
+        return _complain(str(error), FAILED_STATUS)
+
+
+def _parse_and_run(words: list[str]) -> int:
+    from deploy import commands, options
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            command = options.parse(words)
+    except SystemExit as ending:
+        if not ending.code:  # --help
+            return 0
+        return _complain(_as_line(said.getvalue()), CONFIG_STATUS)
+    return commands.execute(command)
+
+
+def _as_line(boxed: str) -> str:
+    """tyro's boxed message as one line, without its frame, headings and help text."""
+    rows = [row.strip("│╭╮╰╯─ \t") for row in boxed.splitlines()]
+    body = [row for row in rows if row]
+    ends = [i for i, row in enumerate(body) if row.startswith(("For full helptext", "Argument helptext"))]
+    heading = 1 if len(body) > 1 else 0
+    return " ".join(body[heading : ends[0] if ends else None]) + " (see rmc --help)"
+
+
+def _complain(message: str, status: int) -> int:
+    sys.stderr.write(f"rmc: {message}\n")
+    return status
+
+
+if __name__ == "__main__":
+    main()

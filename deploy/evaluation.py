@@ -1,0 +1,81 @@
+"""Playing a checkpoint: the one way in which ``rmc evaluate`` and the end of a run judge a policy."""
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+import torch
+
+from actors.evaluator import play_episodes
+from actors.policy_runner import PolicyRunner
+from common.agent import Agent
+from common.checkpoint import CheckpointFolder
+from common.envs import make_env
+from common.errors import CheckpointError, ConfigError
+from deploy.presets import RunConfig
+from deploy.run_folder import RunFolder
+
+POLICY, PROGRESS = "policy.safetensors", "progress.json"
+
+
+def evaluate_blob(config: RunConfig, blob: bytes, episodes: int, flicker: float | None = None) -> dict[str, Any]:
+    """Deterministic episodes of a policy: mean, standard deviation and number of returns."""
+    env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
+    spec = config.window_spec()
+    runner = PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, episodes)
+    runner.load(blob)
+    returns = play_episodes(runner, lambda: make_env(env), episodes, config.seed)
+    return {
+        "eval_return_mean": float(np.mean(returns)),
+        "eval_return_std": float(np.std(returns)),
+        "eval_episodes": episodes,
+        "eval_flicker": env.flicker,
+    }
+
+
+def evaluate_checkpoint(
+    folder: RunFolder, config: RunConfig, checkpoint: str, episodes: int, flicker: float | None = None
+) -> dict[str, Any]:
+    """Deterministic episodes of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
+    checkpoints = CheckpointFolder(folder.checkpoints)
+    number = _number(checkpoints, checkpoint)
+    try:
+        files = checkpoints.load(number)
+    except CheckpointError as error:
+        others = [other for other in checkpoints.numbers() if other != number]
+        fix = f"use one of {others}" if others else "there is no other"
+        raise ConfigError("--checkpoint", checkpoint, f"{error}; {fix}") from None
+    progress = json.loads(files[PROGRESS])
+    return {
+        "env": config.env.id,
+        "preset": config.preset,
+        "seed": config.seed,
+        "env_steps": progress["env_steps"],
+        "updates": progress["updates"],
+        **evaluate_blob(config, files[POLICY], episodes, flicker),
+    }
+
+
+def _number(checkpoints: CheckpointFolder, which: str) -> int:
+    numbers = checkpoints.numbers()
+    if not numbers:
+        raise ConfigError("RUN", str(checkpoints.folder.parent), "it has no checkpoint yet; train it for longer")
+    if which == "latest":
+        return numbers[-1]
+    if which == "best":
+        best = checkpoints.best()
+        if best is None or best not in numbers:
+            raise ConfigError("--checkpoint", which, "none was evaluated yet; use latest")
+        return best
+    if which.isdigit() and int(which) in numbers:
+        return int(which)
+    raise ConfigError("--checkpoint", which, f"use latest, best or one of {numbers}")
+
+
+def initial_policy(config: RunConfig) -> bytes:
+    """The policy that the run's learner starts from, before it has learnt anything."""
+    spec = config.window_spec()
+    torch.manual_seed(config.seed)
+    return safetensors.torch.save(Agent(spec.obs_dim, spec.action_dim, config.agent).policy_weights())

@@ -1,0 +1,113 @@
+"""A run as processes of this machine: embedded Redis if none is given, roles under the supervisor, the monitor."""
+
+import logging
+import shutil
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+from common.errors import BusFull, BusUnavailable, ConfigError
+from common.redis_bus import RedisBus
+from common.role import StopSignal
+from deploy.monitor import Monitor
+from deploy.presets import RunConfig, to_json
+from deploy.redis_server import RedisServer
+from deploy.roles import URL_VARIABLE, connect
+from deploy.run_folder import RunFolder
+from deploy.supervisor import RoleCommand, Supervisor
+
+TICK_SECONDS = 0.1
+log = logging.getLogger(__name__)
+
+
+def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -> list[RoleCommand]:
+    """How each role of the run is started here; the same commands start them by hand."""
+    place = ("--run", folder.name)
+    secret = ("--secret-file", str(folder.secret_file))
+    listen = ("--folder", str(folder.replay), "--listen", f"unix:{sockets / 'replay.sock'}")
+    learn = ("--folder", str(folder.checkpoints), "--device", device)
+    actors = [RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))) for index in range(config.actors)]
+    return [
+        RoleCommand("replay", ("replay", *place, *secret, *listen)),
+        RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False),
+        RoleCommand("evaluator", ("evaluator", *place)),
+        *actors,
+    ]
+
+
+class LocalRun:
+    """A run's processes between ``start`` and ``close``."""
+
+    def __init__(self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str) -> None:
+        self._config, self._redis_url = config, redis_url
+        self._leave = ExitStack()
+        self.sockets = Path(tempfile.mkdtemp(prefix="rmc-run-"))  # private, and short: a socket path has 107 bytes
+        self._leave.callback(shutil.rmtree, self.sockets)
+        try:
+            self._server = None if redis_url else self._leave.enter_context(RedisServer(self.sockets))
+            url = redis_url or f"unix://{self.sockets / 'redis.sock'}"
+            self.bus = connect(url, folder.name)
+            _register(self.bus, config)
+        except BaseException:
+            self._leave.close()
+            raise
+        self.supervisor = Supervisor(commands(config, folder, self.sockets, device), {URL_VARIABLE: url}, folder.logs)
+
+    def tend(self) -> None:
+        """Start again what died: roles, and the embedded Redis. Raises RoleDied."""
+        if self._server is not None and not self._server.alive():
+            log.warning("the embedded Redis died; starting it again")
+            self._server.start()
+            self.bus.set_config(to_json(self._config).encode())
+        self.supervisor.tend()
+
+    def finished(self) -> bool:
+        """Whether the learner has ended in order: all steps are in, and the last checkpoint is written."""
+        return self.supervisor.roles["learner"].finished
+
+    def close(self) -> None:
+        """End everything; nothing is left but the run's folder."""
+        try:
+            self.supervisor.stop()
+        finally:
+            self._leave.close()
+
+
+def _register(bus: RedisBus, config: RunConfig) -> None:
+    text = to_json(config).encode()
+    bus.set_config(text)
+    bus.clear_stop()
+
+
+def train(
+    config: RunConfig, folder: RunFolder, redis_url: str | None, device: str, monitor: Monitor, stop: StopSignal
+) -> bool:
+    """Train until the total is reached or ``stop`` is set; whether it was reached. Raises RoleDied, ConfigError."""
+    run = LocalRun(config, folder, redis_url, device)
+    monitor.restarts = run.supervisor.restarts
+    try:
+        monitor.skip_old(run.bus)
+        run.supervisor.start()
+        while not stop.requested and not run.finished():
+            run.tend()
+            _watch(monitor, run.bus)
+            time.sleep(TICK_SECONDS)
+        finished = run.finished()
+        run.supervisor.stop()
+        _watch(monitor, run.bus)  # what the roles said last
+        return finished
+    finally:
+        run.close()
+
+
+def _watch(monitor: Monitor, bus: RedisBus) -> None:
+    try:
+        monitor.watch(bus)
+    except (BusUnavailable, BusFull) as error:
+        log.warning("waiting for Redis: %s", error)
+
+
+def check_redis(url: str) -> None:
+    """Raises ConfigError where no Redis answers."""
+    connect(url, "check")

@@ -1,0 +1,112 @@
+"""What everyone looks at: metrics from the bus to metrics.jsonl, TensorBoard, and a live view or plain lines."""
+
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from tensorboard.compat.proto.event_pb2 import Event
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+from common.bus import Bus
+from common.checkpoint import CheckpointFolder
+from deploy.presets import RunConfig
+from deploy.run_folder import RunFolder
+from deploy.view import Board, line, table
+
+REFRESH_SECONDS = 0.5
+LINE_SECONDS = 10.0
+RECORD_SECONDS = 5.0  # between the launcher's own records
+PAGE = 1000  # records that the bus gives at a time
+
+
+class Monitor:
+    """Reads every role's records and shows them. ``watch`` as often as you like; ``close`` at the end."""
+
+    def __init__(self, folder: RunFolder, config: RunConfig, console: Console) -> None:
+        self.board = Board(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
+        self._console = console
+        self.restarts: Callable[[], dict[str, int]] = dict  # how often each role was started again
+        self._checkpoints = CheckpointFolder(folder.checkpoints, config.learner.keep_checkpoints)
+        self._cursor, self._started, self._wall_before = "0", time.monotonic(), folder.wall_seconds()
+        self._next_view = self._next_record = 0.0
+        self._lines = folder.metrics.open("a", buffering=1)
+        self._events = EventFileWriter(str(folder.events))
+        self._live: Live | None = None
+        if console.is_terminal:
+            self._live = Live(table(self.board), console=console, auto_refresh=False)
+            self._live.start()
+
+    @property
+    def wall_seconds(self) -> float:
+        """Seconds trained, over all starts of the run."""
+        return self._wall_before + time.monotonic() - self._started
+
+    def skip_old(self, bus: Bus) -> None:
+        """Pass over what an earlier start left in a shared Redis."""
+        records, self._cursor = bus.records(self._cursor)
+        while len(records) >= PAGE:
+            records, self._cursor = bus.records(self._cursor)
+
+    def watch(self, bus: Bus) -> None:
+        """Take in what is new, and refresh the view when it is due."""
+        self._take_in(bus)
+        now = time.monotonic()
+        if now >= self._next_record:
+            self._next_record = now + RECORD_SECONDS
+            self._record_launcher()
+        if now >= self._next_view:
+            self._next_view = now + (REFRESH_SECONDS if self._live else LINE_SECONDS)
+            self.show()
+
+    def _take_in(self, bus: Bus) -> None:
+        while True:
+            records, self._cursor = bus.records(self._cursor)
+            for record in records:
+                self.record(record)
+            if len(records) < PAGE:
+                return
+
+    def record(self, record: dict[str, Any]) -> None:
+        """Write one record (with its ``role``) and take it into the view."""
+        self._lines.write(json.dumps(record) + "\n")
+        self.board.take(record)
+        self._write_events(record)
+        if "eval_update" in record:
+            self._checkpoints.mark_best(int(record["eval_update"]), float(record["eval_return_mean"]))
+
+    def _record_launcher(self) -> None:
+        restarts = {f"restarts_{role}": count for role, count in self.restarts().items()}
+        total = sum(restarts.values())
+        self.record(
+            {"role": "launcher", "time": time.time(), "wall_s": self.wall_seconds, "restarts": total, **restarts}
+        )
+
+    def _write_events(self, record: dict[str, Any]) -> None:
+        role = record["role"]
+        values = [
+            Summary.Value(tag=f"{role}/{name}", simple_value=value)
+            for name, value in record.items()
+            if isinstance(value, int | float) and name != "time"
+        ]
+        when, step = record.get("time", time.time()), self.board.env_steps
+        self._events.add_event(Event(wall_time=when, step=step, summary=Summary(value=values)))
+
+    def show(self) -> None:
+        """Refresh the view now."""
+        if self._live is not None:
+            self._live.update(table(self.board), refresh=True)
+        else:
+            self._console.print(line(self.board), soft_wrap=True, highlight=False)
+
+    def close(self) -> None:
+        """Show the last state and close the files."""
+        self._record_launcher()
+        self.show()
+        if self._live is not None:
+            self._live.stop()
+        self._lines.close()
+        self._events.close()

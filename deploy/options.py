@@ -1,0 +1,164 @@
+"""The command line as dataclasses; tyro makes ``--help`` of them. Options of the roles' configs are flat."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from actors.actor import ActorConfig
+from actors.evaluator import EvaluatorConfig
+from common.agent import AgentConfig
+from common.envs import EnvConfig
+from deploy import presets
+from deploy.presets import Preset, RunConfig, WindowConfig
+from deploy.run_folder import IfExists
+from deploy.training import Launcher, Placement
+from learner.learner import LearnerConfig
+from learner.update import UpdateConfig
+from replay_server.server import ReplayConfig
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train an agent, or go on with a run."""
+
+    env: Positional[str]
+    """Gymnasium id, like HalfCheetah-v5, or module:EnvId-v0 for your own."""
+    window: WindowConfig
+    agent: AgentConfig
+    actor: ActorConfig
+    replay: ReplayConfig
+    update: UpdateConfig
+    learner: LearnerConfig
+    evaluator: EvaluatorConfig
+    preset: Preset = "robust"
+    """Where the other options' defaults come from."""
+    seed: int = 0
+    """Seed of networks, environments, noise and sampling."""
+    total_steps: int = 1_000_000
+    """Environment steps of the run, over all actors."""
+    actors: int = 1
+    """Actor processes."""
+    flicker: float = 0.0
+    """Probability that an observation is replaced by zeros."""
+    run_dir: Path | None = None
+    """The run's folder; by default runs/<env>__<preset>__<seed>__<time>."""
+    if_exists: IfExists = "resume"
+    """What to do if the run's folder is there: go on, refuse, or take a new one beside it."""
+    launcher: Launcher = "local"
+    """Processes on this machine, or every role in one thread, with the same bits for the same seed."""
+    device: str = "cpu"
+    """The learner's device: cpu or cuda."""
+    redis_url: str | None = None
+    """A Redis of your own: unix:///path, redis://host:port or rediss://…; by default an embedded one."""
+
+    def config(self) -> RunConfig:
+        """The run's config."""
+        own = {item.name: getattr(self, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
+        return RunConfig(env=EnvConfig(self.env, self.flicker), **own)
+
+    def placement(self) -> Placement:
+        """Where and on what it runs."""
+        return Placement(self.run_dir, self.if_exists, self.launcher, self.device, self.redis_url)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Play deterministic episodes with a run's checkpoint."""
+
+    run: Positional[Path]
+    """The run's folder."""
+    episodes: int = 10
+    """Episodes to play."""
+    flicker: float | None = None
+    """Probability of a blank observation; by default the run's own."""
+    checkpoint: str = "latest"
+    """latest, best, or the number of a checkpoint."""
+    json: bool = False
+    """Print one line of JSON."""
+
+
+@dataclass(frozen=True)
+class Stats:
+    """Show the newest metrics of a run."""
+
+    run: Positional[Path]
+    """The run's folder."""
+
+
+@dataclass(frozen=True)
+class _Role:
+    run: str
+    """The run's name."""
+    redis_url: str = ""
+    """The run's Redis; by default what RMC_REDIS_URL says."""
+
+
+@dataclass(frozen=True)
+class ActorRole(_Role):
+    """Run one actor of a registered run in this process."""
+
+    index: int = 0
+    """Which actor, from 0 on."""
+
+
+@dataclass(frozen=True)
+class ReplayRole(_Role):
+    """Run the replay server of a registered run in this process."""
+
+    folder: Path = Path("replay")
+    """Where the ring lies."""
+    listen: str = "tcp:127.0.0.1:0"
+    """Where the learner connects to: unix:PATH or tcp:HOST:PORT, port 0 for a free one."""
+    secret_file: Path | None = None
+    """File with the run's secret; by default RMC_SECRET holds it."""
+
+
+@dataclass(frozen=True)
+class LearnerRole(_Role):
+    """Run the learner of a registered run in this process."""
+
+    folder: Path = Path("checkpoints")
+    """Where checkpoints go, and where it resumes from."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    secret_file: Path | None = None
+    """File with the run's secret; by default RMC_SECRET holds it."""
+
+
+@dataclass(frozen=True)
+class EvaluatorRole(_Role):
+    """Run the evaluator of a registered run in this process."""
+
+
+Command = Train | Evaluate | Stats | ActorRole | ReplayRole | LearnerRole | EvaluatorRole
+
+
+def parse(words: list[str]) -> Command:
+    """The command line as one of the classes above. Raises SystemExit, its message on standard error."""
+    start = presets.preset(_named_preset(words), EnvConfig(""))
+    shared = {item.name: getattr(start, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
+    commands = (
+        Annotated[Train, tyro.conf.subcommand("train", default=Train(env=tyro.MISSING, **shared))]
+        | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+        | Annotated[Stats, tyro.conf.subcommand("stats")]
+        | Annotated[ActorRole, tyro.conf.subcommand("actor")]
+        | Annotated[ReplayRole, tyro.conf.subcommand("replay")]
+        | Annotated[LearnerRole, tyro.conf.subcommand("learner")]
+        | Annotated[EvaluatorRole, tyro.conf.subcommand("evaluator")]
+    )
+    flat = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+    command: Command = tyro.cli(commands, prog="rmc", args=words, config=flat)  # type: ignore[call-overload]
+    return command
+
+
+def _named_preset(words: list[str]) -> Preset:
+    """The preset must be known before the options, whose defaults it gives; a wrong one is refused later."""
+    given = [word.partition("=")[2] for word in words if word.startswith("--preset=")]
+    given += [after for word, after in zip(words, words[1:], strict=False) if word == "--preset"]
+    if "paper" in given[-1:]:
+        return "paper"
+    return "debug" if "debug" in given[-1:] else "robust"

@@ -1,0 +1,153 @@
+"""Each role as a process: reads the run's config from Redis, builds the role from its part, runs its loop."""
+
+import logging
+import os
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from actors.actor import Actor
+from actors.evaluator import Evaluator
+from common.bus import ReplayAddress
+from common.checkpoint import CheckpointFolder
+from common.envs import Env, make_env
+from common.errors import BusUnavailable, ConfigError
+from common.redis_bus import RedisBus
+from common.role import StopSignal, run_role
+from deploy.lifeline import die_with
+from deploy.presets import RunConfig, from_json
+from learner.learner import Learner
+from learner.replay_client import ReplayClient
+from replay_server.process import ReplayProcess
+from replay_server.server import ReplayServer
+from replay_server.socket_server import SocketServer
+
+SECRET_VARIABLE, URL_VARIABLE, PARENT_VARIABLE = "RMC_SECRET", "RMC_REDIS_URL", "RMC_PARENT"
+EVALUATOR_NICENESS = 10  # it must not take the learner's core
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a role finds its run."""
+
+    run: str
+    redis_url: str
+    secret_file: Path | None = None
+
+    def secret(self) -> bytes:
+        """The run's secret, from its file or the environment. Raises ConfigError."""
+        if self.secret_file is None:
+            secret = os.environ.get(SECRET_VARIABLE, "").encode()
+        else:
+            try:
+                secret = self.secret_file.read_bytes().strip()
+            except OSError as error:
+                raise ConfigError(
+                    "--secret-file", str(self.secret_file), f"cannot be read ({error.strerror})"
+                ) from None
+        if not secret:
+            raise ConfigError("--secret-file", None, f"give the run's secret file, or set {SECRET_VARIABLE}")
+        return secret
+
+
+class Process:
+    """What every role's process has: stop signal, bus, the run's config. Dies with its supervisor, if it has one."""
+
+    def __init__(self, place: Place) -> None:
+        parent = os.environ.pop(PARENT_VARIABLE, None)
+        if parent is not None:
+            die_with(int(parent))
+        logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
+        self.stop = StopSignal()
+        self.stop.install()
+        self.bus = connect(place.redis_url, place.run)
+        raw = self.bus.config()
+        if raw is None:
+            raise ConfigError("--run", place.run, "no run of this name is registered in that Redis; start it first")
+        self.config: RunConfig = from_json(raw)
+
+    def make_env(self) -> Env:
+        """A new environment of the run."""
+        return make_env(self.config.env)
+
+
+def connect(url: str, run: str) -> RedisBus:
+    """A bus whose Redis answers. Raises ConfigError."""
+    bus = RedisBus(url, run)
+    try:
+        bus.ping()
+    except BusUnavailable as error:
+        raise ConfigError("--redis-url", without_password(url), f"no Redis answers there ({error})") from None
+    return bus
+
+
+def without_password(url: str) -> str:
+    """The URL as it may be shown."""
+    scheme, separator, rest = url.partition("://")
+    return scheme + separator + rest.rpartition("@")[2]
+
+
+def run_actor(place: Place, index: int) -> None:
+    """The process of actor ``index``."""
+    process = Process(place)
+    config = process.config
+    if not 0 <= index < config.actors:
+        raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
+    torch.set_num_threads(1)
+    actor = Actor(index, config.seed, process.make_env, config.window_spec(), config.agent, config.actor, process.bus)
+    run_role(actor, process.bus, process.stop)
+
+
+def run_evaluator(place: Place) -> None:
+    """The evaluator's process."""
+    process = Process(place)
+    config = process.config
+    torch.set_num_threads(1)
+    os.nice(EVALUATOR_NICENESS)
+    evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, process.bus)
+    run_role(evaluator, process.bus, process.stop)
+
+
+def run_replay(place: Place, folder: Path, listen: str) -> None:
+    """The replay server's process; its ring lies in ``folder``, its socket at ``listen``."""
+    secret, process = place.secret(), Process(place)
+    config, spec = process.config, process.config.window_spec()
+    torch.set_num_threads(1)
+    server = ReplayServer(
+        spec, config.replay, folder, config.seed, config.total_steps, config.actors, config.slack_steps(), process.bus
+    )
+    sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size)
+    process.bus.announce_replay(ReplayAddress(server.epoch, sockets.address))
+    run_role(ReplayProcess(server, sockets), process.bus, process.stop)
+
+
+def run_learner(place: Place, folder: Path, device: str) -> None:
+    """The learner's process; checkpoints go to ``folder``. Its last record says ``finished`` where the run is."""
+    secret, process = place.secret(), Process(place)
+    config, spec, bus = process.config, process.config.window_spec(), process.bus
+    torch.set_num_threads(config.learner.threads or len(os.sched_getaffinity(0)))
+    check_device(device)
+
+    def address() -> str | None:
+        found = bus.replay_address()
+        return found.address if found else None
+
+    client = ReplayClient(address, secret, spec, config.learner.batch_size, pinned=device.startswith("cuda"))
+    checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
+    learner = Learner(spec, config.agent, config.update, config.learner, client, bus, checkpoints, config.seed, device)
+    run_role(learner, bus, process.stop, lambda: learner.finished)
+    client.close()
+    if learner.finished:
+        bus.emit(learner.name, {**learner.metrics(), "finished": 1})
+
+
+def check_device(device: str) -> None:
+    """Raises ConfigError where the device is not there."""
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+        raise ConfigError("--device", device, "take cpu, cuda or cuda:N")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError("--device", device, "PyTorch sees no CUDA device; use --device cpu")

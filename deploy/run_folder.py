@@ -1,0 +1,172 @@
+"""A run's folder: config, secret, metrics, checkpoints, ring, logs, result. The same folder resumes.
+
+``runs/<env>__<preset>__<seed>__<time>/``
+"""
+
+import dataclasses
+import fcntl
+import json
+import os
+import secrets
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+from common.checkpoint import CheckpointFolder
+from common.errors import CheckpointError, ConfigError
+from deploy.presets import RunConfig, from_json, option, to_json
+
+IfExists = Literal["resume", "fail", "new"]
+MAY_CHANGE = {"total_steps", "actors", "learner.threads", "learner.keep_checkpoints", "learner.checkpoint_steps"}
+
+
+class RunFolder:
+    """Names and small files of a run's folder."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path.resolve()
+        self.checkpoints, self.replay, self.logs = self.path / "checkpoints", self.path / "replay", self.path / "logs"
+        self.metrics, self.events = self.path / "metrics.jsonl", self.path / "events"
+        self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
+        self._lock: int | None = None
+
+    @property
+    def name(self) -> str:
+        """The run's name, in Redis too."""
+        return self.path.name
+
+    def config(self) -> RunConfig:
+        """The run's config. Raises ConfigError where this is no run's folder."""
+        try:
+            return from_json((self.path / "config.json").read_bytes())
+        except OSError:
+            raise ConfigError("RUN", str(self.path), "no config.json there; give the folder of a run") from None
+
+    def result(self) -> dict[str, Any] | None:
+        """What ``result.json`` says, once the run has ended."""
+        try:
+            return dict(json.loads(self.result_file.read_bytes()))
+        except OSError:
+            return None
+
+    def write_result(self, result: dict[str, Any]) -> None:
+        """Write ``result.json``, whole or not at all."""
+        temporary = self.path / ".result.json"
+        temporary.write_text(json.dumps(result, indent=2) + "\n")
+        temporary.rename(self.result_file)
+
+    def secret(self) -> bytes:
+        """The run's secret, made at first use; only the owner may read it."""
+        if not self.secret_file.exists():
+            handle = os.open(self.secret_file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(handle, "w") as file:
+                file.write(secrets.token_hex(32) + "\n")
+        return self.secret_file.read_bytes().strip()
+
+    def wall_seconds(self) -> float:
+        """How long the run was trained before, over all its starts."""
+        if not self.metrics.exists():
+            return 0.0
+        last = 0.0
+        with self.metrics.open() as lines:
+            for line in lines:
+                if '"launcher"' in line:
+                    last = max(last, _wall(line))
+        return last
+
+    def lock(self) -> None:
+        """Be the one launcher of this run. Raises ConfigError where another one is."""
+        self._lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.unlock()
+            raise ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first") from None
+
+    def unlock(self) -> None:
+        """Let another launcher in."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+
+def _wall(line: str) -> float:
+    try:
+        return float(json.loads(line).get("wall_s", 0.0))
+    except ValueError:  # a line torn by a crash
+        return 0.0
+
+
+def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> RunFolder:
+    """Make or take up a run's folder, locked. Raises ConfigError before anything is written where it may not be."""
+    folder = RunFolder(run_dir or Path("runs") / _new_name(config))
+    if if_exists == "new":
+        folder = _unused(folder)
+    if (folder.path / "config.json").exists():
+        if if_exists == "fail":
+            raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")
+        _check_resumable(folder, config)
+    elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
+        raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
+    _make(folder)
+    folder.lock()
+    (folder.path / "config.json").write_text(to_json(config) + "\n")
+    folder.secret()
+    return folder
+
+
+def _new_name(config: RunConfig) -> str:
+    env = config.env.id.replace(":", "_").replace("/", "_")
+    return f"{env}__{config.preset}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def _unused(folder: RunFolder) -> RunFolder:
+    number, candidate = 1, folder
+    while candidate.path.exists():
+        number += 1
+        candidate = RunFolder(folder.path.with_name(f"{folder.name}-{number}"))
+    return candidate
+
+
+def _make(folder: RunFolder) -> None:
+    try:
+        for path in (folder.path, folder.checkpoints, folder.replay, folder.logs):
+            path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError("--run-dir", str(folder.path), f"cannot be made ({error.strerror}); give another") from None
+
+
+def _check_resumable(folder: RunFolder, config: RunConfig) -> None:
+    was, now = flat(folder.config()), flat(config)
+    for path in ["env.id", "preset", *was]:
+        if was[path] != now[path] and path not in MAY_CHANGE:
+            name = "ENV" if path == "env.id" else option(path)
+            fix = f"the run in {folder.path} has {was[path]!r}; use that, or another --run-dir"
+            raise ConfigError(name, now[path], fix)
+    check_checkpoints(folder)
+
+
+def check_checkpoints(folder: RunFolder) -> None:
+    """Raises ConfigError where there are checkpoints but none is whole."""
+    checkpoints = CheckpointFolder(folder.checkpoints)
+    faults = []
+    for number in reversed(checkpoints.numbers()):
+        try:
+            checkpoints.load(number)
+            return
+        except CheckpointError as error:
+            faults.append(str(error))
+    if faults:
+        raise ConfigError("--run-dir", str(folder.path), f"{faults[0]}; none is whole, so use another --run-dir")
+
+
+def flat(config: Any, prefix: str = "") -> dict[str, Any]:
+    """A config's values by dotted path."""
+    values: dict[str, Any] = {}
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            values |= flat(value, f"{prefix}{item.name}.")
+        else:
+            values[prefix + item.name] = value
+    return values

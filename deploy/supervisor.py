@@ -1,0 +1,149 @@
+"""Keeps a run's roles alive as processes of this machine, and ends them so that nothing is left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+
+from common.errors import RoleDied
+from deploy.roles import PARENT_VARIABLE
+
+QUICK_DEATHS, QUICK_SECONDS = 3, 60.0  # so many deaths within so long end the run
+FIRST_BACKOFF, LONGEST_BACKOFF = 0.5, 10.0  # seconds before a role is started again, doubled at each quick death
+STOP_SECONDS = 4.0  # for the roles to end in order; then they are killed
+EXIT_CONFIG = 2  # the exit status of an error that starting again cannot mend
+TRACEBACK_BYTES = 8192
+SINGLE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+
+
+@dataclass(frozen=True)
+class RoleCommand:
+    """How a role is started: ``rmc`` and its words."""
+
+    name: str
+    words: tuple[str, ...]
+    single_thread: bool = True
+
+
+class RoleProcess:
+    """One role: its process, its log, its deaths."""
+
+    def __init__(self, command: RoleCommand, environment: dict[str, str], logs: Path) -> None:
+        self.command, self.log, self.restarts = command, logs / f"{command.name}.log", 0
+        self._environment = {**os.environ, **environment, PARENT_VARIABLE: str(os.getpid())}
+        if command.single_thread:
+            self._environment |= SINGLE_THREAD
+        self._deaths: deque[float] = deque(maxlen=QUICK_DEATHS)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._log_start, self._start_at, self.finished = 0, 0.0, False
+
+    @property
+    def running(self) -> bool:
+        """Whether its process is there."""
+        return self._process is not None and self._process.poll() is None
+
+    @property
+    def pid(self) -> int | None:
+        """Its process, if it runs."""
+        return self._process.pid if self._process is not None and self.running else None
+
+    def start(self) -> None:
+        """Start its process, in a process group of its own: Ctrl-C is for the supervisor alone."""
+        self._log_start = self.log.stat().st_size if self.log.exists() else 0
+        words = [sys.executable, "-P", "-m", "deploy.cli", *self.command.words]
+        with self.log.open("ab") as log:
+            self._process = subprocess.Popen(
+                words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=self._environment, process_group=0
+            )
+
+    def tend(self) -> None:
+        """Note a death, or start again when it is time. Raises RoleDied."""
+        if self.finished or self.running:
+            return
+        if self._process is not None:
+            status, self._process = self._process.returncode, None
+            if status == 0:
+                self.finished = True
+            else:
+                self._note_death(status)
+        elif time.monotonic() >= self._start_at:
+            self.restarts += 1
+            self.start()
+
+    def _note_death(self, status: int) -> None:
+        now = time.monotonic()
+        self._deaths.append(now)
+        recent = sum(now - death < QUICK_SECONDS for death in self._deaths)
+        if recent >= QUICK_DEATHS or status == EXIT_CONFIG:
+            how = f"killed by signal {-status}" if status < 0 else f"exit status {status}"
+            often = "once" if recent == 1 else f"{recent} times within {QUICK_SECONDS:.0f} s"
+            raise RoleDied(f"{self.command.name} ended {often}, last by {how}; its last words:\n{self.last_words()}")
+        self._start_at = now + min(FIRST_BACKOFF * 2 ** (recent - 1), LONGEST_BACKOFF)
+
+    def last_words(self) -> str:
+        """The end of its log, of this start only: the traceback, if it left one."""
+        with self.log.open("rb") as log:
+            log.seek(max(self._log_start, self.log.stat().st_size - TRACEBACK_BYTES))
+            text = log.read().decode(errors="replace").rstrip()
+        start = text.rfind("Traceback (most recent call last)")
+        return text[start:] if start >= 0 else "\n".join(text.splitlines()[-20:]) or "(none)"
+
+    def signal(self, number: int) -> None:
+        """Send a signal to its process group, if it runs."""
+        if self.running:
+            assert self._process is not None
+            os.killpg(self._process.pid, number)
+
+    def reap(self, timeout: float) -> bool:
+        """Wait for its end; whether it came."""
+        if self._process is None:
+            return True
+        try:
+            self._process.wait(max(0.0, timeout))
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+
+class Supervisor:
+    """All roles of a run. ``tend`` them often; ``stop`` them at the end, whatever the end was."""
+
+    def __init__(self, commands: list[RoleCommand], environment: dict[str, str], logs: Path) -> None:
+        self.roles = {command.name: RoleProcess(command, environment, logs) for command in commands}
+
+    def start(self) -> None:
+        """Start every role."""
+        for role in self.roles.values():
+            role.start()
+
+    def tend(self) -> None:
+        """Start dead roles again. Raises RoleDied for one that dies too often."""
+        for role in self.roles.values():
+            role.tend()
+
+    def restarts(self) -> dict[str, int]:
+        """How often each role was started again."""
+        return {name: role.restarts for name, role in self.roles.items()}
+
+    def stop(self, last: str = "replay") -> None:
+        """End every role, ``last`` after the others, which may still need it; kill what does not end in time."""
+        deadline = time.monotonic() + STOP_SECONDS
+        others = [role for name, role in self.roles.items() if name != last]
+        try:
+            self._end(others, deadline - STOP_SECONDS / 4)
+            self._end([role for name, role in self.roles.items() if name == last], deadline)
+        finally:
+            for role in self.roles.values():
+                role.signal(signal.SIGKILL)
+                role.reap(STOP_SECONDS)
+
+    @staticmethod
+    def _end(roles: list[RoleProcess], deadline: float) -> None:
+        for role in roles:
+            role.signal(signal.SIGTERM)
+        for role in roles:
+            role.reap(deadline - time.monotonic())

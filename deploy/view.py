@@ -1,0 +1,127 @@
+"""The newest state of a run as a table for a terminal, or as one plain line."""
+
+import time
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
+
+SILENT_SECONDS = 5.0  # after which a role's silence is shown
+
+
+class Board:
+    """The newest value of everything, by role."""
+
+    def __init__(self, env: str, preset: str, seed: int, total_steps: int, replay_ratio: float) -> None:
+        self.env, self.preset, self.seed, self.total_steps = env, preset, seed, total_steps
+        self.replay_ratio = replay_ratio
+        self.roles: dict[str, dict[str, Any]] = {}
+
+    def take(self, record: dict[str, Any]) -> None:
+        """Take in a record; what it does not name stays as it was."""
+        self.roles.setdefault(record["role"], {}).update(record)
+
+    def get(self, role: str, name: str) -> Any:
+        """The newest value, or None."""
+        return self.roles.get(role, {}).get(name)
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps committed to the ring."""
+        return int(self.get("replay", "env_steps") or self.get("learner", "env_steps") or 0)
+
+    @property
+    def episode_return(self) -> float | None:
+        """Mean of the actors' newest episode returns."""
+        values = [record["episode_return_mean"] for record in self.roles.values() if "episode_return_mean" in record]
+        return sum(values) / len(values) if values else None
+
+    @property
+    def policy_lag(self) -> float | None:
+        """Weight versions between what acts and the newest, at insertion."""
+        value: float | None = self.get("replay", "policy_lag_mean")
+        return value
+
+
+def number(value: Any, form: str = ",.3g") -> str:
+    """A number as text, or a dash where there is none yet."""
+    return "–" if value is None else format(value, form)
+
+
+def _evaluation(board: Board) -> str:
+    mean, deviation, update = (
+        board.get("evaluator", f"eval_{name}") for name in ("return_mean", "return_std", "update")
+    )
+    return "–" if mean is None else f"{mean:,.1f} ± {deviation:,.1f} at update {update:,}"
+
+
+def _facts(board: Board) -> list[tuple[str, str]]:
+    learner = board.roles.get("learner", {})
+    losses = ", ".join(f"{name[:-5]} {number(learner[name])}" for name in learner if name.endswith("_loss"))
+    return [
+        ("environment steps", f"{board.env_steps:,} of {board.total_steps:,}, "
+                              f"{number(board.get('replay', 'env_steps_per_s'), ',.0f')} /s"),
+        ("updates", f"{number(learner.get('updates'), ',')}, {number(learner.get('updates_per_s'), ',.1f')} /s"),
+        ("replay", f"ring {number(board.get('replay', 'ring_fill'), '.0%')} full, "
+                   f"ratio {number(board.get('replay', 'replay_ratio'), ',.1f')} of {board.replay_ratio:g}"),
+        ("episode return", number(board.episode_return, ",.1f")),
+        ("evaluation return", _evaluation(board)),
+        ("losses", losses or "–"),
+        ("alpha, beta", f"{number(learner.get('alpha'))}, {number(learner.get('beta'))}"),
+        ("curiosity in reward", number(learner.get("curiosity_share"), ".1%")),
+        ("latent rank", number(learner.get("latent_rank"), ".1f")),
+        ("weights", f"version {number(learner.get('updates'), ',')}, lag {number(board.policy_lag, ',.1f')} updates"),
+    ]  # fmt: skip
+
+
+def _stages(board: Board) -> Table:
+    stages = Table("role", "busy", "waiting", "for", "restarts", box=None, padding=(0, 2, 0, 0), title_justify="left")
+    for role in sorted(role for role in board.roles if role != "launcher"):
+        record = board.roles[role]
+        silent = time.time() - record.get("time", 0.0)
+        reason = f"{record.get('waiting_for', '')}" if record.get("waiting_share", 0.0) > 0.005 else ""
+        stages.add_row(
+            role,
+            number(record.get("busy_share"), ".0%"),
+            number(record.get("waiting_share"), ".0%"),
+            f"silent for {silent:.0f} s" if silent > SILENT_SECONDS else reason,
+            str(board.get("launcher", f"restarts_{role}") or 0),
+        )
+    return stages
+
+
+def table(board: Board) -> Group:
+    """Everything, for a terminal."""
+    facts = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    facts.add_column(style="bold")
+    facts.add_column()
+    for name, value in _facts(board):
+        facts.add_row(name, value)
+    return Group(f"[bold]{board.env}[/] · {board.preset} · seed {board.seed}", facts, _stages(board))
+
+
+def line(board: Board) -> str:
+    """The same in one line, shorter."""
+    learner = board.roles.get("learner", {})
+    waits = [
+        f"{role} {record['waiting_share']:.0%} for {record['waiting_for']}"
+        for role, record in sorted(board.roles.items())
+        if record.get("waiting_share", 0.0) > 0.5 and record.get("waiting_for") and role != "evaluator"
+    ]
+    parts = [
+        f"steps {board.env_steps}/{board.total_steps}",
+        f"{number(board.get('replay', 'env_steps_per_s'), '.0f')} steps/s",
+        f"updates {number(learner.get('updates'), 'd')}",
+        f"{number(learner.get('updates_per_s'), '.1f')}/s",
+        f"ring {number(board.get('replay', 'ring_fill'), '.0%')}",
+        f"ratio {number(board.get('replay', 'replay_ratio'), '.1f')}/{board.replay_ratio:g}",
+        f"episode {number(board.episode_return, '.1f')}",
+        f"eval {number(board.get('evaluator', 'eval_return_mean'), '.1f')}",
+        f"q {number(learner.get('q_loss'))} model {number(learner.get('model_loss'))}",
+        f"alpha {number(learner.get('alpha'))} beta {number(learner.get('beta'))}",
+        f"curiosity {number(learner.get('curiosity_share'), '.1%')}",
+        f"rank {number(learner.get('latent_rank'), '.1f')}",
+        f"lag {number(board.policy_lag, '.1f')}",
+        f"restarts {board.get('launcher', 'restarts') or 0}",
+    ]
+    return " | ".join(parts) + (f" | waiting: {', '.join(waits)}" if waits else "")
