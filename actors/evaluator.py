@@ -96,7 +96,7 @@ class Evaluator:
         assert observation
         assert action
         self._runner = PolicyRunner(observation[0], action[0], agent, config.episodes)
-        self._version: Version | None = None
+        self._version = Version(0, -1)  # none yet
         self._match: Match | None = None
         self._next_look = float("-inf")
         self._records: deque[dict[str, Any]] = deque()
@@ -141,11 +141,11 @@ class Evaluator:
             env.close()
 
 
-def _record(match: Match, version: Version | None) -> dict[str, Any]:
+def _record(match: Match, version: Version) -> dict[str, Any]:
     return {
         "eval_return_mean": float(match.returns.mean()),
         "eval_return_std": float(match.returns.std()),
         "eval_episodes": len(match.returns),
         "eval_steps": match.steps,
-        "eval_update": version.update if version else -1,
+        "eval_update": version.update,
     }

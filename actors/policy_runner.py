@@ -4,6 +4,8 @@ Shapes: N environments, O observation, A action, E embedding, H hidden. Float32 
 ``common.agent`` (its modules are the reference) to 1e-5.
 """
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
@@ -67,30 +69,29 @@ class PolicyRunner:
             self._take(weights)
         except (SafetensorError, KeyError, ValueError) as error:
             raise MessageError("weights", f"not a policy of this run ({error})") from None
+        if weights:
+            raise MessageError("weights", f"not a policy of this run (it also has {', '.join(weights)})")
 
     def _take(self, weights: dict[str, Floats]) -> None:
-        config, inputs, features = self._config, self._input.shape[1], self._config.hidden
-        if config.shortcut:
-            features += self._embedding_dim
-        self._mean, self._std = weights["normalizer.mean"], weights["normalizer.std"]
-        self._scale_embedding = None
-        self._embed = None
+        """Build the layers; takes what it uses out of ``weights``."""
+        config, embedding = self._config, self._embedding_dim
+        inputs = self._obs_dim + self._action_dim
+        features = config.hidden + (embedding if config.shortcut else 0)
+        self._mean, self._std = weights.pop("normalizer.mean"), weights.pop("normalizer.std")
+        self._embed, self._norm = None, None
         if config.embedding:
-            self._embed = self._linear(weights, "memory.embed.0", inputs, config.embedding)
+            self._embed = self._linear(weights, "memory.embed.0.{}", inputs, embedding)
         if config.embedding and config.layer_norm:
-            self._scale_embedding = (weights["memory.embed.1.weight"], weights["memory.embed.1.bias"])
-        gru = {
-            f"{name}.{kind}": weights[f"memory.gru.{kind}_{name}_l0"]
-            for name in ("ih", "hh")
-            for kind in ("weight", "bias")
-        }
-        self._from_embedding = self._linear(gru, "ih", self._embedding_dim, 3 * config.hidden)
-        self._from_hidden = self._linear(gru, "hh", config.hidden, 3 * config.hidden)
+            self._norm = weights.pop("memory.embed.1.weight"), weights.pop("memory.embed.1.bias")
+        self._from_embedding = self._linear(weights, "memory.gru.{}_ih_l0", embedding, 3 * config.hidden)
+        self._from_hidden = self._linear(weights, "memory.gru.{}_hh_l0", config.hidden, 3 * config.hidden)
         sizes = (features, *config.heads, 2 * self._action_dim)
-        self._head = [self._linear(weights, f"policy.net.{2 * i}", *sizes[i : i + 2]) for i in range(len(sizes) - 1)]
+        self._head = [
+            self._linear(weights, f"policy.net.{2 * i}.{{}}", *pair) for i, pair in enumerate(itertools.pairwise(sizes))
+        ]
 
     def _linear(self, weights: dict[str, Floats], name: str, inputs: int, outputs: int) -> _Linear:
-        weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
+        weight, bias = weights.pop(name.format("weight")), weights.pop(name.format("bias"))
         if weight.shape != (outputs, inputs):
             raise ValueError(f"{name} has shape {weight.shape}, expected {(outputs, inputs)}")
         return _Linear(weight, bias, self._envs)
@@ -128,8 +129,8 @@ class PolicyRunner:
         if self._embed is None:
             return x
         embedding = self._embed(x)
-        if self._scale_embedding is not None:
-            scale, shift = self._scale_embedding
+        if self._norm is not None:
+            scale, shift = self._norm
             embedding -= embedding.mean(1, keepdims=True)
             variance = np.square(embedding).mean(1, keepdims=True)
             embedding /= np.sqrt(variance + _LAYER_NORM_EPSILON)

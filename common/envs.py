@@ -4,7 +4,7 @@ Shapes: O observation, A action.
 """
 
 import difflib
-import importlib.util
+import importlib
 import logging
 import math
 import os
@@ -50,11 +50,10 @@ def make_env(config: EnvConfig) -> Env:
         env = gym.make(spec, disable_env_checker=True)
     except gym.error.Error as error:
         raise ConfigError("--env.id", config.id, f"gymnasium cannot make it ({_one_line(error)})") from None
-    try:
-        _check_spaces(config.id, env)
-    except ConfigError:
+    fault = _space_fault(env.observation_space, env.action_space)
+    if fault is not None:
         env.close()
-        raise
+        raise ConfigError("--env.id", config.id, fault)
     standard: Env = Standardised(env)
     return Flicker(standard, config.flicker) if config.flicker else standard
 
@@ -120,50 +119,44 @@ class Flicker(gym.Wrapper[Floats, Floats, Floats, Floats]):
 
 
 def _find_spec(env_id: str) -> EnvSpec:
-    _let_users_modules_in()
     module, _, name = env_id.rpartition(":")
-    if module and importlib.util.find_spec(module.split(".")[0]) is None:
-        raise ConfigError("--env.id", env_id, f"no module {module!r} here; start from the folder that holds it")
+    if module:
+        _import_users_module(env_id, module)
     try:
-        return gym.spec(env_id)
-    except ModuleNotFoundError as error:
-        raise ConfigError("--env.id", env_id, _one_line(error)) from None
+        return gym.spec(name)
     except gym.error.Error:
         close = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
         fix = f"did you mean {', '.join(close)}?" if close else "use a gymnasium id or module:EnvId-v0"
         raise ConfigError("--env.id", env_id, f"no such environment; {fix}") from None
 
 
-def _check_spaces(env_id: str, env: gym.Env[Any, Any]) -> None:
-    observation, action = env.observation_space, env.action_space
+def _space_fault(observation: gym.Space[Any], action: gym.Space[Any]) -> str | None:
+    """Why the agent cannot learn with these spaces, and what to do about it; None if it can."""
     Box = gym.spaces.Box
     if not isinstance(observation, Box):
-        raise ConfigError(
-            "--env.id", env_id, f"its observations are {type(observation).__name__}; flatten them to a Box"
-        )
+        return f"its observations are {type(observation).__name__}; flatten them to a Box"
     if len(observation.shape) > 1:
-        raise ConfigError(
-            "--env.id", env_id, f"its observations are images {observation.shape}; only vectors are learnt from"
-        )
-    if isinstance(action, gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary):
-        raise ConfigError(
-            "--env.id", env_id, f"its actions are {type(action).__name__}; only continuous ones are learnt"
-        )
-    if not isinstance(action, Box) or len(action.shape) != 1:
-        raise ConfigError("--env.id", env_id, f"its actions are {action}; only a Box vector is learnt")
+        return f"its observations are images {observation.shape}; only vectors are learnt from"
+    if not observation.shape or not observation.shape[0]:
+        return f"its observations have shape {observation.shape}; only vectors are learnt from"
+    if not isinstance(action, Box):
+        return f"its actions are {type(action).__name__}; only continuous ones (a Box) are learnt"
+    if len(action.shape) != 1 or not action.shape[0]:
+        return f"its actions have shape {action.shape}; only vectors are learnt"
     if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
-        raise ConfigError("--env.id", env_id, "its action space is unbounded; give it a Box with finite low and high")
-    if len(observation.shape) != 1 or not observation.shape[0]:
-        raise ConfigError(
-            "--env.id", env_id, f"its observations have shape {observation.shape}; only vectors are learnt from"
-        )
+        return "its action space is unbounded; give it a Box with finite low and high"
+    return None
 
 
-def _let_users_modules_in() -> None:
-    """A user's module is found in the working folder, but last, so that it cannot shadow ours."""
+def _import_users_module(env_id: str, module: str) -> None:
+    """Found in the working folder, too, but there last, so that it cannot shadow ours."""
     folder = os.getcwd()
-    if folder not in sys.path and "" not in sys.path:
+    if folder not in sys.path:
         sys.path.append(folder)
+    try:
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise ConfigError("--env.id", env_id, f"{error}; start from the folder that holds {module}") from None
 
 
 def _redirect_mujoco_warnings() -> None:

@@ -1,0 +1,110 @@
+"""The fast policy against the agent's own modules."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save
+
+from actors.policy_runner import PolicyRunner
+from common.agent import Agent, AgentConfig, squashed_sample
+from common.errors import MessageError
+
+OBS_DIM, ACTION_DIM, ENVS = 5, 3, 4
+
+
+def make_agent(config: AgentConfig, seed: int = 0) -> Agent:
+    """With statistics, scales and gates away from their defaults, so that each of them shows."""
+    generator = torch.Generator().manual_seed(seed)
+    agent = Agent(OBS_DIM, ACTION_DIM, config)
+    with torch.no_grad():
+        for value in agent.parameters():
+            value.copy_(torch.randn(value.shape, generator=generator) * 0.3)
+    if config.normalize_observations:
+        agent.normalizer.mean.copy_(torch.randn(OBS_DIM, generator=generator))
+        agent.normalizer.std.copy_(torch.rand(OBS_DIM, generator=generator) + 0.1)
+    return agent
+
+
+def make_runner(agent: Agent, envs: int = ENVS) -> PolicyRunner:
+    runner = PolicyRunner(agent.obs_dim, agent.action_dim, agent.config, envs)
+    runner.load(save(agent.policy_weights()))
+    return runner
+
+
+@torch.no_grad()
+def reference(
+    agent: Agent, observation: torch.Tensor, prev_action: torch.Tensor, blank: torch.Tensor, hidden: torch.Tensor,
+    noise: torch.Tensor | None,
+) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+    normalized = agent.normalizer(observation, blank)
+    remembered = agent.memory(normalized.unsqueeze(1), prev_action.unsqueeze(1), hidden)
+    mean, log_std = agent.policy(agent.features(remembered).squeeze(1))
+    action = torch.tanh(mean) if noise is None else squashed_sample(mean, log_std, noise)[0]
+    return action, remembered.hidden.squeeze(1)
+
+
+@pytest.mark.parametrize(
+    ("embedding", "layer_norm", "shortcut", "normalize"),
+    list(product((0, 16), (False, True), (False, True), (False, True))),
+)
+def test_agrees_with_the_agent(embedding: int, layer_norm: bool, shortcut: bool, normalize: bool) -> None:
+    config = AgentConfig(
+        hidden=12, embedding=embedding, heads=(9, 7), layer_norm=layer_norm, shortcut=shortcut,
+        normalize_observations=normalize,
+    )  # fmt: skip
+    agent = make_agent(config)
+    runner = make_runner(agent)
+    rng = np.random.default_rng(0)
+    prev_action, hidden = runner.start()
+    assert not prev_action.any()
+    assert not hidden.any()
+    for step in range(30):
+        observation = rng.normal(0, 8, (ENVS, OBS_DIM)).astype(np.float32)  # some are clipped
+        blank = rng.random(ENVS) < 0.3
+        noise = None if step % 3 == 0 else rng.standard_normal((ENVS, ACTION_DIM), np.float32)
+        given = [observation, prev_action, blank, hidden]
+        kept = [x.copy() for x in given]
+        tensors = [torch.from_numpy(x.copy()) for x in given]
+        action, new_hidden = runner.act(*given, noise)
+        expected = reference(agent, *tensors, None if noise is None else torch.from_numpy(noise))
+        np.testing.assert_allclose(action, expected[0], atol=1e-5)
+        np.testing.assert_allclose(new_hidden, expected[1], atol=1e-5)
+        for before, after in zip(kept, given, strict=True):
+            np.testing.assert_array_equal(before, after)
+        prev_action, hidden = action, new_hidden.copy()
+
+
+def test_full_size_with_extreme_inputs() -> None:
+    """Default sizes; huge states and deviations overflow nothing (a warning would fail the test)."""
+    agent = make_agent(AgentConfig())
+    runner = make_runner(agent, 2)
+    observation = np.array([[1e6] * OBS_DIM, [-1e6] * OBS_DIM], np.float32)
+    hidden = np.full((2, 256), 1.0, np.float32)
+    zeros, noise = np.zeros((2, ACTION_DIM), np.float32), np.ones((2, ACTION_DIM), np.float32)
+    action, new_hidden = runner.act(observation, zeros, np.zeros(2, np.bool_), hidden, noise)
+    assert np.isfinite(new_hidden).all()
+    assert (np.abs(action) <= 1).all()
+
+
+def test_an_action_is_the_callers_to_keep() -> None:
+    agent = make_agent(AgentConfig(hidden=8, embedding=8, heads=(8, 8)))
+    runner = make_runner(agent)
+    zeros = (np.zeros((ENVS, OBS_DIM), np.float32), *runner.start())
+    first, _ = runner.act(zeros[0], zeros[1], np.zeros(ENVS, np.bool_), zeros[2], None)
+    kept = first.copy()
+    runner.act(zeros[0] + 1, zeros[1], np.zeros(ENVS, np.bool_), zeros[2], None)
+    np.testing.assert_array_equal(first, kept)
+
+
+def test_another_runs_weights_are_refused() -> None:
+    agent = make_agent(AgentConfig(hidden=8, embedding=8, heads=(8, 8)))
+    blob = save(agent.policy_weights())
+    for config in (AgentConfig(hidden=9, embedding=8, heads=(8, 8)), AgentConfig(hidden=8, embedding=0, heads=(8, 8))):
+        with pytest.raises(MessageError):
+            PolicyRunner(OBS_DIM, ACTION_DIM, config, ENVS).load(blob)
+    with pytest.raises(MessageError):
+        make_runner(agent).load(blob[:-4])
+    with pytest.raises(MessageError):
+        make_runner(agent).load(save({"policy.net.0.weight": torch.zeros(1)}))

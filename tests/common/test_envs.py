@@ -1,0 +1,205 @@
+"""Environments: what comes out, what is refused in one line, and that MuJoCo keeps quiet."""
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from common.envs import EnvConfig, env_spaces, make_env
+from common.errors import ConfigError
+from tests.memory_env import ANSWER_STEPS
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+class OddSpaces(gym.Env[Any, Any]):
+    """A user's environment with spaces as given."""
+
+    def __init__(self, observation: gym.Space[Any], action: gym.Space[Any]) -> None:
+        self.observation_space, self.action_space = observation, action
+        self.last_action: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.last_action = action
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+Box = gym.spaces.Box
+VECTOR = Box(-1.0, 1.0, (3,), np.float64)
+gym.register("OddSpaces-v0", entry_point=OddSpaces)
+
+
+def odd(name: str, observation: gym.Space[Any], action: gym.Space[Any]) -> EnvConfig:
+    gym.registry.pop(name, None)
+    gym.register(name, entry_point=OddSpaces, kwargs={"observation": observation, "action": action})
+    return EnvConfig(name)
+
+
+def test_mujoco_environment() -> None:
+    assert env_spaces(EnvConfig("HalfCheetah-v5")) == (17, 6, 1000)
+    env = make_env(EnvConfig("HalfCheetah-v5"))
+    observation, info = env.reset(seed=3)
+    assert observation.dtype == np.float32
+    assert "blank" not in info
+    reference = gym.make("HalfCheetah-v5")
+    expected, _ = reference.reset(seed=3)
+    np.testing.assert_allclose(observation, expected, rtol=1e-6)
+    action = np.linspace(-1, 1, 6, dtype=np.float32)
+    for _ in range(5):
+        ours, theirs = env.step(action), reference.step(action)
+        np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-5)
+        assert ours[1] == pytest.approx(theirs[1])
+    env.close()
+    reference.close()
+
+
+def test_time_limit_is_kept() -> None:
+    env = make_env(EnvConfig("HalfCheetah-v5"))
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(6, np.float32))[2:4] for _ in range(1000)]
+    assert ends == [(False, False)] * 999 + [(False, True)]
+    env.close()
+
+
+def test_actions_are_stretched_and_clipped() -> None:
+    low, high = np.array([-2.0, 0.0]), np.array([2.0, 10.0])
+    env = make_env(odd("Stretched-v0", VECTOR, Box(low, high, dtype=np.float64)))
+    inner = env.unwrapped
+    assert isinstance(inner, OddSpaces)
+    observation, _ = env.reset(seed=0)
+    assert observation.dtype == np.float32
+    assert (env.action_space.low, env.action_space.high) == (pytest.approx(-1), pytest.approx(1))  # type: ignore[attr-defined]
+    for given, wanted in (([-1, -1], low), ([1, 1], high), ([0, 0], (low + high) / 2), ([-9, 9], [-2.0, 10.0])):
+        env.step(np.array(given, np.float32))
+        np.testing.assert_allclose(inner.last_action, wanted)
+        assert inner.last_action.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("config", "says"),
+    [
+        (EnvConfig("HalfCheeta-v5"), "did you mean HalfCheetah-v5"),
+        (EnvConfig("Qxzzy-v9"), "no such environment"),
+        (EnvConfig("no_such_module:Thing-v0"), "No module named 'no_such_module'"),
+        (EnvConfig("CartPole-v1"), "actions are Discrete"),
+        (EnvConfig("tests.memory_env:Memory13-v0"), "did you mean Memory12-v0"),
+        (EnvConfig("HalfCheetah-v5", flicker=1.5), "a probability from 0 to 1"),
+        (EnvConfig("HalfCheetah-v5", flicker=math.nan), "a probability from 0 to 1"),
+        (odd("Image-v0", Box(0, 255, (8, 8, 3), np.uint8), VECTOR), "images (8, 8, 3)"),
+        (odd("Dict-v0", gym.spaces.Dict(a=VECTOR), VECTOR), "observations are Dict"),
+        (odd("Scalar-v0", Box(0, 1, (), np.float32), VECTOR), "have shape ()"),
+        (odd("Unbounded-v0", VECTOR, Box(-np.inf, np.inf, (2,))), "action space is unbounded"),
+        (odd("Multi-v0", VECTOR, gym.spaces.MultiDiscrete([2, 2])), "actions are MultiDiscrete"),
+        (odd("Matrix-v0", VECTOR, Box(-1, 1, (2, 2))), "actions have shape (2, 2)"),
+    ],
+    ids=lambda value: value.id if isinstance(value, EnvConfig) else "",
+)
+def test_refused_in_one_line(config: EnvConfig, says: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        make_env(config)
+    message = str(caught.value)
+    assert says in message
+    assert "\n" not in message
+    assert message.startswith("--env.")
+
+
+def test_a_users_module_in_the_working_folder_does_not_shadow_ours(tmp_path: Path) -> None:
+    (tmp_path / "common.py").write_text("raise SystemExit('shadowed')")
+    (tmp_path / "mine.py").write_text(
+        "import gymnasium\n"
+        "from gymnasium.envs.classic_control import PendulumEnv\n"
+        "gymnasium.register('Mine-v0', entry_point=PendulumEnv, max_episode_steps=7)\n"
+    )
+    run = _python(tmp_path, "from common.envs import *; print(env_spaces(EnvConfig('mine:Mine-v0')))")
+    assert (run.returncode, run.stdout.strip()) == (0, "(3, 1, 7)"), run.stderr
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Humanoid-v5"])
+def test_mujoco_prints_nothing_and_leaves_no_file(tmp_path: Path, env_id: str) -> None:
+    run = _python(tmp_path, f"from common.envs import *; make_env(EnvConfig({env_id!r})).reset(seed=0); print('made')")
+    assert (run.stdout, run.stderr) == ("made\n", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def _python(folder: Path, code: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a folder, as an installed command would: the repository on the path, the folder not."""
+    prelude = f"import sys; sys.path = [p for p in sys.path if p]; sys.path.insert(0, {str(REPOSITORY)!r}); "
+    return subprocess.run(
+        [sys.executable, "-c", prelude + code], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+def test_flicker() -> None:
+    env = make_env(EnvConfig("tests.memory_env:Memory12-v0", flicker=0.3))
+    frames, resets = [], []
+    env.reset(seed=5)
+    for _ in range(700):
+        observation, info = env.reset()
+        resets.append(info["blank"])
+        ended = False
+        while not ended:
+            assert info["blank"] == (not observation.any()) or not info["blank"]
+            observation, _, ended, _, info = env.step(np.zeros(1, np.float32))
+            assert not (info["blank"] and observation.any())
+            frames.append(info["blank"])
+    assert all(type(flag) is bool for flag in frames)
+    assert np.mean(frames) == pytest.approx(0.3, abs=4 * math.sqrt(0.21 / len(frames)))
+    assert np.mean(resets) == pytest.approx(0.3, abs=4 * math.sqrt(0.21 / len(resets)))
+    a, b = np.array(frames[:-1]), np.array(frames[1:])
+    assert abs(np.corrcoef(a, b)[0, 1]) < 4 / math.sqrt(len(a))  # a blank says nothing about the next
+
+
+def test_flicker_hides_the_whole_observation_and_nothing_else() -> None:
+    flickering, clear = (make_env(EnvConfig("HalfCheetah-v5", flicker=p)) for p in (0.5, 0.0))
+    flickering.reset(seed=1)
+    clear.reset(seed=1)
+    action = np.full(6, 0.3, np.float32)
+    blanks = []
+    for _ in range(50):
+        seen, reward, _, _, info = flickering.step(action)
+        truth, true_reward, *_ = clear.step(action)
+        np.testing.assert_array_equal(seen, 0.0 * truth if info["blank"] else truth)
+        assert reward == true_reward
+        blanks.append(info["blank"])
+    assert 0 < sum(blanks) < 50
+
+
+def test_flicker_is_seeded() -> None:
+    def blanks(seed: int) -> list[bool]:
+        env = make_env(EnvConfig("tests.memory_env:Memory40-v0", flicker=0.5))
+        first = env.reset(seed=seed)[1]["blank"]
+        return [first] + [env.step(np.zeros(1, np.float32))[4]["blank"] for _ in range(40)]
+
+    assert blanks(1) == blanks(1)
+    assert blanks(1) != blanks(2)
+
+
+@pytest.mark.parametrize("delay", [12, 40])
+def test_memory_task_needs_a_memory(delay: int) -> None:
+    """Remembering reaches the best return; without, half of the episodes cost what the others gain."""
+    env = make_env(EnvConfig(f"tests.memory_env:Memory{delay}-v0"))
+    env.reset(seed=0)
+    remembered, blind = [], []
+    for episode in range(200):
+        for returns, forgets in ((remembered, False), (blind, True)):
+            observation, _ = env.reset(seed=episode)
+            cue, total, steps, ended = observation[0], 0.0, 0, False
+            assert abs(cue) == 1.0
+            while not ended:
+                action = 1.0 if forgets else cue
+                observation, reward, ended, _, _ = env.step(np.array([action], np.float32))
+                assert ended or observation[0] == 0.0
+                total, steps = total + reward, steps + 1
+            assert steps == delay + ANSWER_STEPS
+            returns.append(total)
+    assert min(remembered) == ANSWER_STEPS
+    assert abs(np.mean(blind)) < 4 * ANSWER_STEPS / math.sqrt(200)
