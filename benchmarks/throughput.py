@@ -78,9 +78,13 @@ def learner(env_id: str, batch_size: int, pairs: int, seconds: float) -> Row:
         work: Callable[[], int] = lambda: int(role.step())  # noqa: E731
         speed(work, 1.0)
         result = alternate(
-            f"learner, batch {batch_size}, {env_id}", "updates/s", lambda: speed(work, seconds),
-            lambda: speed(bare, seconds), "bare forward and backward", pairs,
-        )  # fmt: skip
+            f"learner, batch {batch_size}, {env_id}",
+            "updates/s",
+            lambda: speed(work, seconds),
+            lambda: speed(bare, seconds),
+            "bare forward and backward",
+            pairs,
+        )
         role.finished = True  # nothing to save
         role.close()
         client.close()
@@ -120,9 +124,13 @@ def actor(env_id: str, envs: int, pairs: int, seconds: float) -> Row:
 
         speed(ours, 1.0)
         result = alternate(
-            f"actor, {envs} environments, {env_id}", "steps/s", lambda: speed(ours, seconds),
-            lambda: speed(raw, seconds), "raw stepping", pairs,
-        )  # fmt: skip
+            f"actor, {envs} environments, {env_id}",
+            "steps/s",
+            lambda: speed(ours, seconds),
+            lambda: speed(raw, seconds),
+            "raw stepping",
+            pairs,
+        )
         stepper.close()
         role.finished = True
         role.close()

@@ -57,6 +57,7 @@ class Lockstep:
         ]
         self.evaluator = Evaluator(config.seed, lambda: make_env(config.env), config.agent, config.evaluator, self.bus)
         self._seen = self.learner.last_checkpoint
+        self._restart_due = False
 
     @property
     def roles(self) -> list[Role]:
@@ -64,20 +65,24 @@ class Lockstep:
 
     def step(self) -> None:
         """One update, or one round of collection where none is due."""
+        if self._restart_due:
+            self._restart_due = False
+            for actor in self.actors:
+                actor.restart()
         if not self.learner.step():
             for actor in self.actors:
                 actor.step()
-            self.server.step()
+            while self.server.step():
+                pass
         if self.learner.last_checkpoint != self._seen:
             self._after_checkpoint()
 
     def _after_checkpoint(self) -> None:
+        """Save the ring beside the learner; the actors begin anew in the next step, as those of a resumed run do."""
         self._seen = self.learner.last_checkpoint
         self.evaluator.step()
-        for actor in self.actors:
-            actor.restart()
-        self.server.step()  # takes the hellos in, so that a resumed run finds the same epochs
         self.server.checkpoint()
+        self._restart_due = True
 
     def close(self) -> None:
         """Close every role; the learner saves first."""

@@ -154,18 +154,19 @@ class ReplayServer:
         }
 
     def _publish(self, at_once: bool) -> None:
-        """Publish acks that changed. Small changes wait, unless the learner does: then actors need all there is."""
-        now = time.monotonic()
-        repeat = now >= self._republish_at
-        acks = self._acks()
-        if not repeat:
-            acks = {actor: ack for actor, ack in acks.items() if self._published.get(actor) != ack}
+        """Publish acks that changed. Small changes wait, unless the learner does: then actors need all there is.
+
+        The clock only ever repeats what was published, so that in lockstep it decides nothing.
+        """
+        if not self._published or time.monotonic() >= self._republish_at:
+            self._republish_at = time.monotonic() + REPUBLISH_PERIOD
+            self.bus.commit(self.epoch, self._published or self._acks())
+        acks = {actor: ack for actor, ack in self._acks().items() if self._published.get(actor) != ack}
         quantum = max(1, self._slack_steps // (8 * self._actors))
-        at_once = at_once or repeat or bool(self._waiting_for)
+        at_once = at_once or bool(self._waiting_for)
         if acks and (at_once or any(self._grown(actor, ack) >= quantum for actor, ack in acks.items())):
             self.bus.commit(self.epoch, acks)
             self._published.update(acks)
-            self._republish_at = now + REPUBLISH_PERIOD if repeat else self._republish_at
 
     def _grown(self, actor: int, ack: Ack) -> int:
         before = self._published.get(actor)

@@ -120,7 +120,7 @@ def test_a_checkpoint_never_executes_code(setting):
     torch.save({"agent": Hostile()}, file)
     number, files = setting.learner.checkpoints.latest()
     setting.learner.checkpoints.save(number + 1, {**files, "learner.pt": file.getvalue()})
-    with pytest.raises(CheckpointError, match="learner.pt"):
+    with pytest.raises(CheckpointError, match=r"learner\.pt"):
         setting.start()
 
 

@@ -1,0 +1,88 @@
+"""Lockstep: same seed, same bits; and the same bits again across checkpoint, stop and resume."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from common.envs import EnvConfig
+from deploy.lockstep import Lockstep
+from deploy.presets import RunConfig, debug
+from learner.learner import LearnerConfig
+from replay_server.server import ReplayConfig
+
+CONFIG = dataclasses.replace(
+    debug(EnvConfig("InvertedPendulum-v5")),
+    seed=5,
+    actors=2,
+    total_steps=1_500,
+    replay=ReplayConfig(capacity=60, replay_ratio=8.0, warmup_steps=200),  # wraps
+    learner=LearnerConfig(batch_size=8, checkpoint_steps=400, precision="fp32"),
+)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def run(config: RunConfig, folder: Path, stop_after_checkpoints: int = 0) -> Lockstep:
+    lockstep = Lockstep(config, folder)
+    checkpoints, seen = 0, lockstep.learner.last_checkpoint
+    while not lockstep.learner.finished:
+        lockstep.step()
+        if lockstep.learner.last_checkpoint != seen:
+            checkpoints, seen = checkpoints + 1, lockstep.learner.last_checkpoint
+            if checkpoints == stop_after_checkpoints:
+                break
+    lockstep.close()
+    return lockstep
+
+
+def bits(lockstep: Lockstep) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in lockstep.learner.agent.state_dict().items()}
+
+
+def assert_same(a: Lockstep, b: Lockstep) -> None:
+    assert a.learner.updates == b.learner.updates
+    for name, value in bits(a).items():
+        assert torch.equal(value, bits(b)[name]), name
+    theirs = b.server.stats()
+    assert {key: value for key, value in a.server.stats().items() if not key.endswith("_s")} == {
+        key: value for key, value in theirs.items() if not key.endswith("_s")
+    }
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory) -> Lockstep:
+    torch.set_num_threads(1)
+    return run(CONFIG, tmp_path_factory.mktemp("straight"))
+
+
+def test_same_seed_same_bits(straight, tmp_path):
+    assert straight.learner.updates > 100
+    assert_same(straight, run(CONFIG, tmp_path))
+
+
+def test_another_seed_other_bits(straight, tmp_path):
+    other = run(dataclasses.replace(CONFIG, seed=6), tmp_path)
+    assert not torch.equal(bits(straight)["policy.net.0.weight"], bits(other)["policy.net.0.weight"])
+
+
+def test_stop_and_resume_gives_the_same_bits(straight, tmp_path):
+    stopped = run(CONFIG, tmp_path, stop_after_checkpoints=2)
+    assert 0 < stopped.learner.updates < straight.learner.updates
+    assert_same(straight, run(CONFIG, tmp_path))
+
+
+def test_the_ratio_and_the_total_are_kept(straight):
+    stats = straight.server.stats()
+    slack = CONFIG.slack_steps()
+    assert CONFIG.total_steps <= stats["env_steps"] <= CONFIG.total_steps + slack
+    debt = (stats["env_steps"] - 200) * 8.0 - stats["drawn_steps"]
+    batch = 8 * 15
+    assert -(slack * 8.0 + batch) <= debt <= batch
