@@ -23,6 +23,7 @@ from common.metrics import Means, Rate
 from common.window import WindowSpec
 
 POLL_SECONDS = 0.02  # between looks at the bus while there is nothing to do but wait
+RESEND_SECONDS = 5.0  # without a new acknowledgement before everything unacknowledged is sent again
 _NOISE = -1  # the place of the policy's noise among the environments' seeds
 
 
@@ -98,6 +99,7 @@ class Actor:
         self._steps = 0
         self._refresh_at = self._config.refresh_steps
         self._next_poll = self._chunk_due = float("-inf")
+        self._resend_at = float("inf")  # set by the first acknowledgement
         self._waiting_for = "weights"
         n = self._config.envs_per_actor
         self._builder = WindowBuilder(self._spec, self._config.stride, n, self._config.chunk_windows + n)
@@ -184,12 +186,14 @@ class Actor:
                 self._runner.load(blob)
 
     def _poll_ack(self) -> None:
-        ack = self._bus.ack(self._index)
-        if ack is None and self._ack is not None:
-            self._outbox.send_again()  # Redis has lost its data
-        elif ack is not None and ack.id.epoch == self._outbox.epoch:
+        ack, now = self._bus.ack(self._index), self._clock()
+        if ack is not None and ack.id.epoch == self._outbox.epoch:
             self._ack = ack
-            self._outbox.acknowledge(ack)
+            if self._outbox.acknowledge(ack):
+                self._resend_at = now + RESEND_SECONDS
+        if now >= self._resend_at:  # a Redis that came back empty has lost what the replay server never saw
+            self._outbox.send_again()
+            self._resend_at = now + RESEND_SECONDS
 
     # Stepping
 

@@ -12,8 +12,8 @@ class Outbox:
     """The stream of one actor in one epoch.
 
     An entry is put in first and sent then, so that a failed ``send`` loses nothing: the next one goes on,
-    and after a lost connection it starts again at the oldest entry kept, because a Redis that came back
-    may have forgotten them. Explicit ids make repeats harmless.
+    and after a lost connection it starts again at the hello and the oldest entry kept, because a Redis that
+    came back may have forgotten them. Explicit ids make repeats harmless.
     """
 
     def __init__(self, bus: Bus, actor: int, epoch: int, spec: WindowSpec) -> None:
@@ -61,8 +61,10 @@ class Outbox:
         self.resends += self._sent
         self._sent, self._greeted = 0, False
 
-    def acknowledge(self, ack: Ack) -> None:
-        """Forget what is committed."""
+    def acknowledge(self, ack: Ack) -> bool:
+        """Forget what is committed; whether it was anything, or nothing is left."""
+        before = len(self._kept)
         while self._kept and self._kept[0][0] <= ack.id:
             self.bytes -= len(self._kept.popleft()[1])
             self._sent = max(0, self._sent - 1)
+        return len(self._kept) < before or not self._kept

@@ -88,7 +88,11 @@ class Bus(Protocol):
         """The newest epoch taken by this role; 0 before the first."""
 
     def append(self, actor: int, entry_id: EntryId, payload: bytes) -> None:
-        """Add an entry; one that is stored already is left as it is. Raises FencedError."""
+        """Add an entry; one that is stored already is left as it is. Raises FencedError.
+
+        Only a hello makes a stream: where it is gone, BusUnavailable says that Redis has lost its data,
+        and everything from the hello on is to be added again.
+        """
 
     def actors(self) -> list[int]:
         """Ids of all actors that have appended anything."""

@@ -79,7 +79,11 @@ class RedisBus:
     def _add_entry(self, actor: int, stream: str, entry_id: EntryId, payload: bytes) -> None:
         if entry_id.seq == 0:
             self._redis.sadd(self._key("actors"), actor)
-        self._redis.xadd(stream, {"p": payload}, id=f"{entry_id.epoch}-{entry_id.seq}")
+        stored = self._redis.xadd(
+            stream, {"p": payload}, id=f"{entry_id.epoch}-{entry_id.seq}", nomkstream=entry_id.seq > 0
+        )
+        if stored is None:
+            raise BusUnavailable(f"{stream} is gone: Redis has lost its data")
 
     def _check_not_fenced(self, actor: int, stream: str, entry_id: EntryId) -> None:
         """A refused id is ours, stored by a retried call, unless a larger epoch wrote since."""

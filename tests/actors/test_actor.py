@@ -1,0 +1,368 @@
+"""The actor over an in-process bus and over a real Redis: each step once, in order, within its credit."""
+
+import contextlib
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import redis
+from safetensors.torch import save
+
+from actors.actor import Actor, ActorConfig, environment_seed
+from common.agent import Agent, AgentConfig
+from common.bus import Ack, Bus, Entry, EntryId, MemoryBus, Version
+from common.envs import EnvConfig, make_env
+from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
+from common.redis_bus import RedisBus
+from common.window import Rows, WindowSpec
+from common.wire import decode_entry
+from tests.actors.support import join_rows
+from tests.counting_env import ACTION_DIM, OBS_DIM, Step, audit
+
+AGENT = AgentConfig(hidden=8, embedding=8, heads=(8, 8))
+SPEC = WindowSpec(OBS_DIM, ACTION_DIM, AGENT.hidden, burn_in=4, train=6)
+CONFIG = ActorConfig(envs_per_actor=4, stride=6, refresh_steps=50, chunk_windows=5)
+COUNTING = EnvConfig("tests.counting_env:Counting-v0")
+
+
+@pytest.fixture(params=["memory", "redis"])
+def bus(request: pytest.FixtureRequest, redis_url: str, run_name: str) -> Bus:
+    return MemoryBus() if request.param == "memory" else RedisBus(redis_url, run_name)
+
+
+def make_actor(bus: Bus, index: int = 0, seed: int = 1, config: ActorConfig = CONFIG) -> Actor:
+    """Its clock counts calls, so that no test waits for a timer."""
+    clock: Callable[[], float] = itertools.count().__next__
+    return Actor(index, seed, lambda: make_env(COUNTING), SPEC, AGENT, config, bus, clock)
+
+
+def publish(bus: Bus, update: int) -> bytes:
+    blob: bytes = save(Agent(OBS_DIM, ACTION_DIM, AGENT).policy_weights())
+    bus.publish_weights(Version(1, update), blob)
+    return blob
+
+
+class Reader:
+    """Reads and acknowledges as a replay server does, and keeps what it read."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus, self._epoch = bus, bus.take_epoch("replay")
+        self._cursors: dict[int, EntryId] = {}
+        self.entries: list[Entry] = []
+
+    def read(self, granted_steps: int, final: bool = False) -> None:
+        for actor in self._bus.actors():
+            self._cursors.setdefault(actor, EntryId(0, 0))
+        for entry in self._bus.read(self._cursors, count=1000):
+            self.entries.append(entry)
+            self._cursors[entry.actor] = entry.id
+        acks = {actor: Ack(cursor, granted_steps, final) for actor, cursor in self._cursors.items()}
+        self._bus.commit(self._epoch, acks)
+
+    def rows(self) -> Rows:
+        return join_rows([decode_entry(entry.payload, SPEC) for entry in self.entries], SPEC)
+
+
+def step_until_blocked(actor: Actor, limit: int = 10_000) -> int:
+    for steps in range(limit):
+        if not actor.step():
+            return steps
+    raise AssertionError("never blocked")
+
+
+def play(bus: Bus, actor: Actor, reader: Reader, steps: int, final: bool = True) -> None:
+    """So many steps, in several grants; with ``final`` everything open is sent at the end."""
+    for granted in range(100, steps + 1, 100):
+        reader.read(granted)
+        step_until_blocked(actor)
+    reader.read(steps, final)
+    step_until_blocked(actor)
+    reader.read(steps, final)
+
+
+def assert_each_step_once(rows: Rows, steps: int) -> None:
+    """Every environment's steps from its first one on, without a gap, in order of arrival."""
+    found = audit(rows, SPEC)
+    assert set(found.trained.values()) == {1}
+    assert found.trained.total() == found.new_steps == steps
+    by_env: dict[int, list[Step]] = {}
+    for step in found.trained:  # a Counter keeps the order of arrival
+        by_env.setdefault(step.env, []).append(step)
+    for names in by_env.values():
+        assert names == sorted(names)
+        for before, after in itertools.pairwise(names):
+            assert after in (before._replace(step=before.step + 1), Step(before.env, before.episode + 1, 0))
+
+
+def test_each_step_once_in_order(bus: Bus) -> None:
+    publish(bus, 0)
+    actors, reader = [make_actor(bus, index) for index in range(2)], Reader(bus)
+    for actor in actors:
+        play(bus, actor, reader, 1000)
+    assert_each_step_once(reader.rows(), 2000)
+    rows = reader.rows()
+    origins = [tuple(int(row[name]) for name in ("actor", "epoch", "seq", "k")) for row in rows]
+    assert len(set(origins)) == len(origins)
+    for index, actor in enumerate(actors):
+        ids = [entry.id for entry in reader.entries if entry.actor == index]
+        assert ids == [EntryId(1, seq) for seq in range(len(ids))]
+        assert not actor.step()
+        assert actor.metrics()["unacked_entries"] == 0
+        actor.close()
+
+
+def test_waits_for_weights_then_credit_then_stops_at_its_credit(bus: Bus) -> None:
+    actor, reader = make_actor(bus), Reader(bus)
+    assert (actor.step(), actor.waiting_for()) == (False, "weights")
+    publish(bus, 0)
+    assert (actor.step(), actor.waiting_for()) == (False, "credit")
+    for granted in (4, 42, 43, 200):
+        reader.read(granted)
+        step_until_blocked(actor)
+        assert (actor.step(), actor.waiting_for()) == (False, "credit")
+        assert actor.metrics()["env_steps"] == -(-granted // 4) * 4  # past its grant by less than one vector step
+    actor.close()
+
+
+def test_credit_of_an_earlier_epoch_is_none(bus: Bus) -> None:
+    publish(bus, 0)
+    make_actor(bus).close()
+    reader = Reader(bus)
+    reader.read(1000)
+    actor = make_actor(bus)
+    assert (actor.step(), actor.waiting_for()) == (False, "credit")
+    actor.close()
+
+
+def test_final_credit_flushes_open_windows_and_more_credit_goes_on(bus: Bus) -> None:
+    publish(bus, 0)
+    actor, reader = make_actor(bus), Reader(bus)
+    reader.read(20)
+    step_until_blocked(actor)
+    reader.read(20)
+    assert reader.rows()["new_steps"].sum() < 20  # five steps of each of four: mostly open
+    reader.read(20, final=True)
+    step_until_blocked(actor)
+    assert actor.waiting_for() == "the end"
+    reader.read(20, final=True)
+    assert_each_step_once_with_cuts(reader.rows(), 20)
+    for _ in range(20):
+        assert not actor.step()  # nothing is cut twice
+    reader.read(100, final=True)
+    step_until_blocked(actor)
+    reader.read(100, final=True)
+    assert_each_step_once_with_cuts(reader.rows(), 100)
+    actor.close()
+
+
+def assert_each_step_once_with_cuts(rows: Rows, steps: int) -> None:
+    """As above, but an episode may go no further after a cut."""
+    found = audit(rows, SPEC)
+    assert set(found.trained.values()) == {1}
+    assert found.trained.total() == found.new_steps == steps
+
+
+def test_a_full_resend_buffer_makes_it_wait(bus: Bus) -> None:
+    publish(bus, 0)
+    config = ActorConfig(envs_per_actor=2, stride=6, chunk_windows=1, unacked_bytes=3 * SPEC.dtype.itemsize)
+    actor, reader = make_actor(bus, config=config), Reader(bus)
+    reader.read(100_000)
+    step_until_blocked(actor)
+    assert actor.waiting_for() == "acknowledgements"
+    steps = actor.metrics()["env_steps"]
+    assert 0 < steps < 200
+    reader.read(100_000)
+    step_until_blocked(actor)
+    assert actor.metrics()["env_steps"] > steps
+    actor.close()
+
+
+def test_random_phase_and_newer_weights(bus: Bus) -> None:
+    publish(bus, 0)
+    actor, reader = make_actor(bus), Reader(bus)
+    play(bus, actor, reader, 400, final=False)
+    actions = reader.rows()
+    assert set(actions["weights_update"].tolist()) == {0}
+    valid = actions["action"][SPEC.step_valid(actions)]
+    assert abs(valid.mean()) < 0.1
+    assert valid.std() == pytest.approx(1 / np.sqrt(3), abs=0.05)
+    publish(bus, 7)
+    play(bus, actor, reader, 800)
+    versions = reader.rows()["weights_update"]
+    assert set(versions.tolist()) == {0, 7}
+    assert actor.metrics()["weights_update"] == 7
+    assert (reader.rows()["new_steps"][versions == 0].sum()) <= 400 + CONFIG.refresh_steps + 4 * SPEC.steps
+    actor.close()
+
+
+def test_metrics() -> None:
+    bus = MemoryBus()
+    publish(bus, 3)
+    actor, reader = make_actor(bus), Reader(bus)
+    reader.read(400)
+    step_until_blocked(actor)
+    publish(bus, 9)
+    reader.read(800)
+    step_until_blocked(actor)
+    record = actor.metrics()
+    assert record["policy_lag"] == pytest.approx(6)
+    assert record["episodes"] > 10
+    assert 1 <= record["episode_length_mean"] <= 40
+    assert record["episode_return_mean"] > record["episode_length_mean"]  # a step's reward is its number
+    assert "episode_return_mean" not in actor.metrics()
+    actor.close()
+
+
+def test_seeds() -> None:
+    """No two of actor, epoch, environment and run share a seed; a restart begins other episodes."""
+    names = list(itertools.product(range(3), range(3), range(3), range(-1, 3)))
+    assert len({environment_seed(*name) for name in names}) == len(names)
+    assert all(0 <= environment_seed(*name) < 2**31 for name in names)
+
+    def first_steps(seed: int, restarts: int) -> set[Step]:
+        bus = MemoryBus()
+        publish(bus, 0)
+        actor, reader = make_actor(bus, seed=seed), Reader(bus)
+        for _ in range(restarts):
+            actor.restart()
+        play(bus, actor, reader, 200)
+        actor.close()
+        return set(audit(reader.rows(), SPEC).trained)
+
+    assert first_steps(1, 0) == first_steps(1, 0)
+    assert {step.env for step in first_steps(1, 0)}.isdisjoint(step.env for step in first_steps(1, 1))
+    assert {step.env for step in first_steps(1, 0)}.isdisjoint(step.env for step in first_steps(2, 0))
+
+
+def test_same_seed_same_bits() -> None:
+    def played() -> bytes:
+        bus = MemoryBus()
+        bus.publish_weights(Version(1, 5), blob)
+        actor, reader = make_actor(bus), Reader(bus)
+        play(bus, actor, reader, 500)
+        actor.restart()
+        play(bus, actor, reader, 500)
+        actor.close()
+        return reader.rows().tobytes()
+
+    blob = publish(MemoryBus(), 5)
+    assert played() == played()
+
+
+def test_restart_begins_a_new_epoch_without_what_was_open() -> None:
+    bus = MemoryBus()
+    publish(bus, 0)
+    actor, reader = make_actor(bus), Reader(bus)
+    play(bus, actor, reader, 300, final=False)
+    actor.restart()
+    assert actor.metrics()["env_steps"] == 0
+    assert (actor.step(), actor.waiting_for()) == (False, "credit")  # it has the weights again, its credit is old
+    play(bus, actor, reader, 300)
+    rows = reader.rows()
+    assert set(rows["epoch"].tolist()) == {1, 2}
+    later = rows["epoch"] == 2
+    assert_each_step_once(rows[later], 300)
+    assert audit(rows, SPEC).trained.total() <= 600
+    actor.close()
+
+
+class Unsteady(MemoryBus):
+    """Fails appends as told; with ``stored`` the entry arrives but its reply is lost."""
+
+    def __init__(self, failures: list[tuple[type[Exception], bool] | None]) -> None:
+        super().__init__()
+        self.failures = iter(failures)
+        self.appended = 0
+
+    def append(self, actor: int, entry_id: EntryId, payload: bytes) -> None:
+        failure = next(self.failures, None)
+        if failure is None or failure[1]:
+            self.appended += 1
+            super().append(actor, entry_id, payload)
+        if failure is not None:
+            raise failure[0]("as told")
+
+
+def test_a_failed_append_loses_and_repeats_nothing() -> None:
+    kinds = [None, (BusUnavailable, False), (BusUnavailable, True), (BusFull, False)]
+    rng = np.random.default_rng(0)
+    bus = Unsteady([kinds[i] for i in rng.integers(0, 4, 400)])
+    publish(bus, 0)
+    actor, reader = make_actor(bus), Reader(bus)
+    reader.read(1000)
+    for attempt in range(5000):
+        try:
+            if not actor.step():
+                reader.read(1000, final=True)
+        except (BusUnavailable, BusFull):
+            continue
+        if attempt > 100 and actor.waiting_for() == "the end" and not actor.metrics()["unacked_entries"]:
+            break
+    assert actor.metrics()["env_steps"] == 1000
+    assert actor.metrics()["resends"] > 0
+    assert_each_step_once_with_cuts(reader.rows(), 1000)
+    actor.close()
+
+
+@pytest.mark.parametrize("then_steps", [True, False], ids=["while stepping", "while waiting"])
+def test_a_redis_that_forgot_everything_gets_it_again(redis_url: str, run_name: str, then_steps: bool) -> None:
+    bus = RedisBus(redis_url, run_name)
+    publish(bus, 0)
+    actor, reader = make_actor(bus), Reader(bus)
+    play(bus, actor, reader, 200, final=False)
+    unread = 600 if then_steps else 300
+    reader.read(unread)
+    for _ in range(30 if then_steps else 200):
+        actor.step()
+    _forget(redis_url, run_name)
+    with contextlib.suppress(BusUnavailable):  # run_role waits here, and goes on
+        for _ in range(100):
+            actor.step()
+    for _ in range(100):
+        actor.step()
+    assert bus.actors() == [0]  # it has said hello again
+    reader.read(unread, final=True)
+    step_until_blocked(actor)
+    reader.read(unread, final=True)
+    assert_each_step_once_with_cuts(reader.rows(), unread)
+    assert actor.metrics()["resends"] > 0
+    actor.close()
+
+
+def _forget(redis_url: str, run_name: str) -> None:
+    """All but the replay's epoch, which a restarted replay server would take anew."""
+    server = redis.Redis.from_url(redis_url)
+    for key in server.scan_iter(f"rmc:{run_name}:*"):
+        if not key.endswith(b":epoch:replay"):
+            server.delete(key)
+    server.close()
+
+
+def test_a_replaced_actor_ends(bus: Bus) -> None:
+    publish(bus, 0)
+    old, reader = make_actor(bus), Reader(bus)
+    reader.read(1000)
+    old.step()
+    new = make_actor(bus)
+    with pytest.raises(FencedError):
+        for _ in range(200):
+            old.step()
+    old.close()  # quietly
+    play(bus, new, reader, 200)
+    assert {int(epoch) for epoch in reader.rows()["epoch"]} == {2}
+    new.close()
+
+
+@pytest.mark.parametrize(
+    ("config", "option"),
+    [
+        (ActorConfig(stride=0), "--actor.stride"),
+        (ActorConfig(stride=7), "--actor.stride"),
+        (ActorConfig(stride=6, envs_per_actor=0), "--actor.envs-per-actor"),
+        (ActorConfig(stride=6, chunk_windows=0), "--actor.chunk-windows"),
+    ],
+)
+def test_nonsense_is_refused(config: ActorConfig, option: str) -> None:
+    with pytest.raises(ConfigError, match=option):
+        make_actor(MemoryBus(), config=config)

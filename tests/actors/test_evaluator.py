@@ -1,0 +1,91 @@
+"""The evaluator: whole deterministic episodes, side by side, and one record for each policy asked for."""
+
+import itertools
+
+import numpy as np
+import pytest
+from safetensors.torch import save
+
+from actors.evaluator import Evaluator, EvaluatorConfig, play_episodes
+from actors.policy_runner import PolicyRunner
+from common.agent import Agent, AgentConfig
+from common.bus import Bus, MemoryBus, Version
+from common.envs import Env, EnvConfig, make_env
+from common.errors import ConfigError
+from tests.counting_env import ACTION_DIM, OBS_DIM
+
+AGENT = AgentConfig(hidden=8, embedding=8, heads=(8, 8))
+PENDULUM = EnvConfig("Pendulum-v1")
+
+
+def counting() -> Env:
+    return make_env(EnvConfig("tests.counting_env:Counting-v0"))
+
+
+def runner_for(agent: Agent, envs: int) -> PolicyRunner:
+    runner = PolicyRunner(agent.obs_dim, agent.action_dim, agent.config, envs)
+    runner.load(save(agent.policy_weights()))
+    return runner
+
+
+def test_each_environment_plays_its_first_episode_to_its_end() -> None:
+    """A counting episode of n steps returns 1 + … + n; stepping one past its end would fail there."""
+    agent = Agent(OBS_DIM, ACTION_DIM, AGENT)
+    returns = play_episodes(runner_for(agent, 8), counting, 8, seed=4)
+    lengths = [int(np.random.Generator(np.random.PCG64(4 + i)).integers(1, 41)) for i in range(8)]
+    assert returns == [n * (n + 1) / 2 for n in lengths]
+    assert len(set(lengths)) > 3
+
+
+def test_a_batch_of_episodes_is_as_good_as_one_after_the_other() -> None:
+    agent = Agent(3, 1, AGENT)
+    together = play_episodes(runner_for(agent, 3), lambda: make_env(PENDULUM), 3, seed=0)
+    for i, value in enumerate(together):
+        (alone,) = play_episodes(runner_for(agent, 1), lambda: make_env(PENDULUM), 1, seed=i)
+        assert value == pytest.approx(alone, rel=1e-3)
+    assert together == play_episodes(runner_for(agent, 3), lambda: make_env(PENDULUM), 3, seed=0)
+
+
+def publish(bus: Bus, update: int, evaluate: bool) -> None:
+    agent = Agent(OBS_DIM, ACTION_DIM, AGENT)
+    bus.publish_weights(Version(1, update), save(agent.policy_weights()), evaluate)
+
+
+def step_until_idle(evaluator: Evaluator) -> int:
+    return next(count for count in itertools.count() if not evaluator.step())
+
+
+def test_plays_what_it_is_asked_to_once() -> None:
+    bus = MemoryBus()
+    evaluator = Evaluator(1, counting, AGENT, EvaluatorConfig(episodes=3), bus, clock=itertools.count().__next__)
+    publish(bus, 1, evaluate=False)
+    assert (step_until_idle(evaluator), evaluator.metrics()) == (0, {})
+    publish(bus, 2, evaluate=True)
+    publish(bus, 3, evaluate=True)  # only the newest counts
+    assert step_until_idle(evaluator) > 0
+    record = evaluator.metrics()
+    assert (record["eval_update"], record["eval_episodes"]) == (3, 3)
+    assert record["eval_return_mean"] > 0
+    assert evaluator.metrics() == {}
+    assert step_until_idle(evaluator) == 0
+    publish(bus, 4, evaluate=True)
+    step_until_idle(evaluator)
+    again = evaluator.metrics()
+    assert again["eval_update"] == 4
+    assert again["eval_return_mean"] == record["eval_return_mean"]  # the same starts
+    evaluator.close()
+
+
+def test_close_hands_out_what_is_left() -> None:
+    bus = MemoryBus()
+    evaluator = Evaluator(1, counting, AGENT, EvaluatorConfig(episodes=2), bus, clock=itertools.count().__next__)
+    publish(bus, 5, evaluate=True)
+    step_until_idle(evaluator)
+    evaluator.close()
+    (record,), _ = bus.records("0")
+    assert (record["role"], record["eval_update"]) == ("evaluator", 5)
+
+
+def test_nonsense_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"--evaluator\.episodes"):
+        Evaluator(1, counting, AGENT, EvaluatorConfig(episodes=0), MemoryBus())
