@@ -41,7 +41,7 @@ class Lockstep:
         self.learner = Learner(
             spec, config.agent, config.update, config.learner, self.server, self.bus, checkpoints, config.seed, device
         )
-        ticks = itertools.count()  # the actors' timers count calls, so that no clock decides anything
+        ticks = itertools.count()  # timers count calls, so that no clock decides anything
         self.actors = [
             Actor(
                 index,
@@ -55,7 +55,14 @@ class Lockstep:
             )
             for index in range(config.actors)
         ]
-        self.evaluator = Evaluator(config.seed, lambda: make_env(config.env), config.agent, config.evaluator, self.bus)
+        self.evaluator = Evaluator(
+            config.seed,
+            lambda: make_env(config.env),
+            config.agent,
+            config.evaluator,
+            self.bus,
+            clock=lambda: float(next(ticks)),
+        )
         self._seen = self.learner.last_checkpoint
         self._restart_due = False
 
@@ -80,7 +87,8 @@ class Lockstep:
     def _after_checkpoint(self) -> None:
         """Save the ring beside the learner; the actors begin anew in the next step, as those of a resumed run do."""
         self._seen = self.learner.last_checkpoint
-        self.evaluator.step()
+        while self.evaluator.step():
+            pass
         self.server.checkpoint()
         self._restart_due = True
 

@@ -5,7 +5,6 @@ import json
 import logging
 import pickle
 import time
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,7 +15,7 @@ from torch import Tensor
 from common.agent import Agent, AgentConfig
 from common.bus import Bus, Version
 from common.checkpoint import CheckpointFolder
-from common.errors import BusUnavailable, CheckpointError, FencedError
+from common.errors import CheckpointError, FencedError
 from common.metrics import Means, Rate
 from common.replay import Draw, Replay, Sample
 from common.window import WindowSpec
@@ -159,7 +158,6 @@ class Learner:
         self.save()
         self.last_checkpoint = self.updates
         self._next_checkpoint = self._after(self.env_steps)
-        self.mark_best()
         self.publish(evaluate=True)
 
     def save(self) -> None:
@@ -173,12 +171,6 @@ class Learner:
             PROGRESS: json.dumps(progress).encode(),
         }
         self.checkpoints.save(self.updates, files)
-
-    def mark_best(self) -> None:
-        """Take note of the evaluator's newest result."""
-        played = self.bus.stats().get("evaluator", {})
-        if "eval_return_mean" in played:
-            self.checkpoints.mark_best(int(played["eval_update"]), float(played["eval_return_mean"]))
 
     def _after(self, env_steps: int) -> int:
         return (env_steps // self.config.checkpoint_steps + 1) * self.config.checkpoint_steps
@@ -222,8 +214,6 @@ class Learner:
         """Save what a resumed run needs, unless that is done or a newer learner has taken over."""
         if not self.finished and not self._fenced and self.updates > self.last_checkpoint:
             self.save()
-        with suppress(BusUnavailable):
-            self.mark_best()
         self.checkpoints.unlock()
 
 

@@ -147,15 +147,6 @@ def test_a_replaced_learner_is_fenced(setting):
     assert setting.learner.checkpoints.numbers() == saved
 
 
-def test_best_checkpoint_follows_the_evaluator(setting):
-    setting.feed(60)
-    setting.learner.step()
-    setting.learner.checkpoint()
-    setting.bus.emit("evaluator", {"eval_return_mean": 3.0, "eval_update": setting.learner.updates})
-    setting.learner.mark_best()
-    assert setting.learner.checkpoints.best() == setting.learner.updates
-
-
 def test_latent_rank_sees_a_collapse():
     torch.manual_seed(0)
     full, _ = latent_rank(torch.randn(20, 10, 16))
