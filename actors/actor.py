@@ -187,6 +187,9 @@ class Actor:
 
     def _poll_ack(self) -> None:
         ack, now = self._bus.ack(self._index), self._clock()
+        if ack is not None and self._is_forgotten_life(ack):
+            self.restart()
+            return
         if ack is not None and ack.id.epoch == self._outbox.epoch:
             self._ack = ack
             if self._outbox.acknowledge(ack):
@@ -194,6 +197,16 @@ class Actor:
         if now >= self._resend_at:  # a Redis that came back empty has lost what the replay server never saw
             self._outbox.send_again()
             self._resend_at = now + RESEND_SECONDS
+
+    def _is_forgotten_life(self, ack: Ack) -> bool:
+        """Whether the ring knows a life of this actor that Redis has forgotten: our epoch is too small for it.
+
+        Before its first credit a life has sent its hello alone. Raises FencedError where a newer life is real.
+        """
+        ours = self._outbox.epoch
+        if ack.id.epoch > ours and self._bus.current_epoch(self.name) > ours:
+            raise FencedError(f"{self.name}: epoch {ack.id.epoch} has replaced epoch {ours}")
+        return ack.id.epoch > ours or (self._ack is None and ack.id.epoch == ours and ack.id.seq > 0)
 
     # Stepping
 

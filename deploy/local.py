@@ -7,7 +7,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-from common.errors import BusFull, BusUnavailable, ConfigError
+from common.errors import BusFull, BusUnavailable
 from common.redis_bus import RedisBus
 from common.role import StopSignal
 from deploy.monitor import Monitor

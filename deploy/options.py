@@ -1,6 +1,7 @@
 """The command line as dataclasses; tyro makes ``--help`` of them. Options of the roles' configs are flat."""
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -151,14 +152,14 @@ def parse(words: list[str]) -> Command:
         | Annotated[EvaluatorRole, tyro.conf.subcommand("evaluator")]
     )
     flat = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
-    command: Command = tyro.cli(commands, prog="rmc", args=words, config=flat)  # type: ignore[call-overload]
+    command: Command = tyro.cli(commands, prog="rmc", args=words, config=flat)
     return command
 
 
 def _named_preset(words: list[str]) -> Preset:
     """The preset must be known before the options, whose defaults it gives; a wrong one is refused later."""
     given = [word.partition("=")[2] for word in words if word.startswith("--preset=")]
-    given += [after for word, after in zip(words, words[1:], strict=False) if word == "--preset"]
+    given += [after for word, after in itertools.pairwise(words) if word == "--preset"]
     if "paper" in given[-1:]:
         return "paper"
     return "debug" if "debug" in given[-1:] else "robust"

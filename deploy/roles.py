@@ -4,6 +4,7 @@ import logging
 import os
 import re
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -142,7 +143,7 @@ def run_learner(place: Place, folder: Path, device: str) -> None:
     run_role(learner, bus, process.stop, lambda: learner.finished)
     client.close()
     if learner.finished:
-        bus.emit(learner.name, {**learner.metrics(), "finished": 1})
+        bus.emit(learner.name, {"time": time.time(), **learner.metrics(), "finished": 1})
 
 
 def check_device(device: str) -> None:

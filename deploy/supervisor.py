@@ -17,7 +17,7 @@ FIRST_BACKOFF, LONGEST_BACKOFF = 0.5, 10.0  # seconds before a role is started a
 STOP_SECONDS = 4.0  # for the roles to end in order; then they are killed
 EXIT_CONFIG = 2  # the exit status of an error that starting again cannot mend
 TRACEBACK_BYTES = 8192
-SINGLE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+SINGLE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)

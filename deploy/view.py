@@ -6,6 +6,7 @@ from typing import Any
 from rich.console import Group
 from rich.table import Table
 
+NONE_YET = "-"
 SILENT_SECONDS = 5.0  # after which a role's silence is shown
 
 
@@ -44,15 +45,15 @@ class Board:
 
 
 def number(value: Any, form: str = ",.3g") -> str:
-    """A number as text, or a dash where there is none yet."""
-    return "–" if value is None else format(value, form)
+    """A number as text, or a hyphen where there is none yet."""
+    return NONE_YET if value is None else format(value, form)
 
 
 def _evaluation(board: Board) -> str:
     mean, deviation, update = (
         board.get("evaluator", f"eval_{name}") for name in ("return_mean", "return_std", "update")
     )
-    return "–" if mean is None else f"{mean:,.1f} ± {deviation:,.1f} at update {update:,}"
+    return NONE_YET if mean is None else f"{mean:,.1f} ± {deviation:,.1f} at update {update:,}"
 
 
 def _facts(board: Board) -> list[tuple[str, str]]:
@@ -66,7 +67,7 @@ def _facts(board: Board) -> list[tuple[str, str]]:
                    f"ratio {number(board.get('replay', 'replay_ratio'), ',.1f')} of {board.replay_ratio:g}"),
         ("episode return", number(board.episode_return, ",.1f")),
         ("evaluation return", _evaluation(board)),
-        ("losses", losses or "–"),
+        ("losses", losses or NONE_YET),
         ("alpha, beta", f"{number(learner.get('alpha'))}, {number(learner.get('beta'))}"),
         ("curiosity in reward", number(learner.get("curiosity_share"), ".1%")),
         ("latent rank", number(learner.get("latent_rank"), ".1f")),

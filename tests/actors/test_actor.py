@@ -366,3 +366,16 @@ def test_a_replaced_actor_ends(bus: Bus) -> None:
 def test_nonsense_is_refused(config: ActorConfig, option: str) -> None:
     with pytest.raises(ConfigError, match=option):
         make_actor(MemoryBus(), config=config)
+
+
+def test_epochs_that_redis_forgot_do_not_strand_the_actor(bus: Bus) -> None:
+    """The ring remembers entry 1-7 of this actor; a Redis that came back empty hands out epoch 1 again."""
+    publish(bus, 3)
+    actor = make_actor(bus)
+    replay = bus.take_epoch("replay")
+    bus.commit(replay, {0: Ack(EntryId(1, 7), 400)})
+    step_until_blocked(actor)
+    assert bus.current_epoch("actor-0") == 2
+    bus.commit(replay, {0: Ack(EntryId(2, 0), 40)})
+    assert step_until_blocked(actor) == 10
+    actor.close()

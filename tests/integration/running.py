@@ -1,0 +1,113 @@
+"""A real ``rmc train`` in a process of its own, and what can be seen of it from outside."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+START_SECONDS = 90.0  # five processes import torch on two cores that other tests may use
+ENVIRONMENT = {**os.environ, "RMC_SECRET": "", "COLUMNS": "200"}
+
+
+class Training:
+    """Started at once; ``close`` kills what is left of it."""
+
+    def __init__(self, folder: Path, *options: str, env: str = "InvertedPendulum-v5", preset: str = "debug") -> None:
+        self.folder = folder
+        self.output = folder.parent / f"{folder.name}.out"
+        words = [sys.executable, "-m", "deploy.cli", "train", env, "--preset", preset, "--run-dir", str(folder), *options]
+        with self.output.open("ab") as output:
+            self.process = subprocess.Popen(
+                words, stdout=output, stderr=output, stdin=subprocess.DEVNULL, env=ENVIRONMENT, process_group=0
+            )
+        self.launcher = psutil.Process(self.process.pid)
+
+    def text(self) -> str:
+        """All that it printed."""
+        return self.output.read_text(errors="replace")
+
+    def records(self, role: str) -> list[dict[str, Any]]:
+        """The role's metrics so far."""
+        path = self.folder / "metrics.jsonl"
+        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+        records = [json.loads(line) for line in lines if line.endswith("}\n")]
+        return [record for record in records if record["role"] == role]
+
+    def newest(self, role: str, name: str, default: Any = 0) -> Any:
+        """The newest value of a metric."""
+        values = [record[name] for record in self.records(role) if name in record]
+        return values[-1] if values else default
+
+    def role(self, name: str) -> psutil.Process | None:
+        """A role's process; the role's name is ``actor``, ``replay``, ``learner``, ``evaluator`` or ``redis``."""
+        pattern = "unixsocket" if name == "redis" else rf"deploy\.cli {name} "
+        for child in self.launcher.children(recursive=True):
+            try:
+                if re.search(pattern, " ".join(child.cmdline())):
+                    return child
+            except psutil.NoSuchProcess:
+                continue
+        return None
+
+    def wait_for(self, condition: Callable[[], Any], seconds: float = START_SECONDS) -> None:
+        """Wait until the condition holds, while the run goes on."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert self.process.poll() is None, f"the run has ended:\n{self.text()}"
+            assert time.monotonic() < deadline, f"waited {seconds} s in vain:\n{self.text()}\n{self.logs()}"
+            time.sleep(0.1)
+
+    def wait_for_updates(self, more: int = 1) -> None:
+        """Wait until the learner has made so many more updates."""
+        goal = self.newest("learner", "updates") + more
+        self.wait_for(lambda: self.newest("learner", "updates") >= goal)
+
+    def logs(self) -> str:
+        """The ends of the roles' logs."""
+        logs = sorted((self.folder / "logs").glob("*.log"))
+        return "\n".join(f"== {path.name}\n{path.read_text(errors='replace')[-2000:]}" for path in logs)
+
+    def interrupt(self) -> float:
+        """Ctrl-C; how long everything took to end."""
+        began = time.monotonic()
+        self.process.send_signal(signal.SIGINT)
+        self.process.wait(30)
+        return time.monotonic() - began
+
+    def finish(self, seconds: float) -> int:
+        """Wait for the end; the exit status."""
+        try:
+            return self.process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"not finished after {seconds} s:\n{self.text()}\n{self.logs()}") from None
+
+    def close(self) -> None:
+        """Kill what is left."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+    def __enter__(self) -> "Training":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def run_temporaries() -> set[Path]:
+    """Temporary folders of runs, which hold their sockets."""
+    return set(Path(tempfile.gettempdir()).glob("rmc-run-*"))
+
+
+def alive(processes: list[psutil.Process]) -> list[psutil.Process]:
+    """Those that still run."""
+    return [process for process in processes if process.is_running() and process.status() != psutil.STATUS_ZOMBIE]

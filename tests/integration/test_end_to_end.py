@@ -1,0 +1,52 @@
+"""One actor and one learner as real processes, through a real Redis, from the command line to result.json."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.integration.running import Training
+
+RESULT_KEYS = {
+    "env", "preset", "seed", "env_steps", "updates", "wall_s", "eval_return_mean", "eval_return_std", "eval_episodes",
+    "replay_ratio",
+}  # fmt: skip
+
+
+def rmc(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "deploy.cli", *words], capture_output=True, text=True, timeout=100)
+
+
+def test_train_evaluate_stats_and_resume(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with Training(folder, "--total-steps", "1500", "--checkpoint-steps", "500") as training:
+        assert training.finish(170) == 0, training.text() + training.logs()
+        restarts = training.newest("launcher", "restarts")
+    result = json.loads((folder / "result.json").read_bytes())
+    assert result.keys() >= RESULT_KEYS
+    assert (result["env"], result["preset"], result["seed"]) == ("InvertedPendulum-v5", "debug", 0)
+    assert result["env_steps"] == 1500
+    assert restarts == 0
+    warmup, train, batch = 500, 15, 16
+    assert abs(result["replay_ratio"] - 32) <= 2 * batch * train / (1500 - warmup) + 32 * 0.05
+    assert "before training" in training.text()
+    assert "after training" in training.text()
+    assert list((folder / "events").glob("events.out.tfevents.*"))
+    assert {"replay", "learner", "actor-0", "evaluator", "launcher"} <= {
+        json.loads(line)["role"] for line in (folder / "metrics.jsonl").read_text().splitlines()
+    }
+
+    played = rmc("evaluate", str(folder), "--json")
+    assert played.returncode == 0, played.stderr
+    evaluation = json.loads(played.stdout)
+    assert evaluation["eval_return_mean"] == result["eval_return_mean"]  # the same path, the same starts
+    shown = rmc("stats", str(folder))
+    assert shown.returncode == 0, shown.stderr
+    assert "environment steps" in shown.stdout
+
+    with Training(folder, "--total-steps", "2000", "--checkpoint-steps", "500") as resumed:
+        assert resumed.finish(170) == 0, resumed.text() + resumed.logs()
+    longer = json.loads((folder / "result.json").read_bytes())
+    assert longer["env_steps"] == 2000
+    assert longer["updates"] > result["updates"]
+    assert longer["wall_s"] > result["wall_s"]
