@@ -101,7 +101,7 @@ class Bus(Protocol):
         """Up to ``count`` entries of each actor named in ``after``, past the id given, in order."""
 
     def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
-        """Publish acks and trim what they cover, if ``epoch`` is still the replay's. Raises FencedError."""
+        """Publish acks and trim what they cover, unless a newer replay has come. Raises FencedError."""
 
     def ack(self, actor: int) -> Ack | None:
         """The newest ack for an actor."""
@@ -192,8 +192,9 @@ class MemoryBus:
         return found
 
     def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
-        if self.current_epoch("replay") != epoch:
+        if self.current_epoch("replay") > epoch:
             raise FencedError(f"replay epoch {epoch} was replaced by {self.current_epoch('replay')}")
+        self._epochs["replay"] = epoch
         for actor, ack in acks.items():
             self._acks[actor] = ack
             stream = self._streams.get(actor, {})

@@ -110,9 +110,11 @@ class RedisBus:
     def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
         def transaction(pipe: Any) -> None:
             held = int(pipe.get(self._key("epoch", "replay")) or 0)
-            if held != epoch:
+            if held > epoch:
                 raise FencedError(f"replay epoch {epoch} was replaced by {held}")
             pipe.multi()
+            if held < epoch:  # Redis lost its data
+                pipe.set(self._key("epoch", "replay"), epoch)
             for actor, ack in acks.items():
                 pipe.xtrim(self._key("windows", actor), minid=f"{ack.id.epoch}-{ack.id.seq + 1}", approximate=False)
             pipe.hset(

@@ -24,14 +24,13 @@ class ReplayProcess:
         self._bus_is_away = False
 
     def step(self) -> bool:
-        """Serve clients that are ready, then take in a round; waits for clients a little where neither had anything."""
-        now = time.monotonic()
-        due = now >= self._next_intake
-        served = self.sockets.poll(0.0 if due else min(self._next_intake - now, IDLE_WAIT))
-        took = due and self._take_in(now)
-        return served or took
+        """Take in a round if it is time to look, then serve clients, waiting for them until the next look."""
+        took = time.monotonic() >= self._next_intake and self._take_in()
+        wait = self._next_intake - time.monotonic()
+        return self.sockets.poll(min(max(wait, 0.0), IDLE_WAIT)) or took
 
-    def _take_in(self, now: float) -> bool:
+    def _take_in(self) -> bool:
+        now = time.monotonic()
         try:
             took = self.server.step()
             if now >= self._next_announcement:

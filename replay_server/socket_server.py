@@ -198,12 +198,12 @@ def _listen(address: str) -> tuple[socket.socket, Path | None, str]:
         if scheme == "unix":
             return _listen_unix(Path(rest)), Path(rest), address
         host, _, port = rest.rpartition(":")
-        if scheme == "tcp" and host and port.isdigit():
+        if scheme == "tcp" and host and port.isdigit() and int(port) < 65536:
             listener = socket.create_server((host, int(port)), backlog=MAX_CONNECTIONS)
             listener.setblocking(False)
             return listener, None, f"tcp:{host}:{listener.getsockname()[1]}"
-    except (OSError, OverflowError) as error:
-        in_use = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
+    except OSError as error:
+        in_use = error.errno == errno.EADDRINUSE
         fix = "the port is taken; choose another, or 0 for a free one" if in_use else f"cannot listen there ({error})"
         raise ConfigError("replay address", address, fix) from None
     raise ConfigError("replay address", address, "want unix:PATH or tcp:HOST:PORT")

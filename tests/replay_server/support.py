@@ -31,6 +31,10 @@ class Sender:
     def hello(self) -> None:
         """Begin a life."""
         self.epoch, self.seq = self.bus.take_epoch(f"actor-{self.actor}"), 0
+        self.greet()
+
+    def greet(self) -> None:
+        """Append this life's hello, or append it again because Redis has lost it."""
         self.bus.append(self.actor, EntryId(self.epoch, 0), encode_hello(self.spec))
 
     def send(self, count: int) -> None:

@@ -36,7 +36,9 @@ def marks(ring: Ring) -> list[int]:
 @settings(max_examples=80, deadline=None)
 @given(
     capacity=st.integers(1, 12),
-    appends=st.lists(st.tuples(st.integers(0, 15), st.sampled_from(["whole", "after rows", "torn record"])), max_size=12),
+    appends=st.lists(
+        st.tuples(st.integers(0, 15), st.sampled_from(["whole", "after rows", "torn record"])), max_size=12
+    ),
 )
 def test_killed_anywhere(capacity: int, appends: list[tuple[int, str]]) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -55,7 +57,9 @@ def test_killed_anywhere(capacity: int, appends: list[tuple[int, str]]) -> None:
                 ring = Ring(path, SPEC, capacity)  # nothing of the old one was flushed or closed
             progress = ring.progress
             assert progress.next_serial == committed
-            assert progress.valid_from <= max(before, min(committed, committed + count - capacity), committed - capacity)
+            assert progress.valid_from <= max(
+                before, min(committed, committed + count - capacity), committed - capacity
+            )
             assert marks(ring) == list(range(progress.valid_from, committed))
         if all(fate == "whole" for _, fate in appends):
             assert ring.progress.windows == min(capacity, committed)
@@ -75,12 +79,12 @@ def tear_newest_record(path: Path) -> None:
 @given(
     numbers=st.lists(st.integers(0, 2**62), min_size=8, max_size=8),
     streams=st.dictionaries(
-        st.integers(0, 2**31 - 1), st.tuples(st.integers(1, 2**31), st.integers(0, 2**62), st.integers(0, 2**62)), max_size=20
+        st.integers(0, 2**31 - 1),
+        st.tuples(st.integers(1, 2**31), st.integers(0, 2**62), st.integers(0, 2**62)),
+        max_size=20,
     ),
 )
-def test_progress_survives_the_round_trip(
-    numbers: list[int], streams: dict[int, tuple[int, int, int]]
-) -> None:
+def test_progress_survives_the_round_trip(numbers: list[int], streams: dict[int, tuple[int, int, int]]) -> None:
     *counters, observations = numbers
     progress = Progress(SPEC.obs_dim, *counters, max_priority=3.5, observations=observations)
     progress.total += [1.0, 2.0, 3.0]
@@ -116,7 +120,7 @@ def test_damage_is_named(tmp_path: Path, damage: str) -> None:
     if damage == "records":
         raw[RECORDS_START : RECORDS_START + 2 * record_bytes(SPEC.obs_dim)] = bytes(2 * record_bytes(SPEC.obs_dim))
     (tmp_path / "ring").write_bytes(raw[:-1] if damage == "short" else raw)
-    with pytest.raises(ConfigError, match="--run-dir=.*delete"):
+    with pytest.raises(ConfigError, match=r"--run-dir=.*delete"):
         Ring(tmp_path / "ring", SPEC, 10)
 
 

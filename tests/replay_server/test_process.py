@@ -1,0 +1,112 @@
+"""The replay server as a process's role: both its ends at once, and one end while the other is away."""
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.errors import BusUnavailable
+from common.redis_bus import RedisBus
+from common.replay import Draw
+from common.role import StopSignal, run_role
+from deploy.redis_server import RedisServer
+from learner.replay_client import ReplayClient
+from replay_server.process import ReplayProcess
+from replay_server.server import ReplayConfig, ReplayServer
+from replay_server.socket_server import SocketServer
+from tests.replay_server.support import SPEC, Sender
+
+SECRET = b"the run's secret"
+
+
+class Running:
+    """A replay process's loop in a thread, as ``run_role`` runs it."""
+
+    def __init__(self, folder: Path, bus: RedisBus) -> None:
+        config = ReplayConfig(capacity=1000, replay_ratio=1e6, warmup_steps=0)
+        self.server = ReplayServer(SPEC, config, folder / "replay", 1, 10**9, 1, 1000, bus)
+        sockets = SocketServer(self.server, SPEC, f"unix:{folder}/r.sock", SECRET, 64)
+        self.process, self.stop = ReplayProcess(self.server, sockets), StopSignal()
+        self.thread = threading.Thread(target=run_role, args=(self.process, bus, self.stop))
+        self.thread.start()
+
+    def end(self) -> None:
+        self.stop.request()
+        self.thread.join()
+
+
+def until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def client_of(bus: RedisBus) -> ReplayClient:
+    address = bus.replay_address()
+    assert address is not None
+    return ReplayClient(lambda: address.address, SECRET, SPEC, 16)
+
+
+def test_windows_in_batches_out_and_metrics(redis_url: str, run_name: str, tmp_path: Path) -> None:
+    bus = RedisBus(redis_url, run_name)
+    running = Running(tmp_path, RedisBus(redis_url, run_name))
+    try:
+        until(lambda: bus.replay_address() is not None)
+        sender, client = Sender(bus), client_of(bus)
+        assert client.sample(16).draw is Draw.WAIT
+        for _ in range(10):
+            sender.send(5)
+        until(lambda: running.server.stats()["windows"] == 50)
+        until(lambda: client.sample(16).draw is Draw.BATCH)
+        sample = client.sample(16)
+        assert sample.rows is not None
+        assert (sample.rows["reward"][:, 0] == sample.rows["serial"]).all()
+        client.update_priorities(sample.rows["serial"].copy(), np.full(16, 5.0, np.float32))
+        until(lambda: client.stats()["max_priority"] == 5.0)
+        until(lambda: bus.stats().get("replay", {}).get("windows") == 50)
+        record = bus.stats()["replay"]
+        assert record["env_steps"] == 200
+        assert record["waiting_for"] == "windows"
+        assert 0.0 <= record["busy_share"] <= 1.0
+        client.close()
+    finally:
+        running.end()
+    assert not (tmp_path / "r.sock").exists()
+
+
+@pytest.mark.timeout(60)
+def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_path: Path) -> None:
+    folder = tmp_path / "redis"
+    folder.mkdir(mode=0o700)
+    redis_server = RedisServer(folder)
+    redis_server.start()
+    bus = RedisBus(redis_server.url, "run")
+    running = Running(tmp_path, RedisBus(redis_server.url, "run"))
+    try:
+        until(lambda: bus.replay_address() is not None)
+        sender, client = Sender(bus), client_of(bus)
+        sender.send(40)
+        until(lambda: client.sample(16).draw is Draw.BATCH)
+        redis_server.close()
+        with pytest.raises(BusUnavailable):
+            bus.ack(0)
+        until(lambda: running.process.waiting_for() == "redis")
+        started = time.monotonic()
+        for _ in range(40):
+            assert client.sample(16).draw is Draw.BATCH
+        assert time.monotonic() - started < 10.0
+        redis_server.start()  # empty: it keeps no files
+        until(lambda: bus.ack(0) is not None)  # acks and address are said again
+        until(lambda: bus.replay_address() is not None)
+        sender.greet()
+        sender.send(3)
+        until(lambda: running.server.stats()["windows"] == 43)
+        assert running.server.stats()["entry_gaps"] == 0
+        client.close()
+    finally:
+        running.end()
+        redis_server.close()

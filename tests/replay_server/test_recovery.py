@@ -1,0 +1,180 @@
+"""kill -9 of a real replay process amid inserts, draws and priorities; and folders that were damaged."""
+
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.errors import ConfigError
+from common.redis_bus import RedisBus
+from common.replay import Draw
+from learner.replay_client import ReplayClient
+from replay_server.recovery import ReplayStore, open_store, valid_leaves
+from replay_server.sum_tree import SumTree
+from tests.replay_server.replay_child import ACTORS, SECRET
+from tests.replay_server.support import SPEC, Sender, make_rows
+
+CAPACITY = 30_000
+CHUNK = 16
+
+
+@contextmanager
+def opened(folder: Path, capacity: int = CAPACITY) -> Iterator[ReplayStore]:
+    store = open_store(folder, SPEC, capacity, 0.6)
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+def start(url: str, run: str, folder: Path) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "tests.replay_server.replay_child", url, run, str(folder), str(CAPACITY)]
+    return subprocess.Popen(command, cwd=Path(__file__).parents[2])
+
+
+def acknowledged(bus: RedisBus) -> list[int]:
+    """Windows of each actor that an ack covers."""
+    acks = [bus.ack(actor) for actor in range(ACTORS)]
+    return [ack.id.seq * CHUNK if ack is not None else 0 for ack in acks]
+
+
+def check(store: ReplayStore, acked: list[int], sent: list[int]) -> None:
+    """All that was acknowledged, but for what was evicted since, is there once, whole and in order."""
+    progress = store.ring.progress
+    serials = np.arange(progress.valid_from, progress.next_serial)
+    rows = store.ring.rows[serials % CAPACITY]
+    assert np.array_equal(rows["serial"], serials)
+    assert progress.env_steps == progress.next_serial * SPEC.train
+    inserted = [progress.streams[actor].id.seq * CHUNK for actor in range(ACTORS)]
+    assert sum(inserted) == progress.next_serial
+    for actor in range(ACTORS):
+        assert acked[actor] <= inserted[actor] <= sent[actor]
+        own = rows[rows["actor"] == actor]
+        marks = own["reward"][:, 0].astype(int)
+        assert np.array_equal(marks, np.arange(inserted[actor] - len(own), inserted[actor]))
+        assert np.array_equal((own["seq"] - 1) * CHUNK + own["k"], marks)
+        if len(own):
+            expected = make_rows(len(own), marks[0])
+            assert np.array_equal(own["observation"], expected["observation"])
+    rebuilt = SumTree(CAPACITY)
+    leaves = np.zeros(CAPACITY)
+    leaves[serials % CAPACITY] = store.priorities[serials % CAPACITY].astype(float) ** 0.6
+    rebuilt.rebuild(leaves)
+    assert np.array_equal(store.tree._nodes, rebuilt._nodes)
+    assert np.isclose(rebuilt.total, leaves.sum())
+
+
+def draw_until(client: ReplayClient, end: float, rng: np.random.Generator) -> int:
+    """Draw and give priorities back, as a learner does, until a moment; how many batches came."""
+    draws = 0
+    while time.monotonic() < end:
+        sample = client.sample(32)
+        if sample.rows is None:
+            time.sleep(0.001)
+            continue
+        draws += sample.draw is Draw.BATCH
+        client.update_priorities(sample.rows["serial"].copy(), rng.exponential(size=32).astype(np.float32))
+    return draws
+
+
+def test_killed_twenty_times_amid_inserts(redis_url: str, run_name: str, tmp_path: Path) -> None:
+    bus, rng, chance = RedisBus(redis_url, run_name), np.random.default_rng(0), random.Random(0)
+    senders = [Sender(bus, actor) for actor in range(ACTORS)]
+    client = ReplayClient(lambda: f"unix:{tmp_path}/r.sock", SECRET, SPEC, 32)
+    draws = amid = 0
+    for _ in range(20):
+        child = start(redis_url, run_name, tmp_path)
+        try:
+            for sender in senders:
+                for _ in range(chance.randrange(200, 300)):
+                    sender.send(CHUNK)
+            before = acknowledged(bus)
+            deadline = time.monotonic() + 20.0
+            while acknowledged(bus) == before:
+                assert time.monotonic() < deadline
+                assert child.poll() is None
+                time.sleep(0.002)
+            draws += draw_until(client, time.monotonic() + chance.uniform(0.0, 0.03), rng)
+        finally:
+            child.kill()
+            child.wait()
+        acked, sent = acknowledged(bus), [sender.marks for sender in senders]
+        amid += acked != sent
+        with opened(tmp_path / "replay") as store:
+            check(store, acked, sent)
+    client.close()
+    assert draws > 0
+    assert amid > 10, "most kills came after all was taken in"
+    finish(bus, redis_url, run_name, tmp_path, senders)
+
+
+def finish(bus: RedisBus, url: str, run: str, folder: Path, senders: list[Sender]) -> None:
+    """A last life that is ended in order: everything ever sent has been taken in once."""
+    sent = [sender.marks for sender in senders]
+    assert sum(sent) > 2 * CAPACITY  # the ring went round
+    child = start(url, run, folder)
+    deadline = time.monotonic() + 20.0
+    try:
+        while acknowledged(bus) != sent or getattr(bus.replay_address(), "epoch", 0) != 21:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        child.terminate()
+        assert child.wait(10) == 0
+    finally:
+        child.kill()
+        child.wait()
+    with opened(folder / "replay") as store:
+        check(store, sent, sent)
+        assert store.ring.progress.next_serial == sum(sent)
+        assert store.ring.progress.windows == CAPACITY
+        assert store.ring.progress.replay_epoch == 21
+    assert not (folder / "r.sock").exists()
+
+
+def test_rows_torn_by_a_power_cut_are_dropped(tmp_path: Path) -> None:
+    with opened(tmp_path, 10) as store:
+        store.set_priorities(store.ring.write(make_rows(14)), np.full(10, 2.0, np.float32))
+        store.ring.commit()
+        store.ring.rows["serial"][[5, 7]] = 0
+    with opened(tmp_path, 10) as store:
+        assert (store.ring.progress.valid_from, store.ring.progress.next_serial) == (8, 14)
+        assert np.flatnonzero(valid_leaves(store)).tolist() == [0, 1, 2, 3, 8, 9]
+        assert store.tree.total == pytest.approx(6 * 2.0**0.6)
+
+
+@pytest.mark.parametrize("damage", ["gone", "short", "garbage"])
+def test_damaged_priorities_only_cost_their_values(tmp_path: Path, damage: str) -> None:
+    with opened(tmp_path, 10) as store:
+        store.set_priorities(store.ring.write(make_rows(6)), np.full(6, 0.25, np.float32))
+        store.ring.progress.max_priority = 3.0
+        store.ring.commit()
+    path = tmp_path / "priorities"
+    if damage == "gone":
+        path.unlink()
+    else:
+        path.write_bytes(b"\xff" * (40 if damage == "garbage" else 9))  # as float32: not a number
+    with opened(tmp_path, 10) as store:
+        assert store.priorities.tolist() == [3.0] * 10
+        assert store.tree.total == pytest.approx(6 * 3.0**0.6)
+
+
+def test_a_killed_creation_is_begun_again(tmp_path: Path) -> None:
+    (tmp_path / "ring.tmp").write_bytes(b"half")
+    with opened(tmp_path, 10) as store:
+        assert store.ring.progress.windows == 0
+
+
+def test_a_refused_folder_is_unlocked(tmp_path: Path) -> None:
+    with opened(tmp_path, 10):
+        pass
+    for _ in range(2):
+        with pytest.raises(ConfigError, match=r"--replay\.capacity=11"), opened(tmp_path, 11):
+            pass
+    with opened(tmp_path, 10):
+        pass

@@ -1,0 +1,340 @@
+"""The socket: who may speak, what they may say, and that nobody's fault is another's."""
+
+import os
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.bus import MemoryBus
+from common.errors import AuthenticationError, ConfigError, MessageError
+from common.replay import Draw
+from common.wire import HEADER, MAGIC, VERSION, Kind, encode_frame, proof
+from learner.replay_client import Connection, ReplayClient
+from replay_server import socket_server
+from replay_server.server import ReplayConfig, ReplayServer
+from replay_server.socket_server import SocketServer
+from tests.replay_server.support import SPEC, Sender
+
+SECRET = b"a secret of the run"
+MAX_BATCH = 4096
+BIG = MAX_BATCH * (SPEC.dtype.itemsize + 4)
+
+
+class Served:
+    """A replay server with its socket, polled by a thread."""
+
+    def __init__(self, folder: Path, address: str, config: ReplayConfig, windows: int, total: int = 10**9) -> None:
+        bus = MemoryBus()
+        self.replay = ReplayServer(SPEC, config, folder, 3, total, 1, 64, bus)
+        self.sender = Sender(bus)
+        self.sender.send(windows)
+        while self.replay.step():
+            pass
+        self.sockets = SocketServer(self.replay, SPEC, address, SECRET, MAX_BATCH)
+        self.address = self.sockets.address
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._loop)
+        self._thread.start()
+
+    def _loop(self) -> None:
+        while not self._stop.is_set():
+            self.sockets.poll(0.01)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.sockets.close()
+        self.replay.close()
+
+    def connect(self, secret: bytes = SECRET) -> Connection:
+        return Connection(self.address, secret, SPEC.fingerprint, BIG)
+
+    def stranger(self) -> socket.socket:
+        """A raw connection that has got its challenge and said nothing."""
+        raw = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        raw.settimeout(5.0)
+        raw.connect(self.address.removeprefix("unix:"))
+        raw.recv(4096)
+        return raw
+
+    def refused(self, reason: str) -> None:
+        """Wait until a client was sent away for this reason."""
+        end = time.monotonic() + 5.0
+        while self.sockets.refused[reason] == 0:
+            assert time.monotonic() < end, f"nobody was refused for {reason}, but for {dict(self.sockets.refused)}"
+            time.sleep(0.005)
+
+
+Serve = Callable[..., Served]
+FREE = ReplayConfig(capacity=5000, replay_ratio=1e9, warmup_steps=0)
+
+
+@pytest.fixture
+def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serve]:
+    made: list[Served] = []
+
+    def build(config: ReplayConfig = FREE, address: str = "", windows: int = 200, total: int = 10**9) -> Served:
+        folder = tmp_path_factory.mktemp("s")
+        made.append(Served(folder / "replay", address or f"unix:{folder}/r.sock", config, windows, total))
+        return made[-1]
+
+    yield build
+    for served in made:
+        served.close()
+
+
+def draw(connection: Connection, batch_size: int = 32) -> tuple[Kind, np.ndarray, np.ndarray]:
+    connection.send(Kind.SAMPLE, {"batch_size": batch_size})
+    return receive(connection, batch_size)
+
+
+def receive(connection: Connection, batch_size: int) -> tuple[Kind, np.ndarray, np.ndarray]:
+    header, _, body = connection.receive(memoryview(bytearray(BIG)))
+    split = batch_size * SPEC.dtype.itemsize if header.kind is Kind.BATCH else 0
+    return header.kind, np.frombuffer(body[:split], SPEC.dtype), np.frombuffer(body[split:], np.float32)
+
+
+def works(served: Served) -> None:
+    """A lawful client is served at once."""
+    connection = served.connect()
+    started = time.monotonic()
+    kind, rows, _ = draw(connection)
+    assert kind is Kind.BATCH
+    assert len(rows) == 32
+    assert time.monotonic() - started < 1.0
+    connection.close()
+
+
+@pytest.mark.parametrize("address", ["", "tcp:127.0.0.1:0"])
+def test_pipelined_draws_are_what_a_server_in_the_same_thread_gives(serve: Serve, address: str) -> None:
+    served, twin = serve(address=address), serve()
+    connection = served.connect()
+    for _ in range(5):
+        connection.send(Kind.SAMPLE, {"batch_size": 64})
+    for _ in range(5):
+        kind, rows, importance = receive(connection, 64)
+        sample = twin.replay.sample(64)
+        assert kind is Kind.BATCH
+        assert sample.rows is not None
+        assert rows.tobytes() == sample.rows.tobytes()
+        assert np.array_equal(importance, sample.importance)
+    connection.close()
+
+
+def test_priorities_statistics_and_stats(serve: Serve) -> None:
+    served = serve()
+    connection = served.connect()
+    serials, priorities = np.array([0, 7, 10**6], np.int64), np.array([2, 5, 9], np.float32)
+    connection.send(Kind.PRIORITIES, {"count": 3}, (serials.tobytes(), priorities.tobytes()))
+    connection.send(Kind.STATISTICS, {})
+    header, meta, body = connection.receive(memoryview(bytearray(BIG)))
+    expected = served.replay.statistics()
+    assert header.kind is Kind.STATISTICS
+    assert meta["count"] == expected.count == 200 * SPEC.train
+    assert bytes(body) == expected.total.tobytes() + expected.total_square.tobytes()
+    connection.send(Kind.STATS, {})
+    _, stats = connection.receive_small()
+    assert stats["evicted_priorities"] == 1
+    assert stats["max_priority"] == 5.0
+    assert stats["windows"] == 200
+    assert served.replay._store.priorities[[0, 7]].tolist() == [2.0, 5.0]
+    connection.close()
+
+
+def test_wait_is_said_at_once_and_finished_at_the_end(serve: Serve) -> None:
+    waiting = serve(ReplayConfig(capacity=500, replay_ratio=1.0, warmup_steps=10**6)).connect()
+    assert [draw(waiting)[0] for _ in range(3)] == [Kind.WAIT] * 3
+    waiting.close()
+    ending = serve(ReplayConfig(capacity=500, replay_ratio=2.0, warmup_steps=0), windows=100, total=400).connect()
+    kinds = [draw(ending, 10)[0] for _ in range(22)]
+    assert kinds == [Kind.BATCH] * 20 + [Kind.FINISHED] * 2  # 400 steps * 2 / (10 windows of 4)
+    ending.close()
+
+
+def test_a_client_with_another_secret_is_refused(serve: Serve) -> None:
+    served = serve()
+    with pytest.raises((AuthenticationError, ConnectionError)):
+        served.connect(b"another secret")
+    served.refused("authentication")
+    works(served)
+
+
+def test_a_server_with_another_secret_is_refused(tmp_path: Path) -> None:
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener.bind(f"{tmp_path}/r.sock")
+    listener.listen()
+
+    def impostor() -> None:
+        accepted, _ = listener.accept()
+        accepted.sendall(encode_frame(Kind.CHALLENGE, {"nonce": b"c" * 32}))
+        accepted.recv(4096)
+        answer = proof(b"a guess", b"server", b"n" * 32, b"c" * 32)
+        accepted.sendall(encode_frame(Kind.WELCOME, {"proof": answer, "fingerprint": SPEC.fingerprint}))
+        accepted.close()
+
+    thread = threading.Thread(target=impostor)
+    thread.start()
+    with pytest.raises(AuthenticationError, match="does not know this run's secret"):
+        Connection(f"unix:{tmp_path}/r.sock", SECRET, SPEC.fingerprint, BIG)
+    thread.join()
+    listener.close()
+
+
+def test_a_proof_cannot_be_used_again_or_turned_round(serve: Serve) -> None:
+    served, nonce = serve(), os.urandom(32)
+    for side, challenge in ((b"client", b"an older challenge".ljust(32)), (b"server", b"")):
+        raw = served.stranger()
+        raw.sendall(encode_frame(Kind.PROOF, {"nonce": nonce, "proof": proof(SECRET, side, challenge, nonce)}))
+        assert b"does not know" in raw.recv(4096)
+        raw.close()
+    assert served.sockets.refused["authentication"] == 2
+
+
+@pytest.mark.parametrize(
+    ("sent", "reason"),
+    [
+        (os.urandom(200), "version"),
+        (HEADER.pack(MAGIC, VERSION, Kind.PROOF, 0, 10, 0, 1 << 60), "too-large"),
+        (HEADER.pack(MAGIC, VERSION, Kind.PROOF, 0, 1 << 20, 0, 0), "too-large"),
+        (HEADER.pack(MAGIC, VERSION, 200, 0, 0, 0, 0), "kind"),
+        (HEADER.pack(MAGIC, VERSION, Kind.PROOF, 0, 3, 12345, 0) + b"abc", "crc"),
+        (encode_frame(Kind.SAMPLE, {"batch_size": 4}), "authentication"),
+        (encode_frame(Kind.PROOF, {"nonce": "text", "proof": 3}), "authentication"),
+        (encode_frame(Kind.PROOF, {"nonce": b"n" * 32, "proof": [1]}), "authentication"),
+    ],
+)
+def test_a_stranger_who_talks_nonsense(serve: Serve, sent: bytes, reason: str) -> None:
+    served = serve()
+    raw = served.stranger()
+    raw.sendall(sent)
+    served.refused(reason)
+    raw.close()
+    works(served)
+
+
+@pytest.mark.parametrize(
+    ("sent", "reason"),
+    [
+        (b"x" * 100, "version"),
+        (HEADER.pack(MAGIC, VERSION, Kind.PRIORITIES, 0, 5, 0, 12 * MAX_BATCH + 1), "too-large"),
+        (encode_frame(Kind.SAMPLE, {"batch_size": MAX_BATCH + 1}), "batch-size"),
+        (encode_frame(Kind.SAMPLE, {"batch_size": True}), "batch-size"),
+        (encode_frame(Kind.SAMPLE, {}), "batch-size"),
+        (encode_frame(Kind.PRIORITIES, {"count": 3}, (b"1234",)) + b"1234", "length"),
+        (encode_frame(Kind.PRIORITIES, {"count": -1}), "length"),
+        (encode_frame(Kind.WELCOME, {}), "kind"),
+        (HEADER.pack(MAGIC, VERSION, Kind.STATS, 0, 1, 0x1D41B76, 0) + b"\xc1", "crc"),
+    ],
+)
+def test_a_client_who_lies_loses_only_its_own_connection(serve: Serve, sent: bytes, reason: str) -> None:
+    served = serve()
+    liar, other = served.connect(), served.connect()
+    liar._socket.sendall(sent)
+    served.refused(reason)
+    assert draw(other)[0] is Kind.BATCH
+    liar.close()
+    other.close()
+    works(served)
+
+
+def test_half_a_header_or_half_a_body_keeps_nobody_waiting(serve: Serve) -> None:
+    served = serve()
+    half, halved = served.stranger(), served.connect()
+    half.sendall(MAGIC)
+    halved._socket.sendall(HEADER.pack(MAGIC, VERSION, Kind.PRIORITIES, 0, 8, 0, 120) + b"\x81\xa5coun")
+    works(served)
+    half.close()
+    halved.close()
+    works(served)
+
+
+def test_a_client_that_does_not_read_keeps_nobody_waiting_and_gets_its_own_batch(serve: Serve) -> None:
+    served = serve(ReplayConfig(capacity=60_000, replay_ratio=1e9, warmup_steps=0), windows=4000)
+    silent, busy = served.connect(), served.connect()
+    silent._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    for _ in range(30):  # more than the kernel's buffers take
+        silent.send(Kind.SAMPLE, {"batch_size": MAX_BATCH})
+    for _ in range(20):
+        assert draw(busy, 512)[0] is Kind.BATCH
+    for _ in range(30):
+        kind, rows, _ = receive(silent, MAX_BATCH)  # its CRC is checked there
+        assert kind is Kind.BATCH
+        assert (rows["reward"][:, 0] == rows["serial"]).all()
+    silent.close()
+    busy.close()
+
+
+def test_strangers_are_sent_away_and_cannot_fill_the_server(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket_server, "AUTHENTICATION_SECONDS", 0.3)
+    served = serve()
+    strangers = []
+    for _ in range(socket_server.MAX_CONNECTIONS):
+        strangers.append(served.stranger())
+    one_more = served.stranger()
+    served.refused("too-many")
+    served.refused("silent")
+    works(served)
+    for raw in [*strangers, one_more]:
+        raw.close()
+
+
+def test_a_client_of_other_windows_is_told(serve: Serve) -> None:
+    served = serve()
+    with pytest.raises(MessageError, match="fingerprint"):
+        Connection(served.address, SECRET, "0" * 16, BIG)
+
+
+def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> None:
+    addresses: list[str] = []
+    client = ReplayClient(lambda: addresses[-1] if addresses else None, SECRET, SPEC, 16)
+    assert client.sample(16).draw is Draw.WAIT
+    for _ in range(2):
+        served = serve()
+        addresses.append(served.address)
+        draws = [client.sample(16) for _ in range(6)]
+        assert [sample.draw for sample in draws[2:]] == [Draw.BATCH] * 4
+        assert draws[-1].env_steps == 200 * SPEC.train
+        client.update_priorities(np.arange(16), np.full(16, 3.0, np.float32))
+        assert client.statistics().count == 200 * SPEC.train
+        served.close()
+        served.close = lambda: None  # type: ignore[method-assign]
+    assert client.sample(16).draw in (Draw.WAIT, Draw.BATCH)
+    client.close()
+
+
+@pytest.mark.parametrize(
+    "address", ["r.sock", "tcp:host", "tcp:127.0.0.1:99999", "tcp:192.0.2.1:0", "unix:/no/such/r.sock"]
+)
+def test_an_address_that_cannot_be_listened_on(address: str) -> None:
+    with pytest.raises(ConfigError, match="replay address"):
+        SocketServer(None, SPEC, address, SECRET, 1)  # type: ignore[arg-type]
+
+
+def test_a_taken_port_an_old_file_and_an_empty_secret(serve: Serve, tmp_path: Path) -> None:
+    served = serve(address="tcp:127.0.0.1:0")
+    with pytest.raises(ConfigError, match="the port is taken"):
+        SocketServer(served.replay, SPEC, served.address, SECRET, 1)
+    with pytest.raises(ConfigError, match="secret"):
+        SocketServer(served.replay, SPEC, served.address, b"", 1)
+    path = tmp_path / "r.sock"
+    path.touch()  # as a killed server leaves it
+    again = SocketServer(served.replay, SPEC, f"unix:{path}", SECRET, 1)
+    assert path.stat().st_mode & 0o777 == 0o600
+    again.close()
+    assert not path.exists()
+
+
+def test_bytes_one_by_one(serve: Serve) -> None:
+    served = serve()
+    connection = served.connect()
+    for byte in encode_frame(Kind.SAMPLE, {"batch_size": 8}):
+        connection._socket.sendall(struct.pack("B", byte))
+        time.sleep(0.001)
+    assert receive(connection, 8)[0] is Kind.BATCH
+    connection.close()
