@@ -255,6 +255,27 @@ def test_the_limiter_holds_draws_and_credit(make: Make, bus: MemoryBus) -> None:
     assert [sender.granted() for sender in senders] == [20 + headroom // 2, 36 + headroom // 2]
 
 
+def test_small_credit_is_published_late_but_at_once_where_the_learner_waits(make: Make, bus: MemoryBus) -> None:
+    config = ReplayConfig(capacity=1000, replay_ratio=100.0, warmup_steps=0)
+    server, sender, published = make(config, actors=1, slack=800), Sender(bus), set()
+    sender.send(1)
+    drain(server)
+    draws = 20
+    for _ in range(draws):
+        server.sample(64)
+    sender.send(1)
+    drain(server)  # this publishes all of it; from here on only every hundred steps or so
+    while server.sample(64).draw is Draw.BATCH:
+        published.add(sender.granted())
+        draws += 1
+        server.step()
+    assert draws > 300
+    assert len(published) < 10
+    assert sender.granted() < draws * 256 // 100 + 800
+    server.step()
+    assert sender.granted() == draws * 256 // 100 + 800
+
+
 def test_the_end_is_announced_and_reached(make: Make, bus: MemoryBus) -> None:
     config = ReplayConfig(capacity=1000, replay_ratio=2.0, warmup_steps=8)
     server, sender = make(config, actors=1, total=400, slack=16), Sender(bus)

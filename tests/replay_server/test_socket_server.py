@@ -261,7 +261,7 @@ def test_a_client_that_does_not_read_keeps_nobody_waiting_and_gets_its_own_batch
     for _ in range(30):  # more than the kernel's buffers take
         silent.send(Kind.SAMPLE, {"batch_size": MAX_BATCH})
     for _ in range(20):
-        assert draw(busy, 512)[0] is Kind.BATCH
+        assert draw(busy, MAX_BATCH)[0] is Kind.BATCH  # each takes the buffer that a batch unsent may lie in
     for _ in range(30):
         kind, rows, _ = receive(silent, MAX_BATCH)  # its CRC is checked there
         assert kind is Kind.BATCH
