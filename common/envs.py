@@ -69,7 +69,7 @@ def env_spaces(config: EnvConfig) -> tuple[int, int, int | None]:
 
 
 class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
-    """Observations as float32; actions in [-1, 1], clipped, stretched over the environment's own bounds."""
+    """Observations as float32; actions in [-1, 1], stretched over the environment's own bounds."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
@@ -77,7 +77,8 @@ class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
         assert isinstance(inner, gym.spaces.Box)
         assert env.observation_space.shape is not None
         self._low = inner.low.astype(np.float32)
-        self._half_range = (inner.high.astype(np.float32) - self._low) / 2
+        self._high = inner.high.astype(np.float32)
+        self._half_range = (self._high - self._low) / 2
         self._plain = bool((inner.low == -1.0).all() and (inner.high == 1.0).all())
         self._dtype = inner.dtype
         self.action_space = gym.spaces.Box(-1.0, 1.0, inner.shape, np.float32)
@@ -88,9 +89,9 @@ class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
         return np.asarray(observation, np.float32), info
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        action = np.clip(action, -1.0, 1.0)
         if not self._plain:
-            action = (self._low + (action + 1.0) * self._half_range).astype(self._dtype)
+            stretched = self._low + (action + 1.0) * self._half_range
+            action = np.clip(stretched, self._low, self._high).astype(self._dtype)  # rounding may pass a bound
         observation, reward, terminated, truncated, info = self.env.step(action)
         return np.asarray(observation, np.float32), float(reward), terminated, truncated, info
 

@@ -346,8 +346,7 @@ def test_a_replaced_actor_ends(bus: Bus) -> None:
     old.step()
     new = make_actor(bus)
     with pytest.raises(FencedError):
-        for _ in range(200):
-            old.step()
+        step_until_blocked(old)
     old.close()  # quietly
     play(bus, new, reader, 200)
     assert {int(epoch) for epoch in reader.rows()["epoch"]} == {2}

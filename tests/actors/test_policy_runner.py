@@ -76,6 +76,25 @@ def test_agrees_with_the_agent(embedding: int, layer_norm: bool, shortcut: bool,
         prev_action, hidden = action, new_hidden.copy()
 
 
+@pytest.mark.parametrize("envs", [1, 32])
+def test_both_ways_to_multiply_agree_with_the_agent(envs: int) -> None:
+    """Default sizes: plain products for few environments, packed ones for many."""
+    agent = make_agent(AgentConfig(shortcut=True))
+    with torch.no_grad():
+        for value in agent.parameters():
+            value *= 0.1
+    rng = np.random.default_rng(1)
+    observation, prev_action, hidden, noise = (
+        rng.uniform(-1, 1, (envs, size)).astype(np.float32) for size in (OBS_DIM, ACTION_DIM, 256, ACTION_DIM)
+    )
+    blank = np.zeros(envs, np.bool_)
+    action, new_hidden = make_runner(agent, envs).act(observation, prev_action, blank, hidden, noise)
+    tensors = [torch.from_numpy(x) for x in (observation, prev_action, blank, hidden, noise)]
+    expected = reference(agent, *tensors)
+    np.testing.assert_allclose(action, expected[0], atol=1e-5)
+    np.testing.assert_allclose(new_hidden, expected[1], atol=1e-5)
+
+
 def test_full_size_with_extreme_inputs() -> None:
     """Default sizes; huge states and deviations overflow nothing (a warning would fail the test)."""
     agent = make_agent(AgentConfig())
