@@ -5,6 +5,8 @@ import io
 import os
 import sys
 
+from deploy.lifeline import PARENT_VARIABLE, die_with
+
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
 CONFIG_STATUS, FAILED_STATUS = 2, 1
 
@@ -16,6 +18,9 @@ def main() -> None:
 
 def run(words: list[str]) -> int:
     """Run one command; its exit status."""
+    parent = os.environ.pop(PARENT_VARIABLE, None)
+    if parent is not None:  # before the slow imports, so that there is no time in which a role could be left behind
+        die_with(int(parent))
     if words and words[0] in SINGLE_THREADED:  # before numpy and torch are imported, which read these once
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 
+PARENT_VARIABLE = "RMC_PARENT"  # tells a role the process that it must not outlive
 PR_SET_PDEATHSIG = 1
 POLL_SECONDS = 1.0
 

@@ -1,11 +1,14 @@
 """A run as processes of this machine: embedded Redis if none is given, roles under the supervisor, the monitor."""
 
 import logging
+import os
 import shutil
 import tempfile
 import time
 from contextlib import ExitStack
 from pathlib import Path
+
+import psutil
 
 from common.errors import BusFull, BusUnavailable
 from common.redis_bus import RedisBus
@@ -18,6 +21,7 @@ from deploy.run_folder import RunFolder
 from deploy.supervisor import RoleCommand, Supervisor
 
 TICK_SECONDS = 0.1
+PREFIX = "rmc-run-"  # of the temporary folders that hold the sockets
 log = logging.getLogger(__name__)
 
 
@@ -42,7 +46,8 @@ class LocalRun:
     def __init__(self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str) -> None:
         self._config, self._redis_url = config, redis_url
         self._leave = ExitStack()
-        self.sockets = Path(tempfile.mkdtemp(prefix="rmc-run-"))  # private, and short: a socket path has 107 bytes
+        _sweep()
+        self.sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))  # private, and short: see redis_server
         self._leave.callback(shutil.rmtree, self.sockets)
         try:
             self._server = None if redis_url else self._leave.enter_context(RedisServer(self.sockets))
@@ -72,6 +77,14 @@ class LocalRun:
             self.supervisor.stop()
         finally:
             self._leave.close()
+
+
+def _sweep() -> None:
+    """Remove what launchers killed by force have left; their processes died with them."""
+    for left in Path(tempfile.gettempdir()).glob(f"{PREFIX}*-*"):
+        owner = left.name.removeprefix(PREFIX).partition("-")[0]
+        if owner.isdigit() and not psutil.pid_exists(int(owner)) and left.stat().st_uid == os.getuid():
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _register(bus: RedisBus, config: RunConfig) -> None:

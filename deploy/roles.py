@@ -18,7 +18,6 @@ from common.envs import Env, make_env
 from common.errors import BusUnavailable, ConfigError
 from common.redis_bus import RedisBus
 from common.role import StopSignal, run_role
-from deploy.lifeline import die_with
 from deploy.presets import RunConfig, from_json
 from learner.learner import Learner
 from learner.replay_client import ReplayClient
@@ -26,7 +25,7 @@ from replay_server.process import ReplayProcess
 from replay_server.server import ReplayServer
 from replay_server.socket_server import SocketServer
 
-SECRET_VARIABLE, URL_VARIABLE, PARENT_VARIABLE = "RMC_SECRET", "RMC_REDIS_URL", "RMC_PARENT"
+SECRET_VARIABLE, URL_VARIABLE = "RMC_SECRET", "RMC_REDIS_URL"
 EVALUATOR_NICENESS = 10  # it must not take the learner's core
 log = logging.getLogger(__name__)
 
@@ -56,12 +55,9 @@ class Place:
 
 
 class Process:
-    """What every role's process has: stop signal, bus, the run's config. Dies with its supervisor, if it has one."""
+    """What every role's process has: stop signal, bus, the run's config."""
 
     def __init__(self, place: Place) -> None:
-        parent = os.environ.pop(PARENT_VARIABLE, None)
-        if parent is not None:
-            die_with(int(parent))
         logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
         self.stop = StopSignal()
         self.stop.install()

@@ -5,16 +5,15 @@ import signal
 import subprocess
 import sys
 import time
-from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
 from common.errors import RoleDied
-from deploy.roles import PARENT_VARIABLE
+from deploy.lifeline import PARENT_VARIABLE
 
-QUICK_DEATHS, QUICK_SECONDS = 3, 60.0  # so many deaths within so long end the run
-FIRST_BACKOFF, LONGEST_BACKOFF = 0.5, 10.0  # seconds before a role is started again, doubled at each quick death
-STOP_SECONDS = 4.0  # for the roles to end in order; then they are killed
+QUICK_DEATHS, QUICK_SECONDS = 3, 60.0  # so many deaths in a row, each within so long of its start, end the run
+FIRST_BACKOFF, LONGEST_BACKOFF = 0.25, 10.0  # seconds before a role is started again, doubled at each quick death
+STOP_SECONDS = 3.5  # for the roles to end in order; then they are killed
 EXIT_CONFIG = 2  # the exit status of an error that starting again cannot mend
 TRACEBACK_BYTES = 8192
 SINGLE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -37,9 +36,9 @@ class RoleProcess:
         self._environment = {**os.environ, **environment, PARENT_VARIABLE: str(os.getpid())}
         if command.single_thread:
             self._environment |= SINGLE_THREAD
-        self._deaths: deque[float] = deque(maxlen=QUICK_DEATHS)
         self._process: subprocess.Popen[bytes] | None = None
-        self._log_start, self._start_at, self.finished = 0, 0.0, False
+        self._log_start, self._started_at, self._start_at = 0, 0.0, 0.0
+        self._quick_deaths, self.finished = 0, False
 
     @property
     def running(self) -> bool:
@@ -54,6 +53,7 @@ class RoleProcess:
     def start(self) -> None:
         """Start its process, in a process group of its own: Ctrl-C is for the supervisor alone."""
         self._log_start = self.log.stat().st_size if self.log.exists() else 0
+        self._started_at = time.monotonic()
         words = [sys.executable, "-P", "-m", "deploy.cli", *self.command.words]
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
@@ -76,13 +76,13 @@ class RoleProcess:
 
     def _note_death(self, status: int) -> None:
         now = time.monotonic()
-        self._deaths.append(now)
-        recent = sum(now - death < QUICK_SECONDS for death in self._deaths)
-        if recent >= QUICK_DEATHS or status == EXIT_CONFIG:
+        quick = now - self._started_at < QUICK_SECONDS
+        self._quick_deaths = self._quick_deaths + 1 if quick else 0
+        if self._quick_deaths >= QUICK_DEATHS or status == EXIT_CONFIG:
             how = f"killed by signal {-status}" if status < 0 else f"exit status {status}"
-            often = "once" if recent == 1 else f"{recent} times within {QUICK_SECONDS:.0f} s"
-            raise RoleDied(f"{self.command.name} ended {often}, last by {how}; its last words:\n{self.last_words()}")
-        self._start_at = now + min(FIRST_BACKOFF * 2 ** (recent - 1), LONGEST_BACKOFF)
+            often = f"{self._quick_deaths} times in a row soon after its start" if self._quick_deaths > 1 else "at once"
+            raise RoleDied(f"{self.command.name} ended {often}, {how}; its last words:\n{self.last_words()}")
+        self._start_at = now + min(FIRST_BACKOFF * 2**self._quick_deaths, LONGEST_BACKOFF)
 
     def last_words(self) -> str:
         """The end of its log, of this start only: the traceback, if it left one."""

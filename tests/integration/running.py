@@ -24,7 +24,18 @@ class Training:
     def __init__(self, folder: Path, *options: str, env: str = "InvertedPendulum-v5", preset: str = "debug") -> None:
         self.folder = folder
         self.output = folder.parent / f"{folder.name}.out"
-        words = [sys.executable, "-m", "deploy.cli", "train", env, "--preset", preset, "--run-dir", str(folder), *options]
+        words = [
+            sys.executable,
+            "-m",
+            "deploy.cli",
+            "train",
+            env,
+            "--preset",
+            preset,
+            "--run-dir",
+            str(folder),
+            *options,
+        ]
         with self.output.open("ab") as output:
             self.process = subprocess.Popen(
                 words, stdout=output, stderr=output, stdin=subprocess.DEVNULL, env=ENVIRONMENT, process_group=0
@@ -34,6 +45,11 @@ class Training:
     def text(self) -> str:
         """All that it printed."""
         return self.output.read_text(errors="replace")
+
+    def sockets(self) -> list[Path]:
+        """The files of its temporary folder."""
+        folders = Path(tempfile.gettempdir()).glob(f"rmc-run-{self.process.pid}-*")
+        return [path for folder in folders for path in (folder, *folder.iterdir())]
 
     def records(self, role: str) -> list[dict[str, Any]]:
         """The role's metrics so far."""
@@ -101,11 +117,6 @@ class Training:
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-
-def run_temporaries() -> set[Path]:
-    """Temporary folders of runs, which hold their sockets."""
-    return set(Path(tempfile.gettempdir()).glob("rmc-run-*"))
 
 
 def alive(processes: list[psutil.Process]) -> list[psutil.Process]:

@@ -1,0 +1,55 @@
+"""Ends that nobody asked for: the launcher killed by force, a role that dies again and again."""
+
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.integration.running import Training, alive
+
+ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
+
+
+def test_a_killed_launcher_takes_everything_along(tmp_path: Path) -> None:
+    with Training(tmp_path / "run", *ENDLESS) as training:
+        training.wait_for(lambda: training.role("replay") is not None)
+        processes = training.launcher.children(recursive=True)
+        sockets = training.sockets()
+        training.process.send_signal(signal.SIGKILL)
+        training.process.wait()
+        deadline = time.monotonic() + 5.0
+        while alive(processes) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert not alive(processes)
+    with Training(tmp_path / "run", *ENDLESS) as again:  # and what the kill left is swept
+        again.wait_for(lambda: again.role("replay") is not None)
+        assert sockets
+        assert not [path for path in sockets if path.exists()]
+        again.interrupt()
+
+
+def test_a_role_that_dies_at_once_ends_the_run_with_its_traceback(tmp_path: Path) -> None:
+    environments = tmp_path / "broken_env.py"
+    environments.write_text(BROKEN)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path)
+        with Training(tmp_path / "run", "--total-steps", "10000", env="broken_env:Broken-v0") as training:
+            assert training.finish(150) == 1
+    assert "RuntimeError: the wheel came off" in training.text().splitlines()[-1]
+    assert "3 times in a row" in training.text()
+
+
+BROKEN = """
+import gymnasium
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
+import sys
+
+class Broken(InvertedPendulumEnv):
+    def step(self, action):
+        if "actor" in sys.argv:
+            raise RuntimeError("the wheel came off")
+        return super().step(action)
+
+gymnasium.register("Broken-v0", Broken, max_episode_steps=100)
+"""

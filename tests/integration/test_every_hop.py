@@ -1,0 +1,105 @@
+"""A counting environment through every hop, with every role a process of its own, started by hand.
+
+The test is the learner: it publishes the weights and draws until it has every window.
+"""
+
+import dataclasses
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from actors.actor import ActorConfig
+from common.bus import Version
+from common.envs import EnvConfig
+from common.redis_bus import RedisBus
+from common.replay import Draw
+from deploy.evaluation import initial_policy
+from deploy.presets import debug, to_json
+from learner.replay_client import ReplayClient
+from replay_server.server import ReplayConfig
+from tests.counting_env import Step, audit
+
+SECONDS = 90.0
+BATCH = 64
+CONFIG = dataclasses.replace(
+    debug(EnvConfig("tests.counting_env:Counting-v0")),
+    total_steps=2_000,
+    actors=2,
+    actor=ActorConfig(envs_per_actor=4),
+    replay=ReplayConfig(capacity=4_000, replay_ratio=1e6, warmup_steps=0, priority_exponent=0.0),
+    learner=dataclasses.replace(debug(EnvConfig("x")).learner, batch_size=BATCH),
+)
+
+
+@pytest.fixture
+def bus(redis_url: str, run_name: str) -> RedisBus:
+    made = RedisBus(redis_url, run_name)
+    made.set_config(to_json(CONFIG).encode())
+    made.publish_weights(Version(made.take_epoch("learner"), 1), initial_policy(CONFIG))
+    return made
+
+
+@pytest.fixture
+def client(bus: RedisBus, redis_url: str, run_name: str, tmp_path: Path) -> Iterator[ReplayClient]:
+    (tmp_path / "secret").write_text("every hop")
+    place = ["--run", run_name, "--redis-url", redis_url]
+    listen = [
+        "--folder",
+        str(tmp_path / "replay"),
+        "--listen",
+        f"unix:{tmp_path}/s",
+        "--secret-file",
+        str(tmp_path / "secret"),
+    ]
+    roles = [["replay", *place, *listen], *(["actor", *place, "--index", str(index)] for index in range(CONFIG.actors))]
+    processes = [subprocess.Popen([sys.executable, "-m", "deploy.cli", *words], env=os.environ) for words in roles]
+    found = ReplayClient(lambda: f"unix:{tmp_path}/s", b"every hop", CONFIG.window_spec(), BATCH)
+    yield found
+    found.close()
+    bus.request_stop("the test is over")
+    assert [process.wait(30) for process in processes] == [0, 0, 0]
+
+
+def draw_everything(client: ReplayClient, total: int) -> np.ndarray:
+    """All windows of the run, by serial, as batches brought them."""
+    windows: dict[int, np.void] = {}
+    deadline = time.monotonic() + SECONDS
+    while time.monotonic() < deadline:
+        sample = client.sample(BATCH)
+        if sample.draw is not Draw.BATCH:
+            time.sleep(0.01)
+            continue
+        assert sample.rows is not None
+        for row in sample.rows.copy():
+            windows[int(row["serial"])] = row
+        if sample.env_steps >= total and len(windows) == client.stats()["windows"]:
+            return np.array([windows[serial] for serial in sorted(windows)])
+    raise AssertionError(f"{len(windows)} windows after {SECONDS} s; the server has {client.stats()}")
+
+
+def test_each_step_is_trained_once(client: ReplayClient) -> None:
+    rows = draw_everything(client, CONFIG.total_steps)
+    found = audit(rows, CONFIG.window_spec())
+    assert set(found.trained.values()) == {1}, "a step was doubled"
+    assert len(found.trained) == found.new_steps >= CONFIG.total_steps, "a step was lost"
+    assert len({name.env for name in found.trained}) == CONFIG.actors * CONFIG.actor.envs_per_actor
+    assert_whole_episodes(set(found.trained))
+    assert rows["serial"].tolist() == list(range(len(rows)))
+    assert len({(row["actor"], row["epoch"], row["seq"], row["k"]) for row in rows}) == len(rows)
+
+
+def assert_whole_episodes(trained: set[Step]) -> None:
+    """Every episode is there from its first step on without a gap, and so are an environment's episodes."""
+    longest: dict[tuple[int, int], int] = {}
+    for name in trained:
+        longest[name.env, name.episode] = max(longest.get((name.env, name.episode), 0), name.step)
+    assert len(trained) == sum(last + 1 for last in longest.values())
+    for env in {env for env, _ in longest}:
+        episodes = [episode for other, episode in longest if other == env]
+        assert sorted(episodes) == list(range(max(episodes) + 1))
