@@ -9,7 +9,7 @@ from common.role import RECONNECT_SLEEP
 from replay_server.server import ReplayServer
 from replay_server.socket_server import SocketServer
 
-IDLE_WAIT = 0.002  # seconds between looks at the bus while nothing comes in
+IDLE_WAIT = 0.005  # seconds between looks at the bus while nothing comes in
 ANNOUNCE_PERIOD = 5.0  # seconds between repeats of the address, in case Redis lost its data
 
 
