@@ -129,6 +129,7 @@ class ReplayClient:
         self._turn = self._in_flight = self._env_steps = 0
         self._batches: Connection | None = None
         self._control: Connection | None = None
+        self._is_away = False  # said in the log already
 
     def sample(self, batch_size: int) -> Sample:
         """The oldest draw asked for; asks for the next. ``rows`` stay valid until the next draw but one."""
@@ -136,8 +137,7 @@ class ReplayClient:
         try:
             return self._receive_sample()
         except (OSError, MessageError) as error:
-            log.warning("replay connection lost: %s", error)
-            self._drop()
+            self._drop(error)
             return Sample(Draw.WAIT, None, None, self._env_steps)
 
     def _receive_sample(self) -> Sample:
@@ -152,7 +152,7 @@ class ReplayClient:
         self._in_flight -= 1
         if header.kind is Kind.ERROR:
             raise MessageError("replay", str(meta.get("error")))
-        self._env_steps = int(meta["env_steps"])
+        self._env_steps, self._is_away = int(meta["env_steps"]), False
         if header.kind is not Kind.BATCH:
             draw = Draw.FINISHED if header.kind is Kind.FINISHED else Draw.WAIT
             return Sample(draw, None, None, self._env_steps)
@@ -169,7 +169,14 @@ class ReplayClient:
         self._in_flight = 0
         return Connection(address, self._secret, self._spec.fingerprint, self._buffers[0].nbytes)
 
-    def _drop(self) -> None:
+    def _drop(self, error: Exception) -> None:
+        if not self._is_away:
+            log.warning("the replay server is away: %s", error)
+        self._is_away = True
+        self.close()
+
+    def close(self) -> None:
+        """End both connections; the next draw opens them again."""
         for connection in (self._batches, self._control):
             if connection is not None:
                 connection.close()
@@ -183,8 +190,7 @@ class ReplayClient:
             parts = (serials.tobytes(), priorities.astype(np.float32).tobytes())
             self._batches.send(Kind.PRIORITIES, {"count": len(serials)}, parts)
         except OSError as error:
-            log.warning("replay connection lost: %s", error)
-            self._drop()
+            self._drop(error)
 
     def statistics(self) -> ObservationStatistics:
         """Running observation statistics; a count of 0 while the server is away."""
@@ -220,6 +226,3 @@ class ReplayClient:
         if address is None:
             raise ConnectionError("the replay server is not up yet")
         return Connection(address, self._secret, self._spec.fingerprint, self._statistics_buffer.nbytes)
-
-    def close(self) -> None:
-        self._drop()
