@@ -271,7 +271,7 @@ class Actor:
 
 def _check(config: ActorConfig, spec: WindowSpec) -> None:
     if not 1 <= config.stride <= spec.train:
-        raise ConfigError("--actor.stride", config.stride, f"from 1 to the {spec.train} trained steps of a window")
+        raise ConfigError("--stride", config.stride, f"from 1 to the {spec.train} trained steps of a window")
     for name in ("envs_per_actor", "refresh_steps", "chunk_windows", "unacked_bytes"):
         if getattr(config, name) < 1:
-            raise ConfigError(f"--actor.{name.replace('_', '-')}", getattr(config, name), "at least 1")
+            raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), "at least 1")

@@ -89,7 +89,7 @@ class Evaluator:
     ) -> None:
         """``clock`` times the looks for new policies."""
         if config.episodes < 1:
-            raise ConfigError("--evaluator.episodes", config.episodes, "at least 1")
+            raise ConfigError("--episodes", config.episodes, "at least 1")
         self._seed, self._bus, self._clock = seed, bus, clock
         self._envs = [make_env() for _ in range(config.episodes)]
         observation, action = self._envs[0].observation_space.shape, self._envs[0].action_space.shape

@@ -142,9 +142,12 @@ class PolicyRunner:
     def _embedded(self, observation: Floats, prev_action: Floats, blank: BoolArray) -> Floats:
         x = self._input
         normalized = x[:, : self._obs_dim]
-        np.subtract(observation, self._mean, out=normalized)
-        np.divide(normalized, self._std, out=normalized)
-        np.clip(normalized, -NORMALIZED_CLIP, NORMALIZED_CLIP, out=normalized)
+        if self._config.normalize_observations:
+            np.subtract(observation, self._mean, out=normalized)
+            np.divide(normalized, self._std, out=normalized)
+            np.clip(normalized, -NORMALIZED_CLIP, NORMALIZED_CLIP, out=normalized)
+        else:
+            normalized[:] = observation
         normalized[blank] = 0.0
         x[:, self._obs_dim :] = prev_action
         if self._embed is None:

@@ -39,19 +39,22 @@ class AgentConfig:
 
 
 class Normalizer(nn.Module):
-    """(o - mean) / std with frozen statistics; a blank frame stays zero."""
+    """(o - mean) / std with frozen statistics, or o itself where that is off; a blank frame stays zero."""
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, obs_dim: int) -> None:
+    def __init__(self, obs_dim: int, enabled: bool) -> None:
         super().__init__()
+        self.enabled = enabled
         self.register_buffer("mean", torch.zeros(obs_dim))
         self.register_buffer("std", torch.ones(obs_dim))
 
     def forward(self, observation: Tensor, blank: Tensor) -> Tensor:
         """(..., O) raw and (...) bool -> (..., O)."""
-        normalized = ((observation - self.mean) / self.std).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+        normalized = observation
+        if self.enabled:
+            normalized = ((observation - self.mean) / self.std).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
         return torch.where(blank.unsqueeze(-1), 0.0, normalized)
 
     def freeze(self, count: int, total: Tensor, total_square: Tensor) -> None:
@@ -189,7 +192,7 @@ class Agent(nn.Module):
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
         self.config, self.obs_dim, self.action_dim = config, obs_dim, action_dim
-        self.normalizer = Normalizer(obs_dim)
+        self.normalizer = Normalizer(obs_dim, config.normalize_observations)
         self.memory = Memory(obs_dim, action_dim, config)
         features = config.hidden + (self.memory.embedding_dim if config.shortcut else 0)
         self.world_model = WorldModel(features, obs_dim, action_dim, config)

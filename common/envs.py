@@ -42,18 +42,18 @@ def make_env(config: EnvConfig) -> Env:
     Raises ConfigError where it is unknown, or its spaces are none that the agent can learn in.
     """
     if not 0.0 <= config.flicker <= 1.0:
-        raise ConfigError("--env.flicker", config.flicker, "a probability from 0 to 1")
+        raise ConfigError("--flicker", config.flicker, "a probability from 0 to 1")
     _redirect_mujoco_warnings()
     spec = copy(_find_spec(config.id))
     spec.order_enforce = False  # roles reset and step in order; the check costs time at every step
     try:
         env = gym.make(spec, disable_env_checker=True)
     except gym.error.Error as error:
-        raise ConfigError("--env.id", config.id, f"gymnasium cannot make it ({_one_line(error)})") from None
+        raise ConfigError("ENV", config.id, f"gymnasium cannot make it ({_one_line(error)})") from None
     fault = _space_fault(env.observation_space, env.action_space)
     if fault is not None:
         env.close()
-        raise ConfigError("--env.id", config.id, fault)
+        raise ConfigError("ENV", config.id, fault)
     standard: Env = Standardised(env)
     return Flicker(standard, config.flicker) if config.flicker else standard
 
@@ -128,7 +128,7 @@ def _find_spec(env_id: str) -> EnvSpec:
     except gym.error.Error:
         close = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
         fix = f"did you mean {', '.join(close)}?" if close else "use a gymnasium id or module:EnvId-v0"
-        raise ConfigError("--env.id", env_id, f"no such environment; {fix}") from None
+        raise ConfigError("ENV", env_id, f"no such environment; {fix}") from None
 
 
 def _space_fault(observation: gym.Space[Any], action: gym.Space[Any]) -> str | None:
@@ -157,7 +157,7 @@ def _import_users_module(env_id: str, module: str) -> None:
     try:
         importlib.import_module(module)
     except ModuleNotFoundError as error:
-        raise ConfigError("--env.id", env_id, f"{error}; start from the folder that holds {module}") from None
+        raise ConfigError("ENV", env_id, f"{error}; start from the folder that holds {module}") from None
 
 
 def _redirect_mujoco_warnings() -> None:

@@ -10,6 +10,8 @@ import psutil
 import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch starts its threads: small products only, few cores
+TEMPORARY = tempfile.mkdtemp(prefix="rmct-")  # so that what other runs on this machine leave is not taken for ours
+os.environ["TMPDIR"] = tempfile.tempdir = TEMPORARY
 
 from deploy.redis_server import RedisServer
 
@@ -23,6 +25,11 @@ def redis_url() -> Iterator[str]:
             yield server.url
     finally:
         shutil.rmtree(folder)
+
+
+def pytest_unconfigure() -> None:
+    """The session's temporary folder goes with it."""
+    shutil.rmtree(TEMPORARY, ignore_errors=True)
 
 
 @pytest.fixture
