@@ -2,18 +2,27 @@
 
 import contextlib
 import io
+import logging
 import os
 import sys
 
 from deploy.lifeline import PARENT_VARIABLE, die_with
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
-CONFIG_STATUS, FAILED_STATUS = 2, 1
+CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 
 
 def main() -> None:
-    """The entry point."""
-    sys.exit(run(sys.argv[1:]))
+    """The entry point.
+
+    Leaves without Python's own clearing up: all is closed by then, and with torch loaded that takes seconds,
+    which a user waits for after Ctrl-C.
+    """
+    status = run(sys.argv[1:])
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 def run(words: list[str]) -> int:
@@ -32,6 +41,8 @@ def run(words: list[str]) -> int:
         return _parse_and_run(words)
     except ConfigError as error:
         return _complain(str(error), CONFIG_STATUS)
+    except KeyboardInterrupt:  # before the command took the signal over
+        return INTERRUPTED_STATUS
     except RmcError as error:
         if words[0] not in ("train", "evaluate", "stats"):
             raise  # a role: the supervisor shows its traceback

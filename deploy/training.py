@@ -1,6 +1,7 @@
 """``rmc train`` from its checks to ``result.json``."""
 
 import logging
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -39,6 +40,7 @@ def train(config: RunConfig, placement: Placement, console: Console) -> int:
     folder = prepare(config, placement)
     stop = StopSignal()
     stop.install()
+    signal.signal(signal.SIGHUP, lambda *_: stop.request())  # the terminal was closed
     try:
         before = evaluate_blob(config, initial_policy(config), FINAL_EPISODES)
         console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)

@@ -121,7 +121,7 @@ def reserve(path: Path, size: int, capacity: int) -> None:
     except OSError as error:
         path.unlink()
         fix = f"needs {size / 2**30:.2f} GiB in {path.parent} ({error.strerror}); lower it or choose another --run-dir"
-        raise ConfigError("--replay.capacity", capacity, fix) from None
+        raise ConfigError("--capacity", capacity, fix) from None
     finally:
         os.close(handle)
 
@@ -137,7 +137,7 @@ def _check_identity(path: Path, spec: WindowSpec, capacity: int) -> None:
         raise ConfigError("--run-dir", str(path), fix)
     if found != capacity:
         fix = f"the ring in {path.parent} has {found}; keep that or use a new --run-dir"
-        raise ConfigError("--replay.capacity", capacity, fix)
+        raise ConfigError("--capacity", capacity, fix)
     if path.stat().st_size != _rows_start(spec) + capacity * spec.dtype.itemsize:
         raise _unusable(path, "cut short")
 

@@ -41,15 +41,15 @@ class ReplayConfig:
 
     def __post_init__(self) -> None:
         if self.capacity < 1:
-            raise ConfigError("--replay.capacity", self.capacity, "take at least 1 window")
+            raise ConfigError("--capacity", self.capacity, "take at least 1 window")
         if not 0.0 < self.replay_ratio < float("inf"):
-            raise ConfigError("--replay.replay-ratio", self.replay_ratio, "take a positive number, like 128")
+            raise ConfigError("--replay-ratio", self.replay_ratio, "take a positive number, like 128")
         if self.warmup_steps < 0:
-            raise ConfigError("--replay.warmup-steps", self.warmup_steps, "take 0 or more")
+            raise ConfigError("--warmup-steps", self.warmup_steps, "take 0 or more")
         if not 0.0 <= self.priority_exponent <= 4.0:
-            raise ConfigError("--replay.priority-exponent", self.priority_exponent, "take 0 (uniform) to 4")
+            raise ConfigError("--priority-exponent", self.priority_exponent, "take 0 (uniform) to 4")
         if not 0.0 <= self.importance_exponent <= 1.0:
-            raise ConfigError("--replay.importance-exponent", self.importance_exponent, "take 0 (off) to 1")
+            raise ConfigError("--importance-exponent", self.importance_exponent, "take 0 (off) to 1")
 
 
 def importance_weights(values: NDArray[np.float64], total: float, windows: int, exponent: float) -> NDArray[np.float32]:

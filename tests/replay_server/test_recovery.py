@@ -174,7 +174,7 @@ def test_a_refused_folder_is_unlocked(tmp_path: Path) -> None:
     with opened(tmp_path, 10):
         pass
     for _ in range(2):
-        with pytest.raises(ConfigError, match=r"--replay\.capacity=11"), opened(tmp_path, 11):
+        with pytest.raises(ConfigError, match=r"--capacity=11"), opened(tmp_path, 11):
             pass
     with opened(tmp_path, 10):
         pass

@@ -104,7 +104,7 @@ def test_too_many_streams() -> None:
 
 def test_another_layout_or_capacity_is_named(tmp_path: Path) -> None:
     Ring(tmp_path / "ring", SPEC, 10)
-    with pytest.raises(ConfigError, match=r"--replay\.capacity=11: the ring in .* has 10"):
+    with pytest.raises(ConfigError, match=r"--capacity=11: the ring in .* has 10"):
         Ring(tmp_path / "ring", SPEC, 11)
     other = WindowSpec(obs_dim=4, action_dim=2, hidden=4, burn_in=2, train=4)
     with pytest.raises(ConfigError, match=f"layout {SPEC.fingerprint}, this run's of {other.fingerprint}"):
@@ -126,7 +126,7 @@ def test_damage_is_named(tmp_path: Path, damage: str) -> None:
 
 def test_no_space_is_named_and_nothing_is_left(tmp_path: Path) -> None:
     too_many = 2 * shutil.disk_usage(tmp_path).total // SPEC.dtype.itemsize
-    with pytest.raises(ConfigError, match=r"--replay\.capacity=.*GiB"):
+    with pytest.raises(ConfigError, match=r"--capacity=.*GiB"):
         Ring(tmp_path / "ring", SPEC, too_many)
     assert list(tmp_path.iterdir()) == []
 

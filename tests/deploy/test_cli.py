@@ -1,0 +1,200 @@
+"""The command line: its flags, and that every error is one line and exit status 2 before anything starts."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+from common.envs import EnvConfig
+from deploy import cli, options, presets
+from deploy.presets import to_json
+from deploy.run_folder import RunFolder, open_run
+
+PENDULUM = "InvertedPendulum-v5"
+DEBUG = ["train", PENDULUM, "--preset", "debug"]
+
+# Whoever changes this list changes what users have in their scripts.
+TRAIN_FLAGS = """
+    --preset --seed --total-steps --actors --flicker --run-dir --if-exists --launcher --device --redis-url
+    --burn-in --trained-steps
+    --hidden --embedding --heads --layer-norm --shortcut --normalize-observations --grounding
+    --envs-per-actor --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
+    --capacity --replay-ratio --warmup-steps --priority-exponent --importance-exponent
+    --learning-rate --alpha-learning-rate --gamma --polyak --clip-norm --latent-target --target-memory --policy-q
+    --curiosity --curiosity-scale --curiosity-steps --eta
+    --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads
+    --episodes
+""".split()  # noqa: SIM905
+OTHER_FLAGS = {
+    "evaluate": ["--episodes", "--flicker", "--checkpoint", "--json"],
+    "stats": [],
+    "actor": ["--run", "--redis-url", "--index"],
+    "replay": ["--run", "--redis-url", "--folder", "--listen", "--secret-file"],
+    "learner": ["--run", "--redis-url", "--folder", "--device", "--secret-file"],
+    "evaluator": ["--run", "--redis-url"],
+}
+
+
+def flags(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
+    assert cli.run([command, "--help"]) == 0
+    found = re.findall(r"--[a-z][a-z-]*[a-z]", capsys.readouterr().out)
+    return set(found) - {"--help"}
+
+
+@pytest.mark.parametrize(("command", "expected"), [("train", TRAIN_FLAGS), *OTHER_FLAGS.items()])
+def test_the_flags_are_these(command: str, expected: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    found = flags(command, capsys)
+    assert {flag for flag in found if not flag.startswith("--no-")} == set(expected)
+
+
+def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line of a command that must end with status 2 and say nothing else."""
+    assert cli.run(words) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    lines = said.err.splitlines()
+    assert len(lines) == 1, said.err
+    assert lines[0].startswith("rmc: ")
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["train", "Nope-v0"], "Nope-v0"),
+        (["train", "nowhere:Nope-v0"], "nowhere"),
+        (["train", "CartPole-v1"], "Discrete"),
+        (["train", "tests.deploy.odd_envs:OddImage-v0"], "image"),
+        (["train", "tests.deploy.odd_envs:OddUnbounded-v0"], "unbounded"),
+        ([*DEBUG, "--redis-url", "unix:///nowhere/redis.sock"], "--redis-url"),
+        ([*DEBUG, "--redis-url", "redis://user:hush@localhost:1"], "redis://localhost:1"),
+        ([*DEBUG, "--redis-url", "localhost"], "--redis-url"),
+        ([*DEBUG, "--gamma", "nan"], "--gamma"),
+        ([*DEBUG, "--total-steps", "-5"], "--total-steps"),
+        ([*DEBUG, "--actors", "0"], "--actors"),
+        ([*DEBUG, "--envs-per-actor", "0"], "--envs-per-actor"),
+        ([*DEBUG, "--replay-ratio", "nan"], "replay-ratio"),
+        ([*DEBUG, "--replay-ratio", "-1"], "replay-ratio"),
+        ([*DEBUG, "--flicker", "1.5"], "--flicker"),
+        ([*DEBUG, "--batch-size", "1.5"], "--batch-size"),
+        ([*DEBUG, "--capacity", "1000000000000"], "--capacity"),
+        ([*DEBUG, "--device", "tpu"], "--device"),
+        ([*DEBUG, "--preset", "best"], "--preset"),
+        ([*DEBUG, "--sede", "1"], "--sede"),
+        ([], "train"),
+        (["trian"], "trian"),
+        (["train"], "train"),
+        (["stats", "/nowhere"], "/nowhere"),
+        (["evaluate", "/nowhere"], "/nowhere"),
+        (["actor", "--run", "x", "--redis-url", "unix:///nowhere/redis.sock"], "--redis-url"),
+        (["actor"], "--run"),
+    ],
+)
+def test_errors_are_one_line(
+    words: list[str],
+    named: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = complaint(words, capsys)
+    assert named in line
+    assert "hush" not in line
+    assert not list(tmp_path.iterdir())  # nothing was started or written
+
+
+def made_run(folder: Path) -> RunFolder:
+    run = open_run(presets.debug(EnvConfig(PENDULUM)), folder, "fail")
+    run.unlock()
+    return run
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["train", "InvertedDoublePendulum-v5", "--preset", "debug"], "ENV='InvertedDoublePendulum-v5'"),
+        (["train", PENDULUM, "--preset", "paper"], "--preset='paper'"),
+        ([*DEBUG, "--seed", "3"], "--seed=3"),
+        ([*DEBUG, "--gamma", "0.9"], "--gamma=0.9"),
+        ([*DEBUG, "--if-exists", "fail"], "--if-exists"),
+    ],
+)
+def test_another_runs_folder_is_refused(
+    words: list[str], named: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    made_run(tmp_path / "run")
+    assert named in complaint([*words, "--run-dir", str(tmp_path / "run")], capsys)
+
+
+def test_a_folder_that_is_no_runs_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").touch()
+    assert "no run's folder" in complaint([*DEBUG, "--run-dir", str(tmp_path)], capsys)
+
+
+def test_a_folder_in_use_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    run = open_run(presets.debug(EnvConfig(PENDULUM)), tmp_path / "run", "fail")
+    assert "stop it first" in complaint([*DEBUG, "--run-dir", str(tmp_path / "run")], capsys)
+    run.unlock()
+
+
+def test_a_corrupt_checkpoint_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    run = made_run(tmp_path / "run")
+    checkpoint = run.checkpoints / "000000010"
+    checkpoint.mkdir()
+    (checkpoint / "manifest.json").write_text('{"update": 10, "sha256": {"policy.safetensors": "00"}}')
+    (checkpoint / "policy.safetensors").write_bytes(b"rot")
+    for words in ([*DEBUG, "--run-dir", str(run.path)], ["evaluate", str(run.path)]):
+        assert "policy.safetensors does not match" in complaint(words, capsys)
+    assert "latest, best or one of [10]" in complaint(["evaluate", str(run.path), "--checkpoint", "11"], capsys)
+    assert "none was evaluated" in complaint(["evaluate", str(run.path), "--checkpoint", "best"], capsys)
+
+
+def test_runs_without_checkpoint_or_metrics_say_so(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    run = made_run(tmp_path / "run")
+    assert "no checkpoint yet" in complaint(["evaluate", str(run.path)], capsys)
+    assert "no metrics yet" in complaint(["stats", str(run.path)], capsys)
+    assert "--episodes=0" in complaint(["evaluate", str(run.path), "--episodes", "0"], capsys)
+    assert "--flicker=2.0" in complaint(["evaluate", str(run.path), "--flicker", "2"], capsys)
+
+
+def test_a_role_needs_its_runs_secret(
+    redis_url: str, run_name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    words = ["replay", "--run", run_name, "--redis-url", redis_url, "--folder", str(tmp_path / "replay")]
+    assert "RMC_SECRET" in complaint(words, capsys)
+    assert "cannot be read" in complaint([*words, "--secret-file", str(tmp_path / "none")], capsys)
+    secret = tmp_path / "secret"
+    secret.write_text("x\n")
+    assert "no run of this name" in complaint([*words, "--secret-file", str(secret)], capsys)
+
+
+def test_new_takes_a_folder_beside(tmp_path: Path) -> None:
+    config = presets.debug(EnvConfig(PENDULUM))
+    made_run(tmp_path / "run")
+    beside = open_run(config, tmp_path / "run", "new")
+    beside.unlock()
+    assert beside.path == tmp_path / "run-2"
+
+
+def test_a_run_may_be_made_longer(tmp_path: Path) -> None:
+    config = presets.debug(EnvConfig(PENDULUM))
+    made_run(tmp_path / "run")
+    longer = dataclasses.replace(config, total_steps=2 * config.total_steps)
+    run = open_run(longer, tmp_path / "run", "resume")
+    run.unlock()
+    assert run.config() == longer
+    assert oct((run.path / "secret").stat().st_mode & 0o777) == "0o600"
+
+
+def test_options_become_the_config() -> None:
+    words = ["train", PENDULUM, "--preset", "paper", "--seed", "4", "--envs-per-actor", "3", "--heads", "64", "32"]
+    command = options.parse([*words, "--replay-ratio", "64", "--flicker", "0.5", "--shortcut"])
+    assert isinstance(command, options.Train)
+    config = command.config()
+    expected = presets.paper(EnvConfig(PENDULUM, 0.5))
+    assert (config.seed, config.actor.envs_per_actor, config.agent.heads) == (4, 3, (64, 32))
+    assert (config.replay.replay_ratio, config.agent.shortcut, config.env.flicker) == (64.0, True, 0.5)
+    assert config.update == expected.update
+    assert to_json(config) != to_json(expected)

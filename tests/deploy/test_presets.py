@@ -1,0 +1,113 @@
+"""Presets, the strict JSON round trip, and the one place that judges numbers."""
+
+import dataclasses
+import json
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.envs import EnvConfig
+from common.errors import ConfigError
+from deploy import presets
+from deploy.presets import RunConfig, from_json, to_json, validate
+from deploy.run_folder import flat
+
+ENV = EnvConfig("InvertedPendulum-v5")
+NAMES: list[presets.Preset] = ["robust", "paper", "debug"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_presets_are_valid_and_come_back_from_json(name: presets.Preset) -> None:
+    config = presets.preset(name, ENV)
+    validate(config)
+    assert config.preset == name
+    assert from_json(to_json(config)) == config
+
+
+def test_the_paper_preset_is_the_papers() -> None:
+    config = presets.paper(ENV)
+    assert (config.agent.embedding, config.agent.heads, config.agent.grounding) == (0, (400, 300), False)
+    assert (config.update.learning_rate, config.update.alpha_learning_rate) == (1e-4, 1e-5)
+    assert (config.update.curiosity, config.update.curiosity_scale) == (0.5, "raw")
+    assert (config.update.gamma, config.update.polyak, config.update.policy_q) == (0.99, 0.995, "first")
+    assert config.replay.warmup_steps == 10_000
+
+
+@given(st.floats(1e-6, 0.1), st.integers(1, 10**9), st.booleans(), st.sampled_from(["online", "ema"]))
+def test_json_keeps_every_value(rate: float, steps: int, shortcut: bool, memory: Any) -> None:
+    config = presets.robust(ENV)
+    config = dataclasses.replace(
+        config,
+        total_steps=steps,
+        agent=dataclasses.replace(config.agent, shortcut=shortcut, heads=(7, 5)),
+        update=dataclasses.replace(config.update, learning_rate=rate, target_memory=memory),
+    )
+    assert from_json(to_json(config)) == config
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        ("surprise", 1, "no such option"),
+        ("agent.surprise", 1, "no such option"),
+        ("seed", "1", "must be int"),
+        ("seed", True, "must be int"),
+        ("agent.heads", [1], "must be"),
+        ("agent.heads", [1, "2"], "must be int"),
+        ("agent.layer_norm", 1, "must be bool"),
+        ("update.policy_q", "third", "must be"),
+        ("update.gamma", "0.99", "must be float"),
+        ("env", 5, "must be an object"),
+    ],
+)
+def test_strange_json_is_refused(path: str, value: Any, said: str) -> None:
+    raw = json.loads(to_json(presets.robust(ENV)))
+    parent, _, name = path.rpartition(".")
+    (raw[parent] if parent else raw)[name] = value
+    with pytest.raises(ConfigError, match=said) as caught:
+        from_json(json.dumps(raw))
+    assert path.split(".")[0] in str(caught.value)
+
+
+def test_missing_values_and_broken_files_are_refused() -> None:
+    raw = json.loads(to_json(presets.robust(ENV)))
+    del raw["replay"]["capacity"]
+    with pytest.raises(ConfigError, match=r"replay\.capacity"):
+        from_json(json.dumps(raw))
+    with pytest.raises(ConfigError, match="not JSON"):
+        from_json(b"{")
+
+
+def numeric_paths() -> list[str]:
+    values = flat(presets.robust(ENV))
+    return [path for path, value in values.items() if isinstance(value, int | float) and not isinstance(value, bool)]
+
+
+def with_value(config: RunConfig, path: str, value: Any) -> RunConfig:
+    parent, _, name = path.rpartition(".")
+    if not parent:
+        return dataclasses.replace(config, **{name: value})
+    part = dataclasses.replace(getattr(config, parent), **{name: value})
+    return dataclasses.replace(config, **{parent: part})
+
+
+@pytest.mark.parametrize("value", [-1, math.nan, math.inf])
+@pytest.mark.parametrize("path", numeric_paths())
+def test_every_number_is_judged(path: str, value: float) -> None:
+    with pytest.raises(ConfigError) as caught:
+        validate(with_value(presets.robust(ENV), path, value))
+    assert path.rpartition(".")[2].replace("_", "-") in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_values_that_do_not_go_together_are_refused() -> None:
+    config = presets.robust(ENV)
+    with pytest.raises(ConfigError, match="--stride=16"):
+        validate(with_value(config, "actor.stride", 16))
+    with pytest.raises(ConfigError, match="--total-steps"):
+        validate(with_value(config, "total_steps", config.replay.warmup_steps))
+    with pytest.raises(ConfigError, match="--heads"):
+        validate(with_value(config, "agent.heads", (400, 0)))
