@@ -18,7 +18,7 @@ from deploy.presets import RunConfig, to_json
 from deploy.redis_server import RedisServer
 from deploy.roles import URL_VARIABLE, connect
 from deploy.run_folder import RunFolder
-from deploy.supervisor import RoleCommand, Supervisor
+from deploy.supervisor import STOP_SECONDS, RoleCommand, Supervisor
 
 TICK_SECONDS = 0.1
 PREFIX = "rmc-run-"  # of the temporary folders that hold the sockets
@@ -68,7 +68,7 @@ class LocalRun:
         self.supervisor.tend()
 
     def finished(self) -> bool:
-        """Whether the learner has ended in order: all steps are in, and the last checkpoint is written."""
+        """Whether the learner has ended in order."""
         return self.supervisor.roles["learner"].finished
 
     def close(self) -> None:
@@ -106,12 +106,27 @@ def train(
             run.tend()
             _watch(monitor, run.bus)
             time.sleep(TICK_SECONDS)
-        finished = run.finished()
         run.supervisor.stop()
         _watch(monitor, run.bus)  # what the roles said last
-        return finished
+        return monitor.learner_finished()
     finally:
         run.close()
+
+
+def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monitor, stop: StopSignal) -> bool:
+    """Register a run whose roles are started by hand, watch it and end it; whether its total was reached."""
+    bus = connect(redis_url, folder.name)
+    _register(bus, config)
+    monitor.skip_old(bus)
+    while not stop.requested and not monitor.learner_finished():
+        _watch(monitor, bus)
+        time.sleep(TICK_SECONDS)
+    bus.request_stop("stopped by its launcher" if stop.requested else "finished")
+    deadline = time.monotonic() + STOP_SECONDS
+    while stop.requested and time.monotonic() < deadline:  # the learner saves; what it says then is still recorded
+        _watch(monitor, bus)
+        time.sleep(TICK_SECONDS)
+    return monitor.learner_finished()
 
 
 def _watch(monitor: Monitor, bus: RedisBus) -> None:

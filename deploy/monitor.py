@@ -45,6 +45,10 @@ class Monitor:
         """Seconds trained, over all starts of the run."""
         return self._wall_before + time.monotonic() - self._started
 
+    def learner_finished(self) -> bool:
+        """Whether the learner said that all steps are in and its last checkpoint is written."""
+        return bool(self.board.get("learner", "finished"))
+
     def skip_old(self, bus: Bus) -> None:
         """Pass over what an earlier start left in a shared Redis."""
         records, self._cursor = bus.records(self._cursor)

@@ -50,7 +50,7 @@ class Train:
     if_exists: IfExists = "resume"
     """What to do if the run's folder is there: go on, refuse, or take a new one beside it."""
     launcher: Launcher = "local"
-    """Processes on this machine, or every role in one thread, with the same bits for the same seed."""
+    """Processes on this machine; every role in one thread, with the same bits for the same seed; or by hand."""
     device: str = "cpu"
     """The learner's device: cpu or cuda."""
     redis_url: str | None = None

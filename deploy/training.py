@@ -9,6 +9,7 @@ from typing import Any, Literal
 from rich.console import Console
 
 from common.bus import Bus
+from common.errors import ConfigError
 from common.role import StopSignal
 from deploy import local, lockstep
 from deploy.evaluation import evaluate_blob, evaluate_checkpoint, initial_policy
@@ -18,7 +19,7 @@ from deploy.resources import check_ring_fits
 from deploy.roles import check_device
 from deploy.run_folder import IfExists, RunFolder, open_run
 
-Launcher = Literal["local", "lockstep"]
+Launcher = Literal["local", "lockstep", "manual"]
 FINAL_EPISODES = 10  # of the last evaluation
 STOPPED = 130  # exit status after Ctrl-C, as shells have it
 log = logging.getLogger(__name__)
@@ -63,6 +64,8 @@ def prepare(config: RunConfig, placement: Placement) -> RunFolder:
     validate(config)
     spec = config.window_spec()
     check_device(placement.device)
+    if placement.launcher == "manual" and placement.redis_url is None:
+        raise ConfigError("--redis-url", None, "say which Redis the roles that you start by hand will use")
     if placement.redis_url is not None:
         local.check_redis(placement.redis_url)
     if placement.run_dir is not None:
@@ -75,6 +78,10 @@ def prepare(config: RunConfig, placement: Placement) -> RunFolder:
 def _launch(config: RunConfig, folder: RunFolder, placement: Placement, monitor: Monitor, stop: StopSignal) -> bool:
     if placement.launcher == "local":
         return local.train(config, folder, placement.redis_url, placement.device, monitor, stop)
+
+    if placement.launcher == "manual":
+        assert placement.redis_url is not None  # prepare has seen to it
+        return local.attend(config, folder, placement.redis_url, monitor, stop)
 
     def watch(bus: Bus) -> None:
         monitor.watch(bus)

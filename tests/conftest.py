@@ -13,7 +13,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch starts its threads
 TEMPORARY = tempfile.mkdtemp(prefix="rmct-")  # so that what other runs on this machine leave is not taken for ours
 os.environ["TMPDIR"] = tempfile.tempdir = TEMPORARY
 
-from deploy.redis_server import RedisServer
+from deploy.redis_server import RedisServer  # noqa: E402
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,10 @@
 """One actor and one learner as real processes, through a real Redis, from the command line to result.json."""
 
 import json
+import os
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 from tests.integration.running import Training
@@ -50,3 +52,33 @@ def test_train_evaluate_stats_and_resume(tmp_path: Path) -> None:
     assert longer["env_steps"] == 2000
     assert longer["updates"] > result["updates"]
     assert longer["wall_s"] > result["wall_s"]
+
+
+def test_roles_by_hand_over_tcp(redis_url: str, run_name: str, tmp_path: Path) -> None:
+    folder = tmp_path / run_name
+    options = ("--total-steps", "1200", "--checkpoint-steps", "600")
+    with ExitStack() as stack:
+        training = stack.enter_context(Training(folder, *options, "--launcher", "manual", "--redis-url", redis_url))
+        training.wait_for(lambda: "before training" in training.text())
+        secret = (folder / "secret").read_text().strip()
+        environment = {**os.environ, "RMC_SECRET": secret, "RMC_REDIS_URL": redis_url}
+        roles = [
+            subprocess.Popen(
+                [sys.executable, "-m", "deploy.cli", *words, "--run", run_name],
+                env=environment,
+                stdout=subprocess.DEVNULL,
+                stderr=stack.enter_context((tmp_path / f"{words[0]}.log").open("wb")),
+            )
+            for words in (
+                ["replay", "--folder", str(folder / "replay")],
+                ["learner", "--folder", str(folder / "checkpoints")],
+                ["actor"],
+                ["evaluator"],
+            )
+        ]
+        for role in roles:
+            stack.callback(role.wait)
+            stack.callback(role.kill)
+        assert training.finish(150) == 0, training.text()
+        assert [role.wait(20) for role in roles] == [0, 0, 0, 0]
+    assert json.loads((folder / "result.json").read_bytes())["env_steps"] == 1200

@@ -35,6 +35,16 @@ def test_a_killed_role_comes_back(endless: Training, name: str) -> None:
     endless.wait_for(lambda: endless.newest("replay", "env_steps") > steps + 100)
 
 
+def test_a_killed_redis_comes_back(endless: Training) -> None:
+    before = endless.role("redis")
+    assert before is not None
+    before.kill()
+    endless.wait_for(lambda: (now := endless.role("redis")) is not None and now.pid != before.pid)
+    steps = endless.newest("replay", "env_steps")
+    endless.wait_for_updates(100)
+    endless.wait_for(lambda: endless.newest("replay", "env_steps") > steps + 100)
+
+
 def test_a_frozen_learner_stops_the_actors_at_their_credit(endless: Training) -> None:
     learner = endless.role("learner")
     assert learner is not None
