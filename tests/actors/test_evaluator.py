@@ -87,5 +87,5 @@ def test_close_hands_out_what_is_left() -> None:
 
 
 def test_nonsense_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"--evaluator\.episodes"):
+    with pytest.raises(ConfigError, match=r"--episodes"):
         Evaluator(1, counting, AGENT, EvaluatorConfig(episodes=0), MemoryBus())
