@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 from rich.console import Console
 
 from common.bus import Bus
@@ -86,6 +87,7 @@ def _launch(config: RunConfig, folder: RunFolder, placement: Placement, monitor:
     def watch(bus: Bus) -> None:
         monitor.watch(bus)
 
+    torch.set_num_threads(config.learner.threads or 1)  # the bits may depend on it, so it must not on the machine
     lockstep.train(config, folder.path, watch, stop, placement.device)
     return not stop.requested
 
