@@ -33,6 +33,7 @@ def run(words: list[str]) -> int:
     if words and words[0] in SINGLE_THREADED:  # before numpy and torch are imported, which read these once
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
     if os.getcwd() not in sys.path:  # a user's own environments, last, so that they cannot shadow ours
         sys.path.append(os.getcwd())
     from common.errors import ConfigError, RmcError

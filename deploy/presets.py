@@ -85,8 +85,11 @@ def robust(env: EnvConfig) -> RunConfig:
     return RunConfig(
         env=env,
         preset="robust",
+        agent=AgentConfig(shortcut=True, normalize_observations=True),
         actor=ActorConfig(envs_per_actor=8),
-        replay=ReplayConfig(priority_exponent=0.0, importance_exponent=0.0),
+        replay=ReplayConfig(replay_ratio=64.0, priority_exponent=0.0, importance_exponent=0.0),
+        update=UpdateConfig(target_memory="ema"),
+        learner=LearnerConfig(batch_size=32),
     )
 
 
@@ -113,7 +116,7 @@ def debug(env: EnvConfig) -> RunConfig:
         agent=AgentConfig(hidden=32, embedding=32, heads=(64, 64)),
         actor=ActorConfig(envs_per_actor=2),
         replay=ReplayConfig(capacity=2_000, replay_ratio=32.0, warmup_steps=500),
-        learner=LearnerConfig(batch_size=16, checkpoint_steps=1_000, threads=1),
+        learner=LearnerConfig(batch_size=16, checkpoint_steps=1_000, precision="fp32"),
         evaluator=EvaluatorConfig(episodes=2),
     )
 

@@ -126,7 +126,7 @@ def run_learner(place: Place, folder: Path, device: str) -> None:
     """The learner's process; checkpoints go to ``folder``. Its last record says ``finished`` where the run is."""
     secret, process = place.secret(), Process(place)
     config, spec, bus = process.config, process.config.window_spec(), process.bus
-    torch.set_num_threads(config.learner.threads or len(os.sched_getaffinity(0)))
+    torch.set_num_threads(config.learner.threads or max(1, len(os.sched_getaffinity(0)) - 1))
     check_device(device)
 
     def address() -> str | None:

@@ -72,8 +72,8 @@ class JointUpdate:
     def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> None:
         device = agent.log_alpha.device
         self.agent, self.burn_in, self.config, self.bf16 = agent, burn_in, config, bf16
-        self.target_critic = _frozen_copy(agent.critic)
-        self.target_memory = _frozen_copy(agent.memory)
+        self.target_critic = _target_copy(agent.critic)
+        self.target_memory = _target_copy(agent.memory)
         self.optimizer = _adam(agent, config)
         self.generator = torch.Generator(device).manual_seed(seed)
         self.curiosity_variance = torch.ones((), device=device)
@@ -206,8 +206,9 @@ class JointUpdate:
         self.generator.set_state(state["generator"].cpu())
 
 
-def _frozen_copy(module: ModuleT) -> ModuleT:
-    return copy.deepcopy(module).requires_grad_(False)
+def _target_copy(module: ModuleT) -> ModuleT:
+    """A copy for passes under no_grad. Its parameters still say requires_grad: else matmul batches and copies."""
+    return copy.deepcopy(module)
 
 
 def _adam(agent: Agent, config: UpdateConfig) -> torch.optim.Adam:

@@ -20,11 +20,11 @@ PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding=Fa
 BETA = torch.tensor(0.5)
 
 
-def make(agent: AgentConfig, **options: object) -> JointUpdate:
+def make(agent: AgentConfig, bf16: bool = False, **options: object) -> JointUpdate:
     torch.manual_seed(0)
     network = Agent(SPEC.obs_dim, SPEC.action_dim, agent)
     network.normalizer.freeze(10, torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
-    return JointUpdate(network, SPEC.burn_in, UpdateConfig(curiosity=0.5, **options), seed=3)  # type: ignore[arg-type]
+    return JointUpdate(network, SPEC.burn_in, UpdateConfig(curiosity=0.5, **options), 3, bf16)  # type: ignore[arg-type]
 
 
 def gradients(update: JointUpdate, keep: str, monkeypatch: pytest.MonkeyPatch) -> set[str]:
@@ -158,13 +158,15 @@ def test_policy_climbs_the_critic_it_is_told_to():
     assert b > a  # min Q <= Q_1, so the loss is larger
 
 
-def test_targets_follow_by_polyak():
-    update = make(PAPER, polyak=0.9)
+def test_targets_follow_by_polyak_alone():
+    update = make(PAPER, polyak=0.9, target_memory="ema")
     before = copy.deepcopy(update.target_critic.state_dict())
     update(to_batch(random_rows(8)), BETA)
     for name, value in update.target_critic.state_dict().items():
         online = update.agent.critic.state_dict()[name]
         torch.testing.assert_close(value, 0.9 * before[name] + 0.1 * online)
+    targets = [*update.target_critic.parameters(), *update.target_memory.parameters()]
+    assert all(p.grad is None for p in targets)
 
 
 def test_state_comes_back_bit_for_bit():
@@ -195,8 +197,11 @@ def test_beta_decays_to_zero():
 
 
 def test_bf16_stays_near_fp32():
-    plain, half = make(ROBUST), make(ROBUST)
-    half.bf16 = True
+    plain, half = (make(ROBUST, bf16, target_memory="ema") for bf16 in (False, True))
     a, b = (u(to_batch(random_rows(32)), BETA) for u in (plain, half))
     for name in ("model_loss", "q_loss", "policy_loss", "grounding_loss"):
         assert b.metrics[name].item() == pytest.approx(a.metrics[name].item(), rel=0.05, abs=0.02), name
+    for (name, p), q in zip(plain.agent.named_parameters(), half.agent.parameters(), strict=True):
+        assert p.grad is not None
+        assert q.grad is not None
+        assert (p.grad - q.grad).norm() <= 0.1 * p.grad.norm() + 1e-4, name
