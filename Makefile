@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 40000
 
-.PHONY: env demo test lint clean
+.PHONY: env demo test lint results bench clean
 
 env: $(STAMP)
 
@@ -28,6 +28,15 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Hours. Interrupt it as you like: the same command goes on from there.
+results: $(STAMP)
+	for seed in 1 2 3; do $(BIN)/rmc train HalfCheetah-v5 --seed $$seed --total-steps 300000 --run-dir runs/halfcheetah-$$seed || exit; done
+	for seed in 1 2 3; do $(BIN)/rmc train Hopper-v5 --seed $$seed --total-steps 300000 --run-dir runs/hopper-$$seed || exit; done
+	$(BIN)/rmc train HalfCheetah-v5 --flicker 0.5 --seed 1 --total-steps 300000 --run-dir runs/halfcheetah-flicker-1
+
+bench: $(STAMP)
+	$(BIN)/python -m benchmarks.throughput
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
