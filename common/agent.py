@@ -1,7 +1,7 @@
 """The agent's networks: memory, world model, twin Q, policy, temperature.
 
 Shapes: B batch, T time, O observation, A action, H hidden, E embedding, Z = H (+ E) head input.
-Equation numbers in ``learner/losses.py``; here is only what maps inputs to outputs.
+Equations are in ``learner/losses.py``; here is only what maps inputs to outputs.
 """
 
 import math
@@ -92,8 +92,16 @@ class Memory(nn.Module):
     def forward(self, observation: Tensor, prev_action: Tensor, hidden: Tensor) -> Remembered:
         """(B, T, O), (B, T, A), (B, H) the state before the first step."""
         embedding = self.embed(torch.cat([observation, prev_action], dim=-1))
-        sequence, _ = self.gru(embedding, hidden.unsqueeze(0).contiguous())
-        return Remembered(sequence, embedding)
+        return Remembered(self._unroll(embedding, hidden.unsqueeze(0).contiguous()), embedding)
+
+    def _unroll(self, embedding: Tensor, hidden: Tensor) -> Tensor:
+        """(B, T, E), (1, B, H) -> (B, T, H) float32."""
+        if embedding.is_cuda:  # autocast would run cuDNN's GRU in float16, whatever type it is told
+            with torch.autocast("cuda", enabled=False):
+                sequence: Tensor = self.gru(embedding.float(), hidden)[0]
+        else:
+            sequence = self.gru(embedding, hidden)[0]
+        return sequence
 
 
 def _mlp(inputs: int, hidden: tuple[int, int], outputs: int) -> nn.Sequential:

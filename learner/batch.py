@@ -1,4 +1,4 @@
-"""A batch of rows as tensors, without copying a field: views into one block of bytes.
+"""A batch of rows as tensors: views into one block of bytes, copied only where padding becomes zero.
 
 Shapes: B batch, T steps, O observation, A action, H hidden; L_b burn-in.
 """

@@ -49,7 +49,7 @@ class LearnerConfig:
 def bf16_is_native(device: torch.device) -> bool:
     """Whether bfloat16 products are faster than float32 there (AMX or AVX-512 BF16 on a CPU)."""
     if device.type == "cuda":
-        return bool(torch.cuda.is_bf16_supported())
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
 
 
@@ -132,13 +132,16 @@ class Learner:
             for name, value in updated.metrics.items():
                 self._means.add(name, float(value))
         if self.updates % RANK_UPDATES == 1:
-            rank, deviation = latent_rank(updated.hidden)
+            rank, deviation = latent_rank(updated.hidden[updated.observed])
             self._means.add("latent_rank", rank)
             self._means.add("latent_deviation", deviation)
 
-    def publish(self, evaluate: bool = False) -> None:
+    def publish(self) -> None:
         """Broadcast the policy with the newest observation statistics frozen into it. Raises FencedError."""
         self._freeze_statistics()
+        self._broadcast()
+
+    def _broadcast(self, evaluate: bool = False) -> None:
         blob = safetensors.torch.save(self.agent.policy_weights())
         try:
             self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate)
@@ -158,7 +161,7 @@ class Learner:
         self.save()
         self.last_checkpoint = self.updates
         self._next_checkpoint = self._after(self.env_steps)
-        self.publish(evaluate=True)
+        self._broadcast(evaluate=True)
 
     def save(self) -> None:
         """Write everything that a resumed learner needs."""
@@ -220,7 +223,7 @@ class Learner:
 def latent_rank(hidden: Tensor) -> tuple[float, float]:
     """Effective rank, exp(entropy of the normalised singular values), and mean per-unit standard deviation.
 
-    ``hidden`` (B, T, H). A rank near 1 or a deviation near 0 is a collapsed latent.
+    ``hidden`` (..., H). A rank near 1 or a deviation near 0 is a collapsed latent.
     """
     flat = hidden.reshape(-1, hidden.shape[-1]).float()
     flat = flat - flat.mean(0)

@@ -61,6 +61,7 @@ class Updated(NamedTuple):
     priorities: Tensor  # (B,)
     metrics: dict[str, Tensor]  # scalars
     hidden: Tensor  # (B, L_t + 1, H), for the latent's rank
+    observed: Tensor  # (B, L_t + 1) bool, which of them are real
 
 
 class JointUpdate:
@@ -139,7 +140,8 @@ class JointUpdate:
             "curiosity_mean": losses.masked_mean(i, m),
             "curiosity_share": beta * i.sum() / (beta * i.sum() + (m * r.abs()).sum()).clamp(min=1e-8),
         }
-        return parts, Updated(losses.priority(td_error, c.eta, m), metrics, memory.hidden.detach())
+        observed = batch.observation_valid[:, steps]
+        return parts, Updated(losses.priority(td_error, c.eta, m), metrics, memory.hidden.detach(), observed)
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
@@ -151,6 +153,7 @@ class JointUpdate:
         if n:
             with torch.no_grad():
                 burned = memory(o[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
+            torch.clear_autocast_cache()  # older torch would go on with these casts, which carry no gradient
             hidden = torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
         remembered: Remembered = memory(o[:, n:], batch.prev_action[:, n:], hidden)
         return remembered
@@ -208,7 +211,11 @@ class JointUpdate:
 
 def _target_copy(module: ModuleT) -> ModuleT:
     """A copy for passes under no_grad. Its parameters still say requires_grad: else matmul batches and copies."""
-    return copy.deepcopy(module)
+    copied = copy.deepcopy(module)
+    for part in copied.modules():
+        if isinstance(part, nn.RNNBase):
+            part.flatten_parameters()  # deepcopy scatters what cuDNN wants in one block
+    return copied
 
 
 def _adam(agent: Agent, config: UpdateConfig) -> torch.optim.Adam:

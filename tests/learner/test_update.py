@@ -72,6 +72,8 @@ def test_garbage_in_padding_changes_nothing():
     clean_update, dirty_update = make(ROBUST, latent_target="ema"), make(ROBUST, latent_target="ema")
     clean, dirtied = clean_update(to_batch(rows), BETA), dirty_update(to_batch(dirty), BETA)
     assert torch.equal(clean.priorities, dirtied.priorities)
+    assert torch.equal(clean.observed, torch.from_numpy(observed[:, SPEC.burn_in :]))
+    assert torch.equal(clean.hidden[clean.observed], dirtied.hidden[dirtied.observed])
     for name, value in clean.metrics.items():
         assert torch.equal(value, dirtied.metrics[name]), name
     assert_same(clean_update.agent.state_dict(), dirty_update.agent.state_dict())
@@ -167,6 +169,21 @@ def test_targets_follow_by_polyak_alone():
         torch.testing.assert_close(value, 0.9 * before[name] + 0.1 * online)
     targets = [*update.target_critic.parameters(), *update.target_memory.parameters()]
     assert all(p.grad is None for p in targets)
+
+
+@pytest.mark.parametrize(
+    ("option", "moved"), [("latent_target", {"model_loss"}), ("target_memory", {"q_loss"})], ids=["latent", "critics"]
+)
+def test_the_target_memory_is_read_where_the_options_say(option, moved):
+    def parts(memory: str) -> dict[str, Tensor]:
+        update = make(PAPER, **{option: memory})
+        with torch.no_grad():
+            for value in update.target_memory.parameters():
+                value += 0.1
+        return update.forward(to_batch(random_rows(8)), torch.tensor(0.0))[0]
+
+    online, ema = parts("online"), parts("ema")
+    assert {name for name in online if not torch.equal(online[name], ema[name])} == moved
 
 
 def test_state_comes_back_bit_for_bit():
