@@ -76,8 +76,8 @@ class WindowSpec:
 
     @cached_property
     def fingerprint(self) -> str:
-        """16 hexadecimal digits that change with any field, shape or offset of the dtype."""
-        return hashlib.sha256(repr(self.dtype).encode()).hexdigest()[:16]
+        """16 hexadecimal digits that change with the window's split and any field, shape or offset of the dtype."""
+        return hashlib.sha256(repr((self.burn_in, self.train, self.dtype)).encode()).hexdigest()[:16]
 
     def observation_valid(self, rows: Rows) -> BoolArray:
         """(B, T + 1): which observations are real."""

@@ -219,6 +219,8 @@ def validate(config: RunConfig) -> None:
             raise ConfigError(option(path), value, f"take a number from {low:,} to {high:,}".replace(",", "_"))
     if min(config.agent.heads) < 1:
         raise ConfigError("--heads", config.agent.heads, "take at least 1 unit a layer")
+    if config.agent.layer_norm and not config.agent.embedding:
+        raise ConfigError("--layer-norm", True, "it normalises the embedding, so it needs --embedding above 0")
     if not 1 <= config.actor.stride <= config.window.trained_steps:
         raise ConfigError("--stride", config.actor.stride, f"take 1 to --trained-steps={config.window.trained_steps}")
     if config.total_steps <= config.replay.warmup_steps:

@@ -5,6 +5,7 @@ import json
 import logging
 import pickle
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,7 +16,7 @@ from torch import Tensor
 from common.agent import Agent, AgentConfig
 from common.bus import Bus, Version
 from common.checkpoint import CheckpointFolder
-from common.errors import CheckpointError, FencedError
+from common.errors import CheckpointError, FencedError, RmcError
 from common.metrics import Means, Rate
 from common.replay import Draw, Replay, Sample
 from common.window import WindowSpec
@@ -77,7 +78,7 @@ class Learner:
         self.spec, self.config, self.replay, self.bus, self.checkpoints = spec, config, replay, bus, checkpoints
         self.device = torch.device(device)
         self.updates = self.env_steps = self.last_checkpoint = 0
-        self.finished = self._fenced = False
+        self.finished = self._fenced = self._diverged = self._evaluation_due = False
         self._means, self._rate, self._waiting = Means(), Rate(), ""
         torch.manual_seed(seed)  # the networks' initial weights
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent).to(self.device)
@@ -93,6 +94,8 @@ class Learner:
         """Draw and update once, with all that is due after it."""
         if self.finished:
             return False
+        if self._evaluation_due:
+            self._broadcast(evaluate=True)
         sample = self.replay.sample(self.config.batch_size)
         self.env_steps = max(self.env_steps, sample.env_steps)
         if sample.draw is Draw.WAIT:
@@ -142,12 +145,23 @@ class Learner:
         self._broadcast()
 
     def _broadcast(self, evaluate: bool = False) -> None:
-        blob = safetensors.torch.save(self.agent.policy_weights())
+        blob = self._policy()
         try:
             self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate)
         except FencedError:
             self._fenced = True
             raise
+        self._evaluation_due = self._evaluation_due and not evaluate
+
+    def _policy(self) -> bytes:
+        """The policy as it is sent and saved. Raises RmcError where it is not finite: neither must then happen."""
+        weights = self.agent.policy_weights()
+        self._diverged = not all(bool(value.isfinite().all()) for value in weights.values())
+        if self._diverged:
+            raise RmcError(
+                f"update {self.updates}: training has diverged, weights are not finite; lower --learning-rate"
+            )
+        return safetensors.torch.save(weights)
 
     def _freeze_statistics(self) -> None:
         if self.agent.config.normalize_observations and self.env_steps > 0:
@@ -156,9 +170,10 @@ class Learner:
             self.agent.normalizer.freeze(statistics.count, total.to(self.device), square.to(self.device))
 
     def checkpoint(self) -> None:
-        """Save, broadcast, and ask for an evaluation of what was saved."""
+        """Save, broadcast, and ask for an evaluation of what was saved; ``step`` asks again if Redis is away."""
         self._freeze_statistics()
         self.save()
+        self._evaluation_due = True
         self.last_checkpoint = self.updates
         self._next_checkpoint = self._after(self.env_steps)
         self._broadcast(evaluate=True)
@@ -170,7 +185,7 @@ class Learner:
         progress = {"updates": self.updates, "env_steps": self.env_steps, "epoch": self.epoch, "time": time.time()}
         files = {
             STATE: state.getvalue(),
-            POLICY: safetensors.torch.save(self.agent.policy_weights()),
+            POLICY: self._policy(),
             PROGRESS: json.dumps(progress).encode(),
         }
         self.checkpoints.save(self.updates, files)
@@ -214,9 +229,11 @@ class Learner:
         }
 
     def close(self) -> None:
-        """Save what a resumed run needs, unless that is done or a newer learner has taken over."""
-        if not self.finished and not self._fenced and self.updates > self.last_checkpoint:
-            self.save()
+        """Save what a resumed run needs, unless that is done, a newer learner has taken over, or training diverged."""
+        spoilt = self._fenced or self._diverged
+        if not self.finished and not spoilt and self.updates > self.last_checkpoint:
+            with suppress(RmcError):  # diverged since the last look: the checkpoint before is the one to keep
+                self.save()
         self.checkpoints.unlock()
 
 

@@ -10,7 +10,7 @@ import torch
 from common.agent import AgentConfig
 from common.bus import EntryId, MemoryBus
 from common.checkpoint import CheckpointFolder
-from common.errors import CheckpointError, FencedError
+from common.errors import CheckpointError, FencedError, RmcError
 from common.wire import encode_hello, encode_windows
 from learner.learner import Learner, LearnerConfig, latent_rank
 from learner.update import UpdateConfig
@@ -18,7 +18,7 @@ from replay_server.server import ReplayConfig, ReplayServer
 from tests.learner.rows import SPEC, random_rows
 
 AGENT = AgentConfig(hidden=SPEC.hidden, embedding=7, heads=(10, 9), normalize_observations=True)
-CONFIG = LearnerConfig(batch_size=8, publish_updates=4, checkpoint_steps=100, precision="fp32")
+CONFIG = LearnerConfig(batch_size=8, publish_updates=4, checkpoint_steps=2_000, precision="fp32")
 
 
 class Setting:
@@ -145,6 +145,24 @@ def test_a_replaced_learner_is_fenced(setting):
         setting.learner.publish()
     setting.learner.close()
     assert setting.learner.checkpoints.numbers() == saved
+
+
+def test_divergence_ends_it_and_keeps_the_last_good_checkpoint(setting):
+    setting.feed(60)
+    setting.learner.step()
+    saved = setting.learner.checkpoints.numbers()
+    with torch.no_grad():
+        setting.learner.agent.policy.net[0].weight.fill_(float("nan"))
+    with pytest.raises(RmcError, match="not finite"):
+        step_for_long(setting)
+    setting.learner.close()
+    assert setting.learner.checkpoints.numbers() == saved
+
+
+def step_for_long(setting: Setting) -> None:
+    for _ in range(100):
+        setting.feed(60)
+        setting.learner.step()
 
 
 def test_latent_rank_sees_a_collapse():
