@@ -26,6 +26,8 @@ from typing import Any, NamedTuple, Protocol
 
 from common.errors import FencedError, MessageError
 
+METRICS_KEPT = 20_000  # records, at least
+
 
 class EntryId(NamedTuple):
     """A stream entry's explicit id; ``seq`` 0 is the hello."""
@@ -155,6 +157,7 @@ class MemoryBus:
         self._replay: ReplayAddress | None = None
         self._weights: dict[bool, tuple[Version, bytes]] = {}
         self._records: list[dict[str, Any]] = []
+        self._forgotten = 0  # records that made room
         self._stats: dict[str, dict[str, Any]] = {}
         self._stop: str | None = None
         self.dead_letters: list[tuple[Entry, str]] = []
@@ -230,9 +233,12 @@ class MemoryBus:
         entry = {"role": role, **record}
         self._records.append(entry)
         self._stats[role] = entry
+        if len(self._records) >= 2 * METRICS_KEPT:
+            del self._records[:METRICS_KEPT]
+            self._forgotten += METRICS_KEPT
 
     def records(self, after: str) -> tuple[list[dict[str, Any]], str]:
-        return self._records[int(after) :], str(len(self._records))
+        return self._records[max(0, int(after) - self._forgotten) :], str(self._forgotten + len(self._records))
 
     def stats(self) -> dict[str, dict[str, Any]]:
         return dict(self._stats)

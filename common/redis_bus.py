@@ -9,10 +9,9 @@ import redis
 from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
-from common.bus import Ack, Entry, EntryId, ReplayAddress, Version, join_pieces, split_pieces
+from common.bus import METRICS_KEPT, Ack, Entry, EntryId, ReplayAddress, Version, join_pieces, split_pieces
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
 
-METRICS_KEPT = 20_000
 DEAD_LETTERS_KEPT = 1_000
 DEAD_LETTER_BYTES = 1_024
 T = TypeVar("T")
@@ -47,8 +46,11 @@ class RedisBus:
             raise BusUnavailable(str(error)) from None
 
     def ping(self) -> None:
-        """Raises BusUnavailable where no Redis answers."""
-        self._call(self._redis.ping)
+        """Raises BusUnavailable where no Redis answers, or one that will not have us."""
+        try:
+            self._call(self._redis.ping)
+        except redis.exceptions.ResponseError as error:
+            raise BusUnavailable(str(error)) from None
 
     def set_config(self, config: bytes) -> None:
         self._call(lambda: self._redis.set(self._key("config"), config))
@@ -108,15 +110,26 @@ class RedisBus:
         ]
 
     def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
+        if not acks:
+            return
+        try:
+            self._commit(epoch, acks, publish=True)
+        except BusFull:  # a full Redis has no room for the acks either, and only trimming makes some
+            self._commit(epoch, acks, publish=False)
+            self._commit(epoch, acks, publish=True)
+
+    def _commit(self, epoch: int, acks: Mapping[int, Ack], publish: bool) -> None:
         def transaction(pipe: Any) -> None:
             held = int(pipe.get(self._key("epoch", "replay")) or 0)
             if held > epoch:
                 raise FencedError(f"replay epoch {epoch} was replaced by {held}")
             pipe.multi()
-            if held < epoch:  # Redis lost its data
-                pipe.set(self._key("epoch", "replay"), epoch)
             for actor, ack in acks.items():
                 pipe.xtrim(self._key("windows", actor), minid=f"{ack.id.epoch}-{ack.id.seq + 1}", approximate=False)
+            if not publish:
+                return
+            if held < epoch:  # Redis lost its data
+                pipe.set(self._key("epoch", "replay"), epoch)
             pipe.hset(
                 self._key("acks"),
                 mapping={
@@ -125,8 +138,7 @@ class RedisBus:
                 },
             )
 
-        if acks:
-            self._call(lambda: self._redis.transaction(transaction, self._key("epoch", "replay")))
+        self._call(lambda: self._redis.transaction(transaction, self._key("epoch", "replay")))
 
     def ack(self, actor: int) -> Ack | None:
         raw = self._call(lambda: self._redis.hget(self._key("acks"), str(actor)))

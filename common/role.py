@@ -50,32 +50,49 @@ class StopSignal:
         self.requested = True
 
 
+class _Pulse:
+    """What every role says and hears once in a while: its metrics, and whether the run should end."""
+
+    def __init__(self, role: Role, bus: Bus, clock: BusyClock) -> None:
+        self._role, self._bus, self._clock = role, bus, clock
+        self._next_metrics = self._next_stop = 0.0
+
+    def says_stop(self) -> bool:
+        """Whether the bus says so; while Redis is away the role goes on with what needs none."""
+        now = time.monotonic()
+        try:
+            if now >= self._next_stop:
+                self._next_stop = now + STOP_PERIOD
+                if self._bus.stop_requested() is not None:
+                    return True
+            if now >= self._next_metrics:
+                self._next_metrics = now + METRICS_PERIOD
+                self._bus.emit(self._role.name, {"time": time.time(), **self._role.metrics(), **self._clock.shares()})
+        except (BusUnavailable, BusFull) as error:
+            log.warning("%s: waiting for Redis: %s", self._role.name, error)
+            self._clock.wait("redis")
+            self._next_stop = self._next_metrics = time.monotonic() + RECONNECT_SLEEP
+        return False
+
+
 def run_role(role: Role, bus: Bus, stop: StopSignal, finished: Callable[[], bool] = lambda: False) -> None:
     """Step a role until it is stopped, fenced or finished; always closes it.
 
     Redis away or full is waited out here; every other error ends the role.
     """
     clock = BusyClock()
-    next_metrics = next_stop = 0.0
+    pulse = _Pulse(role, bus, clock)
     try:
-        while not stop.requested and not finished():
+        while not (stop.requested or finished() or pulse.says_stop()):
             try:
-                now = time.monotonic()
-                if now >= next_stop:
-                    next_stop = now + STOP_PERIOD
-                    if bus.stop_requested() is not None:
-                        return
-                if now >= next_metrics:
-                    next_metrics = now + METRICS_PERIOD
-                    bus.emit(role.name, {"time": time.time(), **role.metrics(), **clock.shares()})
                 if role.step():
                     clock.busy()
                 else:
-                    clock.wait(role.waiting_for())
                     time.sleep(IDLE_SLEEP)
+                    clock.wait(role.waiting_for())
             except (BusUnavailable, BusFull) as error:
                 log.warning("%s: waiting for Redis: %s", role.name, error)
-                clock.wait("redis")
                 time.sleep(RECONNECT_SLEEP)
+                clock.wait("redis")
     finally:
         role.close()

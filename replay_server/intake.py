@@ -2,13 +2,14 @@
 
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.bus import Bus, Entry, EntryId
-from common.errors import MessageError
+from common.errors import BusFull, MessageError
 from common.window import Rows, WindowSpec
 from common.wire import decode_entry, max_entry_bytes
 from replay_server.record import StreamPosition
@@ -68,7 +69,8 @@ class Intake:
         try:
             return decode_entry(entry.payload, self.spec)
         except MessageError as error:
-            self.bus.dead_letter(entry, str(error))
+            with suppress(BusFull):  # no room for it; the round that frees some must not wait for that
+                self.bus.dead_letter(entry, str(error))
             self.refused[error.reason] += 1
             return None
 

@@ -1,20 +1,23 @@
 """Both buses keep the same promises."""
 
+import itertools
 import os
+import shutil
+import tempfile
 import uuid
+from pathlib import Path
 
 import pytest
 
-from common.bus import Ack, Bus, Entry, EntryId, MemoryBus, ReplayAddress, Version
-from common.errors import BusUnavailable, ConfigError, FencedError
+from common.bus import METRICS_KEPT, Ack, Bus, Entry, EntryId, MemoryBus, ReplayAddress, Version
+from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from common.redis_bus import RedisBus
+from deploy.redis_server import RedisServer
 
 
 @pytest.fixture(params=["memory", "redis"])
-def bus(request) -> Bus:
-    if request.param == "memory":
-        return MemoryBus()
-    return RedisBus(request.getfixturevalue("redis_url"), f"test-{uuid.uuid4().hex}")
+def bus(request, redis_url) -> Bus:
+    return MemoryBus() if request.param == "memory" else RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
 
 
 def test_config_and_stop(bus):
@@ -99,6 +102,45 @@ def test_metrics_and_stats(bus):
     assert records[0]["role"] == "learner"
     assert bus.records(cursor)[0] == []
     assert bus.stats()["learner"]["updates"] == 2
+
+
+def test_the_memory_bus_forgets_old_records():
+    bus, cursor, seen = MemoryBus(), "0", []
+    for i in range(5 * METRICS_KEPT // 2):
+        bus.emit("actor-0", {"i": i})
+        if i % 7_000 == 0:
+            records, cursor = bus.records(cursor)
+            seen += [record["i"] for record in records]
+    seen += [record["i"] for record in bus.records(cursor)[0]]
+    assert seen == list(range(5 * METRICS_KEPT // 2))
+    assert METRICS_KEPT <= len(bus.records("0")[0]) < 2 * METRICS_KEPT
+
+
+def test_a_full_redis_is_emptied_by_commits():
+    folder = Path(tempfile.mkdtemp(prefix="rmc-full-"))  # short: a socket path may have 107 bytes
+    try:
+        with RedisServer(folder, maxmemory=8 << 20) as server:
+            bus = RedisBus(server.url, "full")
+            epoch, seq = bus.take_epoch("replay"), fill(bus)
+            assert seq > 10
+            bus.commit(epoch, {0: Ack(EntryId(1, seq - 1), 5)})
+            assert bus.ack(0) == Ack(EntryId(1, seq - 1), 5)
+            bus.append(0, EntryId(1, seq), b"and on it goes")
+            assert len(bus.read({0: EntryId(0, 0)}, 1000)) == 1
+            with pytest.raises(BusUnavailable, match="out of range"):
+                RedisBus(f"{server.url}?db=99", "full").ping()
+    finally:
+        shutil.rmtree(folder)
+
+
+def fill(bus: Bus) -> int:
+    """Append until Redis is full; the number of the entry that it refused."""
+    for seq in itertools.count():
+        try:
+            bus.append(0, EntryId(1, seq), b"x" * 200_000)
+        except BusFull:
+            return seq
+    raise AssertionError("never full")
 
 
 def test_replay_address(bus):

@@ -96,8 +96,9 @@ def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_
             bus.ack(0)
         until(lambda: running.process.waiting_for() == "redis")
         started = time.monotonic()
-        for _ in range(40):
+        for _ in range(40):  # past several looks at the bus that is away
             assert client.sample(16).draw is Draw.BATCH
+            time.sleep(0.05)
         assert time.monotonic() - started < 10.0
         redis_server.start()  # empty: it keeps no files
         until(lambda: bus.ack(0) is not None)  # acks and address are said again
