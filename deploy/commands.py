@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console
@@ -77,7 +78,8 @@ def stats(command: options.Stats) -> int:
 
 
 def _records(path: Path) -> list[dict[str, object]]:
-    if not path.exists():
-        return []
-    with path.open() as lines:
-        return [json.loads(line) for line in lines if line.endswith("}\n")]
+    records = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        with suppress(ValueError):  # torn by a crash
+            records.append(json.loads(line))
+    return records

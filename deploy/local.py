@@ -5,7 +5,7 @@ import os
 import shutil
 import tempfile
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import psutil
@@ -34,7 +34,7 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
     actors = [RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))) for index in range(config.actors)]
     return [
         RoleCommand("replay", ("replay", *place, *secret, *listen)),
-        RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False),
+        RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
         RoleCommand("evaluator", ("evaluator", *place)),
         *actors,
     ]
@@ -83,8 +83,9 @@ def _sweep() -> None:
     """Remove what launchers killed by force have left; their processes died with them."""
     for left in Path(tempfile.gettempdir()).glob(f"{PREFIX}*-*"):
         owner = left.name.removeprefix(PREFIX).partition("-")[0]
-        if owner.isdigit() and not psutil.pid_exists(int(owner)) and left.stat().st_uid == os.getuid():
-            shutil.rmtree(left, ignore_errors=True)
+        with suppress(FileNotFoundError):  # another launcher sweeps, too
+            if owner.isdigit() and not psutil.pid_exists(int(owner)) and left.stat().st_uid == os.getuid():
+                shutil.rmtree(left, ignore_errors=True)
 
 
 def _register(bus: RedisBus, config: RunConfig) -> None:

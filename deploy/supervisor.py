@@ -26,6 +26,7 @@ class RoleCommand:
     name: str
     words: tuple[str, ...]
     single_thread: bool = True
+    ends: bool = False  # in order, once the run is done; any other that ends unasked is started again
 
 
 class RoleProcess:
@@ -66,7 +67,7 @@ class RoleProcess:
             return
         if self._process is not None:
             status, self._process = self._process.returncode, None
-            if status == 0:
+            if status == 0 and self.command.ends:
                 self.finished = True
             else:
                 self._note_death(status)

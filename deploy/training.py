@@ -40,13 +40,11 @@ class Placement:
 def train(config: RunConfig, placement: Placement, console: Console) -> int:
     """Train to the end, or to a stop signal; the exit status. Raises ConfigError before anything is started."""
     folder = prepare(config, placement)
-    stop = StopSignal()
-    stop.install()
-    signal.signal(signal.SIGHUP, lambda *_: stop.request())  # the terminal was closed
     try:
-        before = evaluate_blob(config, initial_policy(config), FINAL_EPISODES)
         console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
+        before = evaluate_blob(config, initial_policy(config), FINAL_EPISODES)
         console.print(f"before training: {_said(before)}", highlight=False)
+        stop = _catch_signals()  # only now: until here nothing runs that Ctrl-C could not end at once
         monitor = Monitor(folder, config, console)
         try:
             finished = _launch(config, folder, placement, monitor, stop)
@@ -58,6 +56,14 @@ def train(config: RunConfig, placement: Placement, console: Console) -> int:
     finally:
         folder.unlock()
     return _say_result(folder, before, console)
+
+
+def _catch_signals() -> StopSignal:
+    stop = StopSignal()
+    stop.install()
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup ignores it: the terminal may close
+        signal.signal(signal.SIGHUP, lambda *_: stop.request())
+    return stop
 
 
 def prepare(config: RunConfig, placement: Placement) -> RunFolder:

@@ -1,0 +1,43 @@
+"""Which end of a role is one, and which is made good."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from common.errors import RoleDied
+from deploy import supervisor
+from deploy.supervisor import RoleCommand, RoleProcess
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A program in Python's place that ends at once and in order, as a role does after SIGTERM."""
+    program = tmp_path / "program"
+    program.write_text("#!/bin/sh\nexit 0\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(supervisor.sys, "executable", str(program))
+    monkeypatch.setattr(supervisor, "FIRST_BACKOFF", 0.01)
+    return tmp_path
+
+
+def tend_until(role: RoleProcess, seconds: float = 5.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not role.finished and time.monotonic() < deadline:
+        role.tend()
+        time.sleep(0.01)
+
+
+def test_the_learner_may_end(quick: Path) -> None:
+    role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {}, quick)
+    role.start()
+    tend_until(role)
+    assert (role.finished, role.restarts) == (True, 0)
+
+
+def test_any_other_role_that_ends_unasked_is_started_again(quick: Path) -> None:
+    role = RoleProcess(RoleCommand("actor-0", ("actor",)), {}, quick)
+    role.start()
+    with pytest.raises(RoleDied, match=r"3 times in a row soon after its start, exit status 0"):
+        tend_until(role)
+    assert role.restarts == 2
