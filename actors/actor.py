@@ -99,7 +99,7 @@ class Actor:
         self._steps = 0
         self._refresh_at = self._config.refresh_steps
         self._next_poll = self._chunk_due = float("-inf")
-        self._resend_at = float("inf")  # set by the first acknowledgement
+        self._resend_at = self._clock() + RESEND_SECONDS
         self._waiting_for = "weights"
         n = self._config.envs_per_actor
         self._builder = WindowBuilder(self._spec, self._config.stride, n, self._config.chunk_windows + n)

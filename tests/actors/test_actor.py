@@ -330,6 +330,18 @@ def test_a_redis_that_forgot_everything_gets_it_again(redis_url: str, run_name: 
     actor.close()
 
 
+def test_a_hello_that_redis_forgot_is_said_again(redis_url: str, run_name: str) -> None:
+    bus = RedisBus(redis_url, run_name)
+    publish(bus, 0)
+    actor = make_actor(bus)
+    assert bus.actors() == [0]
+    _forget(redis_url, run_name)  # before any replay server has read it
+    for _ in range(100):
+        actor.step()
+    assert bus.actors() == [0]
+    actor.close()
+
+
 def _forget(redis_url: str, run_name: str) -> None:
     """All but the replay's epoch, which a restarted replay server would take anew."""
     server = redis.Redis.from_url(redis_url)
