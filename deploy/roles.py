@@ -126,7 +126,7 @@ def run_learner(place: Place, folder: Path, device: str) -> None:
     """The learner's process; checkpoints go to ``folder``. Its last record says ``finished`` where the run is."""
     secret, process = place.secret(), Process(place)
     config, spec, bus = process.config, process.config.window_spec(), process.bus
-    torch.set_num_threads(config.learner.threads or max(1, len(os.sched_getaffinity(0)) - 1))
+    torch.set_num_threads(config.learner.threads or max(1, cores() - 1))
     check_device(device)
 
     def address() -> str | None:
@@ -140,6 +140,11 @@ def run_learner(place: Place, folder: Path, device: str) -> None:
     client.close()
     if learner.finished:
         bus.emit(learner.name, {"time": time.time(), **learner.metrics(), "finished": 1})
+
+
+def cores() -> int:
+    """Cores that this process may use; macOS only says how many there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def check_device(device: str) -> None:
