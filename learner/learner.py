@@ -26,6 +26,7 @@ from learner.update import JointUpdate, UpdateConfig, Updated
 log = logging.getLogger(__name__)
 STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
 METRICS_UPDATES = 20  # updates between looks at the update's metrics: each look waits for the device
+LOOK_SECONDS = 5.0  # between looks, while waiting, whether Redis still has the weights
 RANK_UPDATES = 500  # updates between looks at the latent's rank (a singular value decomposition)
 
 
@@ -80,6 +81,7 @@ class Learner:
         self.updates = self.env_steps = self.last_checkpoint = 0
         self.finished = self._fenced = self._diverged = self._evaluation_due = False
         self._means, self._rate, self._waiting = Means(), Rate(), ""
+        self._look_at = 0.0  # when to ask next whether Redis still has the weights
         torch.manual_seed(seed)  # the networks' initial weights
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent).to(self.device)
         bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_is_native(self.device))
@@ -100,6 +102,7 @@ class Learner:
         self.env_steps = max(self.env_steps, sample.env_steps)
         if sample.draw is Draw.WAIT:
             self._waiting = "experience"
+            self._publish_if_forgotten()
             return False
         if sample.draw is Draw.FINISHED:
             self.checkpoint()
@@ -143,6 +146,13 @@ class Learner:
         """Broadcast the policy with the newest observation statistics frozen into it. Raises FencedError."""
         self._freeze_statistics()
         self._broadcast()
+
+    def _publish_if_forgotten(self) -> None:
+        """A Redis that lost its data has no weights for a new actor: it would wait for them, and we for it."""
+        if time.monotonic() >= self._look_at:
+            self._look_at = time.monotonic() + LOOK_SECONDS
+            if self.bus.latest_version() is None:
+                self.publish()
 
     def _broadcast(self, evaluate: bool = False) -> None:
         blob = self._policy()

@@ -60,6 +60,12 @@ def test_first_weights_are_out_before_any_experience(setting):
     assert setting.learner.waiting_for() == "experience"
 
 
+def test_weights_that_redis_forgot_are_out_again(setting):
+    setting.bus._weights.clear()
+    assert not setting.learner.step()
+    assert setting.bus.latest_version() == (1, 0)
+
+
 def test_updates_publish_and_give_priorities_back(setting):
     setting.feed(60)
     before = setting.server.stats()["max_priority"]
