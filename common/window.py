@@ -79,18 +79,6 @@ class WindowSpec:
         """16 hexadecimal digits that change with the window's split and any field, shape or offset of the dtype."""
         return hashlib.sha256(repr((self.burn_in, self.train, self.dtype)).encode()).hexdigest()[:16]
 
-    def observation_valid(self, rows: Rows) -> BoolArray:
-        """(B, T + 1): which observations are real."""
-        t = np.arange(self.observations)
-        valid: BoolArray = (rows["first"][:, None] <= t) & (t <= rows["last"][:, None])
-        return valid
-
-    def step_valid(self, rows: Rows) -> BoolArray:
-        """(B, T): which steps are real; the last observation starts none."""
-        t = np.arange(self.steps)
-        valid: BoolArray = (rows["first"][:, None] <= t) & (t < rows["last"][:, None])
-        return valid
-
     def trained_steps(self, rows: Rows) -> int:
         """Real trained steps in all rows, what a draw spends of the replay ratio."""
         return int((rows["last"] - self.burn_in).sum())

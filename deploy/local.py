@@ -44,7 +44,7 @@ class LocalRun:
     """A run's processes between ``start`` and ``close``."""
 
     def __init__(self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str) -> None:
-        self._config, self._redis_url = config, redis_url
+        self._config = config
         self._leave = ExitStack()
         _sweep()
         self.sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))  # private, and short: see redis_server

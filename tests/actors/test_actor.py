@@ -19,6 +19,7 @@ from common.window import Rows, WindowSpec
 from common.wire import decode_entry
 from tests.actors.support import join_rows
 from tests.counting_env import ACTION_DIM, OBS_DIM, Step, audit
+from tests.learner.rows import step_valid
 
 AGENT = AgentConfig(hidden=8, embedding=8, heads=(8, 8))
 SPEC = WindowSpec(OBS_DIM, ACTION_DIM, AGENT.hidden, burn_in=4, train=6)
@@ -184,7 +185,7 @@ def test_random_phase_and_newer_weights(bus: Bus) -> None:
     play(bus, actor, reader, 400, final=False)
     actions = reader.rows()
     assert set(actions["weights_update"].tolist()) == {0}
-    valid = actions["action"][SPEC.step_valid(actions)]
+    valid = actions["action"][step_valid(actions, SPEC)]
     assert abs(valid.mean()) < 0.1
     assert valid.std() == pytest.approx(1 / np.sqrt(3), abs=0.05)
     publish(bus, 7)

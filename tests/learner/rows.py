@@ -9,6 +9,18 @@ from learner.batch import Batch, view_batch
 SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=4, train=5)
 
 
+def observation_valid(rows: Rows, spec: WindowSpec = SPEC) -> np.ndarray:
+    """(B, T + 1): which observations are real."""
+    t = np.arange(spec.observations)
+    return (rows["first"][:, None] <= t) & (t <= rows["last"][:, None])
+
+
+def step_valid(rows: Rows, spec: WindowSpec = SPEC) -> np.ndarray:
+    """(B, T): which steps are real; the last observation starts none."""
+    t = np.arange(spec.steps)
+    return (rows["first"][:, None] <= t) & (t < rows["last"][:, None])
+
+
 def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC) -> Rows:
     """Rows of every shape: padded and real burn-in, full and partial, terminated and not."""
     rng = np.random.default_rng(seed)
@@ -20,7 +32,7 @@ def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC) -> Rows:
     rows["blank"] = rng.uniform(size=rows["blank"].shape) < 0.3
     for name in ("observation", "action", "prev_action", "reward", "hidden"):
         rows[name] = rng.uniform(-1.0, 1.0, rows[name].shape)
-    observed, stepped = spec.observation_valid(rows), spec.step_valid(rows)
+    observed, stepped = observation_valid(rows, spec), step_valid(rows, spec)
     rows["observation"] *= observed[..., None]
     rows["blank"] *= observed
     rows["action"] *= stepped[..., None]

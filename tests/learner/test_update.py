@@ -11,7 +11,7 @@ from torch import Tensor
 from common.agent import Agent, AgentConfig
 from learner import losses
 from learner.update import JointUpdate, UpdateConfig
-from tests.learner.rows import SPEC, random_rows, to_batch
+from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
 
 ROBUST = AgentConfig(
     hidden=SPEC.hidden, embedding=7, heads=(10, 9), layer_norm=True, shortcut=True, normalize_observations=True
@@ -64,7 +64,7 @@ def test_grounding_reaches_memory_and_world_model(monkeypatch):
 def test_garbage_in_padding_changes_nothing():
     rows = random_rows(12)
     dirty = rows.copy()
-    observed, stepped = SPEC.observation_valid(rows), SPEC.step_valid(rows)
+    observed, stepped = observation_valid(rows), step_valid(rows)
     dirty["observation"][~observed] = np.nan
     dirty["blank"][~observed] = 1
     dirty["action"][~stepped] = np.inf

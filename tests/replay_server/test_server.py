@@ -12,6 +12,7 @@ from common.redis_bus import RedisBus
 from common.replay import Draw
 from common.wire import encode_windows
 from replay_server.server import ReplayConfig, ReplayServer, importance_weights, observation_sums
+from tests.learner.rows import observation_valid
 from tests.replay_server.support import SPEC, Sender, make_rows
 
 Make = Callable[..., ReplayServer]
@@ -163,7 +164,7 @@ def test_statistics_against_a_loop_and_padding_changes_nothing() -> None:
     assert sums.count == len(expected)
     np.testing.assert_allclose(sums.total, np.sum(expected, axis=0), rtol=1e-9)
     np.testing.assert_allclose(sums.total_square, np.sum(np.square(expected), axis=0), rtol=1e-9)
-    rows["observation"][~SPEC.observation_valid(rows)] = np.nan
+    rows["observation"][~observation_valid(rows, SPEC)] = np.nan
     rows["observation"][rows["blank"] == 1] = 1e30
     again = observation_sums(rows, SPEC)
     assert again.count == sums.count
