@@ -104,11 +104,17 @@ class Memory(nn.Module):
         return sequence
 
 
-def _mlp(inputs: int, hidden: tuple[int, int], outputs: int) -> nn.Sequential:
+def _mlp(inputs: int, hidden: tuple[int, int], last: nn.Linear) -> nn.Sequential:
     first, second = hidden
-    return nn.Sequential(
-        nn.Linear(inputs, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU(), nn.Linear(second, outputs)
-    )
+    return nn.Sequential(nn.Linear(inputs, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU(), last)
+
+
+class _Float32Linear(nn.Linear):
+    """A last layer that stays float32 under autocast, for what bfloat16's 8 bits would round too much."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.float())
 
 
 class Prediction(NamedTuple):
@@ -124,9 +130,8 @@ class WorldModel(nn.Module):
 
     def __init__(self, inputs: int, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
-        grounded = obs_dim + 1 if config.grounding else 0
         self.sizes = [config.hidden, obs_dim if config.grounding else 0, 1 if config.grounding else 0]
-        self.net = _mlp(inputs + action_dim, config.heads, config.hidden + grounded)
+        self.net = _mlp(inputs + action_dim, config.heads, nn.Linear(config.heads[1], sum(self.sizes)))
 
     def forward(self, features: Tensor, action: Tensor) -> Prediction:
         """(B, T, Z), (B, T, A)."""
@@ -165,8 +170,9 @@ class TwinQ(nn.Module):
         x = x.reshape(1, -1, x.shape[-1]).expand(2, -1, -1)
         for layer in self.layers[:-1]:
             x = F.relu(layer(x))
-        q: Tensor = self.layers[-1](x).float().reshape(2, *shape)
-        return q
+        with torch.autocast(x.device.type, enabled=False):  # bfloat16 would give a Q of 300 in steps of 2
+            q: Tensor = self.layers[-1](x.float())
+        return q.reshape(2, *shape)
 
 
 class Policy(nn.Module):
@@ -174,11 +180,11 @@ class Policy(nn.Module):
 
     def __init__(self, inputs: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
-        self.net = _mlp(inputs, config.heads, 2 * action_dim)
+        self.net = _mlp(inputs, config.heads, _Float32Linear(config.heads[1], 2 * action_dim))
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """(..., Z) -> mean and log standard deviation before the tanh, (..., A) each, float32."""
-        mean, log_std = self.net(features).float().chunk(2, dim=-1)
+        mean, log_std = self.net(features).chunk(2, dim=-1)
         return mean, log_std.clamp(*LOG_STD_RANGE)
 
 

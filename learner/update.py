@@ -77,7 +77,7 @@ class JointUpdate:
         self.target_memory = _target_copy(agent.memory)
         self.optimizer = _adam(agent, config)
         self.generator = torch.Generator(device).manual_seed(seed)
-        self.curiosity_variance = torch.ones((), device=device)
+        self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
 
     def __call__(self, batch: Batch, beta: Tensor) -> Updated:
         """One update from a Batch; ``beta`` is a scalar tensor."""
@@ -170,8 +170,9 @@ class JointUpdate:
         if self.config.curiosity_scale == "raw":
             return i
         variance = losses.masked_mean((i - losses.masked_mean(i, m)).square(), m)
-        self.curiosity_variance.lerp_(variance, 0.01)
-        return i / self.curiosity_variance.sqrt().clamp(min=1e-6)
+        self.curiosity_variance.lerp_(torch.stack([variance, torch.ones_like(variance)]), 0.01)
+        running, weight = self.curiosity_variance.unbind()
+        return i / (running / weight).sqrt().clamp(min=1e-6)
 
     def _step(self, loss: Tensor) -> Tensor:
         """Backward, clip, Adam, Polyak; returns the gradient's norm before clipping."""

@@ -186,6 +186,13 @@ def test_the_target_memory_is_read_where_the_options_say(option, moved):
     assert {name for name in online if not torch.equal(online[name], ema[name])} == moved
 
 
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 100.0])
+def test_curiosity_is_in_units_of_its_deviation_from_the_first_update_on(scale):
+    update, i = make(ROBUST, curiosity_scale="std"), scale * torch.randn(32, SPEC.trained_steps)
+    m = torch.ones_like(i)
+    torch.testing.assert_close(update._scaled(i, m).std(correction=0), torch.tensor(1.0))
+
+
 def test_state_comes_back_bit_for_bit():
     straight, stopped = make(ROBUST, curiosity_scale="std"), make(ROBUST, curiosity_scale="std")
     for u in (straight, stopped):
@@ -211,6 +218,16 @@ def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
 def test_beta_decays_to_zero():
     config = UpdateConfig(curiosity=0.5, curiosity_steps=100)
     assert [config.beta(n) for n in (0, 50, 100, 1000)] == [0.5, 0.25, 0.0, 0.0]
+
+
+def test_values_and_policy_are_not_rounded_to_bf16():
+    agent, action = make(ROBUST).agent, torch.rand(4, 5, SPEC.action_dim)
+    features = torch.randn(4, 5, ROBUST.hidden + (ROBUST.embedding if ROBUST.shortcut else 0))
+    with torch.autocast("cpu", torch.bfloat16):
+        outputs = [agent.critic(features, action), *agent.policy(features)]
+    for output in outputs:
+        assert output.dtype == torch.float32
+        assert not torch.equal(output, output.bfloat16().float())
 
 
 def test_bf16_stays_near_fp32():
