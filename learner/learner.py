@@ -82,6 +82,7 @@ class Learner:
         self.finished = self._fenced = self._diverged = self._evaluation_due = False
         self._means, self._rate, self._waiting = Means(), Rate(), ""
         self._look_at = 0.0  # when to ask next whether Redis still has the weights
+        torch.set_flush_denormal(True)  # into which Adam's moments of idle units decay: 13 % slower on a CPU
         torch.manual_seed(seed)  # the networks' initial weights
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent).to(self.device)
         bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_is_native(self.device))
