@@ -199,14 +199,17 @@ class Actor:
             self._resend_at = now + RESEND_SECONDS
 
     def _is_forgotten_life(self, ack: Ack) -> bool:
-        """Whether the ring knows a life of this actor that Redis has forgotten: our epoch is too small for it.
+        """Whether Redis has forgotten a life of this actor that the ring knows, or the ring has forgotten ours.
 
-        Before its first credit a life has sent its hello alone. Raises FencedError where a newer life is real.
+        The former: our epoch is too small (before its first credit a life has sent its hello alone). The latter: we
+        are granted less than what was acknowledged. Raises FencedError where a newer life is real.
         """
         ours = self._outbox.epoch
-        if ack.id.epoch > ours and self._bus.current_epoch(self.name) > ours:
-            raise FencedError(f"{self.name}: epoch {ack.id.epoch} has replaced epoch {ours}")
-        return ack.id.epoch > ours or (self._ack is None and ack.id.epoch == ours and ack.id.seq > 0)
+        if ack.id.epoch != ours:
+            if ack.id.epoch > ours and self._bus.current_epoch(self.name) > ours:
+                raise FencedError(f"{self.name}: epoch {ack.id.epoch} has replaced epoch {ours}")
+            return ack.id.epoch > ours
+        return (self._ack is None and ack.id.seq > 0) or ack.granted_steps < self._outbox.committed_steps
 
     # Stepping
 

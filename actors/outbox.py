@@ -1,11 +1,18 @@
 """What an actor has sent and must keep: entries in order until the replay server has committed them."""
 
 from collections import deque
+from typing import NamedTuple
 
 from common.bus import Ack, Bus, EntryId
 from common.errors import BusUnavailable
 from common.window import Rows, WindowSpec
 from common.wire import MAX_ENTRY_BYTES, encode_hello, encode_windows
+
+
+class _Kept(NamedTuple):
+    id: EntryId
+    payload: bytes
+    steps: int  # new environment steps in it
 
 
 class Outbox:
@@ -19,8 +26,9 @@ class Outbox:
     def __init__(self, bus: Bus, actor: int, epoch: int, spec: WindowSpec) -> None:
         self._bus, self._actor, self._spec = bus, actor, spec
         self.epoch, self.bytes, self.resends = epoch, 0, 0
+        self.committed_steps = 0  # environment steps that acknowledged entries carried
         self._hello = encode_hello(spec)
-        self._kept: deque[tuple[EntryId, bytes]] = deque()
+        self._kept: deque[_Kept] = deque()
         self._sent = 0  # entries at the front of ``_kept`` that were sent
         self._greeted = False
         self._next_seq = 1
@@ -36,7 +44,8 @@ class Outbox:
             part["actor"], part["epoch"], part["seq"] = self._actor, self.epoch, self._next_seq
             part["k"] = range(len(part))
             payload = encode_windows(part, self._spec)
-            self._kept.append((EntryId(self.epoch, self._next_seq), payload))
+            steps = int(part["new_steps"].sum())
+            self._kept.append(_Kept(EntryId(self.epoch, self._next_seq), payload, steps))
             self.bytes += len(payload)
             self._next_seq += 1
 
@@ -48,7 +57,8 @@ class Outbox:
                 self._bus.append(self._actor, EntryId(self.epoch, 0), self._hello)
                 self._greeted = sent_any = True
             while self._sent < len(self._kept):
-                self._bus.append(self._actor, *self._kept[self._sent])
+                entry = self._kept[self._sent]
+                self._bus.append(self._actor, entry.id, entry.payload)
                 self._sent += 1
                 sent_any = True
         except BusUnavailable:
@@ -64,7 +74,9 @@ class Outbox:
     def acknowledge(self, ack: Ack) -> bool:
         """Forget what is committed; whether it was anything, or nothing is left."""
         before = len(self._kept)
-        while self._kept and self._kept[0][0] <= ack.id:
-            self.bytes -= len(self._kept.popleft()[1])
+        while self._kept and self._kept[0].id <= ack.id:
+            entry = self._kept.popleft()
+            self.bytes -= len(entry.payload)
+            self.committed_steps += entry.steps
             self._sent = max(0, self._sent - 1)
         return len(self._kept) < before or not self._kept

@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
-from common.errors import FencedError, MessageError
+from common.errors import BusUnavailable, FencedError, MessageError
 
 METRICS_KEPT = 20_000  # records, at least
 
@@ -105,6 +105,9 @@ class Bus(Protocol):
     def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
         """Publish acks and trim what they cover, unless a newer replay has come. Raises FencedError."""
 
+    def drop_stream(self, epoch: int, actor: int) -> None:
+        """Make an actor send everything again from its hello on, unless a newer replay has come. Raises FencedError."""
+
     def ack(self, actor: int) -> Ack | None:
         """The newest ack for an actor."""
 
@@ -181,11 +184,13 @@ class MemoryBus:
             if last.epoch > entry_id.epoch:
                 raise FencedError(f"actor {actor}: epoch {last.epoch} has replaced epoch {entry_id.epoch}")
             return
+        if entry_id.seq > 0 and actor not in self._streams:
+            raise BusUnavailable(f"the stream of actor {actor} is gone")
         self._last_ids[actor] = entry_id
         self._streams.setdefault(actor, {})[entry_id] = payload
 
     def actors(self) -> list[int]:
-        return sorted(self._last_ids)
+        return sorted(self._streams)
 
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
         found: list[Entry] = []
@@ -195,14 +200,22 @@ class MemoryBus:
         return found
 
     def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
-        if self.current_epoch("replay") > epoch:
-            raise FencedError(f"replay epoch {epoch} was replaced by {self.current_epoch('replay')}")
+        self._check_replay(epoch)
         self._epochs["replay"] = epoch
         for actor, ack in acks.items():
             self._acks[actor] = ack
             stream = self._streams.get(actor, {})
             for key in [key for key in stream if key <= ack.id]:
                 del stream[key]
+
+    def _check_replay(self, epoch: int) -> None:
+        if self.current_epoch("replay") > epoch:
+            raise FencedError(f"replay epoch {epoch} was replaced by {self.current_epoch('replay')}")
+
+    def drop_stream(self, epoch: int, actor: int) -> None:
+        self._check_replay(epoch)
+        self._streams.pop(actor, None)
+        self._last_ids.pop(actor, None)
 
     def ack(self, actor: int) -> Ack | None:
         return self._acks.get(actor)

@@ -120,9 +120,7 @@ class RedisBus:
 
     def _commit(self, epoch: int, acks: Mapping[int, Ack], publish: bool) -> None:
         def transaction(pipe: Any) -> None:
-            held = int(pipe.get(self._key("epoch", "replay")) or 0)
-            if held > epoch:
-                raise FencedError(f"replay epoch {epoch} was replaced by {held}")
+            held = self._held_by_replay(pipe, epoch)
             pipe.multi()
             for actor, ack in acks.items():
                 pipe.xtrim(self._key("windows", actor), minid=f"{ack.id.epoch}-{ack.id.seq + 1}", approximate=False)
@@ -137,6 +135,21 @@ class RedisBus:
                     for actor, ack in acks.items()
                 },
             )
+
+        self._call(lambda: self._redis.transaction(transaction, self._key("epoch", "replay")))
+
+    def _held_by_replay(self, pipe: Any, epoch: int) -> int:
+        """The newest replay epoch that Redis knows. Raises FencedError where it is newer than ours."""
+        held = int(pipe.get(self._key("epoch", "replay")) or 0)
+        if held > epoch:
+            raise FencedError(f"replay epoch {epoch} was replaced by {held}")
+        return held
+
+    def drop_stream(self, epoch: int, actor: int) -> None:
+        def transaction(pipe: Any) -> None:
+            self._held_by_replay(pipe, epoch)
+            pipe.multi()
+            pipe.delete(self._key("windows", actor))
 
         self._call(lambda: self._redis.transaction(transaction, self._key("epoch", "replay")))
 

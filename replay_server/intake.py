@@ -26,6 +26,7 @@ class Round:
 
     rows: Rows  # (n,) writable, all but the serial as it will stand in the ring
     positions: dict[int, StreamPosition]  # of the streams read from, after this round
+    broken: list[int]  # actors whose stream lacks an entry: nothing past it was taken
 
 
 class Intake:
@@ -35,6 +36,7 @@ class Intake:
         self.spec, self.bus = spec, bus
         self.refused: Counter[str] = Counter()  # dead letters by reason
         self.gaps = 0  # entries whose number does not follow their predecessor's
+        self._asked: dict[int, EntryId] = {}  # past which entry an actor was asked to send again
         self._actors = set(range(actors))
         self._rounds = 0
         self._entry_bytes = ROUND_BYTES  # the largest entry of the last round that had any
@@ -53,17 +55,46 @@ class Intake:
         return self._round(entries, dict(positions))
 
     def _round(self, entries: list[Entry], positions: dict[int, StreamPosition]) -> Round:
+        entries, broken = self._in_order(entries, positions)
         bodies = [self._decode(entry) for entry in entries]
         good = [entry for entry, body in zip(entries, bodies, strict=True) if body is not None and len(body)]
         rows = self._stamped(good, [body for body in bodies if body is not None and len(body)])
         for entry, body, steps in zip(entries, bodies, self._steps(bodies, rows["new_steps"]), strict=True):
             before = positions.get(entry.actor, StreamPosition(BEFORE_ALL, 0))
-            if entry.id.epoch != before.id.epoch:  # a hello: an actor's new life starts from 0
-                before = StreamPosition(EntryId(entry.id.epoch, -1), 0)
-            self.gaps += entry.id.seq != before.id.seq + 1
-            settled = before.settled_steps + (self._lost_steps(entry) if body is None else steps)
+            settled = before.settled_steps if entry.id.epoch == before.id.epoch else 0  # an actor's new life
+            settled += self._lost_steps(entry) if body is None else steps
             positions[entry.actor] = StreamPosition(entry.id, settled)
-        return Round(rows, positions)
+        return Round(rows, positions, broken)
+
+    def _in_order(self, entries: list[Entry], positions: Mapping[int, StreamPosition]) -> tuple[list[Entry], list[int]]:
+        """Entries up to the first gap of each stream that can be filled, and the actors of those with one."""
+        last = {actor: position.id for actor, position in positions.items()}
+        taken: list[Entry] = []
+        broken: list[int] = []
+        for entry in entries:
+            if entry.actor in broken:
+                continue
+            if self._lacks_entries(last.get(entry.actor, BEFORE_ALL), entry):
+                broken.append(entry.actor)
+                continue
+            last[entry.actor] = entry.id
+            taken.append(entry)
+        return taken, broken
+
+    def _lacks_entries(self, before: EntryId, entry: Entry) -> bool:
+        """Whether Redis has lost what comes between, and its actor may still have it.
+
+        It has not where it was asked before, nor where the ring does not know this life at all: what is missing
+        then was trimmed after another ring's commit.
+        """
+        known = entry.id.epoch == before.epoch
+        if entry.id.seq == (before.seq + 1 if known else 0):
+            return False
+        self.gaps += 1
+        if not known or self._asked.get(entry.actor) == before:
+            return False
+        self._asked[entry.actor] = before
+        return True
 
     def _decode(self, entry: Entry) -> Rows | None:
         try:
@@ -89,7 +120,7 @@ class Intake:
     @staticmethod
     def _steps(bodies: list[Rows | None], new_steps: NDArray[np.int32]) -> list[int]:
         """New environment steps of every entry."""
-        ends = np.cumsum([0 if body is None else len(body) for body in bodies])
+        ends = np.cumsum([0 if body is None else len(body) for body in bodies], dtype=np.int64)
         running = np.concatenate([[0], np.cumsum(new_steps)])[ends]
         steps: list[int] = np.diff(running, prepend=0).tolist()
         return steps

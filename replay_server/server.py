@@ -114,6 +114,8 @@ class ReplayServer:
         taken = self._intake.read(self._store.ring.progress.streams)
         if taken is not None:
             self._insert(taken)
+            for actor in taken.broken:
+                self.bus.drop_stream(self.epoch, actor)
         self._publish(at_once=taken is not None)
         return taken is not None
 

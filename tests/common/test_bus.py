@@ -72,6 +72,21 @@ def test_a_replaced_replay_server_cannot_trim(bus):
     assert len(bus.read({0: EntryId(0, 0)}, 10)) == 1
 
 
+def test_a_dropped_stream_is_sent_again_from_its_hello(bus):
+    epoch = bus.take_epoch("replay")
+    for seq in (0, 1, 3):
+        bus.append(0, EntryId(1, seq), b"%d" % seq)
+    bus.drop_stream(epoch, 0)
+    with pytest.raises(BusUnavailable, match="gone"):
+        bus.append(0, EntryId(1, 4), b"4")
+    for seq in (0, 2, 3):
+        bus.append(0, EntryId(1, seq), b"%d" % seq)
+    assert [entry.id.seq for entry in bus.read({0: EntryId(1, 1)}, 10)] == [2, 3]
+    bus.take_epoch("replay")
+    with pytest.raises(FencedError):
+        bus.drop_stream(epoch, 0)
+
+
 def test_weights_of_many_pieces(bus):
     epoch = bus.take_epoch("learner")
     blob = os.urandom(700_000)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.bus import Bus, EntryId, MemoryBus, Version
-from common.errors import ConfigError, FencedError
+from common.errors import BusUnavailable, ConfigError, FencedError
 from common.redis_bus import RedisBus
 from common.replay import Draw
 from common.wire import encode_windows
@@ -359,12 +359,51 @@ def test_bad_entries_are_put_aside_counted_and_cost_no_credit(make: Make, redis_
     assert bus._redis.xlen(f"rmc:{run_name}:windows:0") == 0  # trimmed
 
 
-def test_a_missing_entry_is_counted(make: Make, bus: MemoryBus) -> None:
-    server, sender = make(), Sender(bus)
-    sender.send(1)
-    sender.seq += 1
-    sender.send(1)
+@pytest.mark.parametrize("kind", ["memory", "redis"])
+def test_what_a_stream_lacks_is_sent_again(make: Make, kind: str, redis_url: str, run_name: str) -> None:
+    bus: Bus = MemoryBus() if kind == "memory" else RedisBus(redis_url, run_name)
+    server, sender = make(on=bus), Sender(bus)
+    sender.send(2)
     drain(server)
+    sender.seq += 1  # entry 2 is what Redis lost
+    sender.send_rows(make_rows(1, 3))
+    drain(server)
+    assert server.stats()["entry_gaps"] == 1
+    assert len(stored(server)) == 2
+    assert bus.ack(0) is not None
+    with pytest.raises(BusUnavailable, match="gone"):
+        sender.send(1)
+    sender.greet()
+    sender.seq = 1
+    for mark in (2, 3):
+        sender.send_rows(make_rows(1, mark))
+    drain(server)
+    assert stored(server)["reward"][:, 0].tolist() == [0, 1, 2, 3]
+    assert server.stats()["entry_gaps"] == 1
+    assert sender.granted() > 0
+
+
+def test_what_its_actor_lacks_too_is_given_up(make: Make, bus: MemoryBus) -> None:
+    server, sender = make(), Sender(bus)
+    sender.send(2)
+    drain(server)
+    for _ in range(2):  # what it keeps starts at entry 6, also when it was asked to send again
+        sender.greet()
+        sender.seq = 5
+        sender.send_rows(make_rows(1, 5))
+        drain(server)
+    assert stored(server)["reward"][:, 0].tolist() == [0, 1, 5]
+    assert server.stats()["entry_gaps"] == 2
+
+
+def test_an_empty_ring_goes_on_amid_a_life(make: Make, bus: MemoryBus) -> None:
+    server, sender = make(folder="lost"), Sender(bus)
+    sender.send(2)
+    drain(server)
+    sender.send(3)
+    server = make(folder="empty")
+    drain(server)
+    assert stored(server)["reward"][:, 0].tolist() == [2, 3, 4]
     assert server.stats()["entry_gaps"] == 1
 
 
@@ -377,6 +416,7 @@ def test_lost_redis_data_neither_doubles_nor_goes_back(make: Make, bus: MemoryBu
     server = make(on=empty)
     assert server.epoch == 2  # above the one in the ring, though this bus has never seen a replay server
     sender.bus, sender.seq = empty, 0
+    sender.greet()
     sender.send_rows(make_rows(4))  # seq 1 again: the ack was lost with the data, so the actor sends it again
     sender.send_rows(make_rows(2, 4))
     drain(server)
