@@ -1,5 +1,6 @@
 """The bus over Redis: unix socket, TCP or TLS; the keys stand in ``common/bus.py``."""
 
+import re
 import zlib
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
@@ -51,6 +52,15 @@ class RedisBus:
             self._call(self._redis.ping)
         except redis.exceptions.ResponseError as error:
             raise BusUnavailable(str(error)) from None
+
+    def expire(self, seconds: int | None) -> None:
+        """Let all that this run has in Redis vanish after so many seconds; None takes that back."""
+        pattern = re.sub(r"([*?\[\]\\])", r"\\\1", self._prefix) + ":*"
+        for key in self._call(lambda: list(self._redis.scan_iter(match=pattern, count=1000))):
+            if seconds is None:
+                self._call(self._redis.persist, key)
+            else:
+                self._call(self._redis.expire, key, seconds)
 
     def set_config(self, config: bytes) -> None:
         self._call(lambda: self._redis.set(self._key("config"), config))

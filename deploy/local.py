@@ -21,6 +21,7 @@ from deploy.run_folder import RunFolder
 from deploy.supervisor import STOP_SECONDS, RoleCommand, Supervisor
 
 TICK_SECONDS = 0.1
+KEPT_SECONDS = 3600  # in a user's Redis, after the end
 PREFIX = "rmc-run-"  # of the temporary folders that hold the sockets
 log = logging.getLogger(__name__)
 
@@ -75,6 +76,8 @@ class LocalRun:
         """End everything; nothing is left but the run's folder."""
         try:
             self.supervisor.stop()
+            if self._server is None:
+                _expire(self.bus)
         finally:
             self._leave.close()
 
@@ -89,9 +92,15 @@ def _sweep() -> None:
 
 
 def _register(bus: RedisBus, config: RunConfig) -> None:
-    text = to_json(config).encode()
-    bus.set_config(text)
+    bus.expire(None)
+    bus.set_config(to_json(config).encode())
     bus.clear_stop()
+
+
+def _expire(bus: RedisBus) -> None:
+    """Do not leave a user's Redis full of runs that are over; what they need to go on is in their folders."""
+    with suppress(BusUnavailable):
+        bus.expire(KEPT_SECONDS)
 
 
 def train(
@@ -127,6 +136,7 @@ def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monito
     while stop.requested and time.monotonic() < deadline:  # the learner saves; what it says then is still recorded
         _watch(monitor, bus)
         time.sleep(TICK_SECONDS)
+    _expire(bus)
     return monitor.learner_finished()
 
 

@@ -5,6 +5,7 @@
 
 import dataclasses
 import fcntl
+import hashlib
 import json
 import os
 import secrets
@@ -32,8 +33,8 @@ class RunFolder:
 
     @property
     def name(self) -> str:
-        """The run's name, in Redis too."""
-        return self.path.name
+        """The run's name in Redis: the folder's, and what tells it from others of that name."""
+        return f"{self.path.name}-{hashlib.sha256(self.secret()).hexdigest()[:8]}"
 
     def config(self) -> RunConfig:
         """The run's config. Raises ConfigError where this is no run's folder."""
@@ -124,7 +125,7 @@ def _unused(folder: RunFolder) -> RunFolder:
     number, candidate = 1, folder
     while candidate.path.exists():
         number += 1
-        candidate = RunFolder(folder.path.with_name(f"{folder.name}-{number}"))
+        candidate = RunFolder(folder.path.with_name(f"{folder.path.name}-{number}"))
     return candidate
 
 

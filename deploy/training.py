@@ -44,6 +44,8 @@ def train(config: RunConfig, placement: Placement, console: Console) -> int:
         console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
         before = evaluate_blob(config, initial_policy(config), FINAL_EPISODES)
         console.print(f"before training: {_said(before)}", highlight=False)
+        if placement.launcher == "manual":
+            console.print(f"start the roles with --run {folder.name}", soft_wrap=True, highlight=False)
         stop = _catch_signals()  # only now: until here nothing runs that Ctrl-C could not end at once
         monitor = Monitor(folder, config, console)
         try:

@@ -7,6 +7,8 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
+import redis
+
 from tests.integration.running import Training
 
 RESULT_KEYS = {
@@ -59,12 +61,13 @@ def test_roles_by_hand_over_tcp(redis_url: str, run_name: str, tmp_path: Path) -
     options = ("--total-steps", "1200", "--checkpoint-steps", "600")
     with ExitStack() as stack:
         training = stack.enter_context(Training(folder, *options, "--launcher", "manual", "--redis-url", redis_url))
-        training.wait_for(lambda: "before training" in training.text())
+        training.wait_for(lambda: "start the roles with" in training.text())
+        name = training.text().partition("--run ")[2].split()[0]
         secret = (folder / "secret").read_text().strip()
         environment = {**os.environ, "RMC_SECRET": secret, "RMC_REDIS_URL": redis_url}
         roles = [
             subprocess.Popen(
-                [sys.executable, "-m", "deploy.cli", *words, "--run", run_name],
+                [sys.executable, "-m", "deploy.cli", *words, "--run", name],
                 env=environment,
                 stdout=subprocess.DEVNULL,
                 stderr=stack.enter_context((tmp_path / f"{words[0]}.log").open("wb")),
@@ -82,3 +85,7 @@ def test_roles_by_hand_over_tcp(redis_url: str, run_name: str, tmp_path: Path) -
         assert training.finish(150) == 0, training.text()
         assert [role.wait(20) for role in roles] == [0, 0, 0, 0]
     assert json.loads((folder / "result.json").read_bytes())["env_steps"] == 1200
+    left = redis.Redis.from_url(redis_url)
+    keys = list(left.scan_iter(match=f"rmc:{name}:*"))
+    assert keys
+    assert all(0 < left.ttl(key) <= 3600 for key in keys)
