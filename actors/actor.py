@@ -173,8 +173,8 @@ class Actor:
             self._cut_episodes()
 
     def _refresh_weights(self) -> None:
-        self._refresh_at = self._steps + self._config.refresh_steps
         newest = self._bus.latest_version()
+        self._refresh_at = self._steps + self._config.refresh_steps
         if newest is None or newest == self._version:
             return
         if self._version is not None and newest.epoch == self._version.epoch:

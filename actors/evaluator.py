@@ -3,6 +3,7 @@
 Shapes: N episodes played side by side, O observation, A action, H hidden.
 """
 
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ from common.envs import Env
 from common.errors import BusFull, BusUnavailable, ConfigError
 
 POLL_SECONDS = 0.1  # between looks for a policy to play
+LONGEST_EPISODE = 10_000  # steps, where the environment has no time limit: an episode need not end by itself
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,10 @@ class EvaluatorConfig:
 
 
 class Match:
-    """The first episode of each of N environments, played to its end; those that ended stand still."""
+    """The first episode of each of N environments, played to its end; those that ended stand still.
+
+    Without a time limit, an episode's first 10 000 steps are what counts.
+    """
 
     def __init__(self, runner: PolicyRunner, envs: Sequence[Env], seed: int) -> None:
         """``runner`` is for N environments. The i-th one is reset with seed + i."""
@@ -41,10 +46,13 @@ class Match:
         self._prev_action, self._hidden = runner.start()
         self._playing = np.ones(len(envs), np.bool_)
         self.returns = np.zeros(len(envs))
-        self.steps = 0
+        self.steps = self._rounds = 0
+        limited = all(env.spec is not None and env.spec.max_episode_steps is not None for env in envs)
+        self._longest = sys.maxsize if limited else LONGEST_EPISODE
 
     def step(self) -> bool:
         """One step of every episode that goes on; whether any does."""
+        self._rounds += 1
         action, hidden = self._runner.act(self._observation, self._prev_action, self._blank, self._hidden, None)
         self._prev_action, self._hidden[:] = action, hidden
         for i in np.flatnonzero(self._playing).tolist():
@@ -52,7 +60,7 @@ class Match:
             self._blank[i] = info.get("blank", False)
             self.returns[i] += reward
             self.steps += 1
-            self._playing[i] = not (terminated or truncated)
+            self._playing[i] = not (terminated or truncated or self._rounds >= self._longest)
         return bool(self._playing.any())
 
 

@@ -1,8 +1,10 @@
 """Small means of measuring: running means, rates, and who is busy or waits for what."""
 
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from typing import Any
+
+RATE_SECONDS = 10.0
 
 
 class Means:
@@ -25,18 +27,19 @@ class Means:
 
 
 class Rate:
-    """How fast a counter moves, per second, since the last ``take``."""
+    """How fast a counter moves, per second, over the last ten or so: actors step in bursts, as credit comes."""
 
     def __init__(self) -> None:
-        self._last: tuple[float, float] | None = None
+        self._taken: deque[tuple[float, float]] = deque()
 
     def take(self, counter: float) -> float:
+        """The rate up to now; 0 at the first call."""
         now = time.monotonic()
-        rate = 0.0
-        if self._last is not None and now > self._last[0]:
-            rate = (counter - self._last[1]) / (now - self._last[0])
-        self._last = (now, counter)
-        return rate
+        while len(self._taken) > 1 and self._taken[1][0] <= now - RATE_SECONDS:
+            self._taken.popleft()
+        self._taken.append((now, counter))
+        since, before = self._taken[0]
+        return (counter - before) / (now - since) if now > since else 0.0
 
 
 class BusyClock:

@@ -17,7 +17,7 @@ from common.checkpoint import CheckpointFolder
 from common.envs import Env, make_env
 from common.errors import BusUnavailable, ConfigError
 from common.redis_bus import RedisBus
-from common.role import StopSignal, run_role
+from common.role import RECONNECT_SLEEP, StopSignal, run_role
 from deploy.presets import RunConfig, from_json
 from learner.learner import Learner
 from learner.replay_client import ReplayClient
@@ -26,6 +26,7 @@ from replay_server.server import ReplayServer
 from replay_server.socket_server import SocketServer
 
 SECRET_VARIABLE, URL_VARIABLE = "RMC_SECRET", "RMC_REDIS_URL"
+PATIENCE_SECONDS = 5.0  # of a role that starts while Redis is just coming back
 EVALUATOR_NICENESS = 10  # it must not take the learner's core
 log = logging.getLogger(__name__)
 
@@ -61,25 +62,34 @@ class Process:
         logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
         self.stop = StopSignal()
         self.stop.install()
-        self.bus = connect(place.redis_url, place.run)
-        raw = self.bus.config()
-        if raw is None:
-            raise ConfigError("--run", place.run, "no run of this name is registered in that Redis; start it first")
-        self.config: RunConfig = from_json(raw)
+        self.bus = connect(place.redis_url, place.run, PATIENCE_SECONDS)
+        self.config = self._registered_config(place.run)
+
+    def _registered_config(self, run: str) -> RunConfig:
+        """The run's config; a Redis that has just come back empty gets it again within moments."""
+        deadline = time.monotonic() + PATIENCE_SECONDS
+        while (raw := self.bus.config()) is None:
+            if self.stop.requested or time.monotonic() >= deadline:
+                raise ConfigError("--run", run, "no run of this name is registered in that Redis; start it first")
+            time.sleep(RECONNECT_SLEEP)
+        return from_json(raw)
 
     def make_env(self) -> Env:
         """A new environment of the run."""
         return make_env(self.config.env)
 
 
-def connect(url: str, run: str) -> RedisBus:
-    """A bus whose Redis answers. Raises ConfigError."""
-    bus = RedisBus(url, run)
-    try:
-        bus.ping()
-    except BusUnavailable as error:
-        raise ConfigError("--redis-url", without_password(url), f"no Redis answers there ({error})") from None
-    return bus
+def connect(url: str, run: str, patience_seconds: float = 0.0) -> RedisBus:
+    """A bus whose Redis answers, within so long. Raises ConfigError."""
+    bus, deadline = RedisBus(url, run), time.monotonic() + patience_seconds
+    while True:
+        try:
+            bus.ping()
+            return bus
+        except BusUnavailable as error:
+            if time.monotonic() >= deadline:
+                raise ConfigError("--redis-url", without_password(url), f"no Redis answers there ({error})") from None
+        time.sleep(RECONNECT_SLEEP)
 
 
 def without_password(url: str) -> str:

@@ -2,6 +2,8 @@
 
 import logging
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +12,7 @@ import torch
 from rich.console import Console
 
 from common.bus import Bus
+from common.checkpoint import CheckpointFolder
 from common.errors import ConfigError
 from common.role import StopSignal
 from deploy import local, lockstep
@@ -46,26 +49,34 @@ def train(config: RunConfig, placement: Placement, console: Console) -> int:
         console.print(f"before training: {_said(before)}", highlight=False)
         if placement.launcher == "manual":
             console.print(f"start the roles with --run {folder.name}", soft_wrap=True, highlight=False)
-        stop = _catch_signals()  # only now: until here nothing runs that Ctrl-C could not end at once
         monitor = Monitor(folder, config, console)
         try:
-            finished = _launch(config, folder, placement, monitor, stop)
+            with _signals_caught() as stop:  # before and after, nothing runs that Ctrl-C could not end at once
+                finished = _launch(config, folder, placement, monitor, stop)
         finally:
             monitor.close()
         if not finished:
             return _say_stopped(folder, config, monitor, console)
-        folder.write_result(_result(config, folder, monitor, before))
+        result = _result(config, folder, monitor, before)
+        CheckpointFolder(folder.checkpoints).mark_best(result["updates"], result["eval_return_mean"])
+        folder.write_result(result)
     finally:
         folder.unlock()
     return _say_result(folder, before, console)
 
 
-def _catch_signals() -> StopSignal:
+@contextmanager
+def _signals_caught() -> Iterator[StopSignal]:
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
     stop = StopSignal()
     stop.install()
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup ignores it: the terminal may close
+    if before[signal.SIGHUP] != signal.SIG_IGN:  # nohup ignores it: the terminal may close
         signal.signal(signal.SIGHUP, lambda *_: stop.request())
-    return stop
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def prepare(config: RunConfig, placement: Placement) -> RunFolder:

@@ -2,15 +2,16 @@
 
 import itertools
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from safetensors.torch import save
 
-from actors.evaluator import Evaluator, EvaluatorConfig, play_episodes
+from actors.evaluator import Evaluator, EvaluatorConfig, Match, play_episodes
 from actors.policy_runner import PolicyRunner
 from common.agent import Agent, AgentConfig
 from common.bus import Bus, MemoryBus, Version
-from common.envs import Env, EnvConfig, make_env
+from common.envs import Env, EnvConfig, Standardised, make_env
 from common.errors import ConfigError
 from tests.counting_env import ACTION_DIM, OBS_DIM
 
@@ -44,6 +45,19 @@ def test_a_batch_of_episodes_is_as_good_as_one_after_the_other() -> None:
         (alone,) = play_episodes(runner_for(agent, 1), lambda: make_env(PENDULUM), 1, seed=i)
         assert value == pytest.approx(alone, rel=1e-3)
     assert together == play_episodes(runner_for(agent, 3), lambda: make_env(PENDULUM), 3, seed=0)
+
+
+def test_an_episode_without_end_is_judged_by_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    def endless() -> Env:
+        pendulum = gym.make("Pendulum-v1").unwrapped
+        pendulum.spec = None
+        return Standardised(pendulum)
+
+    monkeypatch.setattr("actors.evaluator.LONGEST_EPISODE", 30)
+    envs = [endless() for _ in range(2)]
+    match = Match(runner_for(Agent(3, 1, AGENT), 2), envs, seed=0)
+    rounds = next(count for count in itertools.count(1) if not match.step())
+    assert (rounds, match.steps) == (30, 60)
 
 
 def publish(bus: Bus, update: int, evaluate: bool) -> None:
