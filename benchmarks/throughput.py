@@ -176,7 +176,7 @@ def main() -> None:
     if "learner" in options.what:
         rows += [learner(options.env, size, options.pairs, options.seconds) for size in (64, 256)]
     if "actor" in options.what:
-        rows += [actor(options.env, envs, options.pairs, options.seconds) for envs in (4, 8, 16, 32)]
+        rows += [actor(options.env, envs, options.pairs, options.seconds) for envs in (4, 8, 16, 32, 64, 128)]
     if "ingest" in options.what:
         rows.append(ingest(options.env, options.pairs, options.seconds))
     path = Path("benchmarks/results") / f"throughput-{time.strftime('%Y-%m-%d')}.jsonl"
