@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 40000
 
-.PHONY: env demo test lint results bench clean
+.PHONY: env demo test lint results trial bench clean
 
 env: $(STAMP)
 
@@ -34,6 +34,20 @@ results: $(STAMP)
 	for seed in 1 2 3; do $(BIN)/rmc train HalfCheetah-v5 --seed $$seed --total-steps 300000 --run-dir runs/halfcheetah-$$seed || exit; done
 	for seed in 1 2 3; do $(BIN)/rmc train Hopper-v5 --seed $$seed --total-steps 300000 --run-dir runs/hopper-$$seed || exit; done
 	$(BIN)/rmc train HalfCheetah-v5 --flicker 0.5 --seed 1 --total-steps 300000 --run-dir runs/halfcheetah-flicker-1
+
+# What robust has and has not, one change at a time, two seeds each. Hours, too, and resumable.
+trial_base :=
+trial_layer_norm := --layer-norm
+trial_prioritized := --priority-exponent 0.6 --importance-exponent 0.4
+trial_ema_latent := --latent-target ema
+trial_online_memory := --target-memory online
+trial_curiosity := --curiosity 0.1 --curiosity-scale std
+trial_no_shortcut := --no-shortcut
+trial_raw_observations := --no-normalize-observations
+TRIALS := base layer_norm prioritized ema_latent online_memory curiosity no_shortcut raw_observations
+
+trial: $(STAMP)
+	$(foreach name,$(TRIALS),$(foreach seed,1 2,$(BIN)/rmc train HalfCheetah-v5 --seed $(seed) --total-steps 100000 --run-dir runs/trial-$(name)-$(seed) $(trial_$(name)) && )) true
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks.throughput
