@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -35,6 +35,9 @@ class ActorConfig:
     """N, environments of one actor; more of them share one forward pass."""
     stride: int = 15
     """Steps between the starts of two windows; as many as are trained means no overlap."""
+    state_strategy: Literal["zero", "stored", "burn-in", "episode"] = "burn-in"
+    """What a window's memory starts from: zeros; the state that the actor stored; that state, then burned in; or
+    zeros at the start of the episode, all of which is the window, as long as the time limit allows."""
     refresh_steps: int = 400
     """Environment steps of an actor between two looks at the newest weights."""
     chunk_windows: int = 16
@@ -102,7 +105,9 @@ class Actor:
         self._resend_at = self._clock() + RESEND_SECONDS
         self._waiting_for = "weights"
         n = self._config.envs_per_actor
-        self._builder = WindowBuilder(self._spec, self._config.stride, n, self._config.chunk_windows + n)
+        strategy, capacity = self._config.state_strategy, self._config.chunk_windows + n
+        stride = self._spec.train if strategy == "episode" else self._config.stride
+        self._builder = WindowBuilder(self._spec, stride, n, capacity, store_states=strategy in ("stored", "burn-in"))
         self._rng = np.random.default_rng(environment_seed(self._seed, self._index, epoch, _NOISE))
         self._returns = np.zeros(n)
         self._lengths = np.zeros(n, np.int64)
@@ -273,7 +278,7 @@ class Actor:
 
 
 def _check(config: ActorConfig, spec: WindowSpec) -> None:
-    if not 1 <= config.stride <= spec.train:
+    if config.state_strategy != "episode" and not 1 <= config.stride <= spec.train:
         raise ConfigError("--stride", config.stride, f"from 1 to the {spec.train} trained steps of a window")
     for name in ("envs_per_actor", "refresh_steps", "chunk_windows", "unacked_bytes"):
         if getattr(config, name) < 1:

@@ -35,11 +35,14 @@ class WindowBuilder:
     acted at the first trained step.
     """
 
-    def __init__(self, spec: WindowSpec, stride: int, envs: int, capacity: int) -> None:
-        """``capacity`` rows fit between two ``take``; at least ``envs``, as one ``add`` may finish that many."""
+    def __init__(self, spec: WindowSpec, stride: int, envs: int, capacity: int, store_states: bool = True) -> None:
+        """``capacity`` rows fit between two ``take``; at least ``envs``, as one ``add`` may finish that many.
+
+        Without ``store_states`` every window says that its memory starts from zeros.
+        """
         assert 1 <= stride <= spec.train, (stride, spec.train)
         assert capacity >= envs, (capacity, envs)
-        self._spec, self._stride, self._envs = spec, stride, envs
+        self._spec, self._stride, self._envs, self._store_states = spec, stride, envs, store_states
         self._slots = slots = spec.observations
         self._observation = np.zeros((slots, envs, spec.obs_dim), np.float32)
         self._blank = np.zeros((slots, envs), np.bool_)
@@ -145,7 +148,8 @@ class WindowBuilder:
         fields["action"][row, first:last] = self._prev_action[slots[1:], env]
         fields["reward"][row, first:last] = self._reward[slots[1:], env]
         fields["prev_action"][row] = self._prev_action[slots[0], env]
-        fields["hidden"][row] = self._hidden[slots[0], env]
+        if self._store_states:
+            fields["hidden"][row] = self._hidden[slots[0], env]
         self.count += 1
         self._covered[env] = steps
         self._block[env] = block + self._stride

@@ -63,16 +63,20 @@ class RunConfig:
 
     def window_spec(self) -> WindowSpec:
         """The window that every role of the run speaks. Makes an environment once; raises ConfigError."""
-        obs_dim, action_dim, _ = self._spaces
-        return WindowSpec(obs_dim, action_dim, self.agent.hidden, self.window.burn_in, self.window.trained_steps)
+        obs_dim, action_dim, time_limit = self._spaces
+        burn_in, train, strategy = self.window.burn_in, self.window.trained_steps, self.actor.state_strategy
+        if strategy == "episode":
+            if time_limit is None:
+                raise ConfigError("--state-strategy", strategy, f"{self.env.id} has no time limit; use burn-in")
+            train = time_limit
+        return WindowSpec(obs_dim, action_dim, self.agent.hidden, burn_in if strategy == "burn-in" else 0, train)
 
     def slack_steps(self) -> int:
         """How far actors may run ahead of the replay ratio: two windows of every environment.
 
         One is what they may hold back unsent, the other keeps them busy while the credit is on its way.
         """
-        longest = max(self.window.trained_steps, self.actor.stride)
-        return 2 * longest * self.actor.envs_per_actor * self.actors
+        return 2 * self.window_spec().train * self.actor.envs_per_actor * self.actors
 
 
 def preset(name: Preset, env: EnvConfig) -> RunConfig:
@@ -199,6 +203,8 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "update.clip_norm": (0, 1e12),
     "update.curiosity": (0, 1e12),
     "update.curiosity_steps": (1, 2**53),
+    "update.scheme": (1, 6),
+    "update.n_step": (1, 10_000),
     "update.eta": (0, 1),
     "learner.batch_size": (1, 65_536),
     "learner.publish_updates": (1, 2**31),

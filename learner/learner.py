@@ -21,7 +21,7 @@ from common.metrics import Means, Rate
 from common.replay import Draw, Replay, Sample
 from common.window import WindowSpec
 from learner.batch import Batch, view_batch
-from learner.update import JointUpdate, UpdateConfig, Updated
+from learner.update import UpdateConfig, Updated, make_update
 
 log = logging.getLogger(__name__)
 STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
@@ -86,7 +86,7 @@ class Learner:
         torch.manual_seed(seed)  # the networks' initial weights
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent).to(self.device)
         bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_is_native(self.device))
-        self.update = JointUpdate(self.agent, spec.burn_in, update, seed, bf16)
+        self.update = make_update(self.agent, spec.burn_in, update, seed, bf16)
         self.beta = torch.zeros((), device=self.device)
         checkpoints.lock()
         floor = self._resume()

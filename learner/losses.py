@@ -6,7 +6,13 @@ sg stop-gradient. Every loss is a masked mean, sum(m * x) / sum(m).
 Source: arXiv 1908.11494, with the gaps settled in ``docs/algorithm.md``.
 """
 
+from typing import Literal
+
+import torch
 from torch import Tensor
+from torch.nn import functional
+
+NORM_FLOOR = 1e-12  # keeps the root's gradient finite at zero
 
 
 def masked_mean(x: Tensor, m: Tensor) -> Tensor:
@@ -14,9 +20,15 @@ def masked_mean(x: Tensor, m: Tensor) -> Tensor:
     return (m * x).sum() / m.sum().clamp(min=1.0)
 
 
-def model_error(predicted_change: Tensor, change: Tensor) -> Tensor:
-    """|f(h_t, a_t) - sg(h_{t+1} - h_t)|, mean over H: (B, T, H) twice -> (B, T). L1, as the paper's text says."""
-    return (predicted_change - change.detach()).abs().mean(-1)
+def model_error(predicted_change: Tensor, change: Tensor, norm: Literal["l1", "l2"]) -> Tensor:
+    """f(h_t, a_t) - sg(h_{t+1} - h_t): its mean size over H (L1) or its root mean square (L2); (B, T, H) -> (B, T).
+
+    The paper's text says L1 and compares it with the L2 that its equation prints.
+    """
+    difference = predicted_change - change.detach()
+    if norm == "l1":
+        return difference.abs().mean(-1)
+    return (difference.square().mean(-1) + NORM_FLOOR).sqrt()
 
 
 def model_loss(error: Tensor, d: Tensor, m: Tensor) -> Tensor:
@@ -29,15 +41,23 @@ def curiosity(error: Tensor, d: Tensor, m: Tensor) -> Tensor:
     return error.detach() * (1.0 - d) * m
 
 
-def td_target(
-    r: Tensor, i: Tensor, beta: Tensor, gamma: float, d: Tensor, next_q: Tensor, alpha: Tensor, next_log_pi: Tensor
-) -> Tensor:
-    """y_t = r_t + beta i_t + gamma (1 - d_t) (min_j Qbar_j(h_{t+1}, a') - alpha log pi(a'|h_{t+1})).
+def soft_value(q: Tensor, alpha: Tensor, log_pi: Tensor) -> Tensor:
+    """V(h) = min_j Qbar_j(h, a') - alpha log pi(a'|h), a' and its log pi from the same sample: (2, B, T) -> (B, T)."""
+    return q.min(0).values - alpha * log_pi
 
-    ``next_q`` (2, B, T); a' and ``next_log_pi`` (B, T) come from the same sample. No gradient.
+
+def td_target(reward: Tensor, gamma: float, d: Tensor, next_value: Tensor, m: Tensor, n: int) -> Tensor:
+    """y_t = R_t + gamma (1 - d_t) V(h_{t+1}), R_t = r_t + beta i_t; (B, T) each. No gradient.
+
+    With n > 1 the n-step return, y_t = sum_{k<n} gamma^k R_{t+k} + gamma^n V(h_{t+n}), as R2D2 has it: not corrected
+    for the policy that acted, and shorter where the window or the episode ends before.
     """
-    soft_value = next_q.min(0).values - alpha * next_log_pi
-    return (r + beta * i + gamma * (1.0 - d) * soft_value).detach()
+    y = reward + gamma * (1.0 - d) * next_value
+    goes_on = functional.pad(m[:, 1:], (0, 1)) > 0  # the step after is real, too
+    for _ in range(n - 1):
+        onward = torch.where(goes_on, functional.pad(y[:, 1:], (0, 1)), next_value)
+        y = reward + gamma * (1.0 - d) * onward
+    return y.detach()
 
 
 def q_loss(q: Tensor, y: Tensor, importance: Tensor, m: Tensor) -> Tensor:

@@ -19,6 +19,14 @@ from learner import losses
 from learner.batch import Batch
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
+TRAINS_MEMORY = {  # the paper's table 1
+    1: {"model", "value"},
+    2: {"value"},
+    3: {"model"},
+    4: {"model", "value", "policy"},
+    5: {"model", "policy"},
+    6: {"value", "policy"},
+}
 
 
 @dataclass(frozen=True)
@@ -47,6 +55,19 @@ class UpdateConfig:
     """Curiosity as it is (the paper), or divided by its running standard deviation."""
     curiosity_steps: int = 100_000
     """Environment steps after which beta has decayed to 0, linearly."""
+    scheme: Literal[1, 2, 3, 4, 5, 6] = 1
+    """Whose losses train the memory: 1 model and value, 2 value, 3 model, 4 all, 5 model and policy, 6 value and
+    policy (table 1 of the paper)."""
+    policy_through_q: bool = True
+    """In schemes 4 to 6: the policy's loss also reaches the memory by the state that Q reads, not by the policy's
+    own input alone."""
+    update_order: Literal["joint", "alternate"] = "joint"
+    """All losses from the parameters as they stood, in one step; or one after the other, each from what the one
+    before left, with optimisers of their own (algorithm 1 as printed)."""
+    model_norm: Literal["l1", "l2"] = "l1"
+    """How the world model's error is measured, as loss and as curiosity."""
+    n_step: int = 1
+    """Steps of reward in a target before it bootstraps; 1 is the paper."""
     eta: float = 0.9
     """Weight of the largest against the mean absolute TD error in a window's priority."""
 
@@ -60,29 +81,31 @@ class Updated(NamedTuple):
 
     priorities: Tensor  # (B,)
     metrics: dict[str, Tensor]  # scalars
+    curiosity_variance: Tensor  # (2,), as it is after this batch
     hidden: Tensor  # (B, L_t + 1, H), for the latent's rank
     observed: Tensor  # (B, L_t + 1) bool, which of them are real
 
 
 class JointUpdate:
-    """Agent, targets and optimiser, and the update that moves them together (gradient scheme 1).
-
-    Scheme 1: the model's and the critics' losses reach the memory, the policy's does not.
-    """
+    """Agent, targets and optimiser, and the update that moves them together."""
 
     def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> None:
         device = agent.log_alpha.device
         self.agent, self.burn_in, self.config, self.bf16 = agent, burn_in, config, bf16
         self.target_critic = _target_copy(agent.critic)
         self.target_memory = _target_copy(agent.memory)
-        self.optimizer = _adam(agent, config)
+        self.optimizers = self._make_optimizers()
         self.generator = torch.Generator(device).manual_seed(seed)
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
+
+    def _make_optimizers(self) -> list[torch.optim.Adam]:
+        return [_adam(self.agent, self.config, "memory", "world_model", "critic", "policy", "log_alpha")]
 
     def __call__(self, batch: Batch, beta: Tensor) -> Updated:
         """One update from a Batch; ``beta`` is a scalar tensor."""
         parts, updated = self.forward(batch, beta)
-        norm = self._step(sum(parts.values(), torch.zeros_like(beta)))
+        norm = self._step(self.optimizers[0], parts.values())
+        self._follow(updated)
         return updated._replace(metrics=updated.metrics | {"grad_norm": norm})
 
     def forward(self, batch: Batch, beta: Tensor) -> tuple[dict[str, Tensor], Updated]:
@@ -98,24 +121,29 @@ class JointUpdate:
             # Memory: h_t from the stored state, burned in without gradient
             memory = self._remember(agent.memory, o, batch)
             z = agent.features(memory)
+            trains = TRAINS_MEMORY[c.scheme]
+            z_model, z_value, z_policy = (z if loss in trains else z.detach() for loss in ("model", "value", "policy"))
 
             # Prediction, and curiosity from its error
             target = self._remember_target(o, batch) if "ema" in (c.latent_target, c.target_memory) else memory
             latent = (target if c.latent_target == "ema" else memory).hidden.detach().float()
-            prediction = agent.world_model(z[:, :-1], a)
-            error = losses.model_error(prediction.hidden_change.float(), latent[:, 1:] - latent[:, :-1])
-            i = self._scaled(losses.curiosity(error, d, m), m)
+            prediction = agent.world_model(z_model[:, :-1], a)
+            change = latent[:, 1:] - latent[:, :-1]
+            error = losses.model_error(prediction.hidden_change.float(), change, c.model_norm)
+            i, curiosity_variance = self._scaled(losses.curiosity(error, d, m), m)
 
             # Intuition: one policy sample for every step serves both the target and the policy loss
-            mean, log_std = agent.policy(z.detach())
+            mean, log_std = agent.policy(z_policy)
             pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean))
             with torch.no_grad():
                 next_z = (agent.features(target) if c.target_memory == "ema" else z)[:, 1:]
                 next_q = self.target_critic(next_z, pi[:, 1:])
-                y = losses.td_target(r, i, beta, c.gamma, d, next_q, alpha, log_pi[:, 1:])
-            q = agent.critic(z[:, :-1], a)
+                next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:])
+                y = losses.td_target(r + beta * i, c.gamma, d, next_value, m, c.n_step)
+            q = agent.critic(z_value[:, :-1], a)
             frozen = {name: value.detach() for name, value in agent.critic.named_parameters()}
-            q_pi = functional_call(agent.critic, frozen, (z[:, :-1].detach(), pi[:, :-1]))
+            z_climbed = z_policy if c.policy_through_q else z.detach()
+            q_pi = functional_call(agent.critic, frozen, (z_climbed[:, :-1], pi[:, :-1]))
             q_pi = q_pi[0] if c.policy_q == "first" else q_pi.min(0).values
 
         log_pi = log_pi[:, :-1]
@@ -126,9 +154,9 @@ class JointUpdate:
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
         if agent.config.grounding:
-            change, seen = o[:, steps].diff(dim=1), _seen(batch)[:, steps]
+            seen = _seen(batch)[:, steps]
             parts["grounding_loss"] = losses.grounding_loss(
-                prediction.observation_change.float(), change, prediction.reward.float(), r, seen, m
+                prediction.observation_change.float(), o[:, steps].diff(dim=1), prediction.reward.float(), r, seen, m
             )
 
         td_error = (q.detach() - y).abs().mean(0)
@@ -141,7 +169,8 @@ class JointUpdate:
             "curiosity_share": beta * i.sum() / (beta * i.sum() + (m * r.abs()).sum()).clamp(min=1e-8),
         }
         observed = batch.observation_valid[:, steps]
-        return parts, Updated(losses.priority(td_error, c.eta, m), metrics, memory.hidden.detach(), observed)
+        priority = losses.priority(td_error, c.eta, m)
+        return parts, Updated(priority, metrics, curiosity_variance, memory.hidden.detach(), observed)
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
@@ -165,25 +194,29 @@ class JointUpdate:
     def _noise_like(self, x: Tensor) -> Tensor:
         return torch.randn(x.shape, generator=self.generator, device=x.device)
 
-    def _scaled(self, i: Tensor, m: Tensor) -> Tensor:
-        """Curiosity in units of its running standard deviation, where configured."""
+    def _scaled(self, i: Tensor, m: Tensor) -> tuple[Tensor, Tensor]:
+        """Curiosity in units of its running standard deviation, where configured, and its running variance."""
         if self.config.curiosity_scale == "raw":
-            return i
+            return i, self.curiosity_variance
         variance = losses.masked_mean((i - losses.masked_mean(i, m)).square(), m)
-        self.curiosity_variance.lerp_(torch.stack([variance, torch.ones_like(variance)]), 0.01)
-        running, weight = self.curiosity_variance.unbind()
-        return i / (running / weight).sqrt().clamp(min=1e-6)
+        moved = self.curiosity_variance.lerp(torch.stack([variance, torch.ones_like(variance)]), 0.01)
+        running, weight = moved.unbind()
+        return i / (running / weight).sqrt().clamp(min=1e-6), moved
 
-    def _step(self, loss: Tensor) -> Tensor:
-        """Backward, clip, Adam, Polyak; returns the gradient's norm before clipping."""
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+    def _step(self, optimizer: torch.optim.Adam, parts: Iterable[Tensor]) -> Tensor:
+        """Backward from the losses' sum, clip, Adam; returns the gradient's norm before clipping."""
+        self.agent.zero_grad(set_to_none=True)
+        sum(parts, torch.zeros_like(self.agent.log_alpha)).backward()  # type: ignore[no-untyped-call]
         limit = self.config.clip_norm or float("inf")
         norm = nn.utils.clip_grad_norm_(self.agent.parameters(), limit)
-        self.optimizer.step()
+        optimizer.step()
+        return norm.detach()
+
+    def _follow(self, updated: Updated) -> None:
+        """What follows the step: targets by Polyak, and the running variance."""
         self._polyak(self.target_critic.parameters(), self.agent.critic.parameters())
         self._polyak(self.target_memory.parameters(), self.agent.memory.parameters())
-        return norm.detach()
+        self.curiosity_variance.copy_(updated.curiosity_variance)
 
     @torch.no_grad()
     def _polyak(self, target: Iterable[Tensor], source: Iterable[Tensor]) -> None:
@@ -195,7 +228,7 @@ class JointUpdate:
             "agent": self.agent.state_dict(),
             "target_critic": self.target_critic.state_dict(),
             "target_memory": self.target_memory.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "curiosity_variance": self.curiosity_variance,
             "generator": self.generator.get_state(),
         }
@@ -205,9 +238,47 @@ class JointUpdate:
         self.agent.load_state_dict(state["agent"])
         self.target_critic.load_state_dict(state["target_critic"])
         self.target_memory.load_state_dict(state["target_memory"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(saved)
         self.curiosity_variance.copy_(state["curiosity_variance"])
         self.generator.set_state(state["generator"].cpu())
+
+
+class AlternateUpdate(JointUpdate):
+    """Algorithm 1 as printed: model, critics, policy and temperature in turn, each from a fresh forward.
+
+    Each has an optimiser of its own, so that a memory that several losses train is moved by several.
+    """
+
+    _STAGES = (
+        ("world_model", ("model_loss", "grounding_loss")),
+        ("critic", ("q_loss",)),
+        ("policy", ("policy_loss",)),
+        ("log_alpha", ("temperature_loss",)),
+    )
+
+    def _make_optimizers(self) -> list[torch.optim.Adam]:
+        return [_adam(self.agent, self.config, "memory", part) for part, _ in self._STAGES]
+
+    def __call__(self, batch: Batch, beta: Tensor) -> Updated:
+        """One round from a Batch. Each metric is from its own stage's forward; priorities from the critics'."""
+        metrics: dict[str, Tensor] = {}
+        norms = []
+        for optimizer, (part, names) in zip(self.optimizers, self._STAGES, strict=True):
+            parts, found = self.forward(batch, beta)
+            own = {name: loss for name, loss in parts.items() if name in names}
+            norms.append(self._step(optimizer, own.values()))
+            metrics |= {name: found.metrics[name] for name in own}
+            if part == "critic":
+                updated = found
+        self._follow(updated)
+        return updated._replace(metrics=updated.metrics | metrics | {"grad_norm": torch.stack(norms).norm()})
+
+
+def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:
+    """The update in the order that the config names."""
+    kind = JointUpdate if config.update_order == "joint" else AlternateUpdate
+    return kind(agent, burn_in, config, seed, bf16)
 
 
 def _target_copy(module: ModuleT) -> ModuleT:
@@ -219,13 +290,14 @@ def _target_copy(module: ModuleT) -> ModuleT:
     return copied
 
 
-def _adam(agent: Agent, config: UpdateConfig) -> torch.optim.Adam:
-    networks = [value for name, value in agent.named_parameters() if name != "log_alpha"]
+def _adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
+    """Adam for the parts of the agent that are named; the temperature has a step size of its own."""
+    networks = [value for part in parts if part != "log_alpha" for value in getattr(agent, part).parameters()]
     groups = [
         {"params": networks, "lr": config.learning_rate},
-        {"params": [agent.log_alpha], "lr": config.alpha_learning_rate},
+        {"params": [agent.log_alpha] if "log_alpha" in parts else [], "lr": config.alpha_learning_rate},
     ]
-    return torch.optim.Adam(groups, fused=True)
+    return torch.optim.Adam([group for group in groups if group["params"]], fused=True)
 
 
 def _seen(batch: Batch) -> Tensor:

@@ -39,14 +39,14 @@ def name(env: int, episode: int, k: int) -> np.ndarray:
     return np.array([env, episode, k], np.float32)
 
 
-def run(play: Play, steps: int, cut: bool = True) -> tuple[Rows, list[int]]:
+def run(play: Play, steps: int, cut: bool = True, store_states: bool = True) -> tuple[Rows, list[int]]:
     """All windows of so many steps, and each environment's number of ended episodes.
 
     An observation, and the state before it, is (env, episode, k); an action is its step's name negated.
     The weights version is the time.
     """
     envs = len(play.lengths)
-    builder = WindowBuilder(play.spec, play.stride, envs, capacity=envs)
+    builder = WindowBuilder(play.spec, play.stride, envs, capacity=envs, store_states=store_states)
     episode, k = np.zeros(envs, int), np.zeros(envs, int)
     for env in range(envs):
         builder.begin(env, name(env, 0, 0), blank=_is_blank(0))
@@ -78,6 +78,14 @@ def run(play: Play, steps: int, cut: bool = True) -> tuple[Rows, list[int]]:
 
 def _is_blank(k: int) -> bool:
     return k % 5 == 3
+
+
+@given(plays(), st.integers(1, 80))
+def test_without_stored_states_only_these_are_missing(play: Play, steps: int) -> None:
+    stored, zero = (run(play, steps, store_states=store_states)[0] for store_states in (True, False))
+    assert not zero["hidden"].any()
+    stored["hidden"] = 0.0
+    assert stored.tobytes() == zero.tobytes()
 
 
 @given(plays(), st.integers(1, 80))

@@ -22,6 +22,7 @@ TRAIN_FLAGS = """
     --envs-per-actor --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
     --capacity --replay-ratio --warmup-steps --priority-exponent --importance-exponent
     --learning-rate --alpha-learning-rate --gamma --polyak --clip-norm --latent-target --target-memory --policy-q
+    --scheme --policy-through-q --update-order --model-norm --n-step --state-strategy
     --curiosity --curiosity-scale --curiosity-steps --eta
     --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads
     --episodes

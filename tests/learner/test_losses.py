@@ -39,22 +39,34 @@ def real_steps(m: np.ndarray) -> list[tuple[int, int]]:
     return [(b, t) for b in range(B) for t in range(T) if m[b, t]]
 
 
-def test_model_error_and_loss(rng, m, d):
+@pytest.mark.parametrize("norm", ["l1", "l2"])
+def test_model_error_and_loss(rng, m, d, norm):
     f, change = rng.normal(size=(2, B, T, H))
     expected, count = 0.0, 0
     for b, t in real_steps(m):
         if not d[b, t]:
-            expected += sum(abs(f[b, t, u] - change[b, t, u]) for u in range(H)) / H
+            differences = [f[b, t, u] - change[b, t, u] for u in range(H)]
+            mean = sum(abs(x) for x in differences) / H
+            expected += mean if norm == "l1" else math.sqrt(sum(x * x for x in differences) / H)
             count += 1
     ft, ct, mt, dt = tensors(f, change, m, d)
-    assert losses.model_loss(losses.model_error(ft, ct), dt, mt).item() == pytest.approx(expected / count, rel=1e-5)
+    found = losses.model_loss(losses.model_error(ft, ct, norm), dt, mt)
+    assert found.item() == pytest.approx(expected / count, rel=1e-5)
 
 
-def test_model_target_gets_no_gradient(rng):
+@pytest.mark.parametrize("norm", ["l1", "l2"])
+def test_model_target_gets_no_gradient(norm):
     f, change = (torch.randn(B, T, H, requires_grad=True) for _ in range(2))
-    losses.model_error(f, change).sum().backward()
+    losses.model_error(f, change, norm).sum().backward()
     assert f.grad is not None
     assert change.grad is None
+
+
+def test_a_perfect_l2_prediction_has_a_finite_gradient():
+    f = torch.zeros(B, T, H, requires_grad=True)
+    losses.model_error(f, torch.zeros(B, T, H), "l2").sum().backward()
+    assert f.grad is not None
+    assert f.grad.isfinite().all()
 
 
 def test_curiosity_is_the_error_without_gradient(rng, m, d):
@@ -67,17 +79,37 @@ def test_curiosity_is_the_error_without_gradient(rng, m, d):
     assert not i.requires_grad
 
 
-def test_td_target(rng, d):
-    r, i, log_pi = rng.normal(size=(3, B, T))
-    q = rng.normal(size=(2, B, T))
-    alpha, beta, gamma = 0.3, 0.2, 0.97
-    rt, it, dt, qt, lt = tensors(r, i, d, q, log_pi)
-    y = losses.td_target(rt, it, torch.tensor(beta), gamma, dt, qt, torch.tensor(alpha), lt)
-    for b in range(B):
-        for t in range(T):
-            soft = min(q[0, b, t], q[1, b, t]) - alpha * log_pi[b, t]
-            wanted = r[b, t] + beta * i[b, t] + (0.0 if d[b, t] else gamma * soft)
-            assert y[b, t].item() == pytest.approx(wanted, rel=1e-5, abs=1e-6)
+def test_soft_value(rng):
+    q, log_pi, alpha = rng.normal(size=(2, B, T)), rng.normal(size=(B, T)), 0.3
+    qt, lt = tensors(q, log_pi)
+    torch.testing.assert_close(
+        losses.soft_value(qt, torch.tensor(alpha), lt), tensors(np.minimum(q[0], q[1]) - alpha * log_pi)[0]
+    )
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 99])
+def test_td_target(rng, m, d, n):
+    """Rewards of up to n steps, then the value; the sum stops at a termination and at the last real step."""
+    reward, value = rng.normal(size=(2, B, T))
+    gamma = 0.97
+    rt, dt, vt, mt = tensors(reward, d, value, m)
+    y = losses.td_target(rt, gamma, dt, vt, mt, n)
+    for b, t in real_steps(m):
+        wanted, k = 0.0, t
+        while True:
+            wanted += gamma ** (k - t) * reward[b, k]
+            if d[b, k]:
+                break
+            if k - t + 1 == n or k + 1 == T or not m[b, k + 1]:
+                wanted += gamma ** (k - t + 1) * value[b, k]  # value[b, k] is that of the state after step k
+                break
+            k += 1
+        assert y[b, t].item() == pytest.approx(wanted, rel=1e-5, abs=1e-6)
+
+
+def test_a_target_has_no_gradient():
+    reward, value = (torch.randn(B, T, requires_grad=True) for _ in range(2))
+    assert not losses.td_target(reward, 0.9, torch.zeros(B, T), value, torch.ones(B, T), 3).requires_grad
 
 
 def test_q_loss(rng, m):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from common.agent import Agent, AgentConfig
 from learner import losses
-from learner.update import JointUpdate, UpdateConfig
+from learner.update import TRAINS_MEMORY, JointUpdate, UpdateConfig, make_update
 from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
 
 ROBUST = AgentConfig(
@@ -24,15 +24,18 @@ def make(agent: AgentConfig, bf16: bool = False, **options: object) -> JointUpda
     torch.manual_seed(0)
     network = Agent(SPEC.obs_dim, SPEC.action_dim, agent)
     network.normalizer.freeze(10, torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
-    return JointUpdate(network, SPEC.burn_in, UpdateConfig(curiosity=0.5, **options), 3, bf16)  # type: ignore[arg-type]
+    return make_update(network, SPEC.burn_in, UpdateConfig(curiosity=0.5, **options), 3, bf16)  # type: ignore[arg-type]
+
+
+def silence_all_but(keep: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in {"model_loss", "q_loss", "policy_loss", "temperature_loss", "grounding_loss"} - {keep}:
+        original = getattr(losses, name)
+        monkeypatch.setattr(losses, name, lambda *args, original=original: 0.0 * original(*args))
 
 
 def gradients(update: JointUpdate, keep: str, monkeypatch: pytest.MonkeyPatch) -> set[str]:
     """Names of parameters that one loss alone gives a gradient."""
-    silence = {"model_loss", "q_loss", "policy_loss", "temperature_loss", "grounding_loss"} - {keep}
-    for name in silence:
-        original = getattr(losses, name)
-        monkeypatch.setattr(losses, name, lambda *args, original=original: original(*args).detach())
+    silence_all_but(keep, monkeypatch)
     update(to_batch(random_rows(8)), BETA)
     return {name for name, p in update.agent.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
 
@@ -42,18 +45,62 @@ def part(update: JointUpdate, *prefixes: str) -> set[str]:
 
 
 @pytest.mark.parametrize("agent", [ROBUST, PAPER], ids=["robust", "paper"])
+@pytest.mark.parametrize("scheme", TRAINS_MEMORY)
+@pytest.mark.parametrize("order", ["joint", "alternate"])
 @pytest.mark.parametrize(
-    ("loss", "reached"),
+    ("loss", "by", "head"),
     [
-        ("model_loss", ("memory.", "world_model.")),
-        ("q_loss", ("memory.", "critic.")),
-        ("policy_loss", ("policy.",)),
-        ("temperature_loss", ("log_alpha",)),
+        ("model_loss", "model", "world_model."),
+        ("q_loss", "value", "critic."),
+        ("policy_loss", "policy", "policy."),
+        ("temperature_loss", None, "log_alpha"),
     ],
 )
-def test_scheme_1_gradients_reach_exactly(agent, loss, reached, monkeypatch):
-    update = make(agent)
-    assert gradients(update, loss, monkeypatch) == part(update, *reached)
+def test_a_schemes_gradients_reach_exactly(agent, scheme, order, loss, by, head, monkeypatch):
+    table = {1: "MV", 2: "V", 3: "M", 4: "MVP", 5: "MP", 6: "VP"}  # the paper's table 1
+    trains = by is not None and by[0].upper() in table[scheme]
+    update = make(agent, scheme=scheme)
+    if order == "joint":
+        assert gradients(update, loss, monkeypatch) == part(update, head, *["memory."] * trains)
+        return
+    moving = make(agent, scheme=scheme, update_order=order)
+    before = copy.deepcopy(moving.agent.state_dict())
+    silence_all_but(loss, monkeypatch)
+    moving(to_batch(random_rows(8)), BETA)
+    moved = {name for name, p in moving.agent.named_parameters() if not torch.equal(p, before[name])}
+    assert moved == part(moving, head, *["memory."] * trains)
+
+
+@pytest.mark.parametrize("scheme", [4, 5, 6])
+def test_the_policy_reaches_the_memory_by_its_own_input_alone_if_told_so(scheme):
+    """The two ways add up: what is left without Q's is the gradient by the policy's input."""
+
+    def memory_gradient(through_q: bool, stop_own: bool = False) -> Tensor:
+        update = make(PAPER, scheme=scheme, policy_through_q=through_q)
+        if stop_own:
+            act = update.agent.policy.forward
+            update.agent.policy.forward = lambda z: act(z.detach())
+        parts, _ = update.forward(to_batch(random_rows(8)), BETA)
+        (gradient,) = torch.autograd.grad(parts["policy_loss"], [update.agent.memory.gru.weight_hh_l0])
+        return gradient
+
+    both, own, by_q = memory_gradient(True), memory_gradient(False), memory_gradient(True, stop_own=True)
+    torch.testing.assert_close(both, own + by_q)
+    assert by_q.abs().sum() > 0
+
+
+def test_each_stage_of_alternate_starts_from_what_the_one_before_left():
+    """With step sizes of 0 both orders have the same losses; with others, all but the first differ."""
+
+    def metrics(order: str, rate: float) -> dict[str, Tensor]:
+        update = make(PAPER, update_order=order, learning_rate=rate, alpha_learning_rate=rate)
+        update._noise_like = lambda x: torch.full_like(x, 0.3)  # a forward more must not mean other noise
+        return update(to_batch(random_rows(8)), BETA).metrics
+
+    names = ("model_loss", "q_loss", "policy_loss")  # the temperature's is 0 at first, whatever the policy
+    still, moved = ([metrics(order, rate) for order in ("joint", "alternate")] for rate in (0.0, 0.1))
+    assert [name for name in names if still[0][name] != still[1][name]] == []
+    assert [name for name in names if moved[0][name] != moved[1][name]] == ["q_loss", "policy_loss"]
 
 
 def test_grounding_reaches_memory_and_world_model(monkeypatch):
@@ -190,7 +237,7 @@ def test_the_target_memory_is_read_where_the_options_say(option, moved):
 def test_curiosity_is_in_units_of_its_deviation_from_the_first_update_on(scale):
     update, i = make(ROBUST, curiosity_scale="std"), scale * torch.randn(32, 15)
     m = torch.ones_like(i)
-    torch.testing.assert_close(update._scaled(i, m).std(correction=0), torch.tensor(1.0))
+    torch.testing.assert_close(update._scaled(i, m)[0].std(correction=0), torch.tensor(1.0))
 
 
 def test_state_comes_back_bit_for_bit():
@@ -202,7 +249,7 @@ def test_state_comes_back_bit_for_bit():
     torch.save(stopped.state_dict(), file)
     file.seek(0)
     torch.manual_seed(99)
-    resumed = JointUpdate(Agent(SPEC.obs_dim, SPEC.action_dim, ROBUST), SPEC.burn_in, straight.config, seed=1234)
+    resumed = make_update(Agent(SPEC.obs_dim, SPEC.action_dim, ROBUST), SPEC.burn_in, straight.config, seed=1234)
     resumed.load_state_dict(torch.load(file, weights_only=True))
     for seed in range(3, 6):
         a, b = (u(to_batch(random_rows(8, seed)), BETA) for u in (straight, resumed))

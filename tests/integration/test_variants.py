@@ -1,0 +1,77 @@
+"""Every variant trains: the whole system in lockstep, for some updates, and ends as it should."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from common.envs import EnvConfig
+from common.errors import ConfigError
+from deploy.lockstep import Lockstep
+from deploy.presets import RunConfig, debug, validate
+
+STEPS, WARMUP = 500, 200
+
+
+def config(env: str = "InvertedPendulum-v5", **options: Any) -> RunConfig:
+    """A short run with some options of its parts changed, by name."""
+    run = dataclasses.replace(debug(EnvConfig(env)), total_steps=STEPS)
+    changes = {"replay": {"replay_ratio": 4.0, "warmup_steps": WARMUP}, "learner": {"batch_size": 4}}
+    for name in ("window", "agent", "actor", "replay", "update", "learner"):
+        part = getattr(run, name)
+        own = {key: value for key, value in options.items() if hasattr(part, key)}
+        run = dataclasses.replace(run, **{name: dataclasses.replace(part, **changes.get(name, {}) | own)})
+        options = {key: value for key, value in options.items() if key not in own}
+    assert not options, f"no such options: {options}"
+    validate(run)
+    return run
+
+
+def train(run: RunConfig, folder: Path) -> Lockstep:
+    lockstep = Lockstep(run, folder)
+    while not lockstep.learner.finished:
+        lockstep.step()
+    lockstep.close()
+    return lockstep
+
+
+VARIANTS: list[dict[str, Any]] = [
+    *({"scheme": scheme} for scheme in (1, 2, 3, 4, 5, 6)),
+    {"scheme": 4, "policy_through_q": False},
+    {"update_order": "alternate"},
+    {"update_order": "alternate", "scheme": 4},
+    {"model_norm": "l2"},
+    {"latent_target": "ema", "target_memory": "ema"},
+    {"policy_q": "first"},
+    {"curiosity": 0.5},
+    {"curiosity": 0.5, "curiosity_scale": "std"},
+    {"n_step": 3},
+    {"stride": 5},
+    {"priority_exponent": 0.0, "importance_exponent": 0.0},
+    {"state_strategy": "zero"},
+    {"state_strategy": "stored"},
+    {"state_strategy": "episode", "env": "Reacher-v5"},
+    {"embedding": 0, "grounding": False},
+    {"layer_norm": True, "shortcut": True, "normalize_observations": True},
+]
+
+
+@pytest.mark.parametrize("options", VARIANTS, ids=lambda options: "-".join(f"{k}={v}" for k, v in options.items()))
+def test_a_variant_trains(options: dict[str, Any], tmp_path: Path) -> None:
+    run = config(**options)
+    lockstep = train(run, tmp_path)
+    stats, learner = lockstep.server.stats(), lockstep.learner
+    assert learner.updates > 0
+    assert stats["env_steps"] == STEPS
+    batch = run.learner.batch_size * run.window_spec().train
+    debt = run.replay.replay_ratio * (STEPS - WARMUP) - stats["drawn_steps"]
+    assert -(run.replay.replay_ratio * run.slack_steps() + batch) <= debt <= batch
+    assert all(value.isfinite().all() for value in learner.agent.state_dict().values())
+    assert all(math.isfinite(value) for value in learner.metrics().values() if isinstance(value, float))
+
+
+def test_an_episode_strategy_needs_a_time_limit() -> None:
+    with pytest.raises(ConfigError, match=r"--state-strategy=.*no time limit"):
+        config("tests.counting_env:Counting-v0", state_strategy="episode").window_spec()
