@@ -4,6 +4,7 @@ Shapes: N environments, O observation, A action, H hidden.
 """
 
 import hashlib
+import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,13 +18,16 @@ from actors.policy_runner import PolicyRunner
 from actors.window_builder import WindowBuilder
 from common.agent import AgentConfig
 from common.bus import Ack, Bus, Version
-from common.envs import Env
+from common.envs import rebuilt, sound_reset
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from common.metrics import Means, Rate
 from common.window import WindowSpec
+from common.wrappers import Env, Floats
 
+log = logging.getLogger(__name__)
 POLL_SECONDS = 0.02  # between looks at the bus while there is nothing to do but wait
 RESEND_SECONDS = 5.0  # without a new acknowledgement before everything unacknowledged is sent again
+BROKEN_STARTS = 5  # episodes in a row that an environment breaks in their first step before the actor gives up
 _NOISE = -1  # the place of the policy's noise among the environments' seeds
 
 
@@ -79,7 +83,9 @@ class Actor:
         self._index, self._seed, self._spec, self._config = index, seed, spec, config
         self._bus, self._clock = bus, clock
         n = config.envs_per_actor
-        self._envs = [make_env() for _ in range(n)]
+        self._make_env, self._envs = make_env, [make_env() for _ in range(n)]
+        self._faults: dict[int, Exception] = {}  # of this step, by environment
+        self._broken = self._broken_starts = 0  # episodes that an environment's fault ended; in a row, at their start
         self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, n)
         self._observation = np.zeros((n, spec.obs_dim), np.float32)
         self._reward = np.zeros(n, np.float32)
@@ -137,6 +143,7 @@ class Actor:
             "weights_update": self._version.update if self._version else -1,
             "unacked_entries": len(self._outbox),
             "resends": self._resends + self._outbox.resends,
+            "broken_episodes": self._broken,
         }
         return record | self._means.take()
 
@@ -225,9 +232,14 @@ class Actor:
         action, hidden = self._runner.act(*now, noise)
         if self._version.update == 0:  # the policy has learnt nothing yet
             action = self._rng.uniform(-1.0, 1.0, action.shape).astype(np.float32)
-        for i, env in enumerate(self._envs):
-            self._observation[i], self._reward[i], self._terminated[i], self._truncated[i], info = env.step(action[i])
-            self._blank[i] = info.get("blank", False)
+        for i in range(n):
+            try:
+                self._step_environment(i, action[i])
+            except Exception as error:
+                self._faults[i] = error
+        self._find_nonsense()
+        for i in self._faults:
+            self._steps -= self._builder.forget(i) + 1
         ended = self._builder.add(
             action, hidden, self._version.update, self._reward, self._observation, self._blank,
             self._terminated, self._truncated,
@@ -239,6 +251,35 @@ class Actor:
         self._lengths += 1
         for env_index in np.flatnonzero(ended).tolist():
             self._end_episode(env_index)
+        while self._faults:
+            self._replace_environment(*self._faults.popitem())
+
+    def _step_environment(self, i: int, action: Floats) -> None:
+        observation, reward, terminated, truncated, info = self._envs[i].step(action)
+        self._observation[i], self._reward[i], self._blank[i] = observation, reward, info.get("blank", False)
+        self._terminated[i], self._truncated[i] = terminated, truncated
+
+    def _find_nonsense(self) -> None:
+        """Whose observation or reward is not finite. What a broken environment left behind must not end an episode."""
+        sound = np.isfinite(self._observation).all(1) & np.isfinite(self._reward)
+        for i in np.flatnonzero(~sound).tolist():
+            self._faults.setdefault(i, ValueError("its observation or reward is not finite"))
+        for i in self._faults:
+            self._observation[i] = self._reward[i] = 0.0
+            self._terminated[i] = self._truncated[i] = False
+
+    def _replace_environment(self, i: int, error: Exception) -> None:
+        """A broken episode is dropped and counted, its environment made anew.
+
+        Raises the error where environments break at the start of one episode after the other: they always will.
+        """
+        log.warning("%s: environment %d broke in step %d of an episode: %r", self.name, i, self._lengths[i], error)
+        self._broken += 1
+        self._broken_starts = self._broken_starts + 1 if self._lengths[i] <= 1 else 0
+        if self._broken_starts >= BROKEN_STARTS:
+            raise error
+        self._envs[i] = rebuilt(self._envs[i], self._make_env)
+        self._begin_episode(i, self._new_seed(i))
 
     def _end_episode(self, env: int) -> None:
         self._episodes += 1
@@ -246,8 +287,19 @@ class Actor:
         self._means.add("episode_length_mean", int(self._lengths[env]))
         self._begin_episode(env, seed=None)
 
+    def _new_seed(self, env: int) -> int:
+        """Of an environment made anew; no other of this epoch has it."""
+        return environment_seed(self._seed, self._index, self._outbox.epoch, len(self._envs) * self._broken + env)
+
     def _begin_episode(self, env: int, seed: int | None) -> None:
-        observation, info = self._envs[env].reset(seed=seed)
+        """Raises what the environment raises where it breaks in a reset, and again when it was made anew."""
+        try:
+            observation, info = sound_reset(self._envs[env], seed)
+        except Exception as error:
+            log.warning("%s: environment %d broke in a reset: %r", self.name, env, error)
+            self._broken += 1
+            self._envs[env] = rebuilt(self._envs[env], self._make_env)
+            observation, info = sound_reset(self._envs[env], self._new_seed(env))
         self._builder.begin(env, observation, info.get("blank", False))
         self._returns[env] = self._lengths[env] = 0
 

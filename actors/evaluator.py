@@ -3,6 +3,8 @@
 Shapes: N episodes played side by side, O observation, A action, H hidden.
 """
 
+import logging
+import math
 import sys
 import time
 from collections import deque
@@ -12,13 +14,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from actors.policy_runner import PolicyRunner
 from common.agent import AgentConfig
 from common.bus import Bus, Version
-from common.envs import Env
-from common.errors import BusFull, BusUnavailable, ConfigError
+from common.envs import rebuilt, sound_reset
+from common.errors import BusFull, BusUnavailable, ConfigError, RmcError
+from common.wrappers import Env, Floats
 
+log = logging.getLogger(__name__)
 POLL_SECONDS = 0.1  # between looks for a policy to play
 LONGEST_EPISODE = 10_000  # steps, where the environment has no time limit: an episode need not end by itself
 
@@ -40,13 +45,15 @@ class Match:
     def __init__(self, runner: PolicyRunner, envs: Sequence[Env], seed: int) -> None:
         """``runner`` is for N environments. The i-th one is reset with seed + i."""
         self._runner, self._envs = runner, envs
-        starts = [env.reset(seed=seed + i) for i, env in enumerate(envs)]
-        self._observation = np.stack([observation for observation, _ in starts])
-        self._blank = np.array([bool(info.get("blank", False)) for _, info in starts])
+        shape = envs[0].observation_space.shape
+        self._observation = np.zeros((len(envs), *(shape or ())), np.float32)
         self._prev_action, self._hidden = runner.start()
         self._playing = np.ones(len(envs), np.bool_)
-        self.returns = np.zeros(len(envs))
+        self._blank, self.broken = np.zeros((2, len(envs)), np.bool_)
+        self._returns = np.zeros(len(envs))
         self.steps = self._rounds = 0
+        for i in range(len(envs)):
+            self._guarded(i, self._reset, seed + i)
         limited = all(env.spec is not None and env.spec.max_episode_steps is not None for env in envs)
         self._longest = sys.maxsize if limited else LONGEST_EPISODE
 
@@ -56,16 +63,42 @@ class Match:
         action, hidden = self._runner.act(self._observation, self._prev_action, self._blank, self._hidden, None)
         self._prev_action, self._hidden[:] = action, hidden
         for i in np.flatnonzero(self._playing).tolist():
-            self._observation[i], reward, terminated, truncated, info = self._envs[i].step(action[i])
-            self._blank[i] = info.get("blank", False)
-            self.returns[i] += reward
-            self.steps += 1
-            self._playing[i] = not (terminated or truncated or self._rounds >= self._longest)
+            self._guarded(i, self._step_environment, action[i])
         return bool(self._playing.any())
+
+    def _guarded(self, i: int, action: Callable[[int, Any], None], argument: Any) -> None:
+        """What an environment breaks in ends its episode, which then counts for nothing."""
+        try:
+            action(i, argument)
+        except Exception as error:
+            log.warning("environment %d of an evaluation broke: %r", i, error)
+            self._playing[i], self.broken[i] = False, True
+            self._observation[i] = 0.0
+
+    def _reset(self, i: int, seed: int) -> None:
+        self._observation[i], info = sound_reset(self._envs[i], seed)
+        self._blank[i] = info.get("blank", False)
+
+    def _step_environment(self, i: int, action: Floats) -> None:
+        self._observation[i], reward, terminated, truncated, info = self._envs[i].step(action)
+        if not (np.isfinite(self._observation[i]).all() and math.isfinite(reward)):
+            raise ValueError("its observation or reward is not finite")
+        self._blank[i] = info.get("blank", False)
+        self._returns[i] += float(reward)
+        self.steps += 1
+        self._playing[i] = not (terminated or truncated or self._rounds >= self._longest)
+
+    @property
+    def returns(self) -> NDArray[np.float64]:
+        """Of the episodes in which the environment did not break."""
+        return self._returns[~self.broken]
 
 
 def play_episodes(runner: PolicyRunner, make_env: Callable[[], Env], episodes: int, seed: int) -> list[float]:
-    """Returns of so many deterministic episodes, played as one batch; ``runner`` is for as many environments."""
+    """Returns of so many deterministic episodes, played as one batch; ``runner`` is for as many environments.
+
+    Those in which the environment broke are left out. Raises RmcError where none is left.
+    """
     envs = [make_env() for _ in range(episodes)]
     try:
         match = Match(runner, envs, seed)
@@ -74,6 +107,8 @@ def play_episodes(runner: PolicyRunner, make_env: Callable[[], Env], episodes: i
     finally:
         for env in envs:
             env.close()
+    if not match.returns.size:
+        raise RmcError(f"the environment broke in each of {episodes} episodes; see what is said above")
     return [float(value) for value in match.returns]
 
 
@@ -99,7 +134,7 @@ class Evaluator:
         if config.episodes < 1:
             raise ConfigError("--episodes", config.episodes, "at least 1")
         self._seed, self._bus, self._clock = seed, bus, clock
-        self._envs = [make_env() for _ in range(config.episodes)]
+        self._make_env, self._envs = make_env, [make_env() for _ in range(config.episodes)]
         observation, action = self._envs[0].observation_space.shape, self._envs[0].action_space.shape
         assert observation
         assert action
@@ -117,6 +152,8 @@ class Evaluator:
             return False
         if not self._match.step():
             self._records.append(_record(self._match, self._version))
+            for i in np.flatnonzero(self._match.broken).tolist():
+                self._envs[i] = rebuilt(self._envs[i], self._make_env)
             self._match = None
         return True
 
@@ -150,7 +187,10 @@ class Evaluator:
 
 
 def _record(match: Match, version: Version) -> dict[str, Any]:
-    return {
+    broken = {"eval_broken_episodes": int(match.broken.sum())}
+    if not match.returns.size:
+        return broken
+    return broken | {
         "eval_return_mean": float(match.returns.mean()),
         "eval_return_std": float(match.returns.std()),
         "eval_episodes": len(match.returns),

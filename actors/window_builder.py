@@ -87,6 +87,16 @@ class WindowBuilder:
         self._start[env] = self._time
         self._block[env] = self._covered[env] = 0
 
+    def forget(self, env: int) -> int:
+        """Drop an episode whose next step must not be trusted; ``add``, then ``begin`` must follow.
+
+        Returns how many of its steps were in no finished window yet.
+        """
+        lost = int(self._time - self._start[env] - self._covered[env])
+        self._start[env] = self._time + 1
+        self._block[env] = self._covered[env] = 0
+        return lost
+
     def add(
         self,
         action: Floats,

@@ -9,21 +9,20 @@ import logging
 import math
 import os
 import sys
+from collections.abc import Callable
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from numpy.typing import NDArray
 
 from common.errors import ConfigError
+from common.wrappers import Env, Flicker, Floats, FrameStack, Noise, Partial, Standardised
 
-Floats = NDArray[np.float32]
-Env = gym.Env[Floats, Floats]
 log = logging.getLogger(__name__)
-_FLICKER_STREAM = 0xF11C  # keeps the flicker's random numbers apart from the environment's own
 
 
 @dataclass(frozen=True)
@@ -34,89 +33,111 @@ class EnvConfig:
     """Gymnasium id, like HalfCheetah-v5, or module:EnvId-v0 for your own."""
     flicker: float = 0.0
     """Probability that an observation is replaced by zeros, at every step, the reset included."""
+    hide: Literal["nothing", "velocities", "positions"] = "nothing"
+    """Part of a MuJoCo observation that is left out."""
+    noise: float = 0.0
+    """Standard deviation of Gaussian noise on every observation, in the observation's own units."""
+    frame_stack: int = 1
+    """Newest observations that make one, oldest first; a blank frame among them is an ordinary one."""
+    action_repeat: int = 1
+    """Steps of the environment for one of the agent's; rewards are added up."""
+    time_limit: int = 0
+    """Steps of the environment after which an episode is cut off; 0 keeps the environment's own limit."""
+    env_timeout: float = 60.0
+    """Seconds in a step or reset after which an environment hangs: its process is ended and started again."""
 
 
 def make_env(config: EnvConfig) -> Env:
-    """One environment: (O,) float32 observations, (A,) float32 actions in [-1, 1], gymnasium's time limit kept.
+    """One environment: (O,) float32 observations, (A,) float32 actions in [-1, 1], cut off at its time limit.
 
     Raises ConfigError where it is unknown, or its spaces are none that the agent can learn in.
     """
-    if not 0.0 <= config.flicker <= 1.0:
-        raise ConfigError("--flicker", config.flicker, "a probability from 0 to 1")
+    _check_numbers(config)
     _redirect_mujoco_warnings()
+    made = _make(config)
+    fault = _space_fault(made.observation_space, made.action_space)
+    if fault is None and config.hide != "nothing" and not _structure(made):
+        fault = f"it does not say which observations are {config.hide}; --hide is for MuJoCo's bodies, like Ant-v5"
+    if fault is not None:
+        made.close()
+        raise ConfigError("ENV", config.id, fault)
+    return _as_seen(made, config)
+
+
+def _make(config: EnvConfig) -> gym.Env[Any, Any]:
+    """As gymnasium makes it, with its own limit or ours."""
     spec = copy(_find_spec(config.id))
     spec.order_enforce = False  # roles reset and step in order; the check costs time at every step
     try:
-        env = gym.make(spec, disable_env_checker=True)
+        return gym.make(spec, max_episode_steps=config.time_limit or None, disable_env_checker=True)
     except gym.error.Error as error:
         raise ConfigError("ENV", config.id, f"gymnasium cannot make it ({_one_line(error)})") from None
-    fault = _space_fault(env.observation_space, env.action_space)
-    if fault is not None:
+
+
+def _as_seen(env: gym.Env[Any, Any], config: EnvConfig) -> Env:
+    """The environment as the agent sees it: each wrapper only where it does something."""
+    shown = _shown(env, config.hide)
+    if isinstance(env.observation_space, gym.spaces.Dict):
+        env = gym.wrappers.FlattenObservation(env)
+    if config.action_repeat > 1:
+        env = gym.wrappers.RepeatAction(env, config.action_repeat)
+    seen: Env = Standardised(env)
+    if shown is not None:
+        seen = Partial(seen, shown)
+    if config.noise:
+        seen = Noise(seen, config.noise)
+    if config.flicker:
+        seen = Flicker(seen, config.flicker)
+    return FrameStack(seen, config.frame_stack) if config.frame_stack > 1 else seen
+
+
+def sound_reset(env: Env, seed: int | None) -> tuple[Floats, dict[str, Any]]:
+    """Reset. Raises ValueError where the observation is not finite."""
+    observation, info = env.reset(seed=seed)
+    if not np.isfinite(observation).all():
+        raise ValueError("its first observation is not finite")
+    return observation, info
+
+
+def rebuilt(env: Env, make_env: Callable[[], Env]) -> Env:
+    """Another one in the place of a broken one."""
+    with suppress(Exception):
         env.close()
-        raise ConfigError("ENV", config.id, fault)
-    standard: Env = Standardised(env)
-    return Flicker(standard, config.flicker) if config.flicker else standard
+    return make_env()
 
 
 def env_spaces(config: EnvConfig) -> tuple[int, int, int | None]:
-    """O, A and the time limit in steps (None where there is none). Raises ConfigError."""
+    """O, A and the time limit in the agent's steps (None where there is none). Raises ConfigError."""
     env = make_env(config)
     limit = env.spec.max_episode_steps if env.spec else None
     env.close()
     assert env.observation_space.shape
     assert env.action_space.shape
+    if limit is not None:
+        limit = -(-limit // config.action_repeat)
     return env.observation_space.shape[0], env.action_space.shape[0], limit
 
 
-class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
-    """Observations as float32; actions in [-1, 1], stretched over the environment's own bounds."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        inner = env.action_space
-        assert isinstance(inner, gym.spaces.Box)
-        assert env.observation_space.shape is not None
-        self._low = inner.low.astype(np.float32)
-        self._high = inner.high.astype(np.float32)
-        self._half_range = (self._high - self._low) / 2
-        self._plain = bool((inner.low == -1.0).all() and (inner.high == 1.0).all())
-        self._dtype = inner.dtype
-        self.action_space = gym.spaces.Box(-1.0, 1.0, inner.shape, np.float32)
-        self.observation_space = gym.spaces.Box(-math.inf, math.inf, env.observation_space.shape, np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        observation, info = self.env.reset(seed=seed, options=options)
-        return np.asarray(observation, np.float32), info
-
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        if not self._plain:
-            stretched = self._low + (action + 1.0) * self._half_range
-            action = np.clip(stretched, self._low, self._high).astype(self._dtype)  # rounding may pass a bound
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return np.asarray(observation, np.float32), float(reward), terminated, truncated, info
+def _structure(env: gym.Env[Any, Any]) -> dict[str, int]:
+    """Names and sizes of the observation's parts in order, where the environment tells them (MuJoCo's bodies)."""
+    parts = getattr(env.unwrapped, "observation_structure", None) or {}
+    return {name: size for name, size in parts.items() if not name.startswith("skipped")}
 
 
-class Flicker(gym.Wrapper[Floats, Floats, Floats, Floats]):
-    """Whole observations become zeros, independently with probability p; ``info["blank"]`` says which."""
+def _shown(env: gym.Env[Any, Any], hide: str) -> slice | None:
+    """Positions come first, and what follows is velocities and what depends on them; None shows all."""
+    positions = _structure(env).get("qpos", 0)
+    return {"nothing": None, "velocities": slice(0, positions), "positions": slice(positions, None)}[hide]
 
-    def __init__(self, env: Env, probability: float) -> None:
-        super().__init__(env)
-        self._probability = probability
-        self._rng = np.random.default_rng()
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        if seed is not None:
-            self._rng = np.random.default_rng([seed, _FLICKER_STREAM])
-        observation, info = self.env.reset(seed=seed, options=options)
-        return self._flicker(observation, info), info
-
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._flicker(observation, info), float(reward), terminated, truncated, info
-
-    def _flicker(self, observation: Floats, info: dict[str, Any]) -> Floats:
-        info["blank"] = bool(self._rng.random() < self._probability)
-        return np.zeros_like(observation) if info["blank"] else observation
+def _check_numbers(config: EnvConfig) -> None:
+    if not 0.0 <= config.flicker <= 1.0:
+        raise ConfigError("--flicker", config.flicker, "a probability from 0 to 1")
+    if not 0.0 <= config.noise < math.inf:
+        raise ConfigError("--noise", config.noise, "a standard deviation, 0 or more")
+    for name, least in (("frame_stack", 1), ("action_repeat", 1), ("time_limit", 0)):
+        if getattr(config, name) < least:
+            raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), f"{least} or more")
 
 
 def _find_spec(env_id: str) -> EnvSpec:
@@ -134,6 +155,11 @@ def _find_spec(env_id: str) -> EnvSpec:
 def _space_fault(observation: gym.Space[Any], action: gym.Space[Any]) -> str | None:
     """Why the agent cannot learn with these spaces, and what to do about it; None if it can."""
     Box = gym.spaces.Box
+    if isinstance(observation, gym.spaces.Dict):
+        odd = {name: type(part).__name__ for name, part in observation.items() if not isinstance(part, Box)}
+        if odd:
+            return f"of its observations {odd} are no Box; turn them into one, or leave them out"
+        return _space_fault(gym.spaces.flatten_space(observation), action)
     if not isinstance(observation, Box):
         return f"its observations are {type(observation).__name__}; flatten them to a Box"
     if len(observation.shape) > 1:

@@ -75,8 +75,14 @@ class _Pulse:
         return False
 
 
-def run_role(role: Role, bus: Bus, stop: StopSignal, finished: Callable[[], bool] = lambda: False) -> None:
-    """Step a role until it is stopped, fenced or finished; always closes it.
+def run_role(
+    role: Role,
+    bus: Bus,
+    stop: StopSignal,
+    finished: Callable[[], bool] = lambda: False,
+    beat: Callable[[], None] = lambda: None,
+) -> None:
+    """Step a role until it is stopped, fenced or finished; always closes it. ``beat`` is called before every step.
 
     Redis away or full is waited out here; every other error ends the role.
     """
@@ -84,6 +90,7 @@ def run_role(role: Role, bus: Bus, stop: StopSignal, finished: Callable[[], bool
     pulse = _Pulse(role, bus, clock)
     try:
         while not (stop.requested or finished() or pulse.says_stop()):
+            beat()
             try:
                 if role.step():
                     clock.busy()

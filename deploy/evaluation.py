@@ -30,7 +30,7 @@ def evaluate_blob(config: RunConfig, blob: bytes, episodes: int, flicker: float 
     return {
         "eval_return_mean": float(np.mean(returns)),
         "eval_return_std": float(np.std(returns)),
-        "eval_episodes": episodes,
+        "eval_episodes": len(returns),
         "eval_flicker": env.flicker,
     }
 

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional
@@ -45,6 +45,18 @@ class Train:
     """Actor processes."""
     flicker: float = 0.0
     """Probability that an observation is replaced by zeros."""
+    hide: Literal["nothing", "velocities", "positions"] = "nothing"
+    """Part of a MuJoCo observation that is left out."""
+    noise: float = 0.0
+    """Standard deviation of Gaussian noise on every observation, in the observation's own units."""
+    frame_stack: int = 1
+    """Newest observations that make one."""
+    action_repeat: int = 1
+    """Steps of the environment for one of the agent's; rewards are added up."""
+    time_limit: int = 0
+    """Steps after which an episode is cut off; 0 keeps the environment's own limit."""
+    env_timeout: float = 60.0
+    """Seconds in a step or reset after which an environment hangs: its process is ended and started again."""
     run_dir: Path | None = None
     """The run's folder; by default runs/<env>__<preset>__<seed>__<time>."""
     if_exists: IfExists = "resume"
@@ -59,7 +71,8 @@ class Train:
     def config(self) -> RunConfig:
         """The run's config."""
         own = {item.name: getattr(self, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
-        return RunConfig(env=EnvConfig(self.env, self.flicker), **own)
+        seen = {item.name: getattr(self, item.name) for item in dataclasses.fields(EnvConfig) if item.name != "id"}
+        return RunConfig(env=EnvConfig(self.env, **seen), **own)
 
     def placement(self) -> Placement:
         """Where and on what it runs."""

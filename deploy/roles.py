@@ -14,10 +14,12 @@ from actors.actor import Actor
 from actors.evaluator import Evaluator
 from common.bus import ReplayAddress
 from common.checkpoint import CheckpointFolder
-from common.envs import Env, make_env
+from common.envs import make_env
 from common.errors import BusUnavailable, ConfigError
 from common.redis_bus import RedisBus
 from common.role import RECONNECT_SLEEP, StopSignal, run_role
+from common.watchdog import Watchdog
+from common.wrappers import Env
 from deploy.presets import RunConfig, from_json
 from learner.learner import Learner
 from learner.replay_client import ReplayClient
@@ -106,7 +108,9 @@ def run_actor(place: Place, index: int) -> None:
         raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
     torch.set_num_threads(1)
     actor = Actor(index, config.seed, process.make_env, config.window_spec(), config.agent, config.actor, process.bus)
-    run_role(actor, process.bus, process.stop)
+    watchdog = Watchdog(config.env.env_timeout)
+    run_role(actor, process.bus, process.stop, beat=watchdog.beat)
+    watchdog.close()
 
 
 def run_evaluator(place: Place) -> None:
@@ -116,7 +120,9 @@ def run_evaluator(place: Place) -> None:
     torch.set_num_threads(1)
     os.nice(EVALUATOR_NICENESS)
     evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, process.bus)
-    run_role(evaluator, process.bus, process.stop)
+    watchdog = Watchdog(config.env.env_timeout)
+    run_role(evaluator, process.bus, process.stop, beat=watchdog.beat)
+    watchdog.close()
 
 
 def run_replay(place: Place, folder: Path, listen: str) -> None:

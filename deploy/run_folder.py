@@ -18,7 +18,14 @@ from common.errors import CheckpointError, ConfigError
 from deploy.presets import RunConfig, from_json, option, to_json
 
 IfExists = Literal["resume", "fail", "new"]
-MAY_CHANGE = {"total_steps", "actors", "learner.threads", "learner.keep_checkpoints", "learner.checkpoint_steps"}
+MAY_CHANGE = {
+    "total_steps",
+    "actors",
+    "env.env_timeout",
+    "learner.threads",
+    "learner.keep_checkpoints",
+    "learner.checkpoint_steps",
+}
 
 
 class RunFolder:

@@ -43,6 +43,12 @@ class Board:
         value: float | None = self.get("replay", "policy_lag_mean")
         return value
 
+    @property
+    def episodes(self) -> str:
+        """The episodes' return, and how many the environment's own faults have ended."""
+        broken = sum(record.get("broken_episodes", 0) for record in self.roles.values())
+        return number(self.episode_return, ",.1f") + (f", {broken} broken" if broken else "")
+
 
 def number(value: Any, form: str = ",.3g") -> str:
     """A number as text, or a hyphen where there is none yet."""
@@ -65,7 +71,7 @@ def _facts(board: Board) -> list[tuple[str, str]]:
         ("updates", f"{number(learner.get('updates'), ',')}, {number(learner.get('updates_per_s'), ',.1f')} /s"),
         ("replay", f"ring {number(board.get('replay', 'ring_fill'), '.0%')} full, "
                    f"ratio {number(board.get('replay', 'replay_ratio'), ',.1f')} of {board.replay_ratio:g}"),
-        ("episode return", number(board.episode_return, ",.1f")),
+        ("episode return", board.episodes),
         ("evaluation return", _evaluation(board)),
         ("losses", losses or NONE_YET),
         ("alpha, beta", f"{number(learner.get('alpha'))}, {number(learner.get('beta'))}"),
@@ -116,7 +122,7 @@ def line(board: Board) -> str:
         f"{number(learner.get('updates_per_s'), '.1f')}/s",
         f"ring {number(board.get('replay', 'ring_fill'), '.0%')}",
         f"ratio {number(board.get('replay', 'replay_ratio'), '.1f')}/{board.replay_ratio:g}",
-        f"episode {number(board.episode_return, '.1f')}",
+        f"episode {board.episodes}",
         f"eval {number(board.get('evaluator', 'eval_return_mean'), '.1f')}",
         f"q {number(learner.get('q_loss'))} model {number(learner.get('model_loss'))}",
         f"alpha {number(learner.get('alpha'))} beta {number(learner.get('beta'))}",

@@ -3,7 +3,9 @@
 import contextlib
 import itertools
 from collections.abc import Callable
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import redis
@@ -18,6 +20,7 @@ from common.redis_bus import RedisBus
 from common.window import Rows, WindowSpec
 from common.wire import decode_entry
 from tests.actors.support import join_rows
+from tests.broken_env import FAULTS
 from tests.counting_env import ACTION_DIM, OBS_DIM, Step, audit
 from tests.learner.rows import step_valid
 
@@ -404,4 +407,58 @@ def test_a_life_that_the_ring_forgot_is_begun_anew(bus: Bus) -> None:
     play(bus, actor, reader, 300)
     later = reader.rows()[reader.rows()["epoch"] == 2]
     assert_each_step_once(later, 300)
+    actor.close()
+
+
+def make_broken(bus: Bus, env: str) -> Actor:
+    clock: Callable[[], float] = itertools.count().__next__
+    return Actor(0, 1, lambda: make_env(EnvConfig(f"tests.broken_env:{env}")), SPEC, AGENT, CONFIG, bus, clock)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_broken_episode_is_dropped_and_training_goes_on(fault: str) -> None:
+    """What was sent of it before is sound; nothing of the step that broke is, and it costs no credit."""
+    bus = MemoryBus()
+    publish(bus, 0)
+    actor, reader = make_broken(bus, f"Broken-{fault}-v0"), Reader(bus)
+    play(bus, actor, reader, 2000)
+    rows = reader.rows()
+    found = audit(rows, SPEC)
+    assert set(found.trained.values()) == {1}
+    assert found.trained.total() == found.new_steps  # as many as were granted, broken ones not among them
+    assert 2000 <= found.new_steps < 2000 + CONFIG.envs_per_actor
+    assert np.isfinite(rows["observation"]).all()
+    assert actor.metrics()["broken_episodes"] > 10
+    sent = {step.step for step in found.trained if step.episode % 3 == 2}
+    assert {0, SPEC.train - 1} <= sent
+    actor.close()
+
+
+def test_an_environment_that_always_breaks_at_once_ends_the_actor() -> None:
+    class Dead(gym.Wrapper[Any, Any, Any, Any]):
+        def step(self, action: Any) -> Any:
+            raise RuntimeError("it is dead")
+
+    bus = MemoryBus()
+    publish(bus, 0)
+    clock: Callable[[], float] = itertools.count().__next__
+    actor = Actor(0, 1, lambda: Dead(make_env(COUNTING)), SPEC, AGENT, CONFIG, bus, clock)
+    with pytest.raises(RuntimeError, match="it is dead"):
+        play(bus, actor, Reader(bus), 2000)
+
+
+def test_a_reset_that_breaks_is_tried_once_more_on_a_new_environment() -> None:
+    bus = MemoryBus()
+    publish(bus, 0)
+    actor, reader = make_actor(bus), Reader(bus)
+
+    class BreaksAtReset(gym.Wrapper[Any, Any, Any, Any]):
+        def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+            observation, info = self.env.reset(**options)
+            return np.full_like(observation, np.nan), info
+
+    actor._envs[2] = BreaksAtReset(actor._envs[2])
+    play(bus, actor, reader, 1000)
+    assert actor.metrics()["broken_episodes"] == 1
+    assert audit(reader.rows(), SPEC).trained.total() == 1000
     actor.close()

@@ -1,6 +1,7 @@
 """The evaluator: whole deterministic episodes, side by side, and one record for each policy asked for."""
 
 import itertools
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,8 +12,9 @@ from actors.evaluator import Evaluator, EvaluatorConfig, Match, play_episodes
 from actors.policy_runner import PolicyRunner
 from common.agent import Agent, AgentConfig
 from common.bus import Bus, MemoryBus, Version
-from common.envs import Env, EnvConfig, Standardised, make_env
-from common.errors import ConfigError
+from common.envs import EnvConfig, make_env
+from common.errors import ConfigError, RmcError
+from common.wrappers import Env, Standardised
 from tests.counting_env import ACTION_DIM, OBS_DIM
 
 AGENT = AgentConfig(hidden=8, embedding=8, heads=(8, 8))
@@ -103,3 +105,41 @@ def test_close_hands_out_what_is_left() -> None:
 def test_nonsense_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"--episodes"):
         Evaluator(1, counting, AGENT, EvaluatorConfig(episodes=0), MemoryBus())
+
+
+class Dead(gym.Wrapper[Any, Any, Any, Any]):
+    """Breaks in its first step."""
+
+    def step(self, action: Any) -> Any:
+        raise RuntimeError("it is dead")
+
+
+def test_an_episode_that_breaks_is_left_out() -> None:
+    sound = play_episodes(runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT), 3), counting, 3, seed=4)
+    made = itertools.count()
+    some = play_episodes(
+        runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT), 3),
+        lambda: Dead(counting()) if next(made) == 1 else counting(),
+        3,
+        4,
+    )
+    assert some == [sound[0], sound[2]]
+    with pytest.raises(RmcError, match="broke in each of 2 episodes"):
+        play_episodes(runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT), 2), lambda: Dead(counting()), 2, seed=4)
+
+
+def test_the_evaluator_counts_them_and_makes_new_environments() -> None:
+    bus, made = MemoryBus(), itertools.count()
+
+    def breaking_once() -> Env:
+        return Dead(counting()) if next(made) == 0 else counting()
+
+    config = EvaluatorConfig(episodes=3)
+    evaluator = Evaluator(1, breaking_once, AGENT, config, bus, clock=itertools.count().__next__)
+    found = []
+    for update in (1, 2):
+        publish(bus, update, evaluate=True)
+        step_until_idle(evaluator)
+        found.append(evaluator.metrics())
+    assert [(record["eval_broken_episodes"], record["eval_episodes"]) for record in found] == [(1, 2), (0, 3)]
+    evaluator.close()

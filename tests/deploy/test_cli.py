@@ -16,7 +16,8 @@ DEBUG = ["train", PENDULUM, "--preset", "debug"]
 
 # Whoever changes this list changes what users have in their scripts.
 TRAIN_FLAGS = """
-    --preset --seed --total-steps --actors --flicker --run-dir --if-exists --launcher --device --redis-url
+    --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
+    --env-timeout --run-dir --if-exists --launcher --device --redis-url
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --shortcut --normalize-observations --grounding
     --envs-per-actor --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes

@@ -1,0 +1,140 @@
+"""What stands between an environment and the agent: one class for each thing done to what is seen.
+
+Shapes: O observation, A action.
+"""
+
+import math
+from collections import deque
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+Env = gym.Env[Floats, Floats]
+_FLICKER_STREAM, _NOISE_STREAM = 0xF11C, 0x2015E  # keep their random numbers apart from the environment's own
+
+
+class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
+    """Observations as float32; actions in [-1, 1], stretched over the environment's own bounds.
+
+    Raises ValueError where an observation is no vector of numbers of the size that its space says.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        inner = env.action_space
+        assert isinstance(inner, gym.spaces.Box)
+        assert env.observation_space.shape is not None
+        self._low = inner.low.astype(np.float32)
+        self._high = inner.high.astype(np.float32)
+        self._half_range = (self._high - self._low) / 2
+        self._plain = bool((inner.low == -1.0).all() and (inner.high == 1.0).all())
+        self._dtype, self._shape = inner.dtype, env.observation_space.shape
+        self.action_space = gym.spaces.Box(-1.0, 1.0, inner.shape, np.float32)
+        self.observation_space = _box(env.observation_space.shape[0])
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._vector(observation), info
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        if not self._plain:
+            stretched = self._low + (action + 1.0) * self._half_range
+            action = np.clip(stretched, self._low, self._high).astype(self._dtype)  # rounding may pass a bound
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._vector(observation), float(reward), terminated, truncated, info
+
+    def _vector(self, observation: Any) -> Floats:
+        vector = np.asarray(observation, np.float32)
+        if vector.shape != self._shape:
+            raise ValueError(f"its observation has shape {vector.shape}, its space says {self._shape}")
+        return vector
+
+
+class Flicker(gym.Wrapper[Floats, Floats, Floats, Floats]):
+    """Whole observations become zeros, independently with probability p; ``info["blank"]`` says which."""
+
+    def __init__(self, env: Env, probability: float) -> None:
+        super().__init__(env)
+        self._probability = probability
+        self._rng = np.random.default_rng()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+        if seed is not None:
+            self._rng = np.random.default_rng([seed, _FLICKER_STREAM])
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._flicker(observation, info), info
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._flicker(observation, info), float(reward), terminated, truncated, info
+
+    def _flicker(self, observation: Floats, info: dict[str, Any]) -> Floats:
+        info["blank"] = bool(self._rng.random() < self._probability)
+        return np.zeros_like(observation) if info["blank"] else observation
+
+
+class Partial(gym.Wrapper[Floats, Floats, Floats, Floats]):
+    """Only some of the observation's dimensions."""
+
+    def __init__(self, env: Env, shown: slice) -> None:
+        super().__init__(env)
+        self._shown = shown
+        size = range(*shown.indices(env.observation_space.shape[0] if env.observation_space.shape else 0))
+        self.observation_space = _box(len(size))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        return observation[self._shown], info
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation[self._shown], float(reward), terminated, truncated, info
+
+
+class Noise(gym.Wrapper[Floats, Floats, Floats, Floats]):
+    """Independent Gaussian noise on every dimension of every observation."""
+
+    def __init__(self, env: Env, deviation: float) -> None:
+        super().__init__(env)
+        self._deviation = deviation
+        self._rng = np.random.default_rng()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+        if seed is not None:
+            self._rng = np.random.default_rng([seed, _NOISE_STREAM])
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._noisy(observation), info
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._noisy(observation), float(reward), terminated, truncated, info
+
+    def _noisy(self, observation: Floats) -> Floats:
+        return observation + self._deviation * self._rng.standard_normal(observation.shape, np.float32)
+
+
+class FrameStack(gym.Wrapper[Floats, Floats, Floats, Floats]):
+    """The newest observations side by side, oldest first; the first one of an episode stands for those before it."""
+
+    def __init__(self, env: Env, frames: int) -> None:
+        super().__init__(env)
+        assert env.observation_space.shape
+        self._frames: deque[Floats] = deque(maxlen=frames)
+        self.observation_space = _box(frames * env.observation_space.shape[0])
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._frames.extend([observation] * (self._frames.maxlen or 1))
+        return np.concatenate(self._frames), info | {"blank": False}
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._frames.append(observation)
+        return np.concatenate(self._frames), float(reward), terminated, truncated, info | {"blank": False}
+
+
+def _box(size: int) -> gym.Space[Floats]:
+    return gym.spaces.Box(-math.inf, math.inf, (size,), np.float32)

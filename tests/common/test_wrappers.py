@@ -1,0 +1,113 @@
+"""What is done to an environment before the agent sees it."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from common.envs import EnvConfig, env_spaces, make_env
+
+CHEETAH, ACTION = "HalfCheetah-v5", np.linspace(-1, 1, 6, dtype=np.float32)
+
+
+def played(config: EnvConfig, steps: int = 30, seed: int = 1) -> tuple[np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    """Observations (steps + 1, O), rewards (steps,) and infos of one episode's start."""
+    env = make_env(config)
+    observation, info = env.reset(seed=seed)
+    observations, rewards, infos = [observation], [], [info]
+    for _ in range(steps):
+        observation, reward, *_, info = env.step(ACTION)
+        observations.append(observation)
+        rewards.append(reward)
+        infos.append(info)
+    env.close()
+    assert all(o.dtype == np.float32 for o in observations)
+    assert observations[0].shape == env.observation_space.shape
+    return np.stack(observations), np.array(rewards), infos
+
+
+@pytest.mark.parametrize(("hide", "kept"), [("velocities", slice(0, 8)), ("positions", slice(8, 17))])
+def test_part_of_the_observation_is_left_out(hide: Any, kept: slice) -> None:
+    clear, rewards, _ = played(EnvConfig(CHEETAH))
+    seen, same_rewards, _ = played(EnvConfig(CHEETAH, hide=hide))
+    np.testing.assert_array_equal(seen, clear[:, kept])
+    np.testing.assert_array_equal(rewards, same_rewards)
+    assert env_spaces(EnvConfig(CHEETAH, hide=hide))[0] == seen.shape[1]
+
+
+def test_what_depends_on_velocities_goes_with_them() -> None:
+    assert env_spaces(EnvConfig("Ant-v5", hide="velocities"))[0] == 13
+    assert env_spaces(EnvConfig("Ant-v5", hide="positions"))[0] == 105 - 13
+
+
+def test_noise_is_gaussian_independent_and_seeded() -> None:
+    clear, _, _ = played(EnvConfig(CHEETAH), 300)
+    noisy, _, _ = played(EnvConfig(CHEETAH, noise=0.5), 300)
+    noise = (noisy - clear) / 0.5
+    assert abs(noise.mean()) < 5 / np.sqrt(noise.size)
+    assert noise.std() == pytest.approx(1.0, rel=0.05)
+    assert np.abs(np.corrcoef(noise.T) - np.eye(17)).max() < 5 / np.sqrt(len(noise))
+    np.testing.assert_array_equal(noisy, played(EnvConfig(CHEETAH, noise=0.5), 300)[0])
+    assert not np.array_equal(noisy, played(EnvConfig(CHEETAH, noise=0.5), 300, seed=2)[0])
+
+
+def test_a_blank_frame_has_no_noise() -> None:
+    seen, _, infos = played(EnvConfig(CHEETAH, noise=0.5, flicker=0.5))
+    for observation, info in zip(seen, infos, strict=True):
+        assert observation.any() == (not info["blank"])
+
+
+def test_stacked_frames_are_the_newest_oldest_first() -> None:
+    clear, _, _ = played(EnvConfig(CHEETAH))
+    stacked, _, infos = played(EnvConfig(CHEETAH, frame_stack=3))
+    for t, observation in enumerate(stacked):
+        wanted = np.concatenate([clear[max(0, t - 2)], clear[max(0, t - 1)], clear[t]])
+        np.testing.assert_array_equal(observation, wanted)
+    assert not any(info["blank"] for info in infos)
+
+
+def test_a_stack_holds_blank_frames_as_they_are() -> None:
+    blank = [info["blank"] for info in played(EnvConfig(CHEETAH, flicker=0.5))[2]]
+    stacked, _, infos = played(EnvConfig(CHEETAH, flicker=0.5, frame_stack=2))
+    for t in range(1, len(stacked)):
+        older, newest = stacked[t, :17], stacked[t, 17:]
+        assert (not older.any(), not newest.any()) == (blank[t - 1], blank[t])
+        assert infos[t]["blank"] is False
+
+
+def test_repeated_actions_add_their_rewards() -> None:
+    clear, rewards, _ = played(EnvConfig(CHEETAH), 30)
+    repeated, sums, _ = played(EnvConfig(CHEETAH, action_repeat=3), 10)
+    np.testing.assert_allclose(repeated, clear[::3], rtol=1e-6)
+    np.testing.assert_allclose(sums, rewards.reshape(10, 3).sum(1))
+
+
+@pytest.mark.parametrize(("repeat", "limit", "steps"), [(1, 7, 7), (3, 7, 3), (3, 0, 334)])
+def test_a_time_limit_counts_the_environments_steps(repeat: int, limit: int, steps: int) -> None:
+    config = EnvConfig(CHEETAH, action_repeat=repeat, time_limit=limit)
+    assert env_spaces(config)[2] == steps
+    env = make_env(config)
+    env.reset(seed=0)
+    assert [env.step(ACTION)[2:4] for _ in range(steps)] == [(False, False)] * (steps - 1) + [(False, True)]
+    env.close()
+
+
+class Parts(gym.Env[Any, Any]):
+    """A Dict of boxes."""
+
+    observation_space = gym.spaces.Dict(b=gym.spaces.Box(-9, 9, (2, 2)), a=gym.spaces.Box(-9, 9, (1,), np.float64))
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return {"b": np.array([[1, 2], [3, 4]], np.float32), "a": np.array([5.0])}, {}
+
+
+gym.register("Parts-v0", entry_point=Parts)
+
+
+def test_a_dict_of_boxes_is_flattened() -> None:
+    config = EnvConfig("Parts-v0")
+    assert env_spaces(config) == (5, 1, None)
+    observation, _ = make_env(config).reset(seed=0)
+    assert observation.tolist() == [1, 2, 3, 4, 5]
