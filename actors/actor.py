@@ -42,6 +42,8 @@ class ActorConfig:
     state_strategy: Literal["zero", "stored", "burn-in", "episode"] = "burn-in"
     """What a window's memory starts from: zeros; the state that the actor stored; that state, then burned in; or
     zeros at the start of the episode, all of which is the window, as long as the time limit allows."""
+    reward_scale: float = 1.0
+    """Rewards are multiplied by this to learn from; returns are told as the environment gives them."""
     refresh_steps: int = 400
     """Environment steps of an actor between two looks at the newest weights."""
     chunk_windows: int = 16
@@ -241,8 +243,8 @@ class Actor:
         for i in self._faults:
             self._steps -= self._builder.forget(i) + 1
         ended = self._builder.add(
-            action, hidden, self._version.update, self._reward, self._observation, self._blank,
-            self._terminated, self._truncated,
+            action, hidden, self._version.update, self._config.reward_scale * self._reward, self._observation,
+            self._blank, self._terminated, self._truncated,
         )  # fmt: skip
         self._next_poll = float("-inf")
         self._steps += n

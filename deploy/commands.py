@@ -8,8 +8,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from common.envs import EnvConfig
 from common.errors import ConfigError
-from deploy import options, roles, training
+from deploy import env_check, options, roles, training
 from deploy.evaluation import evaluate_checkpoint
 from deploy.run_folder import RunFolder
 from deploy.view import Board, table
@@ -22,6 +23,8 @@ def execute(command: options.Command) -> int:
         return training.train(command.config(), command.placement(), Console())
     if isinstance(command, options.Evaluate):
         return evaluate(command)
+    if isinstance(command, options.CheckEnv):
+        return check_env(command)
     if isinstance(command, options.Stats):
         return stats(command)
     return run_role(command)
@@ -59,6 +62,13 @@ def evaluate(command: options.Evaluate) -> int:
     text = f"{config.env.id}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
     Console().print(f"{text}, after {played['env_steps']:,} environment steps", highlight=False)
     return 0
+
+
+def check_env(command: options.CheckEnv) -> int:
+    """Say what the agent will make of an environment."""
+    if not 1 <= command.steps <= 10_000_000:
+        raise ConfigError("--steps", command.steps, "take 1 to 10_000_000")
+    return env_check.check(EnvConfig(command.env), command.steps, Console())
 
 
 def stats(command: options.Stats) -> int:

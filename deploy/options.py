@@ -96,6 +96,16 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class CheckEnv:
+    """Play an environment at random, and say whether it can be trained on and what to mend."""
+
+    env: Positional[str]
+    """Gymnasium id, like HalfCheetah-v5, or module:EnvId-v0 for your own."""
+    steps: int = 2_000
+    """Random steps to play."""
+
+
+@dataclass(frozen=True)
 class Stats:
     """Show the newest metrics of a run."""
 
@@ -148,7 +158,7 @@ class EvaluatorRole(_Role):
     """Run the evaluator of a registered run in this process."""
 
 
-Command = Train | Evaluate | Stats | ActorRole | ReplayRole | LearnerRole | EvaluatorRole
+Command = Train | Evaluate | CheckEnv | Stats | ActorRole | ReplayRole | LearnerRole | EvaluatorRole
 
 
 def parse(words: list[str]) -> Command:
@@ -158,6 +168,7 @@ def parse(words: list[str]) -> Command:
     commands = (
         Annotated[Train, tyro.conf.subcommand("train", default=Train(env=tyro.MISSING, **shared))]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+        | Annotated[CheckEnv, tyro.conf.subcommand("check-env")]
         | Annotated[Stats, tyro.conf.subcommand("stats")]
         | Annotated[ActorRole, tyro.conf.subcommand("actor")]
         | Annotated[ReplayRole, tyro.conf.subcommand("replay")]

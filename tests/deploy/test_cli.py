@@ -20,7 +20,7 @@ TRAIN_FLAGS = """
     --env-timeout --run-dir --if-exists --launcher --device --redis-url
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --shortcut --normalize-observations --grounding
-    --envs-per-actor --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
+    --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
     --capacity --replay-ratio --warmup-steps --priority-exponent --importance-exponent
     --learning-rate --alpha-learning-rate --gamma --polyak --clip-norm --latent-target --target-memory --policy-q
     --scheme --policy-through-q --update-order --model-norm --n-step --state-strategy
@@ -30,6 +30,7 @@ TRAIN_FLAGS = """
 """.split()  # noqa: SIM905
 OTHER_FLAGS = {
     "evaluate": ["--episodes", "--flicker", "--checkpoint", "--json"],
+    "check-env": ["--steps"],
     "stats": [],
     "actor": ["--run", "--redis-url", "--index"],
     "replay": ["--run", "--redis-url", "--folder", "--listen", "--secret-file"],

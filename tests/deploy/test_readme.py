@@ -41,3 +41,30 @@ def test_its_commands_run(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stdout + done.stderr
         assert done.stderr == ""
         assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+@pytest.mark.timeout(300)
+def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "custom-environments.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "shuttle.py").write_text(code)
+    commands = re.findall(r"^rmc .*$", page, re.MULTILINE)
+    assert [command.split()[1] for command in commands] == ["check-env", "train", "evaluate"]
+    said = []
+    for command in commands:
+        shorter = ["--preset", "debug", "--total-steps", "1500"] * command.startswith("rmc train")
+        words = [sys.executable, "-m", "deploy.cli", *command.split()[1:], *shorter]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=280)
+        assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
+        said.append(done.stdout)
+    assert "time limit 100" in said[0]
+    assert said[0].endswith("it can be trained on\n")
+    assert "note" not in said[0]
+
+
+def test_the_docs_name_options_that_exist() -> None:
+    made = subprocess.run([sys.executable, "-m", "deploy.cli", "train", "--help"], capture_output=True, text=True)
+    there = set(re.findall(r"--[a-z][a-z-]*[a-z]", made.stdout)) | {"--listen", "--run", "--pairs", "--seconds"}
+    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+        named = set(re.findall(r"`[^`\n]*?(--[a-z][a-z-]*[a-z])", page.read_text()))
+        assert named <= there | {"--episodes", "--json", "--checkpoint", "--steps", "--logdir"}, (page, named - there)

@@ -1,0 +1,84 @@
+"""rmc check-env, as someone who brings an environment sees it."""
+
+import re
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from deploy import cli
+
+
+def said(env: str, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, str]:
+    status = cli.run(["check-env", env, *options])
+    return status, capsys.readouterr().out
+
+
+class Odd(gym.Env[Any, Any]):
+    """Sound but strange: large rewards, a dimension that never moves, no end, another start each time."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self._observation(), 1000.0, False, False, {}
+
+    def _observation(self) -> Any:
+        return np.array([np.random.default_rng().normal(), 0.0, 1e6 * np.random.default_rng().normal()], np.float32)
+
+
+class Unrewarded(Odd):
+    """Never rewards."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self._observation(), 0.0, False, False, {}
+
+
+gym.register("Odd-v0", entry_point=Odd)
+gym.register("Unrewarded-v0", entry_point=Unrewarded)
+
+
+def test_a_sound_environment(capsys):
+    status, text = said("HalfCheetah-v5", capsys)
+    assert status == 0
+    assert "observations 17, actions 6, time limit 1000" in text
+    assert re.search(r"2,000 random steps, [\d,]+ a second; reward -?[\d.]+ ± [\d.]+", text)
+    assert "2 episodes of 1000 to 1000 steps, 0 of them terminated" in text
+    assert text.endswith("it can be trained on\n")
+    assert "note" not in text
+
+
+def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
+    status, text = said("Odd-v0", capsys, "--steps", "300")
+    assert status == 0
+    for words in ("observations [1] never changed", "observations reach", "--reward-scale 0.001", "--time-limit"):
+        assert words in text
+    assert "the same seed and actions gave other observations" in text
+    assert "--curiosity" in said("Unrewarded-v0", capsys, "--steps", "100")[1]
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("raise", "fault: RuntimeError: the simulation is unstable"),
+        ("nan", "fault: observations are not finite"),
+        ("reward", "fault: rewards are not finite"),
+        ("shape", "fault: ValueError: its observation has shape (3,), its space says (4,)"),
+    ],
+)
+def test_faults_are_named(fault, words, capsys):
+    status, text = said(f"tests.broken_env:Broken-{fault}-v0", capsys)
+    assert status == 1
+    assert words in text
+    assert "mend the fault first" in text
+
+
+def test_what_cannot_be_made_is_one_line(capsys):
+    assert cli.run(["check-env", "CartPole-v1"]) == 2
+    assert "actions are Discrete" in capsys.readouterr().err
+    assert cli.run(["check-env", "HalfCheetah-v5", "--steps", "0"]) == 2
