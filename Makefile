@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 40000
 
-.PHONY: env demo test lint results trial bench clean
+.PHONY: env demo test lint results trial docs bench clean
 
 env: $(STAMP)
 
@@ -48,6 +48,9 @@ TRIALS := base layer_norm prioritized ema_latent online_memory curiosity no_shor
 
 trial: $(STAMP)
 	$(foreach name,$(TRIALS),$(foreach seed,1 2,$(BIN)/rmc train HalfCheetah-v5 --seed $(seed) --total-steps 100000 --run-dir runs/trial-$(name)-$(seed) $(trial_$(name)) && )) true
+
+docs: $(STAMP)
+	$(BIN)/python -m docs.generate
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks.throughput

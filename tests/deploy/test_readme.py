@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from docs.generate import page
+
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 PACKAGES = ("common", "actors", "replay_server", "learner", "deploy")
@@ -65,6 +67,10 @@ def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Pat
 def test_the_docs_name_options_that_exist() -> None:
     made = subprocess.run([sys.executable, "-m", "deploy.cli", "train", "--help"], capture_output=True, text=True)
     there = set(re.findall(r"--[a-z][a-z-]*[a-z]", made.stdout)) | {"--listen", "--run", "--pairs", "--seconds"}
-    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
-        named = set(re.findall(r"`[^`\n]*?(--[a-z][a-z-]*[a-z])", page.read_text()))
-        assert named <= there | {"--episodes", "--json", "--checkpoint", "--steps", "--logdir"}, (page, named - there)
+    for text in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+        named = set(re.findall(r"`[^`\n]*?(--[a-z][a-z-]*[a-z])", text.read_text()))
+        assert named <= there | {"--episodes", "--json", "--checkpoint", "--steps", "--logdir"}, (text, named - there)
+
+
+def test_the_page_of_options_is_up_to_date() -> None:
+    assert page() == (ROOT / "docs" / "configuration.md").read_text(), "run make docs"

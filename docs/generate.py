@@ -1,0 +1,141 @@
+"""Writes docs/configuration.md from the options' dataclasses: ``make docs``. A test asks whether it is up to date."""
+
+import ast
+import dataclasses
+import importlib
+import inspect
+import itertools
+from pathlib import Path
+from typing import Any
+
+from common.envs import EnvConfig
+from deploy.presets import option, paper, robust
+
+PAGE = Path(__file__).parent / "configuration.md"
+TITLES = {
+    "run": "The run",
+    "env": "The environment, as the agent sees it",
+    "window": "Windows",
+    "agent": "Networks",
+    "actor": "Actors",
+    "replay": "Replay",
+    "update": "The update",
+    "learner": "The learner",
+    "evaluator": "Evaluation",
+}
+# When a user should touch an option; what it does is said where it is defined.
+WHEN = {
+    "preset": "`paper` to compare with the paper, `debug` to see everything run within a minute",
+    "seed": "for every repetition",
+    "total_steps": "always: it is the length of the run, and also where a finished one goes on to",
+    "actors": "when the learner waits for experience; on two cores one actor is enough",
+    "flicker": "for trials of partial observation",
+    "hide": "for trials of partial observation",
+    "noise": "for trials of partial observation",
+    "frame_stack": "to compare a memory with a stack; 1 with a memory",
+    "action_repeat": "where a single step changes almost nothing",
+    "time_limit": "where episodes do not end, or the end comes too late to learn from",
+    "env_timeout": "up for an environment whose steps or resets take long",
+    "burn_in": "up where the past matters for longer than 10 steps",
+    "trained_steps": "up to learn longer memories; the network unrolls them one after the other",
+    "hidden": "up for large observations, down for speed",
+    "embedding": "0 for the paper's raw input",
+    "heads": "rarely",
+    "layer_norm": "rarely: it cost return in the [trial](results.md)",
+    "shortcut": "off where nothing but the memory may be read, as in the paper",
+    "normalize_observations": "off where observations are scaled already and their statistics keep moving",
+    "grounding": "off for the paper's model; without it the latent can collapse in other schemes than 1",
+    "envs_per_actor": "up where actors are the bottleneck: they share one forward pass",
+    "stride": "down for overlapping windows, which repeat each step in training",
+    "state_strategy": "to compare the strategies of the paper; `episode` is slow, and right",
+    "reward_scale": "where a step's reward is in the hundreds, as in HumanoidStandup",
+    "refresh_steps": "rarely: how far actors lag behind is in the metrics",
+    "chunk_windows": "up on a slow network",
+    "chunk_seconds": "rarely",
+    "unacked_bytes": "down where actors have little memory",
+    "capacity": "down for a small disk; a window is about two kilobytes for HalfCheetah",
+    "replay_ratio": "up for more learning from each step, down for more steps a second: the learner is what takes time",
+    "warmup_steps": "up where random actions rarely meet a reward",
+    "priority_exponent": "0.6 for R2D2's prioritized replay, 0 for uniform",
+    "importance_exponent": "0.4 with prioritized replay",
+    "learning_rate": "down when the losses jump or training diverges",
+    "alpha_learning_rate": "up where exploration stays high for too long",
+    "gamma": "up for goals further away than 100 steps, down for nearer ones",
+    "polyak": "up for slower, steadier targets",
+    "clip_norm": "0 for the paper; the gradient's norm is in the metrics",
+    "scheme": "to repeat the paper's table 1; 1 is best there",
+    "policy_through_q": "with schemes 4 to 6",
+    "update_order": "`alternate` for algorithm 1 as printed, at four times the forwards",
+    "model_norm": "to repeat the paper's comparison",
+    "n_step": "up where rewards are rare; it is biased by old data",
+    "latent_target": "`ema` where the latent rank in the metrics falls",
+    "target_memory": "`online` for the paper",
+    "policy_q": "`first` for the paper",
+    "curiosity": "up where rewards are rare, 0 where observations flicker for long",
+    "curiosity_scale": "`std` makes beta mean the same in every environment, `raw` is the paper's",
+    "curiosity_steps": "as long as exploration should last",
+    "eta": "rarely; only with prioritized replay",
+    "batch_size": "up for steadier, slower updates; the replay ratio then makes fewer of them",
+    "publish_updates": "rarely",
+    "checkpoint_steps": "down to see more evaluations",
+    "keep_checkpoints": "up to go back further; the best is always kept",
+    "precision": "`fp32` to rule rounding out, at half the speed where the CPU has bfloat16",
+    "threads": "rarely: on a CPU two threads help only where nothing else runs",
+    "episodes": "up for less noise in what is called the best checkpoint",
+}
+
+
+def main() -> None:
+    """Write the page."""
+    PAGE.write_text(page())
+
+
+def page() -> str:
+    """The whole page as Markdown."""
+    lines = [
+        "# Every option of `rmc train`",
+        "",
+        "Written by `make docs` from the code. Defaults are `robust`'s; what `paper` has otherwise is in brackets.",
+    ]
+    ours, theirs = robust(EnvConfig("")), paper(EnvConfig(""))
+    for part, title in TITLES.items():
+        lines += ["", f"## {title}", "", "| option | default | what it is | when to touch it |", "|---|---|---|---|"]
+        configs = (ours, theirs) if part == "run" else (getattr(ours, part), getattr(theirs, part))
+        lines += _rows(*configs)
+    return "\n".join(lines) + "\n"
+
+
+def _rows(ours: Any, theirs: Any) -> list[str]:
+    said = _docstrings(type(ours))
+    rows = []
+    for item in dataclasses.fields(ours):
+        value, other = getattr(ours, item.name), getattr(theirs, item.name)
+        if dataclasses.is_dataclass(value) or item.name == "id":
+            continue
+        default = _text(value) if value == other or item.name == "preset" else f"{_text(value)} ({_text(other)})"
+        rows.append(f"| `{option(item.name)}` | {default} | {said[item.name]} | {WHEN[item.name]} |")
+    return rows
+
+
+def _docstrings(kind: type[Any]) -> dict[str, str]:
+    """What stands under each field in the source."""
+    tree = ast.parse(inspect.getsource(importlib.import_module(kind.__module__)))
+    body = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind.__name__).body
+    found = {}
+    for field, after in itertools.pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(after, ast.Expr):
+            assert isinstance(after.value, ast.Constant)
+            found[field.target.id] = " ".join(str(after.value.value).split())
+    return found
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, tuple):
+        return " ".join(map(str, value))
+    return f"{value:,}".replace(",", " ") if isinstance(value, int) else str(value)
+
+
+if __name__ == "__main__":
+    main()
