@@ -10,7 +10,7 @@ from rich.console import Console
 
 from common.envs import EnvConfig
 from common.errors import ConfigError
-from deploy import env_check, options, roles, training
+from deploy import env_check, export, options, roles, training
 from deploy.evaluation import evaluate_checkpoint
 from deploy.run_folder import RunFolder
 from deploy.view import Board, table
@@ -23,6 +23,8 @@ def execute(command: options.Command) -> int:
         return training.train(command.config(), command.placement(), Console())
     if isinstance(command, options.Evaluate):
         return evaluate(command)
+    if isinstance(command, options.Export):
+        return export_policy(command)
     if isinstance(command, options.CheckEnv):
         return check_env(command)
     if isinstance(command, options.Stats):
@@ -61,6 +63,13 @@ def evaluate(command: options.Evaluate) -> int:
     mean, deviation = played["eval_return_mean"], played["eval_return_std"]
     text = f"{config.env.id}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
     Console().print(f"{text}, after {played['env_steps']:,} environment steps", highlight=False)
+    return 0
+
+
+def export_policy(command: options.Export) -> int:
+    """Write a policy as ONNX."""
+    export.export(RunFolder(command.run), command.checkpoint, command.out)
+    Console().print(f"{command.out}: inputs {', '.join(export.INPUTS)}; outputs {', '.join(export.OUTPUTS)}")
     return 0
 
 

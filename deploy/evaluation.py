@@ -39,6 +39,19 @@ def evaluate_checkpoint(
     folder: RunFolder, config: RunConfig, checkpoint: str, episodes: int, flicker: float | None = None
 ) -> dict[str, Any]:
     """Deterministic episodes of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
+    progress, blob = load_checkpoint(folder, checkpoint)
+    return {
+        "env": config.env.id,
+        "preset": config.preset,
+        "seed": config.seed,
+        "env_steps": progress["env_steps"],
+        "updates": progress["updates"],
+        **evaluate_blob(config, blob, episodes, flicker),
+    }
+
+
+def load_checkpoint(folder: RunFolder, checkpoint: str) -> tuple[dict[str, Any], bytes]:
+    """Progress and policy of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
     checkpoints = CheckpointFolder(folder.checkpoints)
     number = _number(checkpoints, checkpoint)
     try:
@@ -47,15 +60,7 @@ def evaluate_checkpoint(
         others = [other for other in checkpoints.numbers() if other != number]
         fix = f"use one of {others}" if others else "there is no other"
         raise ConfigError("--checkpoint", checkpoint, f"{error}; {fix}") from None
-    progress = json.loads(files[PROGRESS])
-    return {
-        "env": config.env.id,
-        "preset": config.preset,
-        "seed": config.seed,
-        "env_steps": progress["env_steps"],
-        "updates": progress["updates"],
-        **evaluate_blob(config, files[POLICY], episodes, flicker),
-    }
+    return json.loads(files[PROGRESS]), files[POLICY]
 
 
 def _number(checkpoints: CheckpointFolder, which: str) -> int:

@@ -96,6 +96,18 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class Export:
+    """Write a run's policy as an ONNX file, for programs without torch."""
+
+    run: Positional[Path]
+    """The run's folder."""
+    out: Path = Path("policy.onnx")
+    """The file to write."""
+    checkpoint: str = "latest"
+    """latest, best, or the number of a checkpoint."""
+
+
+@dataclass(frozen=True)
 class CheckEnv:
     """Play an environment at random, and say whether it can be trained on and what to mend."""
 
@@ -158,7 +170,7 @@ class EvaluatorRole(_Role):
     """Run the evaluator of a registered run in this process."""
 
 
-Command = Train | Evaluate | CheckEnv | Stats | ActorRole | ReplayRole | LearnerRole | EvaluatorRole
+Command = Train | Evaluate | Export | CheckEnv | Stats | ActorRole | ReplayRole | LearnerRole | EvaluatorRole
 
 
 def parse(words: list[str]) -> Command:
@@ -168,6 +180,7 @@ def parse(words: list[str]) -> Command:
     commands = (
         Annotated[Train, tyro.conf.subcommand("train", default=Train(env=tyro.MISSING, **shared))]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+        | Annotated[Export, tyro.conf.subcommand("export")]
         | Annotated[CheckEnv, tyro.conf.subcommand("check-env")]
         | Annotated[Stats, tyro.conf.subcommand("stats")]
         | Annotated[ActorRole, tyro.conf.subcommand("actor")]

@@ -30,6 +30,7 @@ TRAIN_FLAGS = """
 """.split()  # noqa: SIM905
 OTHER_FLAGS = {
     "evaluate": ["--episodes", "--flicker", "--checkpoint", "--json"],
+    "export": ["--out", "--checkpoint"],
     "check-env": ["--steps"],
     "stats": [],
     "actor": ["--run", "--redis-url", "--index"],

@@ -43,6 +43,9 @@ def test_its_commands_run(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stdout + done.stderr
         assert done.stderr == ""
         assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
 
 
 @pytest.mark.timeout(300)
@@ -69,7 +72,10 @@ def test_the_docs_name_options_that_exist() -> None:
     there = set(re.findall(r"--[a-z][a-z-]*[a-z]", made.stdout)) | {"--listen", "--run", "--pairs", "--seconds"}
     for text in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
         named = set(re.findall(r"`[^`\n]*?(--[a-z][a-z-]*[a-z])", text.read_text()))
-        assert named <= there | {"--episodes", "--json", "--checkpoint", "--steps", "--logdir"}, (text, named - there)
+        assert named <= there | {"--episodes", "--json", "--checkpoint", "--steps", "--logdir", "--out"}, (
+            text,
+            named - there,
+        )
 
 
 def test_the_page_of_options_is_up_to_date() -> None:

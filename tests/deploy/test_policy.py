@@ -1,0 +1,96 @@
+"""A policy outside of training: in a user's own loop, and as an ONNX file."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from safetensors.torch import save
+
+from common.agent import Agent, AgentConfig
+from common.checkpoint import CheckpointFolder
+from common.envs import EnvConfig
+from deploy import cli
+from deploy.evaluation import evaluate_checkpoint
+from deploy.policy import load_policy
+from deploy.presets import debug
+from deploy.run_folder import RunFolder, open_run
+
+AGENTS = {
+    "robust": AgentConfig(hidden=16, embedding=12, heads=(10, 9), shortcut=True, normalize_observations=True),
+    "layer norm": AgentConfig(hidden=16, embedding=12, heads=(10, 9), layer_norm=True),
+    "paper": AgentConfig(hidden=16, embedding=0, heads=(10, 9), grounding=False),
+}
+
+
+@pytest.fixture(params=AGENTS)
+def run(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
+    """A run's folder with one checkpoint of an agent that was never trained."""
+    config = dataclasses.replace(debug(EnvConfig("Pendulum-v1", flicker=0.2)), agent=AGENTS[request.param])
+    folder = open_run(config, tmp_path / "run", "fail")
+    folder.unlock()
+    torch.manual_seed(0)
+    agent = Agent(3, 1, config.agent)
+    agent.normalizer.freeze(10, torch.full((3,), 2.0), torch.full((3,), 30.0))
+    progress = json.dumps({"updates": 7, "env_steps": 70}).encode()
+    CheckpointFolder(folder.checkpoints).save(
+        7, {"policy.safetensors": save(agent.policy_weights()), "progress.json": progress, "learner.pt": b""}
+    )
+    return folder
+
+
+def test_a_loop_of_ones_own_gives_what_an_evaluation_gives(run: RunFolder) -> None:
+    policy = load_policy(run.path)
+    env, returns = policy.make_env(), []
+    for episode in range(3):
+        observation, info = env.reset(seed=run.config().seed + episode)
+        policy.reset()
+        total, ended = 0.0, False
+        while not ended:
+            action = policy.act(observation, info["blank"])
+            assert action.shape == (1,)
+            observation, reward, terminated, truncated, info = env.step(action)
+            total, ended = total + float(reward), terminated or truncated
+        returns.append(total)
+    found = evaluate_checkpoint(run, run.config(), "latest", episodes=3)
+    assert np.mean(returns) == pytest.approx(found["eval_return_mean"], rel=1e-4)
+
+
+def test_exploring_actions_vary_and_are_seeded(run: RunFolder) -> None:
+    observation = np.ones(3, np.float32)
+    found = [[load_policy(run.path).act(observation, explore=explore) for _ in range(2)] for explore in (False, True)]
+    assert found[0][0] == found[0][1]
+    assert found[1][0] == found[1][1]
+    assert found[0][0] != found[1][0]
+
+
+def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "policy.onnx"
+    assert cli.run(["export", str(run.path), "--out", str(file)]) == 0
+    assert "inputs observation, previous_action, blank, hidden" in capsys.readouterr().out
+    session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    rng, policy = np.random.default_rng(0), load_policy(run.path)
+    feed = {
+        "previous_action": np.zeros((3, 1), np.float32),
+        "hidden": np.zeros((3, run.config().agent.hidden), np.float32),
+    }
+    for step in range(20):  # three rows, though it was traced with two; the first one beside the policy
+        observation, blank = rng.normal(size=(3, 3)).astype(np.float32), np.array([step % 5 == 2, False, True])
+        action, hidden = session.run(None, {"observation": observation, "blank": blank, **feed})
+        np.testing.assert_allclose(action[0], policy.act(observation[0], bool(blank[0])), atol=1e-5)
+        feed = {"previous_action": action, "hidden": hidden}
+
+
+def test_export_says_what_is_wrong_in_one_line(
+    run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert cli.run(["export", str(run.path), "--out", str(tmp_path / "no" / "policy.onnx")]) == 2
+    assert "its folder is not there" in capsys.readouterr().err
+    assert cli.run(["export", str(run.path), "--checkpoint", "best"]) == 2
+    assert "none was evaluated yet" in capsys.readouterr().err
+    monkeypatch.setattr("deploy.export.NEEDED", ("no_such_package",))
+    assert cli.run(["export", str(run.path)]) == 2
+    assert "pip install 'rmc[onnx]'" in capsys.readouterr().err
