@@ -47,14 +47,15 @@ class EnvConfig:
     """Seconds in a step or reset after which an environment hangs: its process is ended and started again."""
 
 
-def make_env(config: EnvConfig) -> Env:
+def make_env(config: EnvConfig, render: bool = False) -> Env:
     """One environment: (O,) float32 observations, (A,) float32 actions in [-1, 1], cut off at its time limit.
 
-    Raises ConfigError where it is unknown, or its spaces are none that the agent can learn in.
+    With ``render``, its ``render()`` gives frames. Raises ConfigError where it is unknown, or its spaces are none that
+    the agent can learn in.
     """
     _check_numbers(config)
     _redirect_mujoco_warnings()
-    made = _make(config)
+    made = _make(config, render)
     fault = _space_fault(made.observation_space, made.action_space)
     if fault is None and config.hide != "nothing" and not _structure(made):
         fault = f"it does not say which observations are {config.hide}; --hide is for MuJoCo's bodies, like Ant-v5"
@@ -64,12 +65,17 @@ def make_env(config: EnvConfig) -> Env:
     return _as_seen(made, config)
 
 
-def _make(config: EnvConfig) -> gym.Env[Any, Any]:
+def _make(config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
     """As gymnasium makes it, with its own limit or ours."""
     spec = copy(_find_spec(config.id))
     spec.order_enforce = False  # roles reset and step in order; the check costs time at every step
     try:
-        return gym.make(spec, max_episode_steps=config.time_limit or None, disable_env_checker=True)
+        return gym.make(
+            spec,
+            max_episode_steps=config.time_limit or None,
+            disable_env_checker=True,
+            **({"render_mode": "rgb_array"} if render else {}),
+        )
     except gym.error.Error as error:
         raise ConfigError("ENV", config.id, f"gymnasium cannot make it ({_one_line(error)})") from None
 

@@ -5,13 +5,15 @@ import logging
 import os
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from common.envs import EnvConfig
 from common.errors import ConfigError
-from deploy import env_check, export, options, roles, training
+from deploy import env_check, export, options, roles, training, video
 from deploy.evaluation import evaluate_checkpoint
+from deploy.policy import load_policy
 from deploy.run_folder import RunFolder
 from deploy.view import Board, table
 
@@ -52,18 +54,28 @@ def evaluate(command: options.Evaluate) -> int:
     """Play a checkpoint and print how it did."""
     if not 1 <= command.episodes <= 10_000:
         raise ConfigError("--episodes", command.episodes, "take 1 to 10_000")
-    if command.flicker is not None and not 0.0 <= command.flicker <= 1.0:
-        raise ConfigError("--flicker", command.flicker, "take a probability from 0 to 1")
-    folder = RunFolder(command.run)
+    for flicker in command.flicker:
+        if not 0.0 <= flicker <= 1.0:
+            raise ConfigError("--flicker", flicker, "take probabilities from 0 to 1")
+    folder, console = RunFolder(command.run), Console()
     config = folder.config()
-    played = evaluate_checkpoint(folder, config, command.checkpoint, command.episodes, command.flicker)
-    if command.json:
-        Console().print(json.dumps(played), soft_wrap=True, highlight=False, markup=False)
-        return 0
-    mean, deviation = played["eval_return_mean"], played["eval_return_std"]
-    text = f"{config.env.id}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
-    Console().print(f"{text}, after {played['env_steps']:,} environment steps", highlight=False)
+    for probability in command.flicker or (None,):
+        played = evaluate_checkpoint(folder, config, command.checkpoint, command.episodes, probability)
+        text = json.dumps(played) if command.json else _said(played)
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
+    if command.video is not None:
+        policy = load_policy(command.run, command.checkpoint)
+        total = video.record(policy, config.seed, command.video)
+        if not command.json:
+            console.print(f"{command.video}: an episode with return {total:,.1f}", soft_wrap=True, highlight=False)
     return 0
+
+
+def _said(played: dict[str, Any]) -> str:
+    mean, deviation, flicker = (played[f"eval_{name}"] for name in ("return_mean", "return_std", "flicker"))
+    seen = f" with {flicker:.0%} of the frames blank" if flicker else ""
+    text = f"{played['env']}{seen}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
+    return f"{text}, after {played['env_steps']:,} environment steps"
 
 
 def export_policy(command: options.Export) -> int:

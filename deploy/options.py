@@ -87,10 +87,12 @@ class Evaluate:
     """The run's folder."""
     episodes: int = 10
     """Episodes to play."""
-    flicker: float | None = None
-    """Probability of a blank observation; by default the run's own."""
+    flicker: tuple[float, ...] = ()
+    """Probabilities of a blank observation, each of which is played; by default the run's own."""
     checkpoint: str = "latest"
     """latest, best, or the number of a checkpoint."""
+    video: Path | None = None
+    """Also write the first episode to this file, like episode.mp4."""
     json: bool = False
     """Print one line of JSON."""
 

@@ -29,7 +29,7 @@ TRAIN_FLAGS = """
     --episodes
 """.split()  # noqa: SIM905
 OTHER_FLAGS = {
-    "evaluate": ["--episodes", "--flicker", "--checkpoint", "--json"],
+    "evaluate": ["--episodes", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
     "check-env": ["--steps"],
     "stats": [],

@@ -28,13 +28,17 @@ AGENTS = {
 
 @pytest.fixture(params=AGENTS)
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
+    return make_run(tmp_path / "run", AGENTS[request.param], "Pendulum-v1", flicker=0.2)
+
+
+def make_run(path: Path, agent_config: AgentConfig, env: str, flicker: float = 0.0) -> RunFolder:
     """A run's folder with one checkpoint of an agent that was never trained."""
-    config = dataclasses.replace(debug(EnvConfig("Pendulum-v1", flicker=0.2)), agent=AGENTS[request.param])
-    folder = open_run(config, tmp_path / "run", "fail")
+    config = dataclasses.replace(debug(EnvConfig(env, flicker=flicker)), agent=agent_config)
+    folder, spec = open_run(config, path, "fail"), config.window_spec()
     folder.unlock()
     torch.manual_seed(0)
-    agent = Agent(3, 1, config.agent)
-    agent.normalizer.freeze(10, torch.full((3,), 2.0), torch.full((3,), 30.0))
+    agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
+    agent.normalizer.freeze(10, torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
     progress = json.dumps({"updates": 7, "env_steps": 70}).encode()
     CheckpointFolder(folder.checkpoints).save(
         7, {"policy.safetensors": save(agent.policy_weights()), "progress.json": progress, "learner.pt": b""}

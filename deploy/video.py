@@ -1,0 +1,76 @@
+"""An episode of a policy as a video, rendered off screen."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.envs import EnvConfig, make_env
+from common.errors import ConfigError
+from common.wrappers import Env
+from deploy.policy import Policy
+
+BACKENDS = ("egl", "osmesa", "glfw")  # MuJoCo's, the ones that need no screen first
+PROBE = "import sys; from deploy.video import probe; probe(sys.argv[1])"
+PROBE_SECONDS = 60
+FRAMES_PER_SECOND = 30
+
+
+def record(policy: Policy, seed: int, out: Path) -> float:
+    """Play one deterministic episode and write it to ``out``; its return. Raises ConfigError, before it plays."""
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ConfigError("--video", str(out), "imageio-ffmpeg is missing; pip install 'rmc[video]'")
+    if not out.parent.is_dir():
+        raise ConfigError("--video", str(out), "its folder is not there; make it, or give another")
+    os.environ["MUJOCO_GL"] = _working_backend(policy.config.env, out)
+    from imageio_ffmpeg import write_frames  # an extra
+
+    env = make_env(policy.config.env, render=True)
+    observation, info = env.reset(seed=seed)
+    frame, rate = _frame(env), env.metadata.get("render_fps", FRAMES_PER_SECOND)
+    video = write_frames(str(out), (frame.shape[1], frame.shape[0]), fps=rate, macro_block_size=1)
+    video.send(None)  # the generator's start
+    total, ended = 0.0, False
+    while not ended:
+        video.send(_frame(env).tobytes())
+        action = policy.act(observation, bool(info.get("blank", False)))
+        observation, reward, terminated, truncated, info = env.step(action)
+        total, ended = total + float(reward), terminated or truncated
+    video.close()
+    env.close()
+    return total
+
+
+def _frame(env: Env) -> NDArray[np.uint8]:
+    """(height, width, 3), both even, as the codec wants them."""
+    frame = np.asarray(env.render(), np.uint8)
+    return frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
+
+
+def _working_backend(env: EnvConfig, out: Path) -> str:
+    """The first backend that renders, tried in processes of their own: a failed one spoils a process for others."""
+    asked = os.environ.get("MUJOCO_GL")
+    said = {}
+    for backend in (asked,) if asked else BACKENDS:
+        done = subprocess.run(
+            [sys.executable, "-c", PROBE, env.id],
+            env={**os.environ, "MUJOCO_GL": backend, "PYTHONPATH": os.pathsep.join(sys.path)},
+            capture_output=True, text=True, timeout=PROBE_SECONDS, check=False,
+        )  # fmt: skip
+        if done.returncode == 0:
+            return backend
+        said[backend] = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+    reasons = "; ".join(f"{backend}: {reason}" for backend, reason in said.items())
+    raise ConfigError("--video", str(out), f"nothing here can render ({reasons}); install libegl1 or libosmesa6")
+
+
+def probe(env_id: str) -> None:
+    """Render one frame. Raises whatever stands in the way."""
+    env = make_env(EnvConfig(env_id), render=True)
+    env.reset(seed=0)
+    if env.render() is None:
+        raise RuntimeError("it renders nothing")

@@ -1,0 +1,58 @@
+"""rmc evaluate --video and its grid of flicker probabilities, as a user runs them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from imageio_ffmpeg import get_ffmpeg_exe
+
+from deploy import cli
+from tests.deploy.test_policy import AGENTS, make_run
+
+
+def evaluate(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """In a process of its own: rendering leaves traces in one."""
+    command = [sys.executable, "-m", "deploy.cli", "evaluate", str(folder), "--episodes", "1", *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=170, check=False)
+
+
+def test_a_video_or_a_line_that_says_why_not(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5").path
+    done = evaluate(folder, "--video", str(tmp_path / "episode.mp4"))
+    if done.returncode == 2:  # a machine without EGL, OSMesa and screen
+        assert "nothing here can render (egl: " in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+        pytest.skip(done.stderr)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "episode.mp4: an episode with return" in done.stdout
+    command = [get_ffmpeg_exe(), "-v", "error", "-i", str(tmp_path / "episode.mp4"), "-f", "framemd5", "-"]
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert "#dimensions 0: 480x480" in lines
+    images = [line.split(",")[-1] for line in lines if not line.startswith("#")]
+    assert 1 < len(set(images)) <= 1000
+
+
+def test_what_stands_in_the_way_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    folder = str(make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5").path)
+    words = ["evaluate", folder, "--episodes", "1", "--video"]
+    assert cli.run([*words, str(tmp_path / "no" / "episode.mp4")]) == 2
+    assert "its folder is not there" in capsys.readouterr().err
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    assert cli.run([*words, str(tmp_path / "episode.mp4")]) == 2
+    said = capsys.readouterr().err
+    assert "nothing here can render (nonsense: " in said
+    assert "libegl1 or libosmesa6" in said
+    assert len(said.splitlines()) == 1
+
+
+def test_a_grid_of_flicker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = str(make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5").path)
+    assert cli.run(["evaluate", folder, "--episodes", "2", "--flicker", "0", "0.5", "1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3
+    assert "blank" not in lines[0]
+    assert "with 50% of the frames blank: return" in lines[1]
+    assert "with 100% of the frames blank: return" in lines[2]
+    assert cli.run(["evaluate", folder, "--flicker", "0", "2"]) == 2
+    assert "--flicker=2.0" in capsys.readouterr().err
