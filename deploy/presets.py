@@ -91,8 +91,8 @@ def robust(env: EnvConfig) -> RunConfig:
         preset="robust",
         agent=AgentConfig(shortcut=True, normalize_observations=True),
         actor=ActorConfig(envs_per_actor=8),
-        replay=ReplayConfig(replay_ratio=64.0, priority_exponent=0.0, importance_exponent=0.0),
-        update=UpdateConfig(target_memory="ema"),
+        replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0, importance_exponent=0.0),
+        update=UpdateConfig(latent_target="ema", target_memory="ema"),
         learner=LearnerConfig(batch_size=32),
     )
 
