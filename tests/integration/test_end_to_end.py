@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from contextlib import ExitStack
@@ -89,3 +90,15 @@ def test_roles_by_hand_over_tcp(redis_url: str, run_name: str, tmp_path: Path) -
     keys = list(left.scan_iter(match=f"rmc:{name}:*"))
     assert keys
     assert all(0 < left.ttl(key) <= 3600 for key in keys)
+
+
+def test_every_metric_is_in_the_glossary(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with Training(folder, "--total-steps", "1200", "--checkpoint-steps", "600", "--curiosity", "0.1") as training:
+        assert training.finish(170) == 0, training.text() + training.logs()
+    glossary = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text()
+    explained = set(re.findall(r"`([a-z_]+)`", glossary))
+    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    said = {name for record in records for name in record} - {"role", "time"}
+    unexplained = {name for name in said - explained if not name.startswith(("restarts_", "dead_letters_"))}
+    assert not unexplained
