@@ -45,7 +45,7 @@ def run(words: list[str]) -> int:
     except KeyboardInterrupt:  # before the command took the signal over
         return INTERRUPTED_STATUS
     except RmcError as error:
-        if words[0] not in ("train", "evaluate", "export", "check-env", "stats"):
+        if words[0] not in ("train", "evaluate", "export", "inspect", "check-env", "stats"):
             raise  # a role: the supervisor shows its traceback
         return _complain(str(error), FAILED_STATUS)
 

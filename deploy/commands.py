@@ -7,11 +7,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from common.envs import EnvConfig
 from common.errors import ConfigError
-from deploy import env_check, export, options, roles, training, video
+from deploy import env_check, export, inspection, options, roles, training, video
 from deploy.evaluation import evaluate_checkpoint
 from deploy.policy import load_policy
 from deploy.run_folder import RunFolder
@@ -27,6 +28,8 @@ def execute(command: options.Command) -> int:
         return evaluate(command)
     if isinstance(command, options.Export):
         return export_policy(command)
+    if isinstance(command, options.Inspect):
+        return inspect(command)
     if isinstance(command, options.CheckEnv):
         return check_env(command)
     if isinstance(command, options.Stats):
@@ -82,6 +85,21 @@ def export_policy(command: options.Export) -> int:
     """Write a policy as ONNX."""
     export.export(RunFolder(command.run), command.checkpoint, command.out)
     Console().print(f"{command.out}: inputs {', '.join(export.INPUTS)}; outputs {', '.join(export.OUTPUTS)}")
+    return 0
+
+
+def inspect(command: options.Inspect) -> int:
+    """Write a picture of what the world model knows, and say it in numbers."""
+    found, console = inspection.inspect(command.run, command.checkpoint, command.out), Console()
+    ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in found.open_loop.items())
+    worst = ", ".join(f"{i} ({found.unexplained[i]:.0%})" for i in np.argsort(-found.unexplained)[: inspection.SHOWN])
+    console.print(
+        f"unexplained of the observation's change: {ahead} (100% is a guess of no change)",
+        soft_wrap=True,
+        highlight=False,
+    )
+    console.print(f"worst dimensions one step ahead: {worst}", highlight=False)
+    console.print(f"{command.out}", soft_wrap=True, highlight=False)
     return 0
 
 

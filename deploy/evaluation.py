@@ -17,7 +17,7 @@ from common.errors import CheckpointError, ConfigError
 from deploy.presets import RunConfig
 from deploy.run_folder import RunFolder
 
-POLICY, PROGRESS = "policy.safetensors", "progress.json"
+STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
 
 
 def evaluate_blob(config: RunConfig, blob: bytes, episodes: int, flicker: float | None = None) -> dict[str, Any]:
@@ -52,15 +52,24 @@ def evaluate_checkpoint(
 
 def load_checkpoint(folder: RunFolder, checkpoint: str) -> tuple[dict[str, Any], bytes]:
     """Progress and policy of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
+    files = _load(folder, checkpoint)
+    return json.loads(files[PROGRESS]), files[POLICY]
+
+
+def load_state(folder: RunFolder, checkpoint: str) -> bytes:
+    """The learner's whole state of a checkpoint, for ``torch.load``. Raises ConfigError."""
+    return _load(folder, checkpoint)[STATE]
+
+
+def _load(folder: RunFolder, checkpoint: str) -> dict[str, bytes]:
     checkpoints = CheckpointFolder(folder.checkpoints)
     number = _number(checkpoints, checkpoint)
     try:
-        files = checkpoints.load(number)
+        return checkpoints.load(number)
     except CheckpointError as error:
         others = [other for other in checkpoints.numbers() if other != number]
         fix = f"use one of {others}" if others else "there is no other"
         raise ConfigError("--checkpoint", checkpoint, f"{error}; {fix}") from None
-    return json.loads(files[PROGRESS]), files[POLICY]
 
 
 def _number(checkpoints: CheckpointFolder, which: str) -> int:

@@ -110,6 +110,18 @@ class Export:
 
 
 @dataclass(frozen=True)
+class Inspect:
+    """Show what a run's world model knows: a picture of one episode, predicted against real."""
+
+    run: Positional[Path]
+    """The run's folder."""
+    out: Path = Path("inspect.png")
+    """The picture to write."""
+    checkpoint: str = "latest"
+    """latest, best, or the number of a checkpoint."""
+
+
+@dataclass(frozen=True)
 class CheckEnv:
     """Play an environment at random, and say whether it can be trained on and what to mend."""
 
@@ -172,7 +184,7 @@ class EvaluatorRole(_Role):
     """Run the evaluator of a registered run in this process."""
 
 
-Command = Train | Evaluate | Export | CheckEnv | Stats | ActorRole | ReplayRole | LearnerRole | EvaluatorRole
+Command = Train | Evaluate | Export | Inspect | CheckEnv | Stats | ActorRole | ReplayRole | LearnerRole | EvaluatorRole
 
 
 def parse(words: list[str]) -> Command:
@@ -183,6 +195,7 @@ def parse(words: list[str]) -> Command:
         Annotated[Train, tyro.conf.subcommand("train", default=Train(env=tyro.MISSING, **shared))]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Export, tyro.conf.subcommand("export")]
+        | Annotated[Inspect, tyro.conf.subcommand("inspect")]
         | Annotated[CheckEnv, tyro.conf.subcommand("check-env")]
         | Annotated[Stats, tyro.conf.subcommand("stats")]
         | Annotated[ActorRole, tyro.conf.subcommand("actor")]

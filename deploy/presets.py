@@ -92,7 +92,6 @@ def robust(env: EnvConfig) -> RunConfig:
         agent=AgentConfig(shortcut=True, normalize_observations=True),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0, importance_exponent=0.0),
-        update=UpdateConfig(latent_target="ema", target_memory="ema"),
         learner=LearnerConfig(batch_size=32),
     )
 

@@ -30,6 +30,7 @@ def record(policy: Policy, seed: int, out: Path) -> float:
     from imageio_ffmpeg import write_frames  # an extra
 
     env = make_env(policy.config.env, render=True)
+    _follow(env)
     observation, info = env.reset(seed=seed)
     frame, rate = _frame(env), env.metadata.get("render_fps", FRAMES_PER_SECOND)
     video = write_frames(str(out), (frame.shape[1], frame.shape[0]), fps=rate, macro_block_size=1)
@@ -43,6 +44,16 @@ def record(policy: Policy, seed: int, out: Path) -> float:
     video.close()
     env.close()
     return total
+
+
+def _follow(env: Env) -> None:
+    """Let a MuJoCo model's own tracking camera film, where it has one: gymnasium's stays where the body started."""
+    renderer = getattr(env.unwrapped, "mujoco_renderer", None)
+    if renderer is not None:
+        import mujoco
+
+        camera = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+        renderer.camera_id = camera if camera >= 0 else renderer.camera_id
 
 
 def _frame(env: Env) -> NDArray[np.uint8]:

@@ -31,6 +31,7 @@ TRAIN_FLAGS = """
 OTHER_FLAGS = {
     "evaluate": ["--episodes", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
+    "inspect": ["--out", "--checkpoint"],
     "check-env": ["--steps"],
     "stats": [],
     "actor": ["--run", "--redis-url", "--index"],

@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
 
+from common.envs import EnvConfig, make_env
 from deploy import cli
+from deploy.video import _follow
 from tests.deploy.test_policy import AGENTS, make_run
 
 
@@ -31,6 +33,13 @@ def test_a_video_or_a_line_that_says_why_not(tmp_path: Path) -> None:
     assert "#dimensions 0: 480x480" in lines
     images = [line.split(",")[-1] for line in lines if not line.startswith("#")]
     assert 1 < len(set(images)) <= 1000
+
+
+def test_the_camera_follows() -> None:
+    env = make_env(EnvConfig("HalfCheetah-v5"), render=True)
+    _follow(env)
+    assert env.unwrapped.mujoco_renderer.camera_id >= 0  # type: ignore[attr-defined]
+    env.close()
 
 
 def test_what_stands_in_the_way_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:

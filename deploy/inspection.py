@@ -1,0 +1,178 @@
+"""``rmc inspect``: what a run's world model knows, along one episode, as a picture and a few numbers.
+
+Shapes: T steps of the episode, O observation, A action, H hidden, K steps ahead. Observations are normalised ones.
+"""
+
+import importlib.util
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from common.agent import Agent, Remembered
+from common.errors import ConfigError
+from deploy.evaluation import load_state
+from deploy.policy import load_policy
+from deploy.presets import RunConfig
+from deploy.run_folder import RunFolder
+
+HORIZONS = (1, 5, 15)  # steps ahead
+SHOWN, SHOWN_STEPS = 4, 100  # dimensions in the picture, those that change the most, and from when on how long
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What was played, as tensors with a batch of one."""
+
+    observation: Tensor  # (1, T + 1, O)
+    action: Tensor  # (1, T, A)
+    reward: Tensor  # (T,)
+    seen: Tensor  # (T,) bool: neither the step's frame nor the next one is blank
+
+
+@dataclass(frozen=True)
+class Insight:
+    """What the world model says of an episode."""
+
+    real: Floats  # (T, O), the next observations
+    predicted: Floats  # (T, O), one step ahead
+    curiosity: Floats  # (T,), the latent error as in training
+    reward: Floats  # (T,)
+    predicted_reward: Floats  # (T,)
+    ahead: dict[int, Floats]  # horizon K -> (T - K + 1, O), predicted without looking, K steps ahead
+    unexplained: (
+        Floats  # (O,), mean error of the change, as a share of its mean size; above 1 is worse than "no change"
+    )
+    open_loop: dict[int, float]  # horizon -> the same over all dimensions
+
+
+def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
+    """The whole agent of a checkpoint, with its world model. Raises ConfigError."""
+    spec = config.window_spec()
+    agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
+    state = torch.load(io.BytesIO(load_state(folder, checkpoint)), map_location="cpu", weights_only=True)
+    agent.load_state_dict(state["agent"])
+    return agent.eval()
+
+
+def play(folder: RunFolder, agent: Agent, config: RunConfig, checkpoint: str) -> Episode:
+    """One deterministic episode."""
+    policy = load_policy(folder.path, checkpoint)
+    env = policy.make_env()
+    observation, info = env.reset(seed=config.seed)
+    policy.reset()
+    observations, blanks, actions, rewards = [observation], [bool(info.get("blank", False))], [], []
+    ended = False
+    while not ended:
+        actions.append(policy.act(observation, blanks[-1]))
+        observation, reward, terminated, truncated, info = env.step(actions[-1])
+        observations.append(observation)
+        blanks.append(bool(info.get("blank", False)))
+        rewards.append(float(reward))
+        ended = terminated or truncated
+    env.close()
+    raw, blank = torch.from_numpy(np.stack(observations)), torch.tensor(blanks)
+    return Episode(
+        agent.normalizer(raw, blank).unsqueeze(0),
+        torch.from_numpy(np.stack(actions)).unsqueeze(0),
+        torch.tensor(rewards),
+        ~(blank[1:] | blank[:-1]),
+    )
+
+
+@torch.no_grad()
+def look(agent: Agent, episode: Episode) -> Insight:
+    """Everything from one pass over the episode, and open-loop rollouts from each of its steps."""
+    previous = torch.cat([torch.zeros_like(episode.action[:, :1]), episode.action], 1)
+    memory = agent.memory(episode.observation, previous, torch.zeros(1, agent.config.hidden))
+    prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
+    latent_change = memory.hidden[0].diff(dim=0)
+    real = episode.observation[0, 1:]
+    ahead = _open_loop(agent, memory, episode)
+    return Insight(
+        real=real.numpy(),
+        predicted=ahead[1].numpy(),
+        curiosity=(prediction.hidden_change[0] - latent_change).abs().mean(-1).numpy(),
+        reward=episode.reward.numpy(),
+        predicted_reward=prediction.reward[0].numpy(),
+        ahead={horizon: found.numpy() for horizon, found in ahead.items()},
+        unexplained=_unexplained(ahead[1], episode, 1).numpy(),
+        open_loop={horizon: float(_unexplained(found, episode, horizon).mean()) for horizon, found in ahead.items()},
+    )
+
+
+def _open_loop(agent: Agent, memory: Remembered, episode: Episode) -> dict[int, Tensor]:
+    """Horizon K -> (T - K + 1, O): from every step on, the model's own states and observations in place of the real."""
+    steps = episode.action.shape[1]
+    hidden, embedding = memory.hidden[0, :-1], memory.embedding[0, :-1]
+    observation = episode.observation[0, :-1]
+    found = {}
+    for ahead in range(1, min(max(HORIZONS), steps) + 1):
+        count = steps - ahead + 1  # starts from which so many steps were played
+        hidden, embedding, observation = hidden[:count], embedding[:count], observation[:count]
+        action = episode.action[0, ahead - 1 :]
+        features = agent.features(Remembered(hidden.unsqueeze(1), embedding.unsqueeze(1)))
+        step = agent.world_model(features, action.unsqueeze(1))
+        hidden = hidden + step.hidden_change.squeeze(1)
+        observation = observation + step.observation_change.squeeze(1)
+        embedding = agent.memory.embed(torch.cat([observation, action], -1))
+        if ahead in HORIZONS:
+            found[ahead] = observation
+    return found
+
+
+def _unexplained(predicted: Tensor, episode: Episode, horizon: int) -> Tensor:
+    """(O,): mean |predicted - real| over mean |real - where it started|, where both frames were seen."""
+    observation = episode.observation[0]
+    start, end = observation[: len(predicted)], observation[horizon:]
+    seen = (episode.seen[: len(predicted)] & episode.seen[horizon - 1 :]).unsqueeze(-1)
+    error = ((predicted - end).abs() * seen).sum(0)
+    return error / ((end - start).abs() * seen).sum(0).clamp(min=1e-9)
+
+
+def inspect(run: Path, checkpoint: str, out: Path) -> Insight:
+    """Play, look, and write the picture. Raises ConfigError."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ConfigError("--out", str(out), "matplotlib is missing; pip install 'rmc[plot]'")
+    if not out.parent.is_dir():
+        raise ConfigError("--out", str(out), "its folder is not there; make it, or give another")
+    folder = RunFolder(run)
+    config = folder.config()
+    if not config.agent.grounding:
+        raise ConfigError("RUN", str(run), "its world model predicts no observations; train with --grounding")
+    agent = load_agent(folder, config, checkpoint)
+    insight = look(agent, play(folder, agent, config, checkpoint))
+    draw(insight, f"{config.env.id}, {config.preset}, seed {config.seed}", out)
+    return insight
+
+
+def draw(insight: Insight, title: str, out: Path) -> None:
+    """Predicted against real amid the episode, then curiosity and reward over all of it."""
+    from matplotlib.figure import Figure  # an extra
+
+    shown = np.argsort(-np.abs(np.diff(insight.real, axis=0)).mean(0))[:SHOWN]
+    figure = Figure(figsize=(11, 2.0 * (len(shown) + 2)), layout="constrained")
+    axes = figure.subplots(len(shown) + 2, 1)
+    time = np.arange(1, len(insight.real) + 1)
+    start = max(1, (len(time) - SHOWN_STEPS) // 2)
+    for axis, dimension in zip(axes, shown, strict=False):
+        axis.plot(time, insight.real[:, dimension], color="black", linewidth=2.0, label="real")
+        for horizon, predicted in insight.ahead.items():
+            label = f"{horizon} step{'s' * (horizon > 1)} ahead"
+            axis.plot(time[horizon - 1 :], predicted[:, dimension], linewidth=1.0, label=label)
+        axis.set_xlim(start, start + SHOWN_STEPS)
+        axis.set_ylabel(f"observation {dimension}")
+    axes[-2].plot(time, insight.curiosity, color="tab:purple", linewidth=0.8)
+    axes[-2].set_ylabel("curiosity")
+    axes[-1].plot(time, insight.reward, color="black", linewidth=1.2, label="real")
+    axes[-1].plot(time, insight.predicted_reward, color="tab:blue", linewidth=0.8, label="predicted")
+    axes[-1].set_ylabel("reward")
+    axes[-1].set_xlabel("step of the episode")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(insight.ahead) + 1)
+    figure.suptitle(f"{title}: the world model against one episode (observations normalised)")
+    figure.savefig(out, dpi=110)

@@ -1,0 +1,96 @@
+"""rmc inspect: the world model against an episode, in numbers that a slow loop gives, too."""
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save
+
+from common.agent import Agent
+from common.checkpoint import CheckpointFolder
+from common.envs import EnvConfig
+from deploy import cli
+from deploy.inspection import HORIZONS, Episode, load_agent, look, play
+from deploy.presets import RunConfig, debug
+from deploy.run_folder import RunFolder, open_run
+from tests.deploy.test_policy import AGENTS
+
+
+def make_run(path: Path, config: RunConfig) -> RunFolder:
+    folder, spec = open_run(config, path, "fail"), config.window_spec()
+    folder.unlock()
+    torch.manual_seed(0)
+    agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
+    agent.normalizer.freeze(10, torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
+    state = io.BytesIO()
+    torch.save({"agent": agent.state_dict()}, state)
+    files = {"policy.safetensors": save(agent.policy_weights()), "learner.pt": state.getvalue()}
+    CheckpointFolder(folder.checkpoints).save(
+        3, files | {"progress.json": json.dumps({"updates": 3, "env_steps": 30}).encode()}
+    )
+    return folder
+
+
+@pytest.fixture(params=["robust", "layer norm"])
+def config(request: pytest.FixtureRequest) -> RunConfig:
+    run = debug(EnvConfig("Pendulum-v1", flicker=0.1, time_limit=40))
+    return RunConfig(env=run.env, preset="debug", agent=AGENTS[request.param])
+
+
+@torch.no_grad()
+def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torch.Tensor:
+    """The observation that the model expects ``horizon`` steps after ``start``, one step at a time."""
+    hidden, previous = torch.zeros(1, agent.config.hidden), torch.zeros(1, 1, agent.action_dim)
+    for t in range(start + 1):
+        seen = agent.memory(episode.observation[:, t : t + 1], previous, hidden)
+        hidden, previous = seen.hidden[:, 0], episode.action[:, t : t + 1]
+    observation = episode.observation[:, start : start + 1]
+    for t in range(start, start + horizon):
+        action = episode.action[:, t : t + 1]
+        step = agent.world_model(agent.features(seen), action)
+        observation = observation + step.observation_change
+        embedding = agent.memory.embed(torch.cat([observation, action], -1))
+        seen = seen._replace(hidden=seen.hidden + step.hidden_change, embedding=embedding)
+    return observation[0, 0]
+
+
+def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run", config)
+    agent = load_agent(folder, config, "latest")
+    episode = play(folder, agent, config, "latest")
+    insight = look(agent, episode)
+    assert episode.action.shape[1] == 40
+    for horizon in HORIZONS:
+        assert len(insight.ahead[horizon]) == 40 - horizon + 1
+        for start in (0, 7, 40 - horizon):
+            wanted = rolled_out(agent, episode, start, horizon)
+            np.testing.assert_allclose(insight.ahead[horizon][start], wanted, atol=1e-5)
+    seen = episode.seen.numpy()
+    assert 0 < seen.sum() < 40  # some frames were blank, and are left out
+    before = np.concatenate([episode.observation[0, :1].numpy(), insight.real[:-1]])
+    error, change = (np.abs(x - insight.real)[seen].sum(0) for x in (insight.predicted, before))
+    np.testing.assert_allclose(insight.unexplained, error / change, rtol=1e-4)
+
+
+def test_the_command_writes_a_picture_and_says_it_in_numbers(
+    config: RunConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = make_run(tmp_path / "run", config)
+    assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 0
+    assert (tmp_path / "seen.png").read_bytes().startswith(b"\x89PNG")
+    said = capsys.readouterr().out
+    assert "% 1 ahead" in said
+    assert "% 15 ahead (100% is a guess of no change)" in said
+    assert "worst dimensions" in said
+    assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "no" / "seen.png")]) == 2
+    assert "its folder is not there" in capsys.readouterr().err
+
+
+def test_a_model_without_grounding_has_nothing_to_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = RunConfig(env=EnvConfig("Pendulum-v1"), preset="debug", agent=AGENTS["paper"])
+    folder = make_run(tmp_path / "run", run)
+    assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 2
+    assert "--grounding" in capsys.readouterr().err
