@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from common.envs import EnvConfig
 from common.errors import ConfigError
 from deploy import env_check, export, inspection, options, roles, training, video
 from deploy.evaluation import evaluate_checkpoint
@@ -107,7 +106,7 @@ def check_env(command: options.CheckEnv) -> int:
     """Say what the agent will make of an environment."""
     if not 1 <= command.steps <= 10_000_000:
         raise ConfigError("--steps", command.steps, "take 1 to 10_000_000")
-    return env_check.check(EnvConfig(command.env), command.steps, Console())
+    return env_check.check(command.env.config(), command.steps, Console())
 
 
 def stats(command: options.Stats) -> int:

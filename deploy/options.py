@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 from tyro.conf import Positional
@@ -23,11 +23,22 @@ from replay_server.server import ReplayConfig
 
 
 @dataclass(frozen=True)
+class EnvOptions(EnvConfig):
+    """The environment, its id without a flag."""
+
+    id: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
+    """Gymnasium id, like HalfCheetah-v5, or module:EnvId-v0 for your own."""
+
+    def config(self) -> EnvConfig:
+        """The same, as the roles know it."""
+        return EnvConfig(**dataclasses.asdict(self))
+
+
+@dataclass(frozen=True)
 class Train:
     """Train an agent, or go on with a run."""
 
-    env: Positional[str]
-    """Gymnasium id, like HalfCheetah-v5, or module:EnvId-v0 for your own."""
+    env: EnvOptions
     window: WindowConfig
     agent: AgentConfig
     actor: ActorConfig
@@ -43,20 +54,6 @@ class Train:
     """Environment steps of the run, over all actors."""
     actors: int = 1
     """Actor processes."""
-    flicker: float = 0.0
-    """Probability that an observation is replaced by zeros."""
-    hide: Literal["nothing", "velocities", "positions"] = "nothing"
-    """Part of a MuJoCo observation that is left out."""
-    noise: float = 0.0
-    """Standard deviation of Gaussian noise on every observation, in the observation's own units."""
-    frame_stack: int = 1
-    """Newest observations that make one."""
-    action_repeat: int = 1
-    """Steps of the environment for one of the agent's; rewards are added up."""
-    time_limit: int = 0
-    """Steps after which an episode is cut off; 0 keeps the environment's own limit."""
-    env_timeout: float = 60.0
-    """Seconds in a step or reset after which an environment hangs: its process is ended and started again."""
     run_dir: Path | None = None
     """The run's folder; by default runs/<env>__<preset>__<seed>__<time>."""
     if_exists: IfExists = "resume"
@@ -71,8 +68,7 @@ class Train:
     def config(self) -> RunConfig:
         """The run's config."""
         own = {item.name: getattr(self, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
-        seen = {item.name: getattr(self, item.name) for item in dataclasses.fields(EnvConfig) if item.name != "id"}
-        return RunConfig(env=EnvConfig(self.env, **seen), **own)
+        return RunConfig(env=self.env.config(), **own)
 
     def placement(self) -> Placement:
         """Where and on what it runs."""
@@ -125,8 +121,7 @@ class Inspect:
 class CheckEnv:
     """Play an environment at random, and say whether it can be trained on and what to mend."""
 
-    env: Positional[str]
-    """Gymnasium id, like HalfCheetah-v5, or module:EnvId-v0 for your own."""
+    env: EnvOptions
     steps: int = 2_000
     """Random steps to play."""
 
@@ -192,7 +187,7 @@ def parse(words: list[str]) -> Command:
     start = presets.preset(_named_preset(words), EnvConfig(""))
     shared = {item.name: getattr(start, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
     commands = (
-        Annotated[Train, tyro.conf.subcommand("train", default=Train(env=tyro.MISSING, **shared))]
+        Annotated[Train, tyro.conf.subcommand("train", default=Train(env=EnvOptions(id=tyro.MISSING), **shared))]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Export, tyro.conf.subcommand("export")]
         | Annotated[Inspect, tyro.conf.subcommand("inspect")]

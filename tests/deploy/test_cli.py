@@ -28,11 +28,12 @@ TRAIN_FLAGS = """
     --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads
     --episodes
 """.split()  # noqa: SIM905
+ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit --env-timeout".split()  # noqa: SIM905
 OTHER_FLAGS = {
     "evaluate": ["--episodes", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
     "inspect": ["--out", "--checkpoint"],
-    "check-env": ["--steps"],
+    "check-env": [*ENV_FLAGS, "--steps"],
     "stats": [],
     "actor": ["--run", "--redis-url", "--index"],
     "replay": ["--run", "--redis-url", "--folder", "--listen", "--secret-file"],
