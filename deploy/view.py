@@ -76,7 +76,8 @@ def _facts(board: Board) -> list[tuple[str, str]]:
         ("losses", losses or NONE_YET),
         ("alpha, beta", f"{number(learner.get('alpha'))}, {number(learner.get('beta'))}"),
         ("curiosity in reward", number(learner.get("curiosity_share"), ".1%")),
-        ("latent rank", number(learner.get("latent_rank"), ".1f")),
+        ("latent rank", f"{number(learner.get('latent_rank'), '.1f')}, "
+                        f"{number(learner.get('model_unexplained'), '.0%')} of its change unexplained"),
         ("weights", f"version {number(learner.get('updates'), ',')}, lag {number(board.policy_lag, ',.1f')} updates"),
     ]  # fmt: skip
 

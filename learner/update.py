@@ -160,11 +160,13 @@ class JointUpdate:
             )
 
         td_error = (q.detach() - y).abs().mean(0)
+        no_change = losses.model_loss(losses.model_error(torch.zeros_like(change), change, c.model_norm), d, m)
         metrics = {name: value.detach() for name, value in parts.items()} | {
             "alpha": alpha,
             "entropy": -losses.masked_mean(log_pi.detach(), m),
             "q_mean": losses.masked_mean(q.detach().mean(0), m),
             "td_error": losses.masked_mean(td_error, m),
+            "model_unexplained": parts["model_loss"].detach() / no_change.clamp(min=1e-8),
             "curiosity_mean": losses.masked_mean(i, m),
             "curiosity_share": beta * i.sum() / (beta * i.sum() + (m * r.abs()).sum()).clamp(min=1e-8),
         }

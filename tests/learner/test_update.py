@@ -201,6 +201,15 @@ def plain_unroll(agent: Agent, row: np.void) -> dict[int, Tensor]:
     return states
 
 
+@pytest.mark.parametrize("norm", ["l1", "l2"])
+def test_a_model_that_predicts_no_change_leaves_all_of_it_unexplained(norm):
+    update = make(PAPER, model_norm=norm)
+    with torch.no_grad():
+        for value in update.agent.world_model.net[-1].parameters():
+            value.zero_()
+    assert update(to_batch(random_rows(8)), BETA).metrics["model_unexplained"].item() == pytest.approx(1.0, rel=1e-4)
+
+
 def test_policy_climbs_the_critic_it_is_told_to():
     first, smaller = make(PAPER, policy_q="first"), make(PAPER, policy_q="min")
     a, b = (u(to_batch(random_rows(8)), BETA).metrics["policy_loss"].item() for u in (first, smaller))
