@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-DEMO_STEPS ?= 40000
+DEMO_STEPS ?= 60000
 
 .PHONY: env demo test lint results trial docs bench clean
 
