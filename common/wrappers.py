@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 Env = gym.Env[Floats, Floats]
-_FLICKER_STREAM, _NOISE_STREAM = 0xF11C, 0x2015E  # keep their random numbers apart from the environment's own
 
 
 class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
@@ -53,29 +52,6 @@ class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
         return vector
 
 
-class Flicker(gym.Wrapper[Floats, Floats, Floats, Floats]):
-    """Whole observations become zeros, independently with probability p; ``info["blank"]`` says which."""
-
-    def __init__(self, env: Env, probability: float) -> None:
-        super().__init__(env)
-        self._probability = probability
-        self._rng = np.random.default_rng()
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        if seed is not None:
-            self._rng = np.random.default_rng([seed, _FLICKER_STREAM])
-        observation, info = self.env.reset(seed=seed, options=options)
-        return self._flicker(observation, info), info
-
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._flicker(observation, info), float(reward), terminated, truncated, info
-
-    def _flicker(self, observation: Floats, info: dict[str, Any]) -> Floats:
-        info["blank"] = bool(self._rng.random() < self._probability)
-        return np.zeros_like(observation) if info["blank"] else observation
-
-
 class Partial(gym.Wrapper[Floats, Floats, Floats, Floats]):
     """Only some of the observation's dimensions."""
 
@@ -94,26 +70,55 @@ class Partial(gym.Wrapper[Floats, Floats, Floats, Floats]):
         return observation[self._shown], float(reward), terminated, truncated, info
 
 
-class Noise(gym.Wrapper[Floats, Floats, Floats, Floats]):
-    """Independent Gaussian noise on every dimension of every observation."""
+class Disturbed(gym.Wrapper[Floats, Floats, Floats, Floats]):
+    """Observations that chance changes; its random numbers are the episode's seed's, apart from the environment's."""
 
-    def __init__(self, env: Env, deviation: float) -> None:
+    stream: int  # keeps the random numbers of different disturbances apart
+
+    def __init__(self, env: Env) -> None:
         super().__init__(env)
-        self._deviation = deviation
         self._rng = np.random.default_rng()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         if seed is not None:
-            self._rng = np.random.default_rng([seed, _NOISE_STREAM])
+            self._rng = np.random.default_rng([seed, self.stream])
         observation, info = self.env.reset(seed=seed, options=options)
-        return self._noisy(observation), info
+        return self.disturb(observation, info), info
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._noisy(observation), float(reward), terminated, truncated, info
+        return self.disturb(observation, info), float(reward), terminated, truncated, info
 
-    def _noisy(self, observation: Floats) -> Floats:
+    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
+        """(O,) as it is -> (O,) as it is seen; may say so in ``info``."""
+        raise NotImplementedError
+
+
+class Noise(Disturbed):
+    """Independent Gaussian noise on every dimension of every observation."""
+
+    stream = 0x2015E
+
+    def __init__(self, env: Env, deviation: float) -> None:
+        super().__init__(env)
+        self._deviation = deviation
+
+    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:  # noqa: ARG002 (Flicker says so in it)
         return observation + self._deviation * self._rng.standard_normal(observation.shape, np.float32)
+
+
+class Flicker(Disturbed):
+    """Whole observations become zeros, independently with probability p; ``info["blank"]`` says which."""
+
+    stream = 0xF11C
+
+    def __init__(self, env: Env, probability: float) -> None:
+        super().__init__(env)
+        self._probability = probability
+
+    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
+        info["blank"] = bool(self._rng.random() < self._probability)
+        return np.zeros_like(observation) if info["blank"] else observation
 
 
 class FrameStack(gym.Wrapper[Floats, Floats, Floats, Floats]):

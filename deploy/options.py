@@ -137,7 +137,7 @@ class Stats:
 @dataclass(frozen=True)
 class _Role:
     run: str
-    """The run's name."""
+    """The run's name, as its launcher prints it."""
     redis_url: str = ""
     """The run's Redis; by default what RMC_REDIS_URL says."""
 
