@@ -152,6 +152,7 @@ class WindowBuilder:
         fields["first"][row], fields["last"][row], fields["terminated"][row] = first, last, terminated
         fields["new_steps"][row] = steps - covered
         fields["new_observations"][row] = steps - covered + (covered == 0)
+        fields["env"][row], fields["episode_step"][row] = env, block
         fields["weights_update"][row] = self._update[(self._time - last + burn_in + 1) % self._slots]
         fields["observation"][row, first : last + 1] = self._observation[slots, env]
         fields["blank"][row, first : last + 1] = self._blank[slots, env]

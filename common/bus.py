@@ -130,7 +130,7 @@ class Bus(Protocol):
         """The newest policy, or the newest to evaluate. None if there is none or it was just replaced."""
 
     def emit(self, role: str, record: Mapping[str, Any]) -> None:
-        """Append a metrics record (flat: str -> int | float | str)."""
+        """Append a metrics record (flat: str -> int | float | str | list of numbers)."""
 
     def records(self, after: str) -> tuple[list[dict[str, Any]], str]:
         """Metrics records past a cursor ("0" = all that is kept), and the next cursor."""

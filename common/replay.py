@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from common.window import Rows
 
+EPISODE_BYTES = 16 << 20  # of rows at most in the answer to ``Replay.episode``
+
 
 class Draw(Enum):
     """How a request for a batch ended."""
@@ -51,6 +53,9 @@ class Replay(Protocol):
 
     def statistics(self) -> ObservationStatistics:
         """Running observation statistics."""
+
+    def episode(self, serial: int) -> Rows | None:
+        """The windows of one episode from its start to that one, oldest first; None where not all are there."""
 
     def stats(self) -> dict[str, Any]:
         """The server's counters, flat."""

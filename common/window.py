@@ -54,6 +54,8 @@ class WindowSpec:
             ("actor", "<i4", ()),
             ("epoch", "<i4", ()),
             ("k", "<i4", ()),  # place inside its stream entry
+            ("env", "<i4", ()),  # which of the actor's environments
+            ("episode_step", "<i4", ()),  # the first trained step, counted from its episode's start
             ("first", "<i4", ()),
             ("last", "<i4", ()),
             ("terminated", "<i4", ()),  # 1: step last - 1 ended in a true termination
@@ -99,6 +101,7 @@ def first_fault(rows: Rows, spec: WindowSpec) -> str | None:
     for name in ("observation", "action", "prev_action", "reward", "hidden", "initial_priority"):
         if not np.isfinite(rows[name]).all():
             return f"{name} is not finite"
-    if (rows["initial_priority"] < 0).any():
-        return "initial_priority is negative"
+    for name in ("initial_priority", "env", "episode_step"):
+        if (rows[name] < 0).any():
+            return f"{name} is negative"
     return None

@@ -46,6 +46,7 @@ class Kind(IntEnum):
     STATISTICS = 9  # client -> server, and its reply: count, then sum | sum of squares (float64)
     STATS = 10  # client -> server, and its reply: the server's counters
     ERROR = 11  # server -> client: why the connection ends
+    EPISODE = 12  # client -> server: serial, and its reply: count, then rows
 
 
 def proof(secret: bytes, side: bytes, challenge: bytes, nonce: bytes) -> bytes:

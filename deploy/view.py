@@ -62,6 +62,18 @@ def _evaluation(board: Board) -> str:
     return NONE_YET if mean is None else f"{mean:,.1f} ± {deviation:,.1f} at update {update:,}"
 
 
+def _staleness(learner: dict[str, Any]) -> str:
+    """Of the states that were replayed, as stored and after the burn-in, and how old what was sampled is."""
+    if "stale_state_stored" not in learner:
+        return NONE_YET
+    stages = [stage for stage in ("stored", "burned") if f"stale_state_{stage}" in learner]
+    state, q = (
+        " → ".join(number(learner[f"{name}_{stage}"], ".1%") for stage in stages)
+        for name in ("stale_state", "stale_q_first")
+    )
+    return f"state {state}, Q {q}, age {number(learner.get('sample_age_mean'), ',.0f')} updates"
+
+
 def _facts(board: Board) -> list[tuple[str, str]]:
     learner = board.roles.get("learner", {})
     losses = ", ".join(f"{name[:-5]} {number(learner[name])}" for name in learner if name.endswith("_loss"))
@@ -78,6 +90,7 @@ def _facts(board: Board) -> list[tuple[str, str]]:
         ("curiosity in reward", number(learner.get("curiosity_share"), ".1%")),
         ("latent rank", f"{number(learner.get('latent_rank'), '.1f')}, "
                         f"{number(learner.get('model_unexplained'), '.0%')} of its change unexplained"),
+        ("staleness", _staleness(learner)),
         ("weights", f"version {number(learner.get('updates'), ',')}, lag {number(board.policy_lag, ',.1f')} updates"),
     ]  # fmt: skip
 

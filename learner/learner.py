@@ -19,15 +19,16 @@ from common.checkpoint import CheckpointFolder
 from common.errors import CheckpointError, FencedError, RmcError
 from common.metrics import Means, Rate
 from common.replay import Draw, Replay, Sample
-from common.window import WindowSpec
+from common.window import Rows, WindowSpec
 from learner.batch import Batch, view_batch
+from learner.staleness import SLICE, measurable, staleness
 from learner.update import UpdateConfig, Updated, make_update
 
 log = logging.getLogger(__name__)
 STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
 METRICS_UPDATES = 20  # updates between looks at the update's metrics: each look waits for the device
 LOOK_SECONDS = 5.0  # between looks, while waiting, whether Redis still has the weights
-RANK_UPDATES = 500  # updates between looks at the latent's rank (a singular value decomposition)
+INSIGHT_UPDATES = 500  # updates between looks at what takes longer: the latent's rank and the states' staleness
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,7 @@ class Learner:
         self.updates = self.env_steps = self.last_checkpoint = 0
         self.finished = self._fenced = self._diverged = self._evaluation_due = False
         self._means, self._rate, self._waiting = Means(), Rate(), ""
+        self._unexplained: list[float] = []  # of every observation dimension, since the last look at it
         self._look_at = 0.0  # when to ask next whether Redis still has the weights
         torch.set_flush_denormal(True)  # into which Adam's moments of idle units decay: 13 % slower on a CPU
         torch.manual_seed(seed)  # the networks' initial weights
@@ -126,6 +128,7 @@ class Learner:
         self.updates += 1
         self.replay.update_priorities(sample.rows["serial"].copy(), updated.priorities.cpu().numpy())
         self._measure(updated)
+        self._measure_age(sample.rows)
 
     def _to_device(self, sample: Sample) -> Batch:
         rows = sample.rows
@@ -138,10 +141,23 @@ class Learner:
         if self.updates % METRICS_UPDATES == 0:
             for name, value in updated.metrics.items():
                 self._means.add(name, float(value))
-        if self.updates % RANK_UPDATES == 1:
+        if self.updates % INSIGHT_UPDATES == 1:
             rank, deviation = latent_rank(updated.hidden[updated.observed])
             self._means.add("latent_rank", rank)
             self._means.add("latent_deviation", deviation)
+            self._unexplained = [round(share, 4) for share in updated.observation_unexplained.tolist()]
+
+    def _measure_age(self, rows: Rows) -> None:
+        """How old what was sampled is: in weight versions, and in what today's weights would remember instead."""
+        if self.updates % METRICS_UPDATES == 0:
+            age = self.updates - rows["weights_update"]
+            self._means.add("sample_age_mean", float(age.mean()))
+            self._means.add("sample_age_max", float(age.max()))
+        if self.updates % INSIGHT_UPDATES == 1:
+            for serial in rows["serial"][measurable(rows, self.spec)][:SLICE].tolist():
+                episode = self.replay.episode(serial)
+                for name, value in (staleness(self.agent, self.spec, episode) if episode is not None else {}).items():
+                    self._means.add(name, value)
 
     def publish(self) -> None:
         """Broadcast the policy with the newest observation statistics frozen into it. Raises FencedError."""
@@ -230,12 +246,14 @@ class Learner:
         return self._waiting
 
     def metrics(self) -> dict[str, Any]:
+        unexplained, self._unexplained = self._unexplained, []
         return {
             "updates": self.updates,
             "updates_per_s": self._rate.take(self.updates),
             "env_steps": self.env_steps,
             "beta": self.update.config.beta(self.env_steps),
             "epoch": self.epoch,
+            **({"observation_unexplained": unexplained} if unexplained else {}),
             **self._means.take(),
         }
 

@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from common.errors import AuthenticationError, MessageError, RmcError
-from common.replay import Draw, ObservationStatistics, Sample
-from common.window import WindowSpec
+from common.replay import EPISODE_BYTES, Draw, ObservationStatistics, Sample
+from common.window import Rows, WindowSpec
 from common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame, proof
 
 log = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ class ReplayClient:
         body = batch_size * (spec.dtype.itemsize + 4)  # rows, then float32 importance weights
         tensors = [torch.empty(body, dtype=torch.uint8, pin_memory=pinned) for _ in range(AHEAD)]
         self._buffers = [tensor.numpy().data for tensor in tensors]
-        self._statistics_buffer = memoryview(bytearray(2 * 8 * spec.obs_dim))
+        self._answer = memoryview(bytearray(max(EPISODE_BYTES, spec.dtype.itemsize, 2 * 8 * spec.obs_dim)))
         self._turn = self._in_flight = self._env_steps = 0
         self._batches: Connection | None = None
         self._control: Connection | None = None
@@ -198,25 +198,34 @@ class ReplayClient:
         """Running observation statistics; a count of 0 while the server is away."""
         obs_dim = self._spec.obs_dim
         try:
-            meta, body = self._ask(Kind.STATISTICS)
+            meta, body = self._ask(Kind.STATISTICS, {})
             total, square = np.frombuffer(body, np.float64).reshape(2, obs_dim).copy()
             return ObservationStatistics(int(meta["count"]), total, square)
         except (OSError, MessageError, ValueError) as error:
             log.warning("no statistics from the replay server: %s", error)
             return ObservationStatistics(0, np.zeros(obs_dim), np.zeros(obs_dim))
 
+    def episode(self, serial: int) -> Rows | None:
+        """The windows of one episode from its start to that one; None where not all, or the server, are there."""
+        try:
+            _, body = self._ask(Kind.EPISODE, {"serial": serial})
+            return np.frombuffer(body, self._spec.dtype).copy() if len(body) else None
+        except (OSError, MessageError, ValueError) as error:
+            log.warning("no episode from the replay server: %s", error)
+            return None
+
     def stats(self) -> dict[str, Any]:
         """The server's counters. Raises RmcError while it is away."""
         try:
-            return self._ask(Kind.STATS)[0]
+            return self._ask(Kind.STATS, {})[0]
         except OSError as error:
             raise RmcError(f"the replay server is away: {error}") from None
 
-    def _ask(self, kind: Kind) -> tuple[dict[str, Any], memoryview]:
+    def _ask(self, kind: Kind, question: dict[str, Any]) -> tuple[dict[str, Any], memoryview]:
         connection = self._control = self._control or self._open_control()
         try:
-            connection.send(kind, {})
-            _, meta, body = connection.receive(self._statistics_buffer)
+            connection.send(kind, question)
+            _, meta, body = connection.receive(self._answer)
         except (OSError, MessageError):
             connection.close()
             self._control = None
@@ -227,4 +236,4 @@ class ReplayClient:
         address = self._address()
         if address is None:
             raise ConnectionError("the replay server is not up yet")
-        return Connection(address, self._secret, self._spec.fingerprint, self._statistics_buffer.nbytes)
+        return Connection(address, self._secret, self._spec.fingerprint, self._answer.nbytes)

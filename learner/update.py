@@ -84,6 +84,7 @@ class Updated(NamedTuple):
     curiosity_variance: Tensor  # (2,), as it is after this batch
     hidden: Tensor  # (B, L_t + 1, H), for the latent's rank
     observed: Tensor  # (B, L_t + 1) bool, which of them are real
+    observation_unexplained: Tensor  # (O,), see ``_unexplained``; (0,) without grounding
 
 
 class JointUpdate:
@@ -153,11 +154,14 @@ class JointUpdate:
             "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, m),
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
+        unexplained = o.new_zeros(0)
         if agent.config.grounding:
-            seen = _seen(batch)[:, steps]
+            seen, observation_change = _seen(batch)[:, steps], o[:, steps].diff(dim=1)
+            predicted = prediction.observation_change.float()
             parts["grounding_loss"] = losses.grounding_loss(
-                prediction.observation_change.float(), o[:, steps].diff(dim=1), prediction.reward.float(), r, seen, m
+                predicted, observation_change, prediction.reward.float(), r, seen, m
             )
+            unexplained = _unexplained(predicted.detach(), observation_change, m * seen)
 
         td_error = (q.detach() - y).abs().mean(0)
         no_change = losses.model_loss(losses.model_error(torch.zeros_like(change), change, c.model_norm), d, m)
@@ -172,7 +176,7 @@ class JointUpdate:
         }
         observed = batch.observation_valid[:, steps]
         priority = losses.priority(td_error, c.eta, m)
-        return parts, Updated(priority, metrics, curiosity_variance, memory.hidden.detach(), observed)
+        return parts, Updated(priority, metrics, curiosity_variance, memory.hidden.detach(), observed, unexplained)
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
@@ -300,6 +304,13 @@ def _adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
         {"params": [agent.log_alpha] if "log_alpha" in parts else [], "lr": config.alpha_learning_rate},
     ]
     return torch.optim.Adam([group for group in groups if group["params"]], fused=True)
+
+
+def _unexplained(predicted: Tensor, change: Tensor, m: Tensor) -> Tensor:
+    """(O,): mean size of the error over that of the change itself, by observation dimension; 1 is "no change"."""
+    weight = m.unsqueeze(-1)
+    error, size = ((weight * x.abs()).sum((0, 1)) for x in (predicted - change, change))
+    return error / size.clamp(min=1e-8)
 
 
 def _seen(batch: Batch) -> Tensor:

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from common.bus import Ack, Bus
 from common.errors import ConfigError
 from common.metrics import Means, Rate
-from common.replay import Draw, ObservationStatistics, Sample
+from common.replay import EPISODE_BYTES, Draw, ObservationStatistics, Sample
 from common.window import Rows, WindowSpec
+from replay_server.episode import find_episode
 from replay_server.intake import Intake, Round
 from replay_server.rate_limiter import RateLimiter
 from replay_server.recovery import open_store
@@ -227,6 +228,16 @@ class ReplayServer:
         """Running sums over all observations inserted so far."""
         progress = self._store.ring.progress
         return ObservationStatistics(progress.observations, progress.total.copy(), progress.total_square.copy())
+
+    def episode(self, serial: int) -> Rows | None:
+        """The windows of one episode from its start to that one; None where not all are there."""
+        ring, itemsize = self._store.ring, self.spec.dtype.itemsize
+        slots = find_episode(ring, serial, max(1, EPISODE_BYTES // itemsize))
+        if slots is None:
+            return None
+        rows: Rows = np.empty(len(slots), self.spec.dtype)
+        ring.gather(slots, rows)
+        return rows
 
     # -- about ------------------------------------------------------------------------------------------
 

@@ -139,6 +139,8 @@ class SocketServer:
             statistics = self._server.statistics()
             sums = (statistics.total.data.cast("B"), statistics.total_square.data.cast("B"))
             connection.send(Kind.STATISTICS, {"count": statistics.count}, sums)
+        elif frame.kind is Kind.EPISODE:
+            self._episode(connection, frame.meta.get("serial"))
         elif frame.kind is Kind.STATS:
             connection.send(Kind.STATS, self._server.stats())
         else:
@@ -156,6 +158,13 @@ class SocketServer:
         else:
             parts = (sample.rows.view(np.uint8).data, sample.importance.data.cast("B"))
             connection.send(Kind.BATCH, meta, parts)
+
+    def _episode(self, connection: Connection, serial: Any) -> None:
+        if type(serial) is not int:
+            raise MessageError("serial", f"{serial!r}, want a number")
+        rows = self._server.episode(serial)
+        parts = () if rows is None else (rows.view(np.uint8).data,)
+        connection.send(Kind.EPISODE, {"count": 0 if rows is None else len(rows)}, parts)
 
     def _priorities(self, frame: Frame) -> None:
         count = frame.meta.get("count")

@@ -100,6 +100,7 @@ def test_windows(play: Play, steps: int) -> None:
         first, last = int(row["first"]), int(row["last"])
         env, episode, k0 = (int(x) for x in row["observation"][first])
         block = k0 + spec.burn_in - first
+        assert (row["env"], row["episode_step"]) == (env, block)
         count = last - spec.burn_in
         length = play.length(env, episode)
         # order, no crossing: consecutive steps of one episode, bootstrap included

@@ -210,6 +210,17 @@ def test_a_model_that_predicts_no_change_leaves_all_of_it_unexplained(norm):
     assert update(to_batch(random_rows(8)), BETA).metrics["model_unexplained"].item() == pytest.approx(1.0, rel=1e-4)
 
 
+def test_error_by_observation_dimension():
+    update, rows = make(ROBUST), random_rows(8)
+    with torch.no_grad():
+        for value in update.agent.world_model.net[-1].parameters():
+            value.zero_()
+    rows["observation"][..., 1] = 0.7  # never changes, wherever it is seen
+    unexplained = update(to_batch(rows), BETA).observation_unexplained
+    torch.testing.assert_close(unexplained, torch.tensor([1.0, 0.0, 1.0]))
+    assert make(PAPER)(to_batch(rows), BETA).observation_unexplained.shape == (0,)
+
+
 def test_policy_climbs_the_critic_it_is_told_to():
     first, smaller = make(PAPER, policy_q="first"), make(PAPER, policy_q="min")
     a, b = (u(to_batch(random_rows(8)), BETA).metrics["policy_loss"].item() for u in (first, smaller))

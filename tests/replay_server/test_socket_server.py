@@ -19,7 +19,7 @@ from learner.replay_client import Connection, ReplayClient
 from replay_server import socket_server
 from replay_server.server import ReplayConfig, ReplayServer
 from replay_server.socket_server import SocketServer
-from tests.replay_server.support import SPEC, Sender
+from tests.replay_server.support import SPEC, Sender, make_rows
 
 SECRET = b"a secret of the run"
 MAX_BATCH = 4096
@@ -144,6 +144,26 @@ def test_priorities_statistics_and_stats(serve: Serve) -> None:
     assert stats["max_priority"] == 5.0
     assert stats["windows"] == 200
     assert served.replay._store.priorities[[0, 7]].tolist() == [2.0, 5.0]
+    connection.close()
+
+
+def test_an_episode_over_the_socket(serve: Serve) -> None:
+    served = serve()
+    rows = make_rows(3)
+    rows["episode_step"] = np.arange(3) * SPEC.train
+    served.sender.send_rows(rows)
+    while served.replay.step():
+        pass
+    connection = served.connect()
+    for serial, expected in ((202, [200, 201, 202]), (200, [200]), (203, [])):
+        connection.send(Kind.EPISODE, {"serial": serial})
+        header, meta, body = connection.receive(memoryview(bytearray(BIG)))
+        assert (header.kind, meta["count"]) == (Kind.EPISODE, len(expected))
+        assert np.frombuffer(body, SPEC.dtype)["serial"].tolist() == expected
+    connection.send(Kind.EPISODE, {"serial": "202"})
+    header, meta = connection.receive_small()
+    assert header.kind is Kind.ERROR
+    assert "serial: '202'" in meta["error"]
     connection.close()
 
 
@@ -302,6 +322,10 @@ def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> Non
         assert draws[-1].env_steps == 200 * SPEC.train
         client.update_priorities(np.arange(16), np.full(16, 3.0, np.float32))
         assert client.statistics().count == 200 * SPEC.train
+        found = client.episode(7)  # every window here is an episode of its own
+        assert found is not None
+        assert found["serial"].tolist() == [7]
+        assert client.episode(999) is None
         served.close()
         served.close = lambda: None  # type: ignore[method-assign]
     assert client.sample(16).draw in (Draw.WAIT, Draw.BATCH)

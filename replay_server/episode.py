@@ -1,0 +1,40 @@
+"""Finds the windows of an episode again, from one of them back to its start."""
+
+import numpy as np
+
+from replay_server.ring import Ring, Slots
+
+CHUNK = 1024  # serials looked through at once
+FARTHEST = 65_536  # serials looked through at most: the learner waits for its next batch meanwhile
+
+
+def find_episode(ring: Ring, serial: int, most: int) -> Slots | None:
+    """Slots of the windows from the start of an episode to the one with that serial, oldest first.
+
+    None where one of them was evicted or refused, or where there are more than ``most``. An actor's windows of one
+    environment lie in the ring in the order of time, those of others between them.
+    """
+    progress, rows = ring.progress, ring.rows
+    if not progress.valid_from <= serial < progress.next_serial:
+        return None
+    found = [serial % ring.capacity]
+    origin = {name: rows[name][found[0]] for name in ("actor", "epoch", "env")}
+    oldest = max(progress.valid_from, serial - FARTHEST)
+    while rows["episode_step"][found[-1]] > 0 and serial > oldest:
+        slots = np.arange(serial - 1, max(oldest, serial - CHUNK) - 1, -1) % ring.capacity
+        serial -= len(slots)
+        same = np.logical_and.reduce([rows[name][slots] == value for name, value in origin.items()])
+        for slot in slots[same].tolist():
+            if rows["episode_step"][found[-1]] == 0:
+                break
+            if len(found) == most or not _adjoins(ring, slot, found[-1]):
+                return None
+            found.append(slot)
+    return np.array(found[::-1]) if rows["episode_step"][found[-1]] == 0 else None
+
+
+def _adjoins(ring: Ring, earlier: int, later: int) -> bool:
+    """Whether no step is missing between the windows in two slots."""
+    begins = ring.rows["episode_step"]
+    end = begins[earlier] + ring.rows["last"][earlier] - ring.spec.burn_in
+    return bool(begins[earlier] < begins[later] <= end)

@@ -1,0 +1,103 @@
+"""Staleness: nothing where the weights are those that acted, and a plain loop's figures where they are not."""
+
+import numpy as np
+import pytest
+import torch
+
+from common.agent import Agent, AgentConfig
+from common.window import Rows, WindowSpec
+from learner.staleness import measurable, staleness
+
+SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=4, train=5)
+UNBURNED = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=0, train=5)
+AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), shortcut=True, normalize_observations=True)
+STEPS = 32  # of the episode
+
+
+def make_agent(seed: int) -> Agent:
+    torch.manual_seed(seed)
+    agent = Agent(SPEC.obs_dim, SPEC.action_dim, AGENT)
+    agent.normalizer.mean += 0.3
+    return agent
+
+
+@torch.no_grad()
+def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray, start: int, stop: int) -> list:
+    """(h, Q of the action taken) of every step from ``start`` on, one at a time, from the state before it."""
+    found, state = [], torch.from_numpy(hidden).reshape(1, -1)
+    for k in range(start, stop):
+        before = episode["action"][k - 1] if k else np.zeros(SPEC.action_dim, np.float32)
+        o, blank, a, previous = (
+            torch.from_numpy(np.asarray(x))[None, None]
+            for x in (episode["observation"][k], episode["blank"][k], episode["action"][k], before)
+        )
+        step = agent.memory(agent.normalizer(o, blank), previous, state)
+        state = step.hidden[:, 0]
+        found.append((state[0].numpy(), float(agent.critic(agent.features(step), a).mean())))
+    return found
+
+
+def play(agent: Agent, spec: WindowSpec) -> tuple[dict[str, np.ndarray], Rows]:
+    """An episode, and its windows with the states that ``agent`` had."""
+    rng = np.random.default_rng(0)
+    episode = {
+        "observation": rng.normal(size=(STEPS + 1, spec.obs_dim)).astype(np.float32),
+        "action": rng.uniform(-1, 1, (STEPS, spec.action_dim)).astype(np.float32),
+        "blank": rng.random(STEPS + 1) < 0.2,
+    }
+    states = [np.zeros(spec.hidden, np.float32)]
+    states += [h for h, _ in remembered(agent, episode, states[0], 0, STEPS)]
+    rows = np.zeros(-(-STEPS // spec.train), spec.dtype)
+    for row, block in zip(rows, range(0, STEPS, spec.train), strict=True):
+        first = 0 if block >= spec.burn_in else spec.burn_in
+        last = spec.burn_in + min(spec.train, STEPS - block)
+        start, end = block - spec.burn_in + first, block - spec.burn_in + last
+        row["episode_step"], row["first"], row["last"] = block, first, last
+        row["observation"][first : last + 1] = episode["observation"][start : end + 1]
+        row["blank"][first : last + 1] = episode["blank"][start : end + 1]
+        row["action"][first:last] = episode["action"][start:end]
+        row["hidden"] = states[start]
+    return episode, rows
+
+
+@pytest.mark.parametrize("spec", [SPEC, UNBURNED])
+def test_todays_weights_find_nothing_stale(spec: WindowSpec) -> None:
+    agent = make_agent(1)
+    _, rows = play(agent, spec)
+    chosen = np.flatnonzero(measurable(rows, spec))
+    assert chosen.tolist() == [1, 2, 3, 4, 5]  # not the first, not the short
+    for window in chosen:
+        found = staleness(agent, spec, rows[: window + 1])
+        assert len(found) == (6 if spec.burn_in else 3)
+        assert max(found.values()) < 1e-5
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_as_a_plain_loop_has_it(window: int) -> None:
+    actor, today = make_agent(1), make_agent(2)
+    episode, rows = play(actor, SPEC)
+    start = window * SPEC.train - SPEC.burn_in
+    stored = rows["hidden"][window]
+    truth = remembered(today, episode, np.zeros(SPEC.hidden, np.float32), 0, start + SPEC.steps)
+    replayed = remembered(today, episode, stored, start, start + SPEC.steps)
+    q = np.array([value for _, value in truth[start:]])
+    gap = np.abs(np.array([value for _, value in replayed]) - q) / np.abs(q).max()
+    burned, true_burned, before = replayed[SPEC.burn_in - 1][0], truth[start + SPEC.burn_in - 1][0], truth[start - 1][0]
+    expected = {
+        "stale_state_stored": np.linalg.norm(stored - before) / np.linalg.norm(before),
+        "stale_state_burned": np.linalg.norm(burned - true_burned) / np.linalg.norm(true_burned),
+        "stale_q_first_stored": gap[0],
+        "stale_q_last_stored": gap[SPEC.train - 1],
+        "stale_q_first_burned": gap[SPEC.burn_in],
+        "stale_q_last_burned": gap[-1],
+    }
+    found = staleness(today, SPEC, rows[: window + 1])
+    assert found == pytest.approx(expected, abs=1e-5)
+    assert found["stale_state_stored"] > found["stale_state_burned"] > 0.0
+
+
+def test_a_state_of_zeros_is_wholly_stale() -> None:
+    agent = make_agent(1)
+    _, rows = play(agent, UNBURNED)
+    rows["hidden"] = 0.0
+    assert staleness(agent, UNBURNED, rows[:3])["stale_state_stored"] == pytest.approx(1.0)
