@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from common.bus import Ack, Bus, Version
 from common.envs import rebuilt, sound_reset
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from common.metrics import Means, Rate
-from common.window import WindowSpec
+from common.window import Rows, WindowSpec
 from common.wrappers import Env, Floats
 
 log = logging.getLogger(__name__)
@@ -54,6 +54,16 @@ class ActorConfig:
     """Most bytes kept to be sent again; the actor waits when they are reached."""
 
 
+class Rates(Protocol):
+    """Gives windows their initial priority."""
+
+    def load(self, blob: bytes) -> None:
+        """Take over broadcast weights."""
+
+    def __call__(self, rows: Rows) -> Floats:
+        """(n,) windows -> (n,) priorities."""
+
+
 def environment_seed(run_seed: int, actor: int, epoch: int, env: int) -> int:
     """A seed that no other environment, actor or restart of the run has; 31 bits, as every environment takes."""
     text = f"{run_seed} {actor} {epoch} {env}".encode()
@@ -78,12 +88,16 @@ class Actor:
         config: ActorConfig,
         bus: Bus,
         clock: Callable[[], float] = time.monotonic,
+        rates: Rates | None = None,
     ) -> None:
-        """``clock`` times polls and the chunk's timer; a lockstep run passes one that counts calls."""
+        """``clock`` times polls and the chunk's timer; a lockstep run passes one that counts calls.
+
+        Without ``rates`` windows enter the replay with the largest priority seen.
+        """
         _check(config, spec)
         self.name = f"actor-{index}"
         self._index, self._seed, self._spec, self._config = index, seed, spec, config
-        self._bus, self._clock = bus, clock
+        self._bus, self._clock, self._rates = bus, clock, rates
         n = config.envs_per_actor
         self._make_env, self._envs = make_env, [make_env() for _ in range(n)]
         self._faults: dict[int, Exception] = {}  # of this step, by environment
@@ -198,6 +212,8 @@ class Actor:
             if found is not None:
                 self._version, blob = found
                 self._runner.load(blob)
+                if self._rates is not None:
+                    self._rates.load(blob)
 
     def _poll_ack(self) -> None:
         ack, now = self._bus.ack(self._index), self._clock()
@@ -323,7 +339,11 @@ class Actor:
 
     def _flush(self) -> None:
         if self._builder.count:
-            self._outbox.put(self._builder.take())
+            rows = self._builder.take()
+            if self._rates is not None:
+                learnt = rows["weights_update"] > 0  # what the first weights think of a window says nothing
+                rows["initial_priority"] = np.where(learnt, self._rates(rows), 0.0)
+            self._outbox.put(rows)
         self._send()
 
     def _send(self) -> None:

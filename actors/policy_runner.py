@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from common.agent import LOG_STD_RANGE, NORMALIZED_CLIP, AgentConfig
+from common.agent import CRITIC_PARTS, LOG_STD_RANGE, NORMALIZED_CLIP, AgentConfig
 from common.errors import MessageError
 from common.window import BoolArray
 
@@ -73,8 +73,9 @@ class PolicyRunner:
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig, envs: int) -> None:
         self._config, self._envs = config, envs
         self._obs_dim, self._action_dim = obs_dim, action_dim
-        self._input = np.empty((envs, obs_dim + action_dim), np.float32)
-        self._embedding_dim = config.embedding or obs_dim + action_dim
+        self._inputs = obs_dim + action_dim + config.blank_flag
+        self._input = np.empty((envs, self._inputs), np.float32)
+        self._embedding_dim = config.embedding or self._inputs
         self._hidden = np.empty((envs, config.hidden), np.float32)
 
     def start(self) -> tuple[Floats, Floats]:
@@ -84,24 +85,26 @@ class PolicyRunner:
         return prev_action, hidden
 
     def load(self, blob: bytes) -> None:
-        """Take over the safetensors of ``Agent.policy_weights()``. Raises MessageError."""
+        """Take over the safetensors of ``Agent.policy_weights()``, or of what is broadcast. Raises MessageError."""
         try:
             weights = load(blob)
             self._take(weights)
         except (SafetensorError, KeyError, ValueError) as error:
             raise MessageError("weights", f"not a policy of this run ({error})") from None
-        if weights:
-            raise MessageError("weights", f"not a policy of this run (it also has {', '.join(weights)})")
+        rates = self._config.initial_priority == "actor"
+        if left := [name for name in weights if not (rates and name.startswith(CRITIC_PARTS))]:
+            raise MessageError("weights", f"not a policy of this run (it also has {', '.join(left)})")
 
     def _take(self, weights: dict[str, Floats]) -> None:
         """Build the layers; takes what it uses out of ``weights``."""
         config, embedding = self._config, self._embedding_dim
-        inputs = self._obs_dim + self._action_dim
         features = config.hidden + (embedding if config.shortcut else 0)
         self._mean, self._std = weights.pop("normalizer.mean"), weights.pop("normalizer.std")
         self._embed, self._norm = None, None
         if config.embedding:
-            self._embed = self._linear(weights, "memory.embed.0.{}", inputs, embedding, relu=not config.layer_norm)
+            self._embed = self._linear(
+                weights, "memory.embed.0.{}", self._inputs, embedding, relu=not config.layer_norm
+            )
         if config.embedding and config.layer_norm:
             self._norm = weights.pop("memory.embed.1.weight"), weights.pop("memory.embed.1.bias")
         self._from_embedding = self._linear(weights, "memory.gru.{}_ih_l0", embedding, 3 * config.hidden)
@@ -149,7 +152,9 @@ class PolicyRunner:
         else:
             normalized[:] = observation
         normalized[blank] = 0.0
-        x[:, self._obs_dim :] = prev_action
+        x[:, self._obs_dim : self._obs_dim + self._action_dim] = prev_action
+        if self._config.blank_flag:
+            x[:, -1] = blank
         if self._embed is None:
             return x
         embedding = self._embed(x)

@@ -6,7 +6,7 @@ Equations are in ``learner/losses.py``; here is only what maps inputs to outputs
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,8 @@ from torch.nn import functional as F
 LOG_STD_RANGE = (-20.0, 2.0)  # of the policy's Gaussian before the tanh
 NORMALIZED_CLIP = 10.0  # standard deviations
 STD_FLOOR = 1e-2  # a constant dimension is not blown up
-POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what an actor needs, and all that is broadcast
+POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what it takes to act
+CRITIC_PARTS = ("critic.", "log_alpha")  # what else it takes to rate a window
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,11 @@ class AgentConfig:
     """Observations are normalised by the replay server's running statistics."""
     grounding: bool = True
     """The world model also predicts the next observation's change and the reward."""
+    blank_flag: bool = False
+    """The memory is told which observations are blank (flickered out), not left to tell them from zeros."""
+    initial_priority: Literal["max", "actor"] = "max"
+    """Priority that a window enters the replay with: the largest seen, or its TD error by the networks of its actor, to
+    which the critics are then sent, too."""
 
 
 class Normalizer(nn.Module):
@@ -75,11 +81,12 @@ class Remembered(NamedTuple):
 
 
 class Memory(nn.Module):
-    """h_t = GRU(h_{t-1}, e_t), e_t = ReLU(Linear([o_t, a_{t-1}])) or the raw input."""
+    """h_t = GRU(h_{t-1}, e_t), e_t = ReLU(Linear([o_t, a_{t-1}])) or the raw input; where asked, with a blank flag."""
 
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
-        width = obs_dim + action_dim
+        width = obs_dim + action_dim + config.blank_flag
+        self.blank_flag = config.blank_flag
         layers: list[nn.Module] = []
         if config.embedding:
             layers = [nn.Linear(width, config.embedding), nn.ReLU()]
@@ -89,10 +96,16 @@ class Memory(nn.Module):
         self.embedding_dim = config.embedding or width
         self.gru = nn.GRU(self.embedding_dim, config.hidden, batch_first=True)
 
-    def forward(self, observation: Tensor, prev_action: Tensor, hidden: Tensor) -> Remembered:
-        """(B, T, O), (B, T, A), (B, H) the state before the first step."""
-        embedding = self.embed(torch.cat([observation, prev_action], dim=-1))
+    def forward(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Remembered:
+        """(B, T, O) normalised, (B, T) bool, (B, T, A), (B, H) the state before the first step."""
+        embedding = self.embedded(observation, blank, prev_action)
         return Remembered(self._unroll(embedding, hidden.unsqueeze(0).contiguous()), embedding)
+
+    def embedded(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
+        """(..., O) normalised, (...) bool, (..., A) -> (..., E)."""
+        flag = [blank.unsqueeze(-1).to(observation.dtype)] if self.blank_flag else []
+        embedding: Tensor = self.embed(torch.cat([observation, prev_action, *flag], dim=-1))
+        return embedding
 
     def _unroll(self, embedding: Tensor, hidden: Tensor) -> Tensor:
         """(B, T, E), (1, B, H) -> (B, T, H) float32."""
@@ -221,9 +234,16 @@ class Agent(nn.Module):
         return remembered.hidden
 
     def policy_weights(self) -> dict[str, Tensor]:
-        """What actors need, detached, on the CPU."""
+        """What it takes to act, detached, on the CPU."""
+        return self._weights(POLICY_PARTS)
+
+    def broadcast_weights(self) -> dict[str, Tensor]:
+        """What actors are sent: the critics, too, where they rate their windows."""
+        return self._weights(POLICY_PARTS + (CRITIC_PARTS if self.config.initial_priority == "actor" else ()))
+
+    def _weights(self, parts: tuple[str, ...]) -> dict[str, Tensor]:
         return {
             name: value.detach().cpu().contiguous()
             for name, value in self.state_dict().items()
-            if name.startswith(POLICY_PARTS)
+            if name.startswith(parts)
         }

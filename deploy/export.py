@@ -37,7 +37,7 @@ class _Step(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """See the module's docstring."""
         seen = self.agent.normalizer(observation, blank)
-        remembered = self.agent.memory(seen.unsqueeze(1), previous_action.unsqueeze(1), hidden)
+        remembered = self.agent.memory(seen.unsqueeze(1), blank.unsqueeze(1), previous_action.unsqueeze(1), hidden)
         mean, _ = self.agent.policy(self.agent.features(remembered).squeeze(1))
         return torch.tanh(mean), remembered.hidden.squeeze(1)
 

@@ -32,7 +32,12 @@ class Episode:
     observation: Tensor  # (1, T + 1, O)
     action: Tensor  # (1, T, A)
     reward: Tensor  # (T,)
-    seen: Tensor  # (T,) bool: neither the step's frame nor the next one is blank
+    blank: Tensor  # (1, T + 1) bool
+
+    @property
+    def seen(self) -> Tensor:
+        """(T,) bool: neither the step's frame nor the next one is blank."""
+        return ~(self.blank[0, 1:] | self.blank[0, :-1])
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,7 @@ def play(folder: RunFolder, agent: Agent, config: RunConfig, checkpoint: str) ->
         agent.normalizer(raw, blank).unsqueeze(0),
         torch.from_numpy(np.stack(actions)).unsqueeze(0),
         torch.tensor(rewards),
-        ~(blank[1:] | blank[:-1]),
+        blank.unsqueeze(0),
     )
 
 
@@ -89,7 +94,7 @@ def play(folder: RunFolder, agent: Agent, config: RunConfig, checkpoint: str) ->
 def look(agent: Agent, episode: Episode) -> Insight:
     """Everything from one pass over the episode, and open-loop rollouts from each of its steps."""
     previous = torch.cat([torch.zeros_like(episode.action[:, :1]), episode.action], 1)
-    memory = agent.memory(episode.observation, previous, torch.zeros(1, agent.config.hidden))
+    memory = agent.memory(episode.observation, episode.blank, previous, torch.zeros(1, agent.config.hidden))
     prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
     latent_change = memory.hidden[0].diff(dim=0)
     real = episode.observation[0, 1:]
@@ -120,7 +125,7 @@ def _open_loop(agent: Agent, memory: Remembered, episode: Episode) -> dict[int, 
         step = agent.world_model(features, action.unsqueeze(1))
         hidden = hidden + step.hidden_change.squeeze(1)
         observation = observation + step.observation_change.squeeze(1)
-        embedding = agent.memory.embed(torch.cat([observation, action], -1))
+        embedding = agent.memory.embedded(observation, torch.zeros(count, dtype=torch.bool), action)
         if ahead in HORIZONS:
             found[ahead] = observation
     return found

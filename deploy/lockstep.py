@@ -13,6 +13,7 @@ from common.envs import make_env
 from common.metrics import BusyClock
 from common.role import METRICS_PERIOD, Role, StopSignal
 from deploy.presets import RunConfig
+from deploy.roles import initial_priority
 from learner.learner import Learner
 from replay_server.server import ReplayServer
 
@@ -52,6 +53,7 @@ class Lockstep:
                 config.actor,
                 self.bus,
                 clock=lambda: float(next(ticks)),
+                rates=initial_priority(config, index),
             )
             for index in range(config.actors)
         ]

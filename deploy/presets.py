@@ -232,6 +232,10 @@ def validate(config: RunConfig) -> None:
         raise ConfigError("--heads", config.agent.heads, "take at least 1 unit a layer")
     if config.agent.layer_norm and not config.agent.embedding:
         raise ConfigError("--layer-norm", True, "it normalises the embedding, so it needs --embedding above 0")
+    if config.agent.initial_priority == "actor" and config.replay.priority_exponent == 0.0:
+        raise ConfigError(
+            "--initial-priority", "actor", "uniform replay has no priorities; try --priority-exponent 0.6"
+        )
     if not 1 <= config.actor.stride <= config.window.trained_steps:
         raise ConfigError("--stride", config.actor.stride, f"take 1 to --trained-steps={config.window.trained_steps}")
     if config.total_steps <= config.replay.warmup_steps:

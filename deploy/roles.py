@@ -21,6 +21,7 @@ from common.role import RECONNECT_SLEEP, StopSignal, run_role
 from common.watchdog import Watchdog
 from common.wrappers import Env
 from deploy.presets import RunConfig, from_json
+from learner.initial_priority import InitialPriority
 from learner.learner import Learner
 from learner.replay_client import ReplayClient
 from replay_server.process import ReplayProcess
@@ -107,10 +108,18 @@ def run_actor(place: Place, index: int) -> None:
     if not 0 <= index < config.actors:
         raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
     torch.set_num_threads(1)
-    actor = Actor(index, config.seed, process.make_env, config.window_spec(), config.agent, config.actor, process.bus)
+    spec, rates = config.window_spec(), initial_priority(config, index)
+    actor = Actor(index, config.seed, process.make_env, spec, config.agent, config.actor, process.bus, rates=rates)
     watchdog = Watchdog(config.env.env_timeout)
     run_role(actor, process.bus, process.stop, beat=watchdog.beat)
     watchdog.close()
+
+
+def initial_priority(config: RunConfig, index: int) -> InitialPriority | None:
+    """What rates the windows of an actor, where actors do."""
+    if config.agent.initial_priority == "max":
+        return None
+    return InitialPriority(config.window_spec(), config.agent, config.update, config.seed + index)
 
 
 def run_evaluator(place: Place) -> None:

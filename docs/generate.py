@@ -45,6 +45,8 @@ WHEN = {
     "shortcut": "off where nothing but the memory may be read, as in the paper",
     "normalize_observations": "off where observations are scaled already and their statistics keep moving",
     "grounding": "off for the paper's model; without it the latent can collapse in other schemes than 1",
+    "blank_flag": "with flicker, to see what the flag is worth; the paper has none",
+    "initial_priority": "`actor` where new windows should not all be drawn soon; it costs the actors a forward pass",
     "envs_per_actor": "up where actors are the bottleneck: they share one forward pass",
     "stride": "down for overlapping windows, which repeat each step in training",
     "state_strategy": "to compare the strategies of the paper; `episode` is slow, and right",

@@ -172,7 +172,7 @@ class Learner:
                 self.publish()
 
     def _broadcast(self, evaluate: bool = False) -> None:
-        blob = self._policy()
+        blob = self._sound(self.agent.broadcast_weights())
         try:
             self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate)
         except FencedError:
@@ -180,9 +180,8 @@ class Learner:
             raise
         self._evaluation_due = self._evaluation_due and not evaluate
 
-    def _policy(self) -> bytes:
-        """The policy as it is sent and saved. Raises RmcError where it is not finite: neither must then happen."""
-        weights = self.agent.policy_weights()
+    def _sound(self, weights: dict[str, Tensor]) -> bytes:
+        """Weights as they are sent and saved. Raises RmcError where they are not finite: neither must then happen."""
         self._diverged = not all(bool(value.isfinite().all()) for value in weights.values())
         if self._diverged:
             raise RmcError(
@@ -212,7 +211,7 @@ class Learner:
         progress = {"updates": self.updates, "env_steps": self.env_steps, "epoch": self.epoch, "time": time.time()}
         files = {
             STATE: state.getvalue(),
-            POLICY: self._policy(),
+            POLICY: self._sound(self.agent.policy_weights()),
             PROGRESS: json.dumps(progress).encode(),
         }
         self.checkpoints.save(self.updates, files)

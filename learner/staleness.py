@@ -37,8 +37,10 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
     window = slice(-spec.steps - 1, -1)  # its steps; the bootstrap observation starts none
     past = slice(None, -spec.steps - 1)
-    before = agent.memory(o[:, past], prev_action[:, past], torch.zeros_like(stored)).hidden[:, -1]
-    replayed, recomputed = (agent.memory(o[:, window], prev_action[:, window], h) for h in (stored, before))
+    before = agent.memory(o[:, past], blank[:, past], prev_action[:, past], torch.zeros_like(stored)).hidden[:, -1]
+    replayed, recomputed = (
+        agent.memory(o[:, window], blank[:, window], prev_action[:, window], h) for h in (stored, before)
+    )
     q, q_replayed = (
         agent.critic(agent.features(remembered), action[:, -spec.steps :]).mean(0).squeeze(0)
         for remembered in (recomputed, replayed)

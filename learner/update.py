@@ -120,7 +120,7 @@ class JointUpdate:
             o = agent.normalizer(batch.observation, batch.blank)
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
-            memory = self._remember(agent.memory, o, batch)
+            memory = remember(agent.memory, o, batch, self.burn_in)
             z = agent.features(memory)
             trains = TRAINS_MEMORY[c.scheme]
             z_model, z_value, z_policy = (z if loss in trains else z.detach() for loss in ("model", "value", "policy"))
@@ -181,21 +181,9 @@ class JointUpdate:
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
 
-    def _remember(self, memory: Memory, o: Tensor, batch: Batch) -> Remembered:
-        """(B, L_t + 1, ·) from the stored state, which starts the trained part itself where the burn-in is padding."""
-        n = self.burn_in
-        hidden = batch.hidden
-        if n:
-            with torch.no_grad():
-                burned = memory(o[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
-            torch.clear_autocast_cache()  # older torch would go on with these casts, which carry no gradient
-            hidden = torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
-        remembered: Remembered = memory(o[:, n:], batch.prev_action[:, n:], hidden)
-        return remembered
-
     @torch.no_grad()
     def _remember_target(self, o: Tensor, batch: Batch) -> Remembered:
-        return self._remember(self.target_memory, o, batch)
+        return remember(self.target_memory, o, batch, self.burn_in)
 
     def _noise_like(self, x: Tensor) -> Tensor:
         return torch.randn(x.shape, generator=self.generator, device=x.device)
@@ -279,6 +267,18 @@ class AlternateUpdate(JointUpdate):
                 updated = found
         self._follow(updated)
         return updated._replace(metrics=updated.metrics | metrics | {"grad_norm": torch.stack(norms).norm()})
+
+
+def remember(memory: Memory, o: Tensor, batch: Batch, burn_in: int) -> Remembered:
+    """(B, L_t + 1, ·) from the stored state, which starts the trained part itself where the burn-in is padding."""
+    n, hidden = burn_in, batch.hidden
+    if n:
+        with torch.no_grad():
+            burned = memory(o[:, :n], batch.blank[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
+        torch.clear_autocast_cache()  # older torch would go on with these casts, which carry no gradient
+        hidden = torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
+    remembered: Remembered = memory(o[:, n:], batch.blank[:, n:], batch.prev_action[:, n:], hidden)
+    return remembered
 
 
 def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:

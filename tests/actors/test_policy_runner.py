@@ -39,20 +39,22 @@ def reference(
     noise: torch.Tensor | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     normalized = agent.normalizer(observation, blank)
-    remembered = agent.memory(normalized.unsqueeze(1), prev_action.unsqueeze(1), hidden)
+    remembered = agent.memory(normalized.unsqueeze(1), blank.unsqueeze(1), prev_action.unsqueeze(1), hidden)
     mean, log_std = agent.policy(agent.features(remembered).squeeze(1))
     action = torch.tanh(mean) if noise is None else squashed_sample(mean, log_std, noise)[0]
     return action, remembered.hidden.squeeze(1)
 
 
 @pytest.mark.parametrize(
-    ("embedding", "layer_norm", "shortcut", "normalize"),
-    list(product((0, 16), (False, True), (False, True), (False, True))),
+    ("embedding", "layer_norm", "shortcut", "normalize", "blank_flag"),
+    list(product((0, 16), (False, True), (False, True), (False, True), (False, True))),
 )
-def test_agrees_with_the_agent(embedding: int, layer_norm: bool, shortcut: bool, normalize: bool) -> None:
+def test_agrees_with_the_agent(
+    embedding: int, layer_norm: bool, shortcut: bool, normalize: bool, blank_flag: bool
+) -> None:
     config = AgentConfig(
         hidden=12, embedding=embedding, heads=(9, 7), layer_norm=layer_norm, shortcut=shortcut,
-        normalize_observations=normalize,
+        normalize_observations=normalize, blank_flag=blank_flag,
     )  # fmt: skip
     agent = make_agent(config)
     runner = make_runner(agent)

@@ -9,7 +9,7 @@ from actors.window_builder import WindowBuilder
 from common.agent import AgentConfig
 from common.window import Rows, WindowSpec
 from learner.batch import Batch, view_batch
-from learner.update import JointUpdate, UpdateConfig
+from learner.update import remember
 from tests.actors.support import join_rows
 from tests.actors.test_policy_runner import ACTION_DIM, OBS_DIM, make_agent, make_runner
 
@@ -23,6 +23,7 @@ AGENTS = {
             layer_norm=bool(embedding),
             shortcut=True,
             normalize_observations=True,
+            blank_flag=bool(embedding),
         )
     )
     for shape, embedding in (("embedded", 12), ("raw", 0))
@@ -67,10 +68,10 @@ def play(
 def relearned(agent_name: str, rows: Rows, spec: WindowSpec) -> tuple[Batch, torch.Tensor]:
     """The learner's own way from rows to h, (B, train + 1, H)."""
     agent = AGENTS[agent_name]
-    update = JointUpdate(agent, spec.burn_in, UpdateConfig(), seed=0)
     raw = torch.from_numpy(rows.view(np.uint8).reshape(len(rows), -1))
     batch = view_batch(raw, torch.ones(len(rows)), spec)
-    return batch, update._remember(agent.memory, agent.normalizer(batch.observation, batch.blank), batch).hidden
+    o = agent.normalizer(batch.observation, batch.blank)
+    return batch, remember(agent.memory, o, batch, spec.burn_in).hidden
 
 
 @settings(max_examples=40, deadline=None)

@@ -20,6 +20,7 @@ TRAIN_FLAGS = """
     --env-timeout --run-dir --if-exists --launcher --device --redis-url
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --shortcut --normalize-observations --grounding
+    --blank-flag --initial-priority
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
     --capacity --replay-ratio --warmup-steps --priority-exponent --importance-exponent
     --learning-rate --alpha-learning-rate --gamma --polyak --clip-norm --latent-target --target-memory --policy-q

@@ -45,7 +45,7 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
     """The observation that the model expects ``horizon`` steps after ``start``, one step at a time."""
     hidden, previous = torch.zeros(1, agent.config.hidden), torch.zeros(1, 1, agent.action_dim)
     for t in range(start + 1):
-        seen = agent.memory(episode.observation[:, t : t + 1], previous, hidden)
+        seen = agent.memory(episode.observation[:, t : t + 1], episode.blank[:, t : t + 1], previous, hidden)
         hidden, previous = seen.hidden[:, 0], episode.action[:, t : t + 1]
     observation = episode.observation[:, start : start + 1]
     for t in range(start, start + horizon):

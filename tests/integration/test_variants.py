@@ -50,6 +50,9 @@ VARIANTS: list[dict[str, Any]] = [
     {"n_step": 3},
     {"stride": 5},
     {"priority_exponent": 0.0, "importance_exponent": 0.0},
+    {"blank_flag": True},
+    {"initial_priority": "actor"},
+    {"initial_priority": "actor", "n_step": 3},
     {"state_strategy": "zero"},
     {"state_strategy": "stored"},
     {"state_strategy": "episode", "env": "Reacher-v5"},
@@ -70,6 +73,41 @@ def test_a_variant_trains(options: dict[str, Any], tmp_path: Path) -> None:
     assert -(run.replay.replay_ratio * run.slack_steps() + batch) <= debt <= batch
     assert all(value.isfinite().all() for value in learner.agent.state_dict().values())
     assert all(math.isfinite(value) for value in learner.metrics().values() if isinstance(value, float))
+
+
+def test_actors_rate_their_windows_once_there_is_something_to_rate_them_by(tmp_path: Path) -> None:
+    server = Lockstep(config(initial_priority="actor", capacity=1_000), tmp_path)
+    while not server.learner.finished:
+        server.step()
+    rows = server.server._store.ring.rows[: server.server.stats()["windows"]]
+    by_actor, random = (
+        rows["initial_priority"][mask] for mask in (rows["weights_update"] > 0, rows["weights_update"] == 0)
+    )
+    server.close()
+    assert len(by_actor) > 10
+    assert (by_actor > 0).all()
+    assert len(random) > 10
+    assert (random == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("strategy", "stages"),
+    [("burn-in", {"stored", "burned"}), ("stored", {"stored"}), ("zero", {"stored"}), ("episode", set())],
+)
+def test_staleness_is_measured(strategy: str, stages: set[str], tmp_path: Path) -> None:
+    run = config(env="Reacher-v5", state_strategy=strategy, batch_size=16, replay_ratio=64.0)
+    metrics = train(run, tmp_path).learner.metrics()
+    found = {name: value for name, value in metrics.items() if name.startswith("stale_")}
+    assert set(found) == {f"stale_{what}_{stage}" for what in ("state", "q_first", "q_last") for stage in stages}
+    assert all(0.0 <= value < 10.0 for value in found.values())
+    if strategy == "zero":
+        assert found["stale_state_stored"] == pytest.approx(1.0)
+    assert metrics["sample_age_max"] >= metrics["sample_age_mean"] >= 0.0
+
+
+def test_initial_priorities_need_priorities() -> None:
+    with pytest.raises(ConfigError, match=r"--initial-priority=.actor.: uniform replay"):
+        config(initial_priority="actor", priority_exponent=0.0)
 
 
 def test_an_episode_strategy_needs_a_time_limit() -> None:

@@ -31,7 +31,7 @@ def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray,
             torch.from_numpy(np.asarray(x))[None, None]
             for x in (episode["observation"][k], episode["blank"][k], episode["action"][k], before)
         )
-        step = agent.memory(agent.normalizer(o, blank), previous, state)
+        step = agent.memory(agent.normalizer(o, blank), blank, previous, state)
         state = step.hidden[:, 0]
         found.append((state[0].numpy(), float(agent.critic(agent.features(step), a).mean())))
     return found

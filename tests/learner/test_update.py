@@ -10,7 +10,7 @@ from torch import Tensor
 
 from common.agent import Agent, AgentConfig
 from learner import losses
-from learner.update import TRAINS_MEMORY, JointUpdate, UpdateConfig, make_update
+from learner.update import TRAINS_MEMORY, JointUpdate, UpdateConfig, make_update, remember
 from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
 
 ROBUST = AgentConfig(
@@ -132,9 +132,10 @@ def test_padded_burn_in_starts_from_the_stored_state():
     rows["first"] = SPEC.burn_in
     rows["observation"][:, : SPEC.burn_in] = 0.0
     batch, update = to_batch(rows), make(PAPER)
-    found = update._remember(update.agent.memory, batch.observation, batch).hidden
+    found = remember(update.agent.memory, batch.observation, batch, SPEC.burn_in).hidden
     n = SPEC.burn_in
-    alone = update.agent.memory(batch.observation[:, n:], batch.prev_action[:, n:], batch.hidden).hidden
+    o, blank, previous = batch.observation[:, n:], batch.blank[:, n:], batch.prev_action[:, n:]
+    alone = update.agent.memory(o, blank, previous, batch.hidden).hidden
     assert torch.equal(found, alone)
 
 
@@ -143,62 +144,10 @@ def test_burn_in_gets_no_gradient():
     rows["first"] = 0
     batch, update = to_batch(rows), make(PAPER)
     o = batch.observation.clone().requires_grad_()
-    update._remember(update.agent.memory, o, batch).hidden.sum().backward()
+    remember(update.agent.memory, o, batch, SPEC.burn_in).hidden.sum().backward()
     assert o.grad is not None
     assert not o.grad[:, : SPEC.burn_in].any()
     assert o.grad[:, SPEC.burn_in :].any()
-
-
-@torch.no_grad()
-def plain_first_losses(reference: Agent, rows: np.ndarray, weights: np.ndarray, noise: Tensor) -> tuple[float, float]:
-    """Model and Q loss by loops over windows and steps, with alpha = 1 and targets equal to the online nets."""
-    model, q_sum, steps, model_steps = 0.0, 0.0, 0, 0
-    for b, row in enumerate(rows):
-        hidden = plain_unroll(reference, row)
-        for t in range(SPEC.burn_in, int(row["last"])):
-            ends = bool(row["terminated"]) and t == row["last"] - 1
-            now, later = hidden[t], hidden[t + 1]
-            action = torch.tensor(row["action"][t])
-            f = reference.world_model(now[None, None], action[None, None]).hidden_change[0, 0]
-            error = float((f - (later - now)).abs().mean())
-            mean, log_std = reference.policy(later)
-            u = mean + log_std.exp() * noise[b, t + 1 - SPEC.burn_in]
-            log_pi = float(torch.distributions.Normal(mean, log_std.exp()).log_prob(u).sum())
-            log_pi -= float(torch.log(1.0 - torch.tanh(u) ** 2).sum())
-            value = float(reference.critic(later[None, None], torch.tanh(u)[None, None]).min()) - log_pi
-            y = float(row["reward"][t]) + (0.0 if ends else 0.5 * error + 0.99 * value)
-            q = reference.critic(now[None, None], action[None, None]).flatten()
-            q_sum += float(weights[b]) * 0.5 * sum((float(q[j]) - y) ** 2 for j in (0, 1))
-            model, model_steps, steps = model + (not ends) * error, model_steps + (not ends), steps + 1
-    return model / model_steps, q_sum / steps
-
-
-@pytest.mark.parametrize("latent", ["online", "ema"])
-def test_metrics_match_a_plain_recomputation(latent):
-    """Model loss and Q loss of the first update, recomputed window by window with plain modules."""
-    update = make(PAPER, latent_target=latent)
-    reference = copy.deepcopy(update.agent)
-    rows = random_rows(5)
-    weights = np.linspace(0.2, 1.0, 5).astype(np.float32)
-    generator = torch.Generator().manual_seed(3)
-    noise = torch.randn((5, SPEC.train + 1, SPEC.action_dim), generator=generator)
-    found = update(to_batch(rows, importance=weights), BETA)
-    model, q = plain_first_losses(reference, rows, weights, noise)
-    assert found.metrics["model_loss"].item() == pytest.approx(model, rel=1e-4)
-    assert found.metrics["q_loss"].item() == pytest.approx(q, rel=1e-4)
-
-
-def plain_unroll(agent: Agent, row: np.void) -> dict[int, Tensor]:
-    """h_t for every real observation, one step at a time, without gradient."""
-    hidden = torch.tensor(row["hidden"])
-    states = {}
-    for t in range(int(row["first"]), int(row["last"]) + 1):
-        previous = row["prev_action"] if t == row["first"] else row["action"][t - 1]
-        o = agent.normalizer(torch.tensor(row["observation"][t]), torch.tensor(bool(row["blank"][t])))
-        x = torch.cat([o, torch.tensor(previous)])
-        hidden = agent.memory.gru(agent.memory.embed(x)[None, None], hidden[None, None])[1].flatten().detach()
-        states[t] = hidden
-    return states
 
 
 @pytest.mark.parametrize("norm", ["l1", "l2"])

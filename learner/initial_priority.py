@@ -1,0 +1,49 @@
+"""The priority that a window enters the replay with, by the networks of the actor that made it.
+
+The learner's own TD error (one-step or n-step, ``learner/losses.py``) and eta-mix, with the critics as they were
+last broadcast in the place of the targets, and without curiosity. Handed to actors by ``deploy/``.
+"""
+
+import numpy as np
+import safetensors.torch
+import torch
+from numpy.typing import NDArray
+
+from common.agent import Agent, AgentConfig, squashed_sample
+from common.window import Rows, WindowSpec
+from learner import losses
+from learner.batch import view_batch
+from learner.update import UpdateConfig, remember
+
+
+class InitialPriority:
+    """Rows in, priorities out; on the CPU."""
+
+    def __init__(self, spec: WindowSpec, agent: AgentConfig, update: UpdateConfig, seed: int) -> None:
+        """``seed`` is for the actions that the policy is asked for. ``load`` must come first."""
+        self._spec, self._update = spec, update
+        self._agent = Agent(spec.obs_dim, spec.action_dim, agent)
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def load(self, blob: bytes) -> None:
+        """Take over what was broadcast, the safetensors of ``Agent.broadcast_weights()``."""
+        self._agent.load_state_dict(safetensors.torch.load(blob), strict=False)
+
+    @torch.no_grad()
+    def __call__(self, rows: Rows) -> NDArray[np.float32]:
+        """Windows (B,) -> (B,)."""
+        agent, steps = self._agent, slice(self._spec.burn_in, None)
+        raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
+        batch = view_batch(raw, torch.ones(len(rows)), self._spec)
+        m = batch.step_valid[:, steps].float()
+        o = agent.normalizer(batch.observation, batch.blank)
+        z = agent.features(remember(agent.memory, o, batch, self._spec.burn_in))
+        mean, log_std = agent.policy(z)
+        pi, log_pi = squashed_sample(mean, log_std, torch.randn(mean.shape, generator=self._generator))
+        next_value = losses.soft_value(agent.critic(z[:, 1:], pi[:, 1:]), agent.log_alpha.exp(), log_pi[:, 1:])
+        y = losses.td_target(
+            batch.reward[:, steps], self._update.gamma, batch.terminated[:, steps], next_value, m, self._update.n_step
+        )
+        td_error = (agent.critic(z[:, :-1], batch.action[:, steps]) - y).abs().mean(0)
+        priority: NDArray[np.float32] = losses.priority(td_error, self._update.eta, m).numpy()
+        return priority

@@ -1,0 +1,209 @@
+"""The update once more, written from the equations of ``docs/algorithm.md`` by loops over windows and steps.
+
+Slow, in float32, without batches, masks or padding: a reference for ``learner/update.py``.
+"""
+
+import copy
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from common.agent import Agent, Memory
+from learner.update import UpdateConfig
+
+REACHES_MEMORY = {1: "MV", 2: "V", 3: "M", 4: "MVP", 5: "MP", 6: "VP"}  # model, value, policy: table 1 of the paper
+ALTERNATE = (("MG", "world_model"), ("V", "critic"), ("P", "policy"), ("T", None))
+
+
+class Known(NamedTuple):
+    """The memory after an observation."""
+
+    h: Tensor
+    e: Tensor
+
+
+class PlainUpdate:
+    """Losses by name: M model, G grounding, V value, P policy, T temperature."""
+
+    def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int) -> None:
+        self.agent, self.burn_in, self.c = agent, burn_in, config
+        self.target_critic, self.target_memory = copy.deepcopy(agent.critic), copy.deepcopy(agent.memory)
+        self.generator = torch.Generator().manual_seed(seed)
+        self.variance_sum = self.variance_weight = 0.0
+        everything = ["world_model", "critic", "policy", None]
+        groups = [everything] if config.update_order == "joint" else [[part] for _, part in ALTERNATE]
+        self.optimizers = [self._optimizer(parts) for parts in groups]
+
+    def _optimizer(self, parts: Sequence[str | None]) -> torch.optim.Adam:
+        networks = list(self.agent.memory.parameters())
+        networks += [p for part in parts if part is not None for p in getattr(self.agent, part).parameters()]
+        groups = [{"params": networks, "lr": self.c.learning_rate}]
+        if None in parts:
+            groups.append({"params": [self.agent.log_alpha], "lr": self.c.alpha_learning_rate})
+        return torch.optim.Adam(groups, fused=False)
+
+    def __call__(self, rows: np.ndarray, importance: np.ndarray, beta: float) -> tuple[dict[str, float], list[float]]:
+        """One update; the losses as they were before it, and the windows' priorities."""
+        wholes = ["MGVPT"] if self.c.update_order == "joint" else [names for names, _ in ALTERNATE]
+        found: dict[str, float] = {}
+        priorities: list[float] = []
+        for names, optimizer in zip(wholes, self.optimizers, strict=True):
+            losses, new_priorities, variance = self.losses(rows, importance, beta)
+            self.agent.zero_grad()
+            sum((losses[name] for name in names), torch.zeros(())).backward()
+            if self.c.clip_norm:
+                torch.nn.utils.clip_grad_norm_(self.agent.parameters(), self.c.clip_norm)
+            optimizer.step()
+            found |= {name: losses[name].item() for name in names}
+            if "V" in names:
+                priorities, moved = new_priorities, variance
+        if self.c.curiosity_scale == "std":
+            self.variance_sum, self.variance_weight = moved
+        with torch.no_grad():
+            for target, source in ((self.target_critic, self.agent.critic), (self.target_memory, self.agent.memory)):
+                for old, new in zip(target.parameters(), source.parameters(), strict=True):
+                    old.copy_(self.c.polyak * old + (1.0 - self.c.polyak) * new)
+        return found, priorities
+
+    def unroll(self, memory: Memory, row: np.void) -> dict[int, Known]:
+        """By observation, from the first trained one on; the burn-in without gradient."""
+        h, known = torch.tensor(row["hidden"]), {}
+        for t in range(int(row["first"]), int(row["last"]) + 1):
+            if t == self.burn_in:
+                h = h.detach()
+            previous = row["prev_action"] if t == row["first"] else row["action"][t - 1]
+            inputs = [self.seen(row, t), torch.tensor(previous)]
+            inputs += [torch.tensor([float(row["blank"][t])])] if self.agent.config.blank_flag else []
+            e = memory.embed(torch.cat(inputs))
+            h = gru(memory, e, h)
+            known[t] = Known(h, e)
+        return {t: known[t] for t in range(self.burn_in, int(row["last"]) + 1)}
+
+    def seen(self, row: np.void, t: int) -> Tensor:
+        """The observation as the networks see it."""
+        if row["blank"][t]:
+            return torch.zeros(self.agent.obs_dim)
+        o = torch.tensor(row["observation"][t])
+        normalizer = self.agent.normalizer
+        return ((o - normalizer.mean) / normalizer.std).clamp(-10, 10) if normalizer.enabled else o
+
+    def z(self, known: Known) -> Tensor:
+        return torch.cat([known.h, known.e]) if self.agent.config.shortcut else known.h
+
+    def sample(self, z: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        mean, log_std = self.agent.policy(z)
+        u = mean + log_std.exp() * noise
+        log_pi = torch.distributions.Normal(mean, log_std.exp()).log_prob(u).sum()
+        return torch.tanh(u), log_pi - torch.log(1.0 - torch.tanh(u) ** 2).sum()
+
+    def losses(
+        self, rows: np.ndarray, importance: np.ndarray, beta: float
+    ) -> tuple[dict[str, Tensor], list[float], tuple[float, float]]:
+        """Every loss, the priorities, and what the running variance of curiosity would become."""
+        c, agent = self.c, self.agent
+        alpha = agent.log_alpha.exp().detach()
+        noise = torch.randn(
+            (len(rows), rows["action"].shape[1] - self.burn_in + 1, agent.action_dim), generator=self.generator
+        )
+        sums: dict[str, list[Tensor]] = {name: [] for name in ("M", "observation", "reward", "V", "P", "T")}
+        errors = []  # of every window, by step
+        for b, row in enumerate(rows):
+            online, target = self.unroll(agent.memory, row), self.unroll(self.target_memory, row)
+            latent = target if c.latent_target == "ema" else online
+            window = {}
+            for t in range(self.burn_in, int(row["last"])):
+                z = self.z(online[t])
+                a = torch.tensor(row["action"][t])
+                predicted = agent.world_model(self.reaching("M", z), a)
+                difference = predicted.hidden_change - (latent[t + 1].h - latent[t].h).detach()
+                error = difference.abs().mean() if c.model_norm == "l1" else difference.square().mean().sqrt()
+                if not self.ends(row, t):
+                    sums["M"].append(error)
+                window[t] = 0.0 if self.ends(row, t) else error.item()
+                if agent.config.grounding:
+                    change = self.seen(row, t + 1) - self.seen(row, t)
+                    if not row["blank"][t] and not row["blank"][t + 1]:
+                        sums["observation"].append((predicted.observation_change - change).abs().mean())
+                    sums["reward"].append((predicted.reward - float(row["reward"][t])).abs())
+                pi, log_pi = self.sample(self.reaching("P", z), noise[b, t - self.burn_in])
+                climbed = self.reaching("P", z) if c.policy_through_q else z.detach()
+                q_pi = twin_q(agent.critic, climbed, pi, frozen=True)
+                sums["P"].append(alpha * log_pi - (q_pi[0] if c.policy_q == "first" else q_pi.min()))
+                sums["T"].append(-agent.log_alpha * (log_pi.detach() - agent.action_dim))
+            errors.append(window)
+        i, variance = self.scaled(errors)
+        priorities = []
+        for b, row in enumerate(rows):
+            online, target = self.unroll(agent.memory, row), self.unroll(self.target_memory, row)
+            td_errors = []
+            for t in range(self.burn_in, int(row["last"])):
+                y = self.target(row, t, i[b], beta, online, target, noise[b])
+                q = twin_q(agent.critic, self.reaching("V", self.z(online[t])), torch.tensor(row["action"][t]))
+                sums["V"].append(float(importance[b]) * 0.5 * ((q[0] - y) ** 2 + (q[1] - y) ** 2))
+                td_errors.append((q.detach() - y).abs().mean().item())
+            priorities.append(c.eta * max(td_errors) + (1.0 - c.eta) * sum(td_errors) / len(td_errors))
+        mean = {name: torch.stack(values).mean() if values else torch.zeros(()) for name, values in sums.items()}
+        mean["G"] = mean.pop("observation") + mean.pop("reward")
+        return mean, priorities, variance
+
+    def reaching(self, loss: str, z: Tensor) -> Tensor:
+        return z if loss in REACHES_MEMORY[self.c.scheme] else z.detach()
+
+    @staticmethod
+    def ends(row: np.void, t: int) -> bool:
+        return bool(row["terminated"]) and t == row["last"] - 1
+
+    def scaled(self, errors: list[dict[int, float]]) -> tuple[list[dict[int, float]], tuple[float, float]]:
+        if self.c.curiosity_scale == "raw":
+            return errors, (0.0, 0.0)
+        variance = float(np.var([error for window in errors for error in window.values()]))
+        total, weight = 0.99 * self.variance_sum + 0.01 * variance, 0.99 * self.variance_weight + 0.01
+        deviation = (total / weight) ** 0.5
+        return [{t: error / deviation for t, error in window.items()} for window in errors], (total, weight)
+
+    @torch.no_grad()
+    def target(
+        self, row: np.void, t: int, i: dict[int, float], beta: float,
+        online: dict[int, Known], target: dict[int, Known], noise: Tensor,
+    ) -> float:  # fmt: skip
+        """r + ... for up to n steps, then the soft value of where they lead."""
+        c, y, discount = self.c, 0.0, 1.0
+        for _ in range(c.n_step):
+            y += discount * (float(row["reward"][t]) + beta * i[t])
+            discount *= c.gamma
+            if self.ends(row, t):
+                return y
+            t += 1
+            if t == row["last"]:
+                break
+        pi, log_pi = self.sample(self.z(online[t]), noise[t - self.burn_in])
+        reads = target if c.target_memory == "ema" else online
+        q = twin_q(self.target_critic, self.z(reads[t]), pi)
+        return y + discount * float(q.min() - self.agent.log_alpha.exp() * log_pi)
+
+
+def gru(memory: Memory, e: Tensor, h: Tensor) -> Tensor:
+    """h' = (1 - z) n + z h."""
+    net = memory.gru
+    x_r, x_z, x_n = (net.weight_ih_l0 @ e + net.bias_ih_l0).chunk(3)
+    h_r, h_z, h_n = (net.weight_hh_l0 @ h + net.bias_hh_l0).chunk(3)
+    r, z = torch.sigmoid(x_r + h_r), torch.sigmoid(x_z + h_z)
+    return (1.0 - z) * torch.tanh(x_n + r * h_n) + z * h
+
+
+def twin_q(critic: torch.nn.Module, z: Tensor, a: Tensor, frozen: bool = False) -> Tensor:
+    """(2,): each critic by itself."""
+    values = []
+    for j in (0, 1):
+        x = torch.cat([z, a])
+        for depth, layer in enumerate(critic.layers):
+            weight, bias = layer.weight[j], layer.bias[j, 0]
+            weight, bias = (weight.detach(), bias.detach()) if frozen else (weight, bias)
+            x = x @ weight + bias
+            x = F.relu(x) if depth < 2 else x
+        values.append(x[0])
+    return torch.stack(values)

@@ -1,0 +1,41 @@
+"""What an actor thinks a window is worth is what the learner would, with the same networks and noise."""
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+from common.agent import Agent, AgentConfig
+from learner.initial_priority import InitialPriority
+from learner.update import UpdateConfig, make_update
+from tests.learner.rows import SPEC, random_rows, to_batch
+
+
+@pytest.mark.parametrize("n_step", [1, 3])
+@pytest.mark.parametrize("shortcut", [False, True])
+def test_it_is_the_learners_own_priority(n_step: int, shortcut: bool) -> None:
+    config = AgentConfig(
+        hidden=SPEC.hidden, embedding=7, heads=(10, 9), shortcut=shortcut, normalize_observations=True,
+        initial_priority="actor",
+    )  # fmt: skip
+    torch.manual_seed(0)
+    agent = Agent(SPEC.obs_dim, SPEC.action_dim, config)
+    agent.normalizer.freeze(10, torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
+    with torch.no_grad():
+        agent.log_alpha.fill_(-1.0)
+    update = UpdateConfig(n_step=n_step, gamma=0.9, eta=0.6)
+    rates = InitialPriority(SPEC, config, update, seed=3)
+    rates.load(safetensors.torch.save(agent.broadcast_weights()))
+    rows = random_rows(6)
+    learner = make_update(agent, SPEC.burn_in, update, seed=3)
+    expected = learner.forward(to_batch(rows), torch.zeros(()))[1].priorities
+    np.testing.assert_allclose(rates(rows), expected, rtol=1e-5)
+
+
+def test_critics_are_broadcast_only_where_they_are_needed() -> None:
+    names = [
+        set(Agent(3, 2, AgentConfig(hidden=4, heads=(5, 5), initial_priority=kind)).broadcast_weights())
+        for kind in ("max", "actor")
+    ]
+    assert not any(name.startswith("critic.") for name in names[0])
+    assert {"log_alpha"} | {name for name in names[1] if name.startswith("critic.")} == names[1] - names[0]

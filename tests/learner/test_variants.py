@@ -1,0 +1,61 @@
+"""Every variant of the update against the plain reference: three updates, their losses, priorities and parameters."""
+
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from common.agent import Agent, AgentConfig
+from learner.update import UpdateConfig, make_update
+from tests.learner.plain_update import PlainUpdate
+from tests.learner.rows import SPEC, random_rows, to_batch
+
+PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding=False)
+ROBUST = AgentConfig(
+    hidden=SPEC.hidden, embedding=7, heads=(10, 9), shortcut=True, normalize_observations=True, blank_flag=True
+)
+NAMES = {
+    "M": "model_loss", "G": "grounding_loss", "V": "q_loss", "P": "policy_loss", "T": "temperature_loss",
+}  # fmt: skip
+BETA = 0.5
+VARIANTS = [
+    *({"scheme": scheme} for scheme in (1, 2, 3, 4, 5, 6)),
+    {"scheme": 4, "policy_through_q": False},
+    {"scheme": 6, "policy_through_q": False},
+    {"update_order": "alternate"},
+    {"update_order": "alternate", "scheme": 4, "curiosity_scale": "std"},
+    {"model_norm": "l2"},
+    {"latent_target": "ema"},
+    {"target_memory": "ema"},
+    {"latent_target": "ema", "target_memory": "ema", "scheme": 4},
+    {"policy_q": "first"},
+    {"curiosity_scale": "std"},
+    {"n_step": 2},
+    {"n_step": 9},
+    {"clip_norm": 0.3},
+    {"clip_norm": 0.0},
+    {"gamma": 0.5, "polyak": 0.9, "eta": 0.3, "target_memory": "ema"},
+]
+
+
+@pytest.mark.parametrize("agent", [PAPER, ROBUST, dataclasses.replace(ROBUST, layer_norm=True, shortcut=False)])
+@pytest.mark.parametrize("options", VARIANTS, ids=lambda options: "-".join(f"{k}={v}" for k, v in options.items()))
+def test_three_updates_are_those_of_the_equations(agent: AgentConfig, options: dict[str, object]) -> None:
+    torch.manual_seed(0)
+    network = Agent(SPEC.obs_dim, SPEC.action_dim, agent)
+    network.normalizer.freeze(10, torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
+    config = UpdateConfig(curiosity=BETA, learning_rate=1e-2, **options)  # type: ignore[arg-type]
+    plain = PlainUpdate(copy.deepcopy(network), SPEC.burn_in, config, seed=3)
+    update = make_update(network, SPEC.burn_in, config, seed=3)
+    for turn in range(3):
+        rows, importance = random_rows(4, seed=turn), np.linspace(0.3, 1.0, 4).astype(np.float32)
+        expected, priorities = plain(rows, importance, BETA)
+        found = update(to_batch(rows, importance=importance), torch.tensor(BETA))
+        for name, value in expected.items():
+            if NAMES[name] in found.metrics:
+                assert found.metrics[NAMES[name]].item() == pytest.approx(value, rel=2e-3, abs=1e-4), (turn, name)
+        np.testing.assert_allclose(found.priorities, priorities, rtol=2e-3)
+    for (name, value), other in zip(network.named_parameters(), plain.agent.parameters(), strict=True):
+        torch.testing.assert_close(value, other, atol=3e-4, rtol=2e-3, msg=lambda text, name=name: f"{name}: {text}")
