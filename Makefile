@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo test lint results trial docs bench clean
+.PHONY: env demo test test-dm-control lint results trial docs bench clean
 
 env: $(STAMP)
 
@@ -22,6 +22,14 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
+
+# In an environment of its own, .venv-dm-control: dm_control wants an older MuJoCo than the others' 4.
+test-dm-control:
+	test -x $(VENV)-dm-control/bin/python || $(PYTHON) -m venv $(VENV)-dm-control
+	grep -v '^mujoco' constraints.txt > $(VENV)-dm-control/constraints.txt
+	$(VENV)-dm-control/bin/python -m pip install --quiet torch==2.13.0 -c $(VENV)-dm-control/constraints.txt
+	$(VENV)-dm-control/bin/python -m pip install --quiet -e '.[dm-control,dev]' -c $(VENV)-dm-control/constraints.txt
+	$(VENV)-dm-control/bin/python -m pytest tests/common/test_dm_control.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -56,4 +64,4 @@ bench: $(STAMP)
 	$(BIN)/python -m benchmarks.throughput
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-dm-control build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

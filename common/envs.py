@@ -5,10 +5,12 @@ Shapes: O observation, A action.
 
 import difflib
 import importlib
+import importlib.util
 import logging
 import math
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
@@ -23,6 +25,8 @@ from common.errors import ConfigError
 from common.wrappers import Env, Flicker, Floats, FrameStack, Noise, Partial, Standardised
 
 log = logging.getLogger(__name__)
+DM_CONTROL = "dm_control/"
+INSTALL_DM_CONTROL = "pip install 'rmc[dm-control]'"
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class EnvConfig:
     """Which environment, and how much of it is seen."""
 
     id: str
-    """Gymnasium id, like HalfCheetah-v5, or module:EnvId-v0 for your own."""
+    """Gymnasium id, like HalfCheetah-v5 or dm_control/walker-walk-v0, or module:EnvId-v0 for your own."""
     flicker: float = 0.0
     """Probability that an observation is replaced by zeros, at every step, the reset included."""
     hide: Literal["nothing", "velocities", "positions"] = "nothing"
@@ -78,6 +82,11 @@ def _make(config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
         )
     except gym.error.Error as error:
         raise ConfigError("ENV", config.id, f"gymnasium cannot make it ({_one_line(error)})") from None
+    except Exception as error:
+        if not config.id.startswith(DM_CONTROL):
+            raise
+        fix = f"dm_control cannot make it ({_one_line(error)}); it wants MuJoCo 3: {INSTALL_DM_CONTROL}"
+        raise ConfigError("ENV", config.id, fix) from None
 
 
 def _as_seen(env: gym.Env[Any, Any], config: EnvConfig) -> Env:
@@ -148,7 +157,9 @@ def _check_numbers(config: EnvConfig) -> None:
 
 def _find_spec(env_id: str) -> EnvSpec:
     module, _, name = env_id.rpartition(":")
-    if module:
+    if name.startswith(DM_CONTROL):
+        _import_dm_control(env_id)
+    elif module:
         _import_users_module(env_id, module)
     try:
         return gym.spec(name)
@@ -190,6 +201,15 @@ def _import_users_module(env_id: str, module: str) -> None:
         importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise ConfigError("ENV", env_id, f"{error}; start from the folder that holds {module}") from None
+
+
+def _import_dm_control(env_id: str) -> None:
+    """Its tasks are gymnasium's once shimmy is imported."""
+    if importlib.util.find_spec("dm_control") is None or importlib.util.find_spec("shimmy") is None:
+        raise ConfigError("ENV", env_id, f"shimmy or dm_control is missing; {INSTALL_DM_CONTROL}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it looks for a screen, and says so where there is none
+        importlib.import_module("shimmy")
 
 
 def _redirect_mujoco_warnings() -> None:

@@ -27,7 +27,7 @@ class EnvOptions(EnvConfig):
     """The environment, its id without a flag."""
 
     id: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
-    """Gymnasium id, like HalfCheetah-v5, or module:EnvId-v0 for your own."""
+    """Gymnasium id, like HalfCheetah-v5 or dm_control/walker-walk-v0, or module:EnvId-v0 for your own."""
 
     def config(self) -> EnvConfig:
         """The same, as the roles know it."""

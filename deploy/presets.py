@@ -67,7 +67,9 @@ class RunConfig:
         burn_in, train, strategy = self.window.burn_in, self.window.trained_steps, self.actor.state_strategy
         if strategy == "episode":
             if time_limit is None:
-                raise ConfigError("--state-strategy", strategy, f"{self.env.id} has no time limit; use burn-in")
+                raise ConfigError(
+                    "--state-strategy", strategy, f"{self.env.id} has no time limit; give --time-limit, or use burn-in"
+                )
             train = time_limit
         return WindowSpec(obs_dim, action_dim, self.agent.hidden, burn_in if strategy == "burn-in" else 0, train)
 

@@ -1,0 +1,58 @@
+"""dm_control's tasks by their gymnasium ids. It needs MuJoCo 3, so ``make test`` lacks it: ``make test-dm-control``."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.envs import EnvConfig, env_spaces, make_env
+from common.errors import ConfigError
+from deploy import cli
+
+INSTALLED = importlib.util.find_spec("dm_control") is not None
+needs_dm_control = pytest.mark.skipif(not INSTALLED, reason="dm_control is not installed: make test-dm-control")
+WALKER = "dm_control/walker-walk-v0"
+
+
+@pytest.mark.skipif(INSTALLED, reason="it is installed")
+def test_who_has_it_not_is_told_how_to_get_it() -> None:
+    with pytest.raises(ConfigError, match=r"ENV='dm_control/walker-walk-v0': .* pip install 'rmc\[dm-control\]'"):
+        make_env(EnvConfig(WALKER))
+
+
+@needs_dm_control
+@pytest.mark.parametrize("env_id", [WALKER, f"shimmy:{WALKER}"])
+def test_a_task_is_an_environment_like_others(env_id: str) -> None:
+    assert env_spaces(EnvConfig(env_id)) == (24, 6, None)
+    env = make_env(EnvConfig(env_id, flicker=0.5))
+    observation, _ = env.reset(seed=1)
+    assert observation.shape == (24,)
+    assert observation.dtype == np.float32
+    steps, truncated = 0, False
+    while not truncated:
+        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        steps += 1
+        assert np.isfinite(observation).all()
+        assert np.isfinite(reward)
+        assert not terminated
+        assert info["blank"] == (not observation.any())
+    assert steps == 1000
+    env.close()
+
+
+@needs_dm_control
+def test_an_unknown_task_is_one_line() -> None:
+    with pytest.raises(ConfigError, match=r"no such environment; did you mean .*dm_control/walker-walk-v0"):
+        make_env(EnvConfig("dm_control/walker-wlak-v0"))
+
+
+@needs_dm_control
+def test_check_train_and_evaluate(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["check-env", WALKER]) == 0
+    run = ["--preset", "debug", "--total-steps", "1200", "--launcher", "lockstep", "--checkpoint-steps", "1100"]
+    assert cli.run(["train", WALKER, *run, "--run-dir", str(tmp_path / "run")]) == 0
+    assert cli.run(["evaluate", str(tmp_path / "run"), "--episodes", "1"]) == 0
+    said = capfd.readouterr()
+    assert "it can be trained on" in said.out
+    assert "GLFW" not in said.err
