@@ -19,7 +19,7 @@ def config(env: str = "InvertedPendulum-v5", **options: Any) -> RunConfig:
     """A short run with some options of its parts changed, by name."""
     run = dataclasses.replace(debug(EnvConfig(env)), total_steps=STEPS)
     changes = {"replay": {"replay_ratio": 4.0, "warmup_steps": WARMUP}, "learner": {"batch_size": 4}}
-    for name in ("window", "agent", "actor", "replay", "update", "learner"):
+    for name in ("env", "window", "agent", "actor", "replay", "update", "learner"):
         part = getattr(run, name)
         own = {key: value for key, value in options.items() if hasattr(part, key)}
         run = dataclasses.replace(run, **{name: dataclasses.replace(part, **changes.get(name, {}) | own)})
@@ -50,7 +50,6 @@ VARIANTS: list[dict[str, Any]] = [
     {"n_step": 3},
     {"stride": 5},
     {"priority_exponent": 0.0, "importance_exponent": 0.0},
-    {"blank_flag": True},
     {"initial_priority": "actor"},
     {"initial_priority": "actor", "n_step": 3},
     {"state_strategy": "zero"},
@@ -58,6 +57,15 @@ VARIANTS: list[dict[str, Any]] = [
     {"state_strategy": "episode", "env": "Reacher-v5"},
     {"embedding": 0, "grounding": False},
     {"layer_norm": True, "shortcut": True, "normalize_observations": True},
+    {"flicker": 0.5},
+    {"flicker": 0.5, "blank_flag": True, "normalize_observations": True},
+    {"hide": "velocities"},
+    {"hide": "positions"},
+    {"noise": 0.1},
+    {"frame_stack": 3},
+    {"reward_scale": 0.1},
+    {"action_repeat": 2},
+    {"time_limit": 20},
 ]
 
 
