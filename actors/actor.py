@@ -37,8 +37,8 @@ class ActorConfig:
 
     envs_per_actor: int = 4
     """N, environments of one actor; more of them share one forward pass."""
-    stride: int = 15
-    """Steps between the starts of two windows; as many as are trained means no overlap."""
+    stride: int = 0
+    """Steps between the starts of two windows; fewer than are trained let them overlap; 0 is as many, no overlap."""
     state_strategy: Literal["zero", "stored", "burn-in", "episode"] = "burn-in"
     """What a window's memory starts from: zeros; the state that the actor stored; that state, then burned in; or
     zeros at the start of the episode, all of which is the window, as long as the time limit allows."""
@@ -128,7 +128,7 @@ class Actor:
         self._waiting_for = "weights"
         n = self._config.envs_per_actor
         strategy, capacity = self._config.state_strategy, self._config.chunk_windows + n
-        stride = self._spec.train if strategy == "episode" else self._config.stride
+        stride = self._config.stride or self._spec.train
         self._builder = WindowBuilder(self._spec, stride, n, capacity, store_states=strategy in ("stored", "burn-in"))
         self._rng = np.random.default_rng(environment_seed(self._seed, self._index, epoch, _NOISE))
         self._returns = np.zeros(n)
@@ -352,8 +352,8 @@ class Actor:
 
 
 def _check(config: ActorConfig, spec: WindowSpec) -> None:
-    if config.state_strategy != "episode" and not 1 <= config.stride <= spec.train:
-        raise ConfigError("--stride", config.stride, f"from 1 to the {spec.train} trained steps of a window")
+    if not 0 <= config.stride <= spec.train:
+        raise ConfigError("--stride", config.stride, f"from 1 to the {spec.train} trained steps of a window, or 0")
     for name in ("envs_per_actor", "refresh_steps", "chunk_windows", "unacked_bytes"):
         if getattr(config, name) < 1:
             raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), "at least 1")

@@ -104,7 +104,7 @@ def replay_process(spec: WindowSpec, config: ReplayConfig, actors: int = 1) -> I
             target=_serve, args=(redis.url, folder, spec, config, actors, cores[-1])
         )
         server.start()
-        while bus.replay_address() is None:
+        while bus.replay_address("replay") is None:
             time.sleep(0.05)
         yield bus
         bus.request_stop("done")

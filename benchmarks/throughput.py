@@ -62,7 +62,7 @@ def learner(env_id: str, batch_size: int, pairs: int, seconds: float) -> Row:
         bus.append(0, EntryId(1, 0), encode_hello(spec))
         _push(bus, spec, 300, 1)
         _wait_for_commit(bus, 300)
-        address = bus.replay_address()
+        address = bus.replay_address("replay")
         assert address is not None
         client = ReplayClient(lambda: address.address, SECRET, spec, batch_size)
         role = Learner(spec, run.agent, run.update, config, client, bus, CheckpointFolder(Path(at)), 0)

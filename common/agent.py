@@ -202,7 +202,7 @@ class Policy(nn.Module):
 
 
 def squashed_sample(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """a = tanh(u), u = mean + std * noise, and its log density; (..., A) -> (..., A), (...).
+    """Eq. 11: a = tanh(u), u = mean + std * noise, and its log density; (..., A) -> (..., A), (...).
 
     log pi(a) = sum log N(u) - log(1 - tanh(u)^2), the latter as 2 (log 2 - u - softplus(-2u)), which
     does not overflow (SAC, appendix C, in its stable form).

@@ -9,7 +9,7 @@ Every Redis key, R = ``rmc:{run}``:
 | R:actors                | set    | actors   | ids of the actors that said hello                        |
 | R:windows:ACTOR         | stream | actor    | entries ``epoch-seq``, field ``p`` = a wire entry        |
 | R:acks                  | hash   | replay   | ACTOR -> ``epoch seq granted_steps final``               |
-| R:replay                | string | replay   | ``epoch address`` of its socket                          |
+| R:replay                | hash   | replay   | ROLE of a shard -> ``epoch address`` of its socket       |
 | R:weights               | string | learner  | ``epoch update pieces crc32`` of the newest weights      |
 | R:weights:EPOCH:UPDATE:I| string | learner  | piece I (256 KiB) of a policy, safetensors               |
 | R:evaluate              | string | learner  | ``epoch update pieces crc32`` the evaluator should play  |
@@ -63,9 +63,16 @@ class Version(NamedTuple):
     update: int
 
 
+class Holder(NamedTuple):
+    """A replay server in its epoch, by which the bus knows one that was replaced."""
+
+    role: str
+    epoch: int
+
+
 @dataclass(frozen=True)
 class ReplayAddress:
-    """Where the replay server listens: ``unix:PATH`` or ``tcp:HOST:PORT``."""
+    """Where a replay server listens: ``unix:PATH`` or ``tcp:HOST:PORT``."""
 
     epoch: int
     address: str
@@ -102,10 +109,10 @@ class Bus(Protocol):
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
         """Up to ``count`` entries of each actor named in ``after``, past the id given, in order."""
 
-    def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
+    def commit(self, holder: Holder, acks: Mapping[int, Ack]) -> None:
         """Publish acks and trim what they cover, unless a newer replay has come. Raises FencedError."""
 
-    def drop_stream(self, epoch: int, actor: int) -> None:
+    def drop_stream(self, holder: Holder, actor: int) -> None:
         """Make an actor send everything again from its hello on, unless a newer replay has come. Raises FencedError."""
 
     def ack(self, actor: int) -> Ack | None:
@@ -114,11 +121,11 @@ class Bus(Protocol):
     def dead_letter(self, entry: Entry, reason: str) -> None:
         """Put a refused entry aside."""
 
-    def announce_replay(self, address: ReplayAddress) -> None:
-        """Say where the replay server listens."""
+    def announce_replay(self, holder: Holder, address: str) -> None:
+        """Say where a replay server listens."""
 
-    def replay_address(self) -> ReplayAddress | None:
-        """Where the replay server listens, once it does."""
+    def replay_address(self, role: str) -> ReplayAddress | None:
+        """Where that replay server listens, once it does."""
 
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
         """Make a policy the newest; ``evaluate`` also asks the evaluator to play it. Raises FencedError."""
@@ -157,7 +164,7 @@ class MemoryBus:
         self._streams: dict[int, dict[EntryId, bytes]] = {}
         self._last_ids: dict[int, EntryId] = {}
         self._acks: dict[int, Ack] = {}
-        self._replay: ReplayAddress | None = None
+        self._replay: dict[str, ReplayAddress] = {}
         self._weights: dict[bool, tuple[Version, bytes]] = {}
         self._records: list[dict[str, Any]] = []
         self._forgotten = 0  # records that made room
@@ -199,21 +206,22 @@ class MemoryBus:
             found += [Entry(actor, key, stream[key]) for key in stream if key > cursor][:count]
         return found
 
-    def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
-        self._check_replay(epoch)
-        self._epochs["replay"] = epoch
+    def commit(self, holder: Holder, acks: Mapping[int, Ack]) -> None:
+        self._check_replay(holder)
+        self._epochs[holder.role] = holder.epoch
         for actor, ack in acks.items():
             self._acks[actor] = ack
             stream = self._streams.get(actor, {})
             for key in [key for key in stream if key <= ack.id]:
                 del stream[key]
 
-    def _check_replay(self, epoch: int) -> None:
-        if self.current_epoch("replay") > epoch:
-            raise FencedError(f"replay epoch {epoch} was replaced by {self.current_epoch('replay')}")
+    def _check_replay(self, holder: Holder) -> None:
+        newest = self.current_epoch(holder.role)
+        if newest > holder.epoch:
+            raise FencedError(f"{holder.role} epoch {holder.epoch} was replaced by {newest}")
 
-    def drop_stream(self, epoch: int, actor: int) -> None:
-        self._check_replay(epoch)
+    def drop_stream(self, holder: Holder, actor: int) -> None:
+        self._check_replay(holder)
         self._streams.pop(actor, None)
         self._last_ids.pop(actor, None)
 
@@ -223,11 +231,11 @@ class MemoryBus:
     def dead_letter(self, entry: Entry, reason: str) -> None:
         self.dead_letters.append((entry, reason))
 
-    def announce_replay(self, address: ReplayAddress) -> None:
-        self._replay = address
+    def announce_replay(self, holder: Holder, address: str) -> None:
+        self._replay[holder.role] = ReplayAddress(holder.epoch, address)
 
-    def replay_address(self) -> ReplayAddress | None:
-        return self._replay
+    def replay_address(self, role: str) -> ReplayAddress | None:
+        return self._replay.get(role)
 
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
         if version.epoch < self.current_epoch("learner"):

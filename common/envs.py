@@ -10,11 +10,13 @@ import logging
 import math
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -26,6 +28,7 @@ from common.wrappers import Env, Flicker, Floats, FrameStack, Noise, Partial, St
 
 log = logging.getLogger(__name__)
 DM_CONTROL = "dm_control/"
+LARGEST_ACTION = 1e9  # of an action space that means its bounds
 INSTALL_DM_CONTROL = "pip install 'rmc[dm-control]'"
 
 
@@ -121,9 +124,19 @@ def rebuilt(env: Env, make_env: Callable[[], Env]) -> Env:
     return make_env()
 
 
+def first_env(config: EnvConfig) -> Env:
+    """``make_env`` where nothing runs yet: whatever the environment raises is the user's to mend, as a ConfigError."""
+    try:
+        return make_env(config)
+    except ConfigError:
+        raise
+    except Exception as error:
+        raise ConfigError("ENV", config.id, f"it cannot be made: {_told(error)}") from None
+
+
 def env_spaces(config: EnvConfig) -> tuple[int, int, int | None]:
     """O, A and the time limit in the agent's steps (None where there is none). Raises ConfigError."""
-    env = make_env(config)
+    env = first_env(config)
     limit = env.spec.max_episode_steps if env.spec else None
     env.close()
     assert env.observation_space.shape
@@ -166,7 +179,8 @@ def _find_spec(env_id: str) -> EnvSpec:
     except gym.error.Error:
         close = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
         fix = f"did you mean {', '.join(close)}?" if close else "use a gymnasium id or module:EnvId-v0"
-        raise ConfigError("ENV", env_id, f"no such environment; {fix}") from None
+        fault = f"{module} registers no {name} (gymnasium.register)" if module else "no such environment"
+        raise ConfigError("ENV", env_id, f"{fault}; {fix}") from None
 
 
 def _space_fault(observation: gym.Space[Any], action: gym.Space[Any]) -> str | None:
@@ -176,6 +190,9 @@ def _space_fault(observation: gym.Space[Any], action: gym.Space[Any]) -> str | N
         odd = {name: type(part).__name__ for name, part in observation.items() if not isinstance(part, Box)}
         if odd:
             return f"of its observations {odd} are no Box; turn them into one, or leave them out"
+        images = {name: part.shape for name, part in observation.items() if len(part.shape or ()) > 2}
+        if images:
+            return f"of its observations {images} are images; only vectors are learnt from, leave them out"
         return _space_fault(gym.spaces.flatten_space(observation), action)
     if not isinstance(observation, Box):
         return f"its observations are {type(observation).__name__}; flatten them to a Box"
@@ -187,8 +204,10 @@ def _space_fault(observation: gym.Space[Any], action: gym.Space[Any]) -> str | N
         return f"its actions are {type(action).__name__}; only continuous ones (a Box) are learnt"
     if len(action.shape) != 1 or not action.shape[0]:
         return f"its actions have shape {action.shape}; only vectors are learnt"
-    if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
-        return "its action space is unbounded; give it a Box with finite low and high"
+    if not np.issubdtype(action.dtype, np.floating):
+        return f"its actions are {action.dtype}; only continuous ones (a Box of floats) are learnt"
+    if not (np.abs([action.low, action.high]) < LARGEST_ACTION).all():
+        return "its action space is unbounded; give it a Box with the low and high that its actions really have"
     return None
 
 
@@ -200,7 +219,11 @@ def _import_users_module(env_id: str, module: str) -> None:
     try:
         importlib.import_module(module)
     except ModuleNotFoundError as error:
-        raise ConfigError("ENV", env_id, f"{error}; start from the folder that holds {module}") from None
+        ours = error.name is not None and (module == error.name or module.startswith(f"{error.name}."))
+        fix = f"start from the folder that holds {module}" if ours else f"{module} needs it; install it"
+        raise ConfigError("ENV", env_id, f"{error}; {fix}") from None
+    except Exception as error:
+        raise ConfigError("ENV", env_id, f"{module} cannot be imported: {_told(error)}") from None
 
 
 def _import_dm_control(env_id: str) -> None:
@@ -225,6 +248,13 @@ def _redirect_mujoco_warnings() -> None:
 def _log_mujoco_warning(message: str) -> None:
     level = logging.DEBUG if "is deprecated" in message else logging.WARNING  # gymnasium's models, not the user's doing
     log.log(level, "mujoco: %s", message)
+
+
+def _told(error: Exception) -> str:
+    """An error of a user's code in a line, with its place."""
+    at = traceback.extract_tb(error.__traceback__)[-1]
+    place = f" ({Path(at.filename).name}, line {at.lineno})" if not isinstance(error, SyntaxError) else ""
+    return f"{type(error).__name__}: {_one_line(error)}{place}"
 
 
 def _one_line(error: Exception) -> str:

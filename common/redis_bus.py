@@ -10,7 +10,7 @@ import redis
 from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
-from common.bus import METRICS_KEPT, Ack, Entry, EntryId, ReplayAddress, Version, join_pieces, split_pieces
+from common.bus import METRICS_KEPT, Ack, Entry, EntryId, Holder, ReplayAddress, Version, join_pieces, split_pieces
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
 
 DEAD_LETTERS_KEPT = 1_000
@@ -119,25 +119,27 @@ class RedisBus:
             for raw_id, fields in entries
         ]
 
-    def commit(self, epoch: int, acks: Mapping[int, Ack]) -> None:
+    def commit(self, holder: Holder, acks: Mapping[int, Ack]) -> None:
         if not acks:
             return
         try:
-            self._commit(epoch, acks, publish=True)
+            self._commit(holder, acks, publish=True)
         except BusFull:  # a full Redis has no room for the acks either, and only trimming makes some
-            self._commit(epoch, acks, publish=False)
-            self._commit(epoch, acks, publish=True)
+            self._commit(holder, acks, publish=False)
+            self._commit(holder, acks, publish=True)
 
-    def _commit(self, epoch: int, acks: Mapping[int, Ack], publish: bool) -> None:
+    def _commit(self, holder: Holder, acks: Mapping[int, Ack], publish: bool) -> None:
+        key = self._key("epoch", holder.role)
+
         def transaction(pipe: Any) -> None:
-            held = self._held_by_replay(pipe, epoch)
+            held = self._held(pipe, holder)
             pipe.multi()
             for actor, ack in acks.items():
                 pipe.xtrim(self._key("windows", actor), minid=f"{ack.id.epoch}-{ack.id.seq + 1}", approximate=False)
             if not publish:
                 return
-            if held < epoch:  # Redis lost its data
-                pipe.set(self._key("epoch", "replay"), epoch)
+            if held < holder.epoch:  # Redis lost its data
+                pipe.set(key, holder.epoch)
             pipe.hset(
                 self._key("acks"),
                 mapping={
@@ -146,22 +148,22 @@ class RedisBus:
                 },
             )
 
-        self._call(lambda: self._redis.transaction(transaction, self._key("epoch", "replay")))
+        self._call(lambda: self._redis.transaction(transaction, key))
 
-    def _held_by_replay(self, pipe: Any, epoch: int) -> int:
-        """The newest replay epoch that Redis knows. Raises FencedError where it is newer than ours."""
-        held = int(pipe.get(self._key("epoch", "replay")) or 0)
-        if held > epoch:
-            raise FencedError(f"replay epoch {epoch} was replaced by {held}")
+    def _held(self, pipe: Any, holder: Holder) -> int:
+        """The newest epoch of this replay server that Redis knows. Raises FencedError where it is newer than ours."""
+        held = int(pipe.get(self._key("epoch", holder.role)) or 0)
+        if held > holder.epoch:
+            raise FencedError(f"{holder.role} epoch {holder.epoch} was replaced by {held}")
         return held
 
-    def drop_stream(self, epoch: int, actor: int) -> None:
+    def drop_stream(self, holder: Holder, actor: int) -> None:
         def transaction(pipe: Any) -> None:
-            self._held_by_replay(pipe, epoch)
+            self._held(pipe, holder)
             pipe.multi()
             pipe.delete(self._key("windows", actor))
 
-        self._call(lambda: self._redis.transaction(transaction, self._key("epoch", "replay")))
+        self._call(lambda: self._redis.transaction(transaction, self._key("epoch", holder.role)))
 
     def ack(self, actor: int) -> Ack | None:
         raw = self._call(lambda: self._redis.hget(self._key("acks"), str(actor)))
@@ -179,11 +181,11 @@ class RedisBus:
         }
         self._call(lambda: self._redis.xadd(self._key("dead"), fields, maxlen=DEAD_LETTERS_KEPT))
 
-    def announce_replay(self, address: ReplayAddress) -> None:
-        self._call(lambda: self._redis.set(self._key("replay"), f"{address.epoch} {address.address}"))
+    def announce_replay(self, holder: Holder, address: str) -> None:
+        self._call(lambda: self._redis.hset(self._key("replay"), holder.role, f"{holder.epoch} {address}"))
 
-    def replay_address(self) -> ReplayAddress | None:
-        raw = self._call(lambda: self._redis.get(self._key("replay")))
+    def replay_address(self, role: str) -> ReplayAddress | None:
+        raw = self._call(lambda: self._redis.hget(self._key("replay"), role))
         if raw is None:
             return None
         epoch, address = raw.decode().split(" ", 1)

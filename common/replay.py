@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,45 @@ class Draw(Enum):
 
 
 @dataclass(frozen=True)
-class Sample:
-    """One draw. ``rows`` and ``importance`` are None unless ``draw`` is BATCH.
+class Shard:
+    """Which of the replay servers that share a run's actors: those whose id is ``index`` mod ``count`` are its own."""
 
-    ``rows`` may be a view into a buffer that the next draw but one overwrites.
+    index: int = 0
+    count: int = 1
+
+    @property
+    def role(self) -> str:
+        """The replay server's name: ``replay``, or ``replay-0`` and so on."""
+        return "replay" if self.count == 1 else f"replay-{self.index}"
+
+    def owns(self, actor: int) -> bool:
+        return actor % self.count == self.index
+
+    def part(self, whole: int, actors: int) -> int:
+        """This shard's part of a whole number that is split by actors; all parts add up to it."""
+        before = sum(len(range(index, actors, self.count)) for index in range(self.index))
+        own = len(range(self.index, actors, self.count))
+        return whole * (before + own) // actors - whole * before // actors
+
+
+WHOLE = Shard()  # where there is but one replay server
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One draw. ``rows`` and ``values`` are None unless ``draw`` is BATCH.
+
+    ``rows`` may be a view into a buffer that the next draw but one overwrites. What was drawn is in proportion to
+    ``values``, priority ** exponent each, of ``mass`` over all ``windows``.
     """
 
     draw: Draw
     rows: Rows | None  # (B,)
-    importance: NDArray[np.float32] | None  # (B,), divided by the batch's largest
+    values: NDArray[np.float64] | None  # (B,)
+    mass: float
+    windows: int
     env_steps: int  # environment steps committed to the ring so far
+    drawn_steps: int  # trained steps drawn so far
 
 
 @dataclass(frozen=True)
@@ -45,8 +74,8 @@ class ObservationStatistics:
 class Replay(Protocol):
     """A replay server as its learner sees it."""
 
-    def sample(self, batch_size: int) -> Sample:
-        """Draw a batch, or learn why there is none."""
+    def sample(self, batch_size: int, elsewhere: int = 0) -> Sample:
+        """Draw a batch, or learn why there is none. ``elsewhere``: trained steps drawn from other shards so far."""
 
     def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
         """Give priorities back, (B,) each; those of evicted serials are dropped and counted."""
@@ -56,6 +85,3 @@ class Replay(Protocol):
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode from its start to that one, oldest first; None where not all are there."""
-
-    def stats(self) -> dict[str, Any]:
-        """The server's counters, flat."""

@@ -38,8 +38,8 @@ class Kind(IntEnum):
     CHALLENGE = 1  # server -> client: its nonce
     PROOF = 2  # client -> server: its nonce and HMAC
     WELCOME = 3  # server -> client: its HMAC, window fingerprint
-    SAMPLE = 4  # client -> server: batch_size
-    BATCH = 5  # server -> client: rows | importance weights (float32)
+    SAMPLE = 4  # client -> server: batch_size, elsewhere (see ``Replay.sample``)
+    BATCH = 5  # server -> client: rows | values (float64), with mass, windows, env_steps, drawn_steps
     WAIT = 6  # server -> client: the limiter holds the draw back
     FINISHED = 7  # server -> client: all steps are in and the ratio is spent
     PRIORITIES = 8  # client -> server: serials (int64) | priorities (float32); no reply

@@ -26,11 +26,10 @@ class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
         inner = env.action_space
         assert isinstance(inner, gym.spaces.Box)
         assert env.observation_space.shape is not None
-        self._low = inner.low.astype(np.float32)
-        self._high = inner.high.astype(np.float32)
+        self._low, self._high = inner.low.astype(np.float64), inner.high.astype(np.float64)
         self._half_range = (self._high - self._low) / 2
         self._plain = bool((inner.low == -1.0).all() and (inner.high == 1.0).all())
-        self._dtype, self._shape = inner.dtype, env.observation_space.shape
+        self._bounds, self._dtype, self._shape = inner, inner.dtype, env.observation_space.shape
         self.action_space = gym.spaces.Box(-1.0, 1.0, inner.shape, np.float32)
         self.observation_space = _box(env.observation_space.shape[0])
 
@@ -41,7 +40,7 @@ class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         if not self._plain:
             stretched = self._low + (action + 1.0) * self._half_range
-            action = np.clip(stretched, self._low, self._high).astype(self._dtype)  # rounding may pass a bound
+            action = stretched.astype(self._dtype).clip(self._bounds.low, self._bounds.high)  # rounding may pass one
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self._vector(observation), float(reward), terminated, truncated, info
 

@@ -1,5 +1,6 @@
 """What each command of the command line does."""
 
+import dataclasses
 import json
 import logging
 import os
@@ -44,7 +45,9 @@ def run_role(command: options.ActorRole | options.ReplayRole | options.LearnerRo
     if isinstance(command, options.ActorRole):
         roles.run_actor(roles.Place(command.run, url), command.index)
     elif isinstance(command, options.ReplayRole):
-        roles.run_replay(roles.Place(command.run, url, command.secret_file), command.folder, command.listen)
+        roles.run_replay(
+            roles.Place(command.run, url, command.secret_file), command.folder, command.listen, command.shard
+        )
     elif isinstance(command, options.LearnerRole):
         roles.run_learner(roles.Place(command.run, url, command.secret_file), command.folder, command.device)
     else:
@@ -67,7 +70,8 @@ def evaluate(command: options.Evaluate) -> int:
         console.print(text, soft_wrap=True, highlight=False, markup=False)
     if command.video is not None:
         policy = load_policy(command.run, command.checkpoint)
-        total = video.record(policy, config.seed, command.video)
+        env = dataclasses.replace(config.env, flicker=command.flicker[0]) if command.flicker else config.env
+        total = video.record(policy, env, config.seed, command.video)
         if not command.json:
             console.print(f"{command.video}: an episode with return {total:,.1f}", soft_wrap=True, highlight=False)
     return 0

@@ -12,12 +12,13 @@ from gymnasium.utils.env_checker import check_env as gymnasiums_checks
 from numpy.typing import NDArray
 from rich.console import Console
 
-from common.envs import EnvConfig, make_env
+from common.envs import EnvConfig, first_env
 from common.wrappers import Env, Floats
 
 BESIDE_THE_POINT = ("is -infinity", "is infinity", "symmetric and normalized")  # of vectors and stretched actions
 REPEATED_STEPS = 50  # played twice from one seed
 LARGE_REWARD = 100.0  # mean size of a step's reward from which the critics start far from their target
+LISTED = 20  # dimensions named in a note
 LARGE_OBSERVATION = 1e4  # from which float32 and a running mean lose precision
 
 
@@ -51,7 +52,7 @@ class Played:
 
 def check(config: EnvConfig, steps: int, console: Console) -> int:
     """Print facts, notes and faults; 0 where there is no fault, else 1. Raises ConfigError as ``rmc train`` would."""
-    env, played = make_env(config), Played()
+    env, played = first_env(config), Played()
     stages: list[Callable[[], Iterable[str]]] = [
         lambda: _gymnasiums_notes(env),
         lambda: _guarded(lambda: played.play(env, steps, seed=0)),
@@ -121,7 +122,7 @@ def _hints(env: Env, played: Played) -> Iterator[str]:
     observations, rewards = np.stack(played.observations), np.array(played.rewards)
     still = np.flatnonzero(observations.std(0) == 0.0).tolist()
     if still:
-        yield f"note: observations {still} never changed"
+        yield f"note: observations {_listed(still)} never changed"
     if np.abs(observations).max() > LARGE_OBSERVATION:
         yield f"note: observations reach {np.abs(observations).max():.3g}; scale them in the environment"
     if np.abs(rewards).mean() > LARGE_REWARD:
@@ -133,6 +134,11 @@ def _hints(env: Env, played: Played) -> Iterator[str]:
         yield "note: no episode ended; without a time limit an evaluation stops at 10 000 steps (--time-limit)"
     if not np.array_equal(_again(env), _again(env)):
         yield "note: the same seed and actions gave other observations; runs will not be repeatable"
+
+
+def _listed(numbers: list[int]) -> str:
+    shown = ", ".join(map(str, numbers[:LISTED]))
+    return f"{shown} and {len(numbers) - LISTED} more" if len(numbers) > LISTED else shown
 
 
 def _again(env: Env) -> NDArray[np.float32]:

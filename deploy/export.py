@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from common.agent import Agent
 from common.errors import ConfigError
 from deploy.evaluation import load_checkpoint
-from deploy.run_folder import RunFolder
+from deploy.run_folder import RunFolder, check_writable
 
 INPUTS, OUTPUTS = ("observation", "previous_action", "blank", "hidden"), ("action", "next_hidden")
 NEEDED = ("onnx", "onnxscript")
@@ -47,8 +47,7 @@ def export(folder: RunFolder, checkpoint: str, out: Path) -> None:
     for name in NEEDED:
         if importlib.util.find_spec(name) is None:
             raise ConfigError("--out", str(out), f"{name} is missing; pip install 'rmc[onnx]'")
-    if not out.parent.is_dir():
-        raise ConfigError("--out", str(out), "its folder is not there; make it, or give another")
+    check_writable("--out", out, (".onnx",))
     config, (_, blob) = folder.config(), load_checkpoint(folder, checkpoint)
     spec = config.window_spec()
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)

@@ -7,19 +7,24 @@ import importlib.util
 import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from actors.evaluator import LONGEST_EPISODE
 from common.agent import Agent, Remembered
 from common.errors import ConfigError
 from deploy.evaluation import load_state
 from deploy.policy import load_policy
 from deploy.presets import RunConfig
-from deploy.run_folder import RunFolder
+from deploy.run_folder import RunFolder, check_writable
+from learner.losses import model_error
+from learner.update import share_unexplained
 
+PICTURES = (".png", ".pdf", ".svg", ".jpg")
 HORIZONS = (1, 5, 15)  # steps ahead
 SHOWN, SHOWN_STEPS = 4, 100  # dimensions in the picture, those that change the most, and from when on how long
 Floats = NDArray[np.float32]
@@ -31,7 +36,7 @@ class Episode:
 
     observation: Tensor  # (1, T + 1, O)
     action: Tensor  # (1, T, A)
-    reward: Tensor  # (T,)
+    reward: Tensor  # (T,), scaled as for training
     blank: Tensor  # (1, T + 1) bool
 
     @property
@@ -46,13 +51,11 @@ class Insight:
 
     real: Floats  # (T, O), the next observations
     predicted: Floats  # (T, O), one step ahead
-    curiosity: Floats  # (T,), the latent error as in training
+    curiosity: Floats  # (T,), the world model's error of the online memory's change
     reward: Floats  # (T,)
     predicted_reward: Floats  # (T,)
     ahead: dict[int, Floats]  # horizon K -> (T - K + 1, O), predicted without looking, K steps ahead
-    unexplained: (
-        Floats  # (O,), mean error of the change, as a share of its mean size; above 1 is worse than "no change"
-    )
+    unexplained: Floats  # (O,), error of the change as a share of its size; above 1 is worse than "no change"
     open_loop: dict[int, float]  # horizon -> the same over all dimensions
 
 
@@ -72,14 +75,14 @@ def play(folder: RunFolder, agent: Agent, config: RunConfig, checkpoint: str) ->
     observation, info = env.reset(seed=config.seed)
     policy.reset()
     observations, blanks, actions, rewards = [observation], [bool(info.get("blank", False))], [], []
-    ended = False
-    while not ended:
+    for _ in range(LONGEST_EPISODE):
         actions.append(policy.act(observation, blanks[-1]))
         observation, reward, terminated, truncated, info = env.step(actions[-1])
         observations.append(observation)
         blanks.append(bool(info.get("blank", False)))
-        rewards.append(float(reward))
-        ended = terminated or truncated
+        rewards.append(config.actor.reward_scale * float(reward))
+        if terminated or truncated:
+            break
     env.close()
     raw, blank = torch.from_numpy(np.stack(observations)), torch.tensor(blanks)
     return Episode(
@@ -91,8 +94,11 @@ def play(folder: RunFolder, agent: Agent, config: RunConfig, checkpoint: str) ->
 
 
 @torch.no_grad()
-def look(agent: Agent, episode: Episode) -> Insight:
-    """Everything from one pass over the episode, and open-loop rollouts from each of its steps."""
+def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> Insight:
+    """Everything from one pass over the episode, and open-loop rollouts from each of its steps.
+
+    ``norm`` is that of the world model's error.
+    """
     previous = torch.cat([torch.zeros_like(episode.action[:, :1]), episode.action], 1)
     memory = agent.memory(episode.observation, episode.blank, previous, torch.zeros(1, agent.config.hidden))
     prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
@@ -102,12 +108,12 @@ def look(agent: Agent, episode: Episode) -> Insight:
     return Insight(
         real=real.numpy(),
         predicted=ahead[1].numpy(),
-        curiosity=(prediction.hidden_change[0] - latent_change).abs().mean(-1).numpy(),
+        curiosity=model_error(prediction.hidden_change[0], latent_change, norm).numpy(),
         reward=episode.reward.numpy(),
         predicted_reward=prediction.reward[0].numpy(),
         ahead={horizon: found.numpy() for horizon, found in ahead.items()},
-        unexplained=_unexplained(ahead[1], episode, 1).numpy(),
-        open_loop={horizon: float(_unexplained(found, episode, horizon).mean()) for horizon, found in ahead.items()},
+        unexplained=share_unexplained(*_error(ahead[1], episode, 1)).numpy(),
+        open_loop={horizon: _overall(*_error(found, episode, horizon)) for horizon, found in ahead.items()},
     )
 
 
@@ -131,27 +137,29 @@ def _open_loop(agent: Agent, memory: Remembered, episode: Episode) -> dict[int, 
     return found
 
 
-def _unexplained(predicted: Tensor, episode: Episode, horizon: int) -> Tensor:
-    """(O,): mean |predicted - real| over mean |real - where it started|, where both frames were seen."""
+def _overall(error: Tensor, size: Tensor) -> float:
+    return float(error.sum() / size.sum().clamp(min=1e-9))
+
+
+def _error(predicted: Tensor, episode: Episode, horizon: int) -> tuple[Tensor, Tensor]:
+    """(O,) sums of |predicted - real| and of |real - where it started|, where both frames were seen."""
     observation = episode.observation[0]
     start, end = observation[: len(predicted)], observation[horizon:]
     seen = (episode.seen[: len(predicted)] & episode.seen[horizon - 1 :]).unsqueeze(-1)
-    error = ((predicted - end).abs() * seen).sum(0)
-    return error / ((end - start).abs() * seen).sum(0).clamp(min=1e-9)
+    return ((predicted - end).abs() * seen).sum(0), ((end - start).abs() * seen).sum(0)
 
 
 def inspect(run: Path, checkpoint: str, out: Path) -> Insight:
     """Play, look, and write the picture. Raises ConfigError."""
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError("--out", str(out), "matplotlib is missing; pip install 'rmc[plot]'")
-    if not out.parent.is_dir():
-        raise ConfigError("--out", str(out), "its folder is not there; make it, or give another")
+    check_writable("--out", out, PICTURES)
     folder = RunFolder(run)
     config = folder.config()
     if not config.agent.grounding:
         raise ConfigError("RUN", str(run), "its world model predicts no observations; train with --grounding")
     agent = load_agent(folder, config, checkpoint)
-    insight = look(agent, play(folder, agent, config, checkpoint))
+    insight = look(agent, play(folder, agent, config, checkpoint), config.update.model_norm)
     draw(insight, f"{config.env.id}, {config.preset}, seed {config.seed}", out)
     return insight
 

@@ -12,6 +12,7 @@ import psutil
 
 from common.errors import BusFull, BusUnavailable
 from common.redis_bus import RedisBus
+from common.replay import Shard
 from common.role import StopSignal
 from deploy.monitor import Monitor
 from deploy.presets import RunConfig, to_json
@@ -30,15 +31,21 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
     """How each role of the run is started here; the same commands start them by hand."""
     place = ("--run", folder.name)
     secret = ("--secret-file", str(folder.secret_file))
-    listen = ("--folder", str(folder.replay), "--listen", f"unix:{sockets / 'replay.sock'}")
+    shards = [Shard(index, config.replay.replay_shards) for index in range(config.replay.replay_shards)]
     learn = ("--folder", str(folder.checkpoints), "--device", device)
     actors = [RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))) for index in range(config.actors)]
     return [
-        RoleCommand("replay", ("replay", *place, *secret, *listen)),
+        *(_replay_command(shard, folder, sockets, (*place, *secret)) for shard in shards),
         RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
         RoleCommand("evaluator", ("evaluator", *place)),
         *actors,
     ]
+
+
+def _replay_command(shard: Shard, folder: RunFolder, sockets: Path, place: tuple[str, ...]) -> RoleCommand:
+    listen = f"unix:{sockets / shard.role}.sock"
+    words = ("--folder", str(folder.path / shard.role), "--listen", listen, "--shard", str(shard.index))
+    return RoleCommand(shard.role, ("replay", *place, *words))
 
 
 class LocalRun:

@@ -88,7 +88,7 @@ class Evaluate:
     checkpoint: str = "latest"
     """latest, best, or the number of a checkpoint."""
     video: Path | None = None
-    """Also write the first episode to this file, like episode.mp4."""
+    """Also write an episode to this file, like episode.mp4, with the first of the flicker probabilities."""
     json: bool = False
     """Print one line of JSON."""
 
@@ -156,6 +156,8 @@ class ReplayRole(_Role):
 
     folder: Path = Path("replay")
     """Where the ring lies."""
+    shard: int = 0
+    """Which of the run's replay servers, from 0 on."""
     listen: str = "tcp:127.0.0.1:0"
     """Where the learner connects to: unix:PATH or tcp:HOST:PORT, port 0 for a free one."""
     secret_file: Path | None = None

@@ -2,9 +2,10 @@
 
     policy = load_policy("runs/first")
     env = policy.make_env()
-    observation, _ = env.reset()
+    observation, info = env.reset()
     policy.reset()
-    observation, reward, terminated, truncated, _ = env.step(policy.act(observation))
+    action = policy.act(observation, info.get("blank", False))
+    observation, reward, terminated, truncated, info = env.step(action)
 
 Shapes: O observation, A action, H hidden.
 """

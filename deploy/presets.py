@@ -93,8 +93,8 @@ def robust(env: EnvConfig) -> RunConfig:
         preset="robust",
         agent=AgentConfig(shortcut=True, normalize_observations=True),
         actor=ActorConfig(envs_per_actor=8),
-        replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0, importance_exponent=0.0),
-        learner=LearnerConfig(batch_size=32),
+        replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0),
+        learner=LearnerConfig(batch_size=32, importance_exponent=0.0),
     )
 
 
@@ -202,7 +202,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "replay.replay_ratio": (1e-6, 1e9),
     "replay.warmup_steps": (0, 2**53),
     "replay.priority_exponent": (0, 4),
-    "replay.importance_exponent": (0, 1),
+    "replay.replay_shards": (1, 1024),
     "update.learning_rate": (1e-12, 1),
     "update.alpha_learning_rate": (0, 1),
     "update.gamma": (0, 1),
@@ -214,6 +214,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "update.n_step": (1, 10_000),
     "update.eta": (0, 1),
     "learner.batch_size": (1, 65_536),
+    "learner.importance_exponent": (0, 1),
     "learner.publish_updates": (1, 2**31),
     "learner.checkpoint_steps": (1, 2**53),
     "learner.keep_checkpoints": (1, 1_000_000),
@@ -238,8 +239,17 @@ def validate(config: RunConfig) -> None:
         raise ConfigError(
             "--initial-priority", "actor", "uniform replay has no priorities; try --priority-exponent 0.6"
         )
-    if not 1 <= config.actor.stride <= config.window.trained_steps:
-        raise ConfigError("--stride", config.actor.stride, f"take 1 to --trained-steps={config.window.trained_steps}")
+    if config.replay.replay_shards > config.actors:
+        fix = f"every shard needs an actor: take at most --actors={config.actors}"
+        raise ConfigError("--replay-shards", config.replay.replay_shards, fix)
+    if not 0 <= config.actor.stride <= config.window.trained_steps:
+        raise ConfigError("--stride", config.actor.stride, f"take 0 to --trained-steps={config.window.trained_steps}")
+    if config.actor.stride and config.actor.state_strategy == "episode":
+        raise ConfigError("--stride", config.actor.stride, "an episode is one window; leave it, or use burn-in")
+    if config.agent.blank_flag and config.env.frame_stack > 1:
+        raise ConfigError("--blank-flag", True, "a stack of frames has no flag; leave it, or use --frame-stack 1")
+    if not config.update.policy_through_q and config.update.scheme < 4:
+        raise ConfigError("--policy-through-q", False, "schemes 1 to 3 have no such way; take --scheme 4, 5 or 6")
     if config.total_steps <= config.replay.warmup_steps:
         raise ConfigError(
             "--total-steps", config.total_steps, f"take more than --warmup-steps={config.replay.warmup_steps}"

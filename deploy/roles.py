@@ -5,6 +5,7 @@ import os
 import re
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,11 +13,11 @@ import torch
 
 from actors.actor import Actor
 from actors.evaluator import Evaluator
-from common.bus import ReplayAddress
 from common.checkpoint import CheckpointFolder
 from common.envs import make_env
 from common.errors import BusUnavailable, ConfigError
 from common.redis_bus import RedisBus
+from common.replay import Shard
 from common.role import RECONNECT_SLEEP, StopSignal, run_role
 from common.watchdog import Watchdog
 from common.wrappers import Env
@@ -24,6 +25,7 @@ from deploy.presets import RunConfig, from_json
 from learner.initial_priority import InitialPriority
 from learner.learner import Learner
 from learner.replay_client import ReplayClient
+from learner.sharded_replay import ShardedReplay
 from replay_server.process import ReplayProcess
 from replay_server.server import ReplayServer
 from replay_server.socket_server import SocketServer
@@ -134,16 +136,20 @@ def run_evaluator(place: Place) -> None:
     watchdog.close()
 
 
-def run_replay(place: Place, folder: Path, listen: str) -> None:
-    """The replay server's process; its ring lies in ``folder``, its socket at ``listen``."""
+def run_replay(place: Place, folder: Path, listen: str, index: int) -> None:
+    """A replay server's process; its ring lies in ``folder``, its socket at ``listen``."""
     secret, process = place.secret(), Process(place)
     config, spec = process.config, process.config.window_spec()
+    shard = Shard(index, config.replay.replay_shards)
+    if not 0 <= index < shard.count:
+        raise ConfigError("--shard", index, f"the run has replay servers 0 to {shard.count - 1}")
     torch.set_num_threads(1)
     server = ReplayServer(
-        spec, config.replay, folder, config.seed, config.total_steps, config.actors, config.slack_steps(), process.bus
-    )
+        spec, config.replay, folder, config.seed, config.total_steps, config.actors, config.slack_steps(), process.bus,
+        shard,
+    )  # fmt: skip
     sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size)
-    process.bus.announce_replay(ReplayAddress(server.epoch, sockets.address))
+    process.bus.announce_replay(server.holder, sockets.address)
     run_role(ReplayProcess(server, sockets), process.bus, process.stop)
 
 
@@ -154,17 +160,31 @@ def run_learner(place: Place, folder: Path, device: str) -> None:
     torch.set_num_threads(config.learner.threads or max(1, cores() - 1))
     check_device(device)
 
-    def address() -> str | None:
-        found = bus.replay_address()
-        return found.address if found else None
-
-    client = ReplayClient(address, secret, spec, config.learner.batch_size, pinned=device.startswith("cuda"))
+    clients = replay_clients(config, bus, secret, pinned=device.startswith("cuda"))
+    replay = clients[0] if len(clients) == 1 else ShardedReplay(clients, spec, config.learner.batch_size, config.seed)
     checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
-    learner = Learner(spec, config.agent, config.update, config.learner, client, bus, checkpoints, config.seed, device)
+    learner = Learner(spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device)
     run_role(learner, bus, process.stop, lambda: learner.finished)
-    client.close()
+    for client in clients:
+        client.close()
     if learner.finished:
         bus.emit(learner.name, {"time": time.time(), **learner.metrics(), "finished": 1})
+
+
+def replay_clients(config: RunConfig, bus: RedisBus, secret: bytes, pinned: bool) -> list[ReplayClient]:
+    """A client of each replay server. What one draws is its part of a batch, where there are several."""
+
+    def address_of(role: str) -> Callable[[], str | None]:
+        def address() -> str | None:
+            found = bus.replay_address(role)
+            return found.address if found else None
+
+        return address
+
+    count = config.replay.replay_shards
+    part = max(1, config.learner.batch_size // count)
+    roles = [Shard(index, count).role for index in range(count)]
+    return [ReplayClient(address_of(role), secret, config.window_spec(), part, pinned) for role in roles]
 
 
 def cores() -> int:

@@ -138,7 +138,7 @@ def _unused(folder: RunFolder) -> RunFolder:
 
 def _make(folder: RunFolder) -> None:
     try:
-        for path in (folder.path, folder.checkpoints, folder.replay, folder.logs):
+        for path in (folder.path, folder.checkpoints, folder.logs):
             path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError("--run-dir", str(folder.path), f"cannot be made ({error.strerror}); give another") from None
@@ -166,6 +166,16 @@ def check_checkpoints(folder: RunFolder) -> None:
             faults.append(str(error))
     if faults:
         raise ConfigError("--run-dir", str(folder.path), f"{faults[0]}; none is whole, so use another --run-dir")
+
+
+def check_writable(name: str, path: Path, suffixes: tuple[str, ...]) -> None:
+    """Raises ConfigError where a file of one of these kinds cannot be written there."""
+    if not path.parent.is_dir():
+        raise ConfigError(name, str(path), "its folder is not there; make it, or give another")
+    if path.is_dir():
+        raise ConfigError(name, str(path), f"is a folder; give a file in it, like {path / f'out{suffixes[0]}'}")
+    if path.suffix.lower() not in suffixes:
+        raise ConfigError(name, str(path), f"give a name that ends in {' or '.join(suffixes)}")
 
 
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:

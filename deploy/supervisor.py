@@ -130,13 +130,14 @@ class Supervisor:
         """How often each role was started again."""
         return {name: role.restarts for name, role in self.roles.items()}
 
-    def stop(self, last: str = "replay") -> None:
-        """End every role, ``last`` after the others, which may still need it; kill what does not end in time."""
+    def stop(self) -> None:
+        """End every role, the replay servers after the others, which may need them; kill what does not end in time."""
         deadline = time.monotonic() + STOP_SECONDS
-        others = [role for name, role in self.roles.items() if name != last]
+        last = [role for name, role in self.roles.items() if name.startswith("replay")]
+        others = [role for role in self.roles.values() if role not in last]
         try:
             self._end(others, deadline - STOP_SECONDS / 4)
-            self._end([role for name, role in self.roles.items() if name == last], deadline)
+            self._end(last, deadline)
         finally:
             for role in self.roles.values():
                 role.signal(signal.SIGKILL)

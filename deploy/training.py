@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mean
 from typing import Any, Literal
 
 import torch
@@ -84,6 +85,10 @@ def prepare(config: RunConfig, placement: Placement) -> RunFolder:
     validate(config)
     spec = config.window_spec()
     check_device(placement.device)
+    if placement.launcher == "lockstep" and config.replay.replay_shards > 1:
+        raise ConfigError(
+            "--replay-shards", config.replay.replay_shards, "a lockstep run has one; use --launcher local"
+        )
     if placement.launcher == "manual" and placement.redis_url is None:
         raise ConfigError("--redis-url", None, "say which Redis the roles that you start by hand will use")
     if placement.redis_url is not None:
@@ -117,7 +122,7 @@ def _result(config: RunConfig, folder: RunFolder, monitor: Monitor, before: dict
         **after,
         "initial_return_mean": before["eval_return_mean"],
         "wall_s": monitor.wall_seconds,
-        "replay_ratio": monitor.board.get("replay", "replay_ratio"),
+        "replay_ratio": monitor.board.replay("replay_ratio", mean),
         "restarts": sum(monitor.restarts().values()),
     }
 

@@ -9,38 +9,42 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.evaluator import LONGEST_EPISODE
 from common.envs import EnvConfig, make_env
 from common.errors import ConfigError
 from common.wrappers import Env
 from deploy.policy import Policy
+from deploy.run_folder import check_writable
 
+VIDEOS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
 BACKENDS = ("egl", "osmesa", "glfw")  # MuJoCo's, the ones that need no screen first
 PROBE = "import sys; from deploy.video import probe; probe(sys.argv[1])"
 PROBE_SECONDS = 60
 FRAMES_PER_SECOND = 30
 
 
-def record(policy: Policy, seed: int, out: Path) -> float:
+def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path) -> float:
     """Play one deterministic episode and write it to ``out``; its return. Raises ConfigError, before it plays."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ConfigError("--video", str(out), "imageio-ffmpeg is missing; pip install 'rmc[video]'")
-    if not out.parent.is_dir():
-        raise ConfigError("--video", str(out), "its folder is not there; make it, or give another")
-    os.environ["MUJOCO_GL"] = _working_backend(policy.config.env, out)
+    check_writable("--video", out, VIDEOS)
+    os.environ["MUJOCO_GL"] = _working_backend(env_config, out)
     from imageio_ffmpeg import write_frames  # an extra
 
-    env = make_env(policy.config.env, render=True)
+    env = make_env(env_config, render=True)
     _follow(env)
     observation, info = env.reset(seed=seed)
     frame, rate = _frame(env), env.metadata.get("render_fps", FRAMES_PER_SECOND)
     video = write_frames(str(out), (frame.shape[1], frame.shape[0]), fps=rate, macro_block_size=1)
     video.send(None)  # the generator's start
-    total, ended = 0.0, False
-    while not ended:
+    total = 0.0
+    for _ in range(LONGEST_EPISODE):
         video.send(_frame(env).tobytes())
         action = policy.act(observation, bool(info.get("blank", False)))
         observation, reward, terminated, truncated, info = env.step(action)
-        total, ended = total + float(reward), terminated or truncated
+        total += float(reward)
+        if terminated or truncated:
+            break
     video.close()
     env.close()
     return total

@@ -1,6 +1,8 @@
 """The newest state of a run as a table for a terminal, or as one plain line."""
 
 import time
+from collections.abc import Callable
+from statistics import mean
 from typing import Any
 
 from rich.console import Group
@@ -29,7 +31,12 @@ class Board:
     @property
     def env_steps(self) -> int:
         """Environment steps committed to the ring."""
-        return int(self.get("replay", "env_steps") or self.get("learner", "env_steps") or 0)
+        return int(self.replay("env_steps", sum) or self.get("learner", "env_steps") or 0)
+
+    def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:
+        """The sum or mean ``over`` all replay servers, or None."""
+        found = [record[name] for role, record in self.roles.items() if role.startswith("replay") and name in record]
+        return over(found) if found else None
 
     @property
     def episode_return(self) -> float | None:
@@ -40,8 +47,7 @@ class Board:
     @property
     def policy_lag(self) -> float | None:
         """Weight versions between what acts and the newest, at insertion."""
-        value: float | None = self.get("replay", "policy_lag_mean")
-        return value
+        return self.replay("policy_lag_mean", mean)
 
     @property
     def episodes(self) -> str:
@@ -79,10 +85,10 @@ def _facts(board: Board) -> list[tuple[str, str]]:
     losses = ", ".join(f"{name[:-5]} {number(learner[name])}" for name in learner if name.endswith("_loss"))
     return [
         ("environment steps", f"{board.env_steps:,} of {board.total_steps:,}, "
-                              f"{number(board.get('replay', 'env_steps_per_s'), ',.0f')} /s"),
+                              f"{number(board.replay('env_steps_per_s', sum), ',.0f')} /s"),
         ("updates", f"{number(learner.get('updates'), ',')}, {number(learner.get('updates_per_s'), ',.1f')} /s"),
-        ("replay", f"ring {number(board.get('replay', 'ring_fill'), '.0%')} full, "
-                   f"ratio {number(board.get('replay', 'replay_ratio'), ',.1f')} of {board.replay_ratio:g}"),
+        ("replay", f"ring {number(board.replay('ring_fill', mean), '.0%')} full, "
+                   f"ratio {number(board.replay('replay_ratio', mean), ',.1f')} of {board.replay_ratio:g}"),
         ("episode return", board.episodes),
         ("evaluation return", _evaluation(board)),
         ("losses", losses or NONE_YET),
@@ -131,11 +137,11 @@ def line(board: Board) -> str:
     ]
     parts = [
         f"steps {board.env_steps}/{board.total_steps}",
-        f"{number(board.get('replay', 'env_steps_per_s'), '.0f')} steps/s",
+        f"{number(board.replay('env_steps_per_s', sum), '.0f')} steps/s",
         f"updates {number(learner.get('updates'), 'd')}",
         f"{number(learner.get('updates_per_s'), '.1f')}/s",
-        f"ring {number(board.get('replay', 'ring_fill'), '.0%')}",
-        f"ratio {number(board.get('replay', 'replay_ratio'), '.1f')}/{board.replay_ratio:g}",
+        f"ring {number(board.replay('ring_fill', mean), '.0%')}",
+        f"ratio {number(board.replay('replay_ratio', mean), '.1f')}/{board.replay_ratio:g}",
         f"episode {board.episodes}",
         f"eval {number(board.get('evaluator', 'eval_return_mean'), '.1f')}",
         f"q {number(learner.get('q_loss'))} model {number(learner.get('model_loss'))}",

@@ -5,7 +5,9 @@ Shapes: B batch, T steps, O observation, A action, H hidden; L_b burn-in.
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from common.window import WindowSpec
@@ -28,6 +30,13 @@ class Batch:
     step_valid: Tensor  # (B, T) bool
     burned_in: Tensor  # (B,) bool: the burn-in is real
     importance: Tensor  # (B,)
+
+
+def importance_weights(values: NDArray[np.float64], mass: float, windows: int, exponent: float) -> NDArray[np.float32]:
+    """(N P(i))^-exponent / max, P(i) = value / mass, N windows: (B,) -> (B,)."""
+    weights = (windows * values / mass) ** -exponent
+    scaled: NDArray[np.float32] = (weights / weights.max()).astype(np.float32)
+    return scaled
 
 
 def _field(raw: Tensor, spec: WindowSpec, name: str) -> Tensor:

@@ -20,7 +20,7 @@ from common.errors import CheckpointError, FencedError, RmcError
 from common.metrics import Means, Rate
 from common.replay import Draw, Replay, Sample
 from common.window import Rows, WindowSpec
-from learner.batch import Batch, view_batch
+from learner.batch import Batch, importance_weights, view_batch
 from learner.staleness import SLICE, measurable, staleness
 from learner.update import UpdateConfig, Updated, make_update
 
@@ -37,6 +37,8 @@ class LearnerConfig:
 
     batch_size: int = 64
     """B, windows in a batch."""
+    importance_exponent: float = 0.4
+    """How far importance weights undo prioritized sampling; 1 is wholly."""
     publish_updates: int = 20
     """Updates between broadcasts of the policy."""
     checkpoint_steps: int = 10_000
@@ -122,7 +124,6 @@ class Learner:
 
     def _learn(self, sample: Sample) -> None:
         assert sample.rows is not None
-        assert sample.importance is not None
         self.beta.fill_(self.update.config.beta(self.env_steps))
         updated = self.update(self._to_device(sample), self.beta)
         self.updates += 1
@@ -131,10 +132,12 @@ class Learner:
         self._measure_age(sample.rows)
 
     def _to_device(self, sample: Sample) -> Batch:
-        rows = sample.rows
+        rows, values = sample.rows, sample.values
         assert rows is not None
+        assert values is not None
+        weights = importance_weights(values, sample.mass, sample.windows, self.config.importance_exponent)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1)).to(self.device, non_blocking=True)
-        importance = torch.from_numpy(sample.importance).to(self.device, non_blocking=True)
+        importance = torch.from_numpy(weights).to(self.device, non_blocking=True)
         return view_batch(raw, importance, self.spec)
 
     def _measure(self, updated: Updated) -> None:

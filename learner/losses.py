@@ -1,6 +1,7 @@
 """The losses of RMC, one function per equation, and nothing else.
 
 Shapes: B batch, T trained steps (L_t), O observation, A action, H hidden. All tensors float32.
+Equations are numbered as in the paper.
 Notation: h_t memory, a_t action, r_t reward, d_t true termination, m_t mask (1 = real trained step),
 sg stop-gradient. Every loss is a masked mean, sum(m * x) / sum(m).
 Source: arXiv 1908.11494, with the gaps settled in ``docs/algorithm.md``.
@@ -21,7 +22,7 @@ def masked_mean(x: Tensor, m: Tensor) -> Tensor:
 
 
 def model_error(predicted_change: Tensor, change: Tensor, norm: Literal["l1", "l2"]) -> Tensor:
-    """f(h_t, a_t) - sg(h_{t+1} - h_t): its mean size over H (L1) or its root mean square (L2); (B, T, H) -> (B, T).
+    """Eq. 7: f(h_t, a_t) - sg(h_{t+1} - h_t), its mean size over H (L1) or root mean square (L2): (B, T, H) -> (B, T).
 
     The paper's text says L1 and compares it with the L2 that its equation prints.
     """
@@ -32,22 +33,22 @@ def model_error(predicted_change: Tensor, change: Tensor, norm: Literal["l1", "l
 
 
 def model_loss(error: Tensor, d: Tensor, m: Tensor) -> Tensor:
-    """L_model: the error where the episode goes on, so (1 - d_t) is part of the mask."""
+    """Eq. 7: L_model: the error where the episode goes on, so (1 - d_t) is part of the mask."""
     return masked_mean(error, m * (1.0 - d))
 
 
 def curiosity(error: Tensor, d: Tensor, m: Tensor) -> Tensor:
-    """i_t: the model's own error of the step, without gradient, zero at terminations and padding."""
+    """Eq. 8: i_t: the model's own error of the step, without gradient, zero at terminations and padding."""
     return error.detach() * (1.0 - d) * m
 
 
 def soft_value(q: Tensor, alpha: Tensor, log_pi: Tensor) -> Tensor:
-    """V(h) = min_j Qbar_j(h, a') - alpha log pi(a'|h), a' and its log pi from the same sample: (2, B, T) -> (B, T)."""
+    """Eq. 9: V(h) = min_j Qbar_j(h, a') - alpha log pi(a'|h), a' and log pi from one sample: (2, B, T) -> (B, T)."""
     return q.min(0).values - alpha * log_pi
 
 
 def td_target(reward: Tensor, gamma: float, d: Tensor, next_value: Tensor, m: Tensor, n: int) -> Tensor:
-    """y_t = R_t + gamma (1 - d_t) V(h_{t+1}), R_t = r_t + beta i_t; (B, T) each. No gradient.
+    """Eq. 9: y_t = R_t + gamma (1 - d_t) V(h_{t+1}), R_t = r_t + beta i_t; (B, T) each. No gradient.
 
     With n > 1 the n-step return, y_t = sum_{k<n} gamma^k R_{t+k} + gamma^n V(h_{t+n}), as R2D2 has it: not corrected
     for the policy that acted, and shorter where the window or the episode ends before.
@@ -61,18 +62,18 @@ def td_target(reward: Tensor, gamma: float, d: Tensor, next_value: Tensor, m: Te
 
 
 def q_loss(q: Tensor, y: Tensor, importance: Tensor, m: Tensor) -> Tensor:
-    """1/2 sum_j (Q_j(h_t, a_t) - y_t)^2, importance-weighted per window; q (2, B, T), importance (B,)."""
+    """Eq. 9: 1/2 sum_j (Q_j(h_t, a_t) - y_t)^2, importance-weighted per window; q (2, B, T), importance (B,)."""
     squared = 0.5 * (q - y).square().sum(0)
     return masked_mean(importance.unsqueeze(1) * squared, m)
 
 
 def policy_loss(log_pi: Tensor, q: Tensor, alpha: Tensor, m: Tensor) -> Tensor:
-    """alpha log pi(a|sg(h_t)) - Q(sg(h_t), a), (B, T) each. (The paper prints the sign the other way round.)"""
+    """Eq. 10: alpha log pi(a|sg(h_t)) - Q(sg(h_t), a), (B, T) each. (The paper prints the sign the other way round.)"""
     return masked_mean(alpha.detach() * log_pi - q, m)
 
 
 def temperature_loss(log_alpha: Tensor, log_pi: Tensor, target_entropy: float, m: Tensor) -> Tensor:
-    """-log_alpha sg(log pi + target entropy)."""
+    """Eq. 12: -log_alpha sg(log pi + target entropy)."""
     return -log_alpha * masked_mean(log_pi.detach() + target_entropy, m)
 
 

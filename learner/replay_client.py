@@ -10,6 +10,7 @@ import os
 import socket
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -124,45 +125,51 @@ class ReplayClient:
         self, address: Callable[[], str | None], secret: bytes, spec: WindowSpec, batch_size: int, pinned: bool = False
     ) -> None:
         self._address, self._secret, self._spec, self._batch_size = address, secret, spec, batch_size
-        body = batch_size * (spec.dtype.itemsize + 4)  # rows, then float32 importance weights
+        body = batch_size * (spec.dtype.itemsize + 8)  # rows, then float64 values
         tensors = [torch.empty(body, dtype=torch.uint8, pin_memory=pinned) for _ in range(AHEAD)]
         self._buffers = [tensor.numpy().data for tensor in tensors]
         self._answer = memoryview(bytearray(max(EPISODE_BYTES, spec.dtype.itemsize, 2 * 8 * spec.obs_dim)))
-        self._turn = self._in_flight = self._env_steps = 0
+        self._turn = self._in_flight = 0
+        self._last = Sample(Draw.WAIT, None, None, 0.0, 0, 0, 0)
         self._batches: Connection | None = None
         self._control: Connection | None = None
         self._is_away = False  # said in the log already
 
-    def sample(self, batch_size: int) -> Sample:
+    def sample(self, batch_size: int, elsewhere: int = 0) -> Sample:
         """The oldest draw asked for; asks for the next. ``rows`` stay valid until the next draw but one."""
         assert batch_size == self._batch_size, (batch_size, self._batch_size)
         try:
-            return self._receive_sample()
-        except (OSError, MessageError) as error:
+            self._last = self._receive_sample(elsewhere)
+            return self._last
+        except (OSError, MessageError, KeyError, TypeError) as error:
             self._drop(error)
-            return Sample(Draw.WAIT, None, None, self._env_steps)
+            return self._away()
 
-    def _receive_sample(self) -> Sample:
+    def _away(self) -> Sample:
+        """What was known last, without a batch."""
+        return replace(self._last, draw=Draw.WAIT, rows=None, values=None)
+
+    def _receive_sample(self, elsewhere: int) -> Sample:
         connection = self._batches = self._batches or self._open()
         if connection is None:
-            return Sample(Draw.WAIT, None, None, self._env_steps)
+            return self._away()
         while self._in_flight < AHEAD:
-            connection.send(Kind.SAMPLE, {"batch_size": self._batch_size})
+            connection.send(Kind.SAMPLE, {"batch_size": self._batch_size, "elsewhere": elsewhere})
             self._in_flight += 1
         self._turn = (self._turn + 1) % AHEAD
         header, meta, body = connection.receive(self._buffers[self._turn])
         self._in_flight -= 1
         if header.kind is Kind.ERROR:
             raise MessageError("replay", str(meta.get("error")))
-        self._env_steps, self._is_away = int(meta["env_steps"]), False
+        self._is_away = False
+        about = float(meta["mass"]), int(meta["windows"]), int(meta["env_steps"]), int(meta["drawn_steps"])
         if header.kind is not Kind.BATCH:
-            draw = Draw.FINISHED if header.kind is Kind.FINISHED else Draw.WAIT
-            return Sample(draw, None, None, self._env_steps)
+            return Sample(Draw.FINISHED if header.kind is Kind.FINISHED else Draw.WAIT, None, None, *about)
         split = self._batch_size * self._spec.dtype.itemsize
-        if len(body) != split + 4 * self._batch_size:
+        if len(body) != split + 8 * self._batch_size:
             raise MessageError("length", f"{len(body)} bytes for a batch of {self._batch_size}")
         rows = np.frombuffer(body[:split], self._spec.dtype)
-        return Sample(Draw.BATCH, rows, np.frombuffer(body[split:], np.float32), self._env_steps)
+        return Sample(Draw.BATCH, rows, np.frombuffer(body[split:], np.float64), *about)
 
     def _open(self) -> Connection | None:
         address = self._address()

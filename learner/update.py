@@ -309,8 +309,12 @@ def _adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
 def _unexplained(predicted: Tensor, change: Tensor, m: Tensor) -> Tensor:
     """(O,): mean size of the error over that of the change itself, by observation dimension; 1 is "no change"."""
     weight = m.unsqueeze(-1)
-    error, size = ((weight * x.abs()).sum((0, 1)) for x in (predicted - change, change))
-    return error / size.clamp(min=1e-8)
+    return share_unexplained(*((weight * x.abs()).sum((0, 1)) for x in (predicted - change, change)))
+
+
+def share_unexplained(error: Tensor, size: Tensor) -> Tensor:
+    """(O,) error over size. What hardly changes counts as a thousandth of what changes most: else it is all noise."""
+    return error / torch.maximum(size, 1e-3 * size.max()).clamp(min=1e-8)
 
 
 def _seen(batch: Batch) -> Tensor:

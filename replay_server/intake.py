@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from common.bus import Bus, Entry, EntryId
 from common.errors import BusFull, MessageError
+from common.replay import WHOLE, Shard
 from common.window import Rows, WindowSpec
 from common.wire import decode_entry, max_entry_bytes
 from replay_server.record import StreamPosition
@@ -32,19 +33,19 @@ class Round:
 class Intake:
     """Reads every actor's stream past where the ring is. Refused entries go to the dead letters, counted."""
 
-    def __init__(self, spec: WindowSpec, bus: Bus, actors: int) -> None:
-        self.spec, self.bus = spec, bus
+    def __init__(self, spec: WindowSpec, bus: Bus, actors: int, shard: Shard = WHOLE) -> None:
+        self.spec, self.bus, self._shard = spec, bus, shard
         self.refused: Counter[str] = Counter()  # dead letters by reason
         self.gaps = 0  # entries whose number does not follow their predecessor's
         self._asked: dict[int, EntryId] = {}  # past which entry an actor was asked to send again
-        self._actors = set(range(actors))
+        self._actors = {actor for actor in range(actors) if shard.owns(actor)}
         self._rounds = 0
         self._entry_bytes = ROUND_BYTES  # the largest entry of the last round that had any
 
     def read(self, positions: Mapping[int, StreamPosition]) -> Round | None:
         """The next entries of all streams, or None where there are none."""
         if self._rounds % DISCOVERY_ROUNDS == 0:
-            self._actors.update(self.bus.actors(), positions)
+            self._actors.update(filter(self._shard.owns, self.bus.actors()), positions)
         self._rounds += 1
         cursors = {actor: positions[actor].id if actor in positions else BEFORE_ALL for actor in self._actors}
         count = ROUND_BYTES // (self._entry_bytes * len(cursors))

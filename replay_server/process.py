@@ -3,7 +3,6 @@
 import time
 from typing import Any
 
-from common.bus import ReplayAddress
 from common.errors import BusFull, BusUnavailable
 from common.role import RECONNECT_SLEEP
 from replay_server.server import ReplayServer
@@ -14,12 +13,10 @@ ANNOUNCE_PERIOD = 5.0  # seconds between repeats of the address, in case Redis l
 
 
 class ReplayProcess:
-    """The role ``replay`` with its socket. The learner is served on while Redis is away."""
-
-    name = "replay"
+    """The role ``replay``, or a shard of it, with its socket. The learner is served on while Redis is away."""
 
     def __init__(self, server: ReplayServer, sockets: SocketServer) -> None:
-        self.server, self.sockets = server, sockets
+        self.server, self.sockets, self.name = server, sockets, server.name
         self._next_intake = self._next_announcement = 0.0
         self._bus_is_away = False
 
@@ -35,7 +32,7 @@ class ReplayProcess:
             took = self.server.step()
             if now >= self._next_announcement:
                 self._next_announcement = now + ANNOUNCE_PERIOD
-                self.server.bus.announce_replay(ReplayAddress(self.server.epoch, self.sockets.address))
+                self.server.bus.announce_replay(self.server.holder, self.sockets.address)
         except (BusUnavailable, BusFull):
             self._bus_is_away, self._next_intake = True, now + RECONNECT_SLEEP
             return False

@@ -18,7 +18,7 @@ from common.errors import ConfigError
 
 MAX_STREAMS = 4096
 _HEADER = struct.Struct("<QII")
-_COUNTERS = struct.Struct("<7qdqq")  # the integers of Progress in order, largest priority, statistics count, streams
+_COUNTERS = struct.Struct("<8qdqq")  # the integers of Progress in order, largest priority, statistics count, streams
 _STREAM_BYTES = 4 * 8
 
 
@@ -41,6 +41,7 @@ class Progress:
     draws: int = 0
     replay_epoch: int = 0  # the largest that has written here
     evicted_priorities: int = 0  # priorities that came back too late
+    elsewhere_steps: int = 0  # trained steps drawn from the other shards, as the learner last said
     max_priority: float = 1.0  # the largest seen
     observations: int = 0  # count of the statistics
     total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (O,)
@@ -62,7 +63,7 @@ class Progress:
             raise ConfigError("--actors", len(self.streams), f"a replay server takes at most {MAX_STREAMS} streams")
         counters = _COUNTERS.pack(
             self.valid_from, self.next_serial, self.env_steps, self.drawn_steps, self.draws, self.replay_epoch,
-            self.evicted_priorities, self.max_priority, self.observations, len(self.streams),
+            self.evicted_priorities, self.elsewhere_steps, self.max_priority, self.observations, len(self.streams),
         )  # fmt: skip
         rows = [(actor, at.id.epoch, at.id.seq, at.settled_steps) for actor, at in self.streams.items()]
         streams = np.array(rows, np.int64).tobytes()

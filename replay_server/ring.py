@@ -23,7 +23,7 @@ from replay_server.record import Progress, RecordPair, record_bytes
 
 _IDENTITY = struct.Struct("<8s16sQQ")  # magic, fingerprint, capacity, row bytes; then its CRC
 _IDENTITY_BYTES = 4096
-_MAGIC = b"RMCRING1"
+_MAGIC = b"RMCRING2"
 Slots = NDArray[np.int64]
 
 
@@ -131,7 +131,9 @@ def _check_identity(path: Path, spec: WindowSpec, capacity: int) -> None:
         raw = file.read(_IDENTITY.size + 4)
     if len(raw) < _IDENTITY.size + 4 or zlib.crc32(raw[:-4]) != struct.unpack("<I", raw[-4:])[0]:
         raise _unusable(path, "not a replay ring, or a damaged one")
-    _, fingerprint, found, _ = _IDENTITY.unpack(raw[:-4])
+    magic, fingerprint, found, _ = _IDENTITY.unpack(raw[:-4])
+    if magic != _MAGIC:
+        raise _unusable(path, "made by another version")
     if fingerprint != spec.fingerprint.encode():
         fix = f"its windows are of layout {fingerprint.decode()}, this run's of {spec.fingerprint}; use a new folder"
         raise ConfigError("--run-dir", str(path), fix)

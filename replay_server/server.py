@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bus import Ack, Bus
+from common.bus import Ack, Bus, Holder
 from common.errors import ConfigError
 from common.metrics import Means, Rate
-from common.replay import EPISODE_BYTES, Draw, ObservationStatistics, Sample
+from common.replay import EPISODE_BYTES, WHOLE, Draw, ObservationStatistics, Sample, Shard
 from common.window import Rows, WindowSpec
 from replay_server.episode import find_episode
 from replay_server.intake import Intake, Round
@@ -37,8 +37,8 @@ class ReplayConfig:
     """Environment steps before the first draw."""
     priority_exponent: float = 0.6
     """How strongly priorities steer sampling; 0 is uniform."""
-    importance_exponent: float = 0.4
-    """How far importance weights undo that; 1 is wholly."""
+    replay_shards: int = 1
+    """Replay servers, each with a share of the actors and of the capacity."""
 
     def __post_init__(self) -> None:
         if self.capacity < 1:
@@ -49,15 +49,6 @@ class ReplayConfig:
             raise ConfigError("--warmup-steps", self.warmup_steps, "take 0 or more")
         if not 0.0 <= self.priority_exponent <= 4.0:
             raise ConfigError("--priority-exponent", self.priority_exponent, "take 0 (uniform) to 4")
-        if not 0.0 <= self.importance_exponent <= 1.0:
-            raise ConfigError("--importance-exponent", self.importance_exponent, "take 0 (off) to 1")
-
-
-def importance_weights(values: NDArray[np.float64], total: float, windows: int, exponent: float) -> NDArray[np.float32]:
-    """(N P(i))^-exponent / max, P(i) = value / total: (B,) -> (B,)."""
-    weights = (windows * values / total) ** -exponent
-    scaled: NDArray[np.float32] = (weights / weights.max()).astype(np.float32)
-    return scaled
 
 
 def observation_sums(rows: Rows, spec: WindowSpec) -> ObservationStatistics:
@@ -69,14 +60,12 @@ def observation_sums(rows: Rows, spec: WindowSpec) -> ObservationStatistics:
 
 
 class ReplayServer:
-    """The role ``replay``, and the Replay protocol for a learner in the same thread.
+    """The role ``replay``, or one of its shards, and the Replay protocol for a learner in the same thread.
 
     Opens or recovers the ring in ``folder``; ``slack_steps`` is how far actors may run ahead of the ratio
     and must cover what they may hold back unsent. Raises ConfigError (see ``open_store``), BusUnavailable,
     and FencedError from ``step`` when a newer replay server has taken over.
     """
-
-    name = "replay"
 
     def __init__(
         self,
@@ -88,18 +77,28 @@ class ReplayServer:
         actors: int,
         slack_steps: int,
         bus: Bus,
+        shard: Shard = WHOLE,
     ) -> None:
-        self.spec, self.config, self.bus = spec, config, bus
-        self._seed, self._actors, self._slack_steps = seed, actors, slack_steps
-        self._limiter = RateLimiter(config.replay_ratio, config.warmup_steps, total_steps, slack_steps)
-        self._intake = Intake(spec, bus, actors)
-        self._store = open_store(folder, spec, config.capacity, config.priority_exponent)
+        self.spec, self.config, self.bus, self.name = spec, config, bus, shard.role
+        self._seed, self._shard = seed, shard
+        self._own_actors = [actor for actor in range(actors) if shard.owns(actor)]
+        self._share = len(self._own_actors) / actors  # of all that is collected
+        self._slack_steps = shard.part(slack_steps, actors)
+        self._limiter = RateLimiter(
+            config.replay_ratio / self._share,  # a shard's steps are a share, what is drawn from all is the whole
+            shard.part(config.warmup_steps, actors),
+            shard.part(total_steps, actors),
+            self._slack_steps,
+        )
+        self._intake = Intake(spec, bus, actors, shard)
+        self._store = open_store(folder, spec, -(-config.capacity // shard.count), config.priority_exponent)
         try:
-            self.epoch = bus.take_epoch(self.name, self._store.ring.progress.replay_epoch)
+            epoch = bus.take_epoch(self.name, self._store.ring.progress.replay_epoch)
         except BaseException:
             self._store.close()
             raise
-        self._store.ring.progress.replay_epoch = self.epoch
+        self.holder = Holder(self.name, epoch)
+        self._store.ring.progress.replay_epoch = epoch
         self._store.ring.commit()
         self._published: dict[int, Ack] = {}
         self._republish_at = 0.0
@@ -116,7 +115,7 @@ class ReplayServer:
         if taken is not None:
             self._insert(taken)
             for actor in taken.broken:
-                self.bus.drop_stream(self.epoch, actor)
+                self.bus.drop_stream(self.holder, actor)
         self._publish(at_once=taken is not None)
         return taken is not None
 
@@ -149,12 +148,17 @@ class ReplayServer:
     def _acks(self) -> dict[int, Ack]:
         """What every actor seen so far has committed, and how far it may step."""
         progress = self._store.ring.progress
-        shares = self._limiter.shares(progress.env_steps, progress.drawn_steps, self._actors)
-        final = self._limiter.is_final(progress.drawn_steps)
+        shares = self._limiter.shares(progress.env_steps, self._drawn, len(self._own_actors))
+        granted = dict(zip(self._own_actors, shares, strict=True))
+        final = self._limiter.is_final(self._drawn)
         return {
-            actor: Ack(at.id, at.settled_steps + (shares[actor] if actor < self._actors else 0), final)
-            for actor, at in progress.streams.items()
+            actor: Ack(at.id, at.settled_steps + granted.get(actor, 0), final) for actor, at in progress.streams.items()
         }
+
+    @property
+    def _drawn(self) -> int:
+        """Trained steps drawn, from all shards."""
+        return self._store.ring.progress.drawn_steps + self._store.ring.progress.elsewhere_steps
 
     def _publish(self, at_once: bool) -> None:
         """Publish acks that changed. Small changes wait, unless the learner does: then actors need all there is.
@@ -163,12 +167,12 @@ class ReplayServer:
         """
         if not self._published or time.monotonic() >= self._republish_at:
             self._republish_at = time.monotonic() + REPUBLISH_PERIOD
-            self.bus.commit(self.epoch, self._published or self._acks())
+            self.bus.commit(self.holder, self._published or self._acks())
         acks = {actor: ack for actor, ack in self._acks().items() if self._published.get(actor) != ack}
-        quantum = max(1, self._slack_steps // (8 * self._actors))
+        quantum = max(1, self._slack_steps // (8 * len(self._own_actors)))
         at_once = at_once or bool(self._waiting_for)
         if acks and (at_once or any(self._grown(actor, ack) >= quantum for actor, ack in acks.items())):
-            self.bus.commit(self.epoch, acks)
+            self.bus.commit(self.holder, acks)
             self._published.update(acks)
 
     def _grown(self, actor: int, ack: Ack) -> int:
@@ -177,29 +181,30 @@ class ReplayServer:
 
     # -- out --------------------------------------------------------------------------------------------
 
-    def sample(self, batch_size: int) -> Sample:
+    def sample(self, batch_size: int, elsewhere: int = 0) -> Sample:
         """Draw (B,) rows in proportion to priority ** exponent, if the limiter lets it.
 
         The rows lie in one of two buffers that draws take in turn. A draw depends on the seed, its number
         and the ring alone.
         """
-        progress = self._store.ring.progress
-        draw = self._limiter.draw(progress.env_steps, progress.drawn_steps, batch_size * self.spec.train)
+        progress, tree = self._store.ring.progress, self._store.tree
+        progress.elsewhere_steps = max(progress.elsewhere_steps, elsewhere)
+        draw = self._limiter.draw(progress.env_steps, self._drawn, batch_size * self.spec.train)
         if draw is Draw.BATCH and progress.windows == 0:
             draw = Draw.WAIT
         self._note_waiting(draw)
         if draw is not Draw.BATCH:
-            return Sample(draw, None, None, progress.env_steps)
-        tree = self._store.tree
-        random = np.random.Generator(np.random.Philox(key=np.array([self._seed, progress.draws], np.uint64)))
+            return Sample(draw, None, None, tree.total, progress.windows, progress.env_steps, progress.drawn_steps)
+        number = progress.draws * self._shard.count + self._shard.index  # of the draw; no shard's like another's
+        random = np.random.Generator(np.random.Philox(key=np.array([self._seed, number], np.uint64)))
         slots = tree.sample(batch_size, random)
         rows = self._buffer(batch_size)
         self._store.ring.gather(slots, rows)
         progress.draws += 1
         progress.drawn_steps += self.spec.trained_steps(rows)
         self._store.ring.commit()
-        weights = importance_weights(tree.values(slots), tree.total, progress.windows, self.config.importance_exponent)
-        return Sample(draw, rows, weights, progress.env_steps)
+        values = tree.values(slots)
+        return Sample(draw, rows, values, tree.total, progress.windows, progress.env_steps, progress.drawn_steps)
 
     def _buffer(self, batch_size: int) -> Rows:
         self._buffers.reverse()
@@ -250,8 +255,8 @@ class ReplayServer:
             "ring_fill": progress.windows / self.config.capacity,
             "draws": progress.draws,
             "drawn_steps": progress.drawn_steps,
-            "replay_ratio": limiter.ratio(progress.env_steps, progress.drawn_steps),
-            "credit_steps": max(0, limiter.limit(progress.drawn_steps) - progress.env_steps),
+            "replay_ratio": limiter.ratio(progress.env_steps, self._drawn) * self._share,
+            "credit_steps": max(0, limiter.limit(self._drawn) - progress.env_steps),
             "learner_waiting_for": self._waiting_for,
             "learner_waiting_s": time.monotonic() - self._waiting_since if self._waiting_for else 0.0,
             "max_priority": progress.max_priority,

@@ -26,10 +26,11 @@ from typing import Any
 import numpy as np
 
 from common.errors import AuthenticationError, ConfigError, MessageError
-from common.replay import Draw, Replay
+from common.replay import Draw
 from common.window import WindowSpec
 from common.wire import Kind, proof
 from replay_server.connection import Connection, Frame
+from replay_server.server import ReplayServer
 
 log = logging.getLogger(__name__)
 NONCE_BYTES = 32
@@ -40,12 +41,12 @@ READ, WRITE = selectors.EVENT_READ, selectors.EVENT_WRITE
 
 
 class SocketServer:
-    """Serves a Replay at ``address``: ``unix:PATH`` or ``tcp:HOST:PORT`` (port 0 takes a free one).
+    """Serves a replay server at ``address``: ``unix:PATH`` or ``tcp:HOST:PORT`` (port 0 takes a free one).
 
     ``address`` afterwards names the port taken. Raises ConfigError where it cannot be listened on.
     """
 
-    def __init__(self, server: Replay, spec: WindowSpec, address: str, secret: bytes, max_batch: int) -> None:
+    def __init__(self, server: ReplayServer, spec: WindowSpec, address: str, secret: bytes, max_batch: int) -> None:
         if not secret:
             raise ConfigError("secret", "", "the run's secret must not be empty")
         self._server, self._spec, self._secret, self._max_batch = server, spec, secret, max_batch
@@ -132,7 +133,7 @@ class SocketServer:
 
     def _handle(self, connection: Connection, frame: Frame) -> None:
         if frame.kind is Kind.SAMPLE:
-            self._sample(connection, frame.meta.get("batch_size"))
+            self._sample(connection, frame.meta.get("batch_size"), frame.meta.get("elsewhere"))
         elif frame.kind is Kind.PRIORITIES:
             self._priorities(frame)
         elif frame.kind is Kind.STATISTICS:
@@ -146,17 +147,19 @@ class SocketServer:
         else:
             raise MessageError("kind", f"{frame.kind.name} is not a request")
 
-    def _sample(self, connection: Connection, batch_size: Any) -> None:
+    def _sample(self, connection: Connection, batch_size: Any, elsewhere: Any) -> None:
         if type(batch_size) is not int or not 1 <= batch_size <= self._max_batch:
             raise MessageError("batch-size", f"{batch_size!r}, want 1 to {self._max_batch}")
+        if type(elsewhere) is not int or not 0 <= elsewhere < 2**62:
+            raise MessageError("elsewhere", f"{elsewhere!r}, want a number of steps")
         for other in self._connections:
             other.own()  # the draw takes a buffer that another client's batch may still lie in
-        sample = self._server.sample(batch_size)
-        meta = {"env_steps": sample.env_steps}
-        if sample.rows is None or sample.importance is None:
+        sample = self._server.sample(batch_size, elsewhere)
+        meta = {name: getattr(sample, name) for name in ("mass", "windows", "env_steps", "drawn_steps")}
+        if sample.rows is None or sample.values is None:
             connection.send(Kind.FINISHED if sample.draw is Draw.FINISHED else Kind.WAIT, meta)
         else:
-            parts = (sample.rows.view(np.uint8).data, sample.importance.data.cast("B"))
+            parts = (sample.rows.view(np.uint8).data, sample.values.data.cast("B"))
             connection.send(Kind.BATCH, meta, parts)
 
     def _episode(self, connection: Connection, serial: Any) -> None:

@@ -13,7 +13,7 @@ from safetensors.torch import save
 
 from actors.actor import Actor, ActorConfig, environment_seed
 from common.agent import Agent, AgentConfig
-from common.bus import Ack, Bus, Entry, EntryId, MemoryBus, Version
+from common.bus import Ack, Bus, Entry, EntryId, Holder, MemoryBus, Version
 from common.envs import EnvConfig, make_env
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from common.redis_bus import RedisBus
@@ -51,7 +51,7 @@ class Reader:
     """Reads and acknowledges as a replay server does, and keeps what it read."""
 
     def __init__(self, bus: Bus) -> None:
-        self._bus, self._epoch = bus, bus.take_epoch("replay")
+        self._bus, self._holder = bus, Holder("replay", bus.take_epoch("replay"))
         self._cursors: dict[int, EntryId] = {}
         self.entries: list[Entry] = []
 
@@ -62,7 +62,7 @@ class Reader:
             self.entries.append(entry)
             self._cursors[entry.actor] = entry.id
         acks = {actor: Ack(cursor, granted_steps, final) for actor, cursor in self._cursors.items()}
-        self._bus.commit(self._epoch, acks)
+        self._bus.commit(self._holder, acks)
 
     def rows(self) -> Rows:
         return join_rows([decode_entry(entry.payload, SPEC) for entry in self.entries], SPEC)
@@ -387,7 +387,7 @@ def test_epochs_that_redis_forgot_do_not_strand_the_actor(bus: Bus) -> None:
     """The ring remembers entry 1-7 of this actor; a Redis that came back empty hands out epoch 1 again."""
     publish(bus, 3)
     actor = make_actor(bus)
-    replay = bus.take_epoch("replay")
+    replay = Holder("replay", bus.take_epoch("replay"))
     bus.commit(replay, {0: Ack(EntryId(1, 7), 400)})
     step_until_blocked(actor)
     assert bus.current_epoch("actor-0") == 2

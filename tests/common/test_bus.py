@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from common.bus import METRICS_KEPT, Ack, Bus, Entry, EntryId, MemoryBus, ReplayAddress, Version
+from common.bus import METRICS_KEPT, Ack, Bus, Entry, EntryId, Holder, MemoryBus, ReplayAddress, Version
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from common.redis_bus import RedisBus
 from deploy.redis_server import RedisServer
@@ -38,12 +38,12 @@ def test_epochs_rise_past_the_floor(bus):
 
 
 def test_entries_are_read_in_order_and_trimmed_by_commit(bus):
-    epoch = bus.take_epoch("replay")
+    holder = Holder("replay", bus.take_epoch("replay"))
     for seq in range(5):
         bus.append(3, EntryId(1, seq), b"%d" % seq)
     assert bus.actors() == [3]
     assert bus.read({3: EntryId(0, 0)}, 2) == [Entry(3, EntryId(1, 0), b"0"), Entry(3, EntryId(1, 1), b"1")]
-    bus.commit(epoch, {3: Ack(EntryId(1, 2), 77, True)})
+    bus.commit(holder, {3: Ack(EntryId(1, 2), 77, True)})
     assert [entry.id.seq for entry in bus.read({3: EntryId(0, 0)}, 10)] == [3, 4]
     assert bus.ack(3) == Ack(EntryId(1, 2), 77, True)
     assert bus.ack(4) is None
@@ -64,19 +64,21 @@ def test_an_older_epoch_is_fenced(bus):
 
 
 def test_a_replaced_replay_server_cannot_trim(bus):
-    old = bus.take_epoch("replay")
+    old = Holder("replay", bus.take_epoch("replay"))
     bus.append(0, EntryId(1, 0), b"")
     bus.take_epoch("replay")
     with pytest.raises(FencedError):
         bus.commit(old, {0: Ack(EntryId(1, 0), 0)})
     assert len(bus.read({0: EntryId(0, 0)}, 10)) == 1
+    bus.commit(Holder("replay-1", bus.take_epoch("replay-1")), {0: Ack(EntryId(1, 0), 0)})  # another shard's epochs
+    assert bus.read({0: EntryId(0, 0)}, 10) == []
 
 
 def test_a_dropped_stream_is_sent_again_from_its_hello(bus):
-    epoch = bus.take_epoch("replay")
+    holder = Holder("replay", bus.take_epoch("replay"))
     for seq in (0, 1, 3):
         bus.append(0, EntryId(1, seq), b"%d" % seq)
-    bus.drop_stream(epoch, 0)
+    bus.drop_stream(holder, 0)
     with pytest.raises(BusUnavailable, match="gone"):
         bus.append(0, EntryId(1, 4), b"4")
     for seq in (0, 2, 3):
@@ -84,7 +86,7 @@ def test_a_dropped_stream_is_sent_again_from_its_hello(bus):
     assert [entry.id.seq for entry in bus.read({0: EntryId(1, 1)}, 10)] == [2, 3]
     bus.take_epoch("replay")
     with pytest.raises(FencedError):
-        bus.drop_stream(epoch, 0)
+        bus.drop_stream(holder, 0)
 
 
 def test_weights_of_many_pieces(bus):
@@ -136,9 +138,9 @@ def test_a_full_redis_is_emptied_by_commits():
     try:
         with RedisServer(folder, maxmemory=8 << 20) as server:
             bus = RedisBus(server.url, "full")
-            epoch, seq = bus.take_epoch("replay"), fill(bus)
+            holder, seq = Holder("replay", bus.take_epoch("replay")), fill(bus)
             assert seq > 10
-            bus.commit(epoch, {0: Ack(EntryId(1, seq - 1), 5)})
+            bus.commit(holder, {0: Ack(EntryId(1, seq - 1), 5)})
             assert bus.ack(0) == Ack(EntryId(1, seq - 1), 5)
             bus.append(0, EntryId(1, seq), b"and on it goes")
             assert len(bus.read({0: EntryId(0, 0)}, 1000)) == 1
@@ -159,9 +161,10 @@ def fill(bus: Bus) -> int:
 
 
 def test_replay_address(bus):
-    assert bus.replay_address() is None
-    bus.announce_replay(ReplayAddress(2, "unix:/tmp/a b"))
-    assert bus.replay_address() == ReplayAddress(2, "unix:/tmp/a b")
+    assert bus.replay_address("replay") is None
+    bus.announce_replay(Holder("replay", 2), "unix:/tmp/a b")
+    assert bus.replay_address("replay") == ReplayAddress(2, "unix:/tmp/a b")
+    assert bus.replay_address("replay-0") is None
 
 
 def test_no_redis_there(tmp_path):

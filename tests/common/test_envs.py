@@ -84,6 +84,20 @@ def test_actions_are_stretched_and_clipped() -> None:
         assert inner.last_action.dtype == np.float64
 
 
+@pytest.mark.parametrize("bound", [0.1, 1 / 3, 1e-5, 1e5])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_outermost_actions_are_within_the_bounds(bound: float, dtype: type) -> None:
+    space = Box(-bound, bound, (2,), dtype)
+    env = make_env(odd(f"Bound{bound}{dtype.__name__}-v0", VECTOR, space))
+    inner = env.unwrapped
+    assert isinstance(inner, OddSpaces)
+    env.reset(seed=0)
+    for given in (-1.0, 1.0, np.tanh(np.float32(9.0)), np.nextafter(np.float32(1), np.float32(2))):
+        env.step(np.full(2, given, np.float32))
+        assert space.contains(inner.last_action)
+        np.testing.assert_allclose(inner.last_action, np.clip(given, -1, 1) * bound, rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("config", "says"),
     [
@@ -96,6 +110,7 @@ def test_actions_are_stretched_and_clipped() -> None:
         (EnvConfig("HalfCheetah-v5", flicker=math.nan), "a probability from 0 to 1"),
         (odd("Image-v0", Box(0, 255, (8, 8, 3), np.uint8), VECTOR), "images (8, 8, 3)"),
         (odd("Dict-v0", gym.spaces.Dict(a=VECTOR, b=gym.spaces.Discrete(3)), VECTOR), "{'b': 'Discrete'} are no Box"),
+        (odd("Pictures-v0", gym.spaces.Dict(a=VECTOR, b=Box(0, 255, (9, 8, 3), np.uint8)), VECTOR), "{'b': (9, 8, 3)}"),
         (odd("Tuple-v0", gym.spaces.Tuple([VECTOR]), VECTOR), "observations are Tuple"),
         (EnvConfig("Pendulum-v1", hide="velocities"), "--hide is for MuJoCo's bodies"),
         (EnvConfig("HalfCheetah-v5", noise=-0.1), "--noise=-0.1"),
@@ -104,6 +119,9 @@ def test_actions_are_stretched_and_clipped() -> None:
         (EnvConfig("HalfCheetah-v5", time_limit=-1), "--time-limit=-1"),
         (odd("Scalar-v0", Box(0, 1, (), np.float32), VECTOR), "have shape ()"),
         (odd("Unbounded-v0", VECTOR, Box(-np.inf, np.inf, (2,))), "action space is unbounded"),
+        (odd("Endless-v0", VECTOR, Box(-3e38, 3e38, (2,))), "action space is unbounded"),
+        (odd("Whole-v0", VECTOR, Box(0, 3, (2,), np.int64)), "actions are int64"),
+        (EnvConfig("json:Nothing-v0"), "json registers no Nothing-v0"),
         (odd("Multi-v0", VECTOR, gym.spaces.MultiDiscrete([2, 2])), "actions are MultiDiscrete"),
         (odd("Matrix-v0", VECTOR, Box(-1, 1, (2, 2))), "actions have shape (2, 2)"),
     ],
@@ -116,6 +134,26 @@ def test_refused_in_one_line(config: EnvConfig, says: str) -> None:
     assert says in message
     assert "\n" not in message
     assert message.startswith(("ENV=", "--"))
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("import nothere", "No module named 'nothere'; broken needs it; install it"),
+        ("x = (", "broken cannot be imported: SyntaxError: '(' was never closed (broken.py, line 1)"),
+        ("x = 1\nx / 0", "broken cannot be imported: ZeroDivisionError: division by zero (broken.py, line 2)"),
+        (
+            "import gymnasium\nclass Env(gymnasium.Env):\n  def __init__(self):\n    self.missing.x\n"
+            "gymnasium.register('Broken-v0', entry_point=Env)",
+            "it cannot be made: AttributeError: 'Env' object has no attribute 'missing' (broken.py, line 4)",
+        ),
+    ],
+)
+def test_a_users_broken_module_is_one_line_with_its_place(source: str, says: str, tmp_path: Path) -> None:
+    (tmp_path / "broken.py").write_text(source)
+    run = _python(tmp_path, "from common.envs import *; env_spaces(EnvConfig('broken:Broken-v0'))")
+    assert says in run.stderr.splitlines()[-1]
+    assert run.stderr.splitlines()[-1].startswith("common.errors.ConfigError: ENV='broken:Broken-v0': ")
 
 
 def test_a_users_module_in_the_working_folder_does_not_shadow_ours(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ TRAIN_FLAGS = """
     --hidden --embedding --heads --layer-norm --shortcut --normalize-observations --grounding
     --blank-flag --initial-priority
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
-    --capacity --replay-ratio --warmup-steps --priority-exponent --importance-exponent
+    --capacity --replay-shards --replay-ratio --warmup-steps --priority-exponent --importance-exponent
     --learning-rate --alpha-learning-rate --gamma --polyak --clip-norm --latent-target --target-memory --policy-q
     --scheme --policy-through-q --update-order --model-norm --n-step --state-strategy
     --curiosity --curiosity-scale --curiosity-steps --eta
@@ -37,7 +37,7 @@ OTHER_FLAGS = {
     "check-env": [*ENV_FLAGS, "--steps"],
     "stats": [],
     "actor": ["--run", "--redis-url", "--index"],
-    "replay": ["--run", "--redis-url", "--folder", "--listen", "--secret-file"],
+    "replay": ["--run", "--redis-url", "--folder", "--listen", "--shard", "--secret-file"],
     "learner": ["--run", "--redis-url", "--folder", "--device", "--secret-file"],
     "evaluator": ["--run", "--redis-url"],
 }

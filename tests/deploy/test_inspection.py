@@ -1,5 +1,6 @@
 """rmc inspect: the world model against an episode, in numbers that a slow loop gives, too."""
 
+import dataclasses
 import io
 import json
 from pathlib import Path
@@ -12,7 +13,7 @@ from safetensors.torch import save
 from common.agent import Agent
 from common.checkpoint import CheckpointFolder
 from common.envs import EnvConfig
-from deploy import cli
+from deploy import cli, inspection
 from deploy.inspection import HORIZONS, Episode, load_agent, look, play
 from deploy.presets import RunConfig, debug
 from deploy.run_folder import RunFolder, open_run
@@ -87,6 +88,20 @@ def test_the_command_writes_a_picture_and_says_it_in_numbers(
     assert "worst dimensions" in said
     assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "no" / "seen.png")]) == 2
     assert "its folder is not there" in capsys.readouterr().err
+    assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.xyz")]) == 2
+    assert "ends in .png" in capsys.readouterr().err
+
+
+def test_an_episode_that_never_ends_is_looked_at_for_a_while(
+    config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inspection, "LONGEST_EPISODE", 25)
+    scaled = dataclasses.replace(config, actor=dataclasses.replace(config.actor, reward_scale=0.5))
+    folder = make_run(tmp_path / "run", scaled)
+    agent = load_agent(folder, scaled, "latest")
+    short, plain = (play(folder, agent, run, "latest") for run in (scaled, config))
+    assert short.action.shape[1] == 25
+    torch.testing.assert_close(short.reward, 0.5 * plain.reward)  # as the world model has learnt it
 
 
 def test_a_model_without_grounding_has_nothing_to_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

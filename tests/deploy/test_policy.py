@@ -93,6 +93,8 @@ def test_export_says_what_is_wrong_in_one_line(
 ) -> None:
     assert cli.run(["export", str(run.path), "--out", str(tmp_path / "no" / "policy.onnx")]) == 2
     assert "its folder is not there" in capsys.readouterr().err
+    assert cli.run(["export", str(run.path), "--out", str(tmp_path)]) == 2
+    assert "is a folder" in capsys.readouterr().err
     assert cli.run(["export", str(run.path), "--checkpoint", "best"]) == 2
     assert "none was evaluated yet" in capsys.readouterr().err
     monkeypatch.setattr("deploy.export.NEEDED", ("no_such_package",))

@@ -109,5 +109,13 @@ def test_values_that_do_not_go_together_are_refused() -> None:
         validate(with_value(config, "actor.stride", 16))
     with pytest.raises(ConfigError, match="--total-steps"):
         validate(with_value(config, "total_steps", config.replay.warmup_steps))
+    with pytest.raises(ConfigError, match="--stride=5: an episode is one window"):
+        validate(with_value(with_value(config, "actor.stride", 5), "actor.state_strategy", "episode"))
+    with pytest.raises(ConfigError, match="--blank-flag"):
+        validate(with_value(with_value(config, "agent.blank_flag", True), "env.frame_stack", 2))
+    with pytest.raises(ConfigError, match="--policy-through-q"):
+        validate(with_value(config, "update.policy_through_q", False))
+    with pytest.raises(ConfigError, match=r"--replay-shards=2: .*--actors=1"):
+        validate(with_value(config, "replay.replay_shards", 2))
     with pytest.raises(ConfigError, match="--heads"):
         validate(with_value(config, "agent.heads", (400, 0)))

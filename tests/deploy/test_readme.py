@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from common import agent, wrappers
 from docs.generate import page
+from learner import losses, staleness, update
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -24,6 +26,28 @@ def test_its_tree_names_every_file() -> None:
             found.add(f"{folder}/{leaf[1]}")
     there = {f"{package}/{path.name}" for package in PACKAGES for path in (ROOT / package).glob("*.py")}
     assert found == {path for path in there if not path.endswith("__init__.py")}
+
+
+def test_every_equation_leads_to_its_code_and_back() -> None:
+    """What the docs' table names is there, and its docstring names the equation."""
+    modules = {"losses": losses, "agent": agent, "update": update, "wrappers": wrappers, "staleness": staleness}
+    table = (ROOT / "docs" / "algorithm.md").read_text().split("## From the paper to the code")[1].split("\n\n")[1]
+    seen = set()
+    for row in table.splitlines()[2:]:
+        equations, _, code, *_ = (cell for cell in re.split(r"(?<!\\)\|", row)[1:])
+        numbers = re.findall(r"\d+", equations) if "eq" in equations else []
+        module, said = losses, []
+        for name in re.findall(r"`([\w.]+)`", code):
+            if "." in name and name.split(".")[0] in modules:
+                module, name = modules[name.split(".")[0]], name.split(".")[1]
+            if numbers:
+                said.append(getattr(module, name).__doc__)
+            elif "/" not in name and "." not in name:
+                assert hasattr(module, name), name
+        assert all(any(f"Eq. {number}:" in text for text in said) for number in numbers), row
+        assert all(any(f"Eq. {number}:" in text for number in numbers) for text in said), row
+        seen.update(map(int, numbers))
+    assert seen == {7, 8, 9, 10, 11, 12}
 
 
 def test_its_make_targets_exist() -> None:

@@ -47,6 +47,10 @@ def test_what_stands_in_the_way_is_one_line(tmp_path: Path, capsys: pytest.Captu
     words = ["evaluate", folder, "--episodes", "1", "--video"]
     assert cli.run([*words, str(tmp_path / "no" / "episode.mp4")]) == 2
     assert "its folder is not there" in capsys.readouterr().err
+    assert cli.run([*words, str(tmp_path)]) == 2
+    assert "is a folder" in capsys.readouterr().err
+    assert cli.run([*words, str(tmp_path / "episode.txt")]) == 2
+    assert "ends in .mp4" in capsys.readouterr().err
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
     assert cli.run([*words, str(tmp_path / "episode.mp4")]) == 2
     said = capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from learner.batch import importance_weights
 from tests.learner.rows import SPEC, random_rows, to_batch
 
 
@@ -42,3 +43,13 @@ def test_row_is_a_multiple_of_a_cache_line_and_the_fingerprint_follows_the_sizes
     assert SPEC.dtype.itemsize % 64 == 0
     others = [WindowSpec(4, 2, 8, 4, 5), WindowSpec(3, 2, 8, 3, 6)]
     assert SPEC.fingerprint not in {other.fingerprint for other in others}
+
+
+def test_importance_weights_against_the_formula():
+    values = np.random.default_rng(0).exponential(size=20)
+    mass, windows = 3.0 * values.sum(), 60
+    expected = np.array([(windows * value / mass) ** -0.4 for value in values])
+    found = importance_weights(values, mass, windows, 0.4)
+    np.testing.assert_allclose(found, expected / expected.max(), rtol=1e-5)
+    assert found.dtype == np.float32
+    assert (importance_weights(values, mass, windows, 0.0) == 1).all()

@@ -46,7 +46,7 @@ def until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
 
 
 def client_of(bus: RedisBus) -> ReplayClient:
-    address = bus.replay_address()
+    address = bus.replay_address("replay")
     assert address is not None
     return ReplayClient(lambda: address.address, SECRET, SPEC, 16)
 
@@ -55,7 +55,7 @@ def test_windows_in_batches_out_and_metrics(redis_url: str, run_name: str, tmp_p
     bus = RedisBus(redis_url, run_name)
     running = Running(tmp_path, RedisBus(redis_url, run_name))
     try:
-        until(lambda: bus.replay_address() is not None)
+        until(lambda: bus.replay_address("replay") is not None)
         sender, client = Sender(bus), client_of(bus)
         assert client.sample(16).draw is Draw.WAIT
         for _ in range(10):
@@ -87,7 +87,7 @@ def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_
     bus = RedisBus(redis_server.url, "run")
     running = Running(tmp_path, RedisBus(redis_server.url, "run"))
     try:
-        until(lambda: bus.replay_address() is not None)
+        until(lambda: bus.replay_address("replay") is not None)
         sender, client = Sender(bus), client_of(bus)
         sender.send(40)
         until(lambda: client.sample(16).draw is Draw.BATCH)
@@ -102,7 +102,7 @@ def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_
         assert time.monotonic() - started < 10.0
         redis_server.start()  # empty: it keeps no files
         until(lambda: bus.ack(0) is not None)  # acks and address are said again
-        until(lambda: bus.replay_address() is not None)
+        until(lambda: bus.replay_address("replay") is not None)
         sender.greet()
         sender.send(3)
         until(lambda: running.server.stats()["windows"] == 43)

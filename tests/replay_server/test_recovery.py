@@ -121,7 +121,7 @@ def finish(bus: RedisBus, url: str, run: str, folder: Path, senders: list[Sender
     child = start(url, run, folder)
     deadline = time.monotonic() + 20.0
     try:
-        while acknowledged(bus) != sent or getattr(bus.replay_address(), "epoch", 0) != 21:
+        while acknowledged(bus) != sent or getattr(bus.replay_address("replay"), "epoch", 0) != 21:
             assert time.monotonic() < deadline
             time.sleep(0.01)
         child.terminate()

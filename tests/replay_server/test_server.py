@@ -11,7 +11,7 @@ from common.errors import BusUnavailable, ConfigError, FencedError
 from common.redis_bus import RedisBus
 from common.replay import Draw
 from common.wire import encode_windows
-from replay_server.server import ReplayConfig, ReplayServer, importance_weights, observation_sums
+from replay_server.server import ReplayConfig, ReplayServer, observation_sums
 from tests.learner.rows import observation_valid
 from tests.replay_server.support import SPEC, Sender, make_rows
 
@@ -113,7 +113,7 @@ def test_new_windows_enter_with_their_own_or_the_largest_priority(make: Make, bu
     assert server._store.priorities[:5].tolist() == [0.5, 6.0, 6.0, 2.0, 6.0]
 
 
-def test_importance_weights_against_the_formula(make: Make, bus: MemoryBus) -> None:
+def test_values_are_what_windows_are_drawn_by(make: Make, bus: MemoryBus) -> None:
     server, sender = make(), Sender(bus)
     sender.send(20)
     drain(server)
@@ -121,12 +121,10 @@ def test_importance_weights_against_the_formula(make: Make, bus: MemoryBus) -> N
     server.update_priorities(np.arange(20), priorities)
     sample = server.sample(64)
     assert sample.rows is not None
-    assert sample.importance is not None
     scaled = priorities.astype(float) ** 0.6
-    probability = scaled / scaled.sum()
-    expected = np.array([(20 * probability[serial]) ** -0.4 for serial in sample.rows["serial"]])
-    np.testing.assert_allclose(sample.importance, expected / expected.max(), rtol=1e-5)
-    assert sample.importance.dtype == np.float32
+    np.testing.assert_allclose(sample.values, scaled[sample.rows["serial"]])
+    assert sample.mass == pytest.approx(scaled.sum())
+    assert (sample.windows, sample.drawn_steps) == (20, 64 * SPEC.train)
 
 
 def test_exponent_zero_is_uniform(make: Make, bus: MemoryBus) -> None:
@@ -139,11 +137,9 @@ def test_exponent_zero_is_uniform(make: Make, bus: MemoryBus) -> None:
     for _ in range(40):
         sample = server.sample(50)
         assert sample.rows is not None
-        assert sample.importance is not None
-        assert (sample.importance == 1).all()
+        assert (sample.values == 1).all()
         counts += np.bincount(sample.rows["serial"], minlength=50)
     assert (counts == 40).all()  # 50 strata over 50 equal windows
-    assert (importance_weights(np.array([1.0, 9.0]), 10.0, 2, 0.0) == 1).all()
 
 
 def test_statistics_against_a_loop_and_padding_changes_nothing() -> None:
@@ -195,8 +191,8 @@ def test_draws_follow_from_seed_number_and_ring_alone(make: Make, tmp_path: Path
             for _ in range(3):
                 sample = server.sample(16)
                 assert sample.rows is not None
-                assert sample.importance is not None
-                drawn.append(sample.rows.tobytes() + sample.importance.tobytes())
+                assert sample.values is not None
+                drawn.append(sample.rows.tobytes() + sample.values.tobytes())
                 server.update_priorities(sample.rows["serial"].copy(), sample.rows["reward"][:, 0] + 1)
             if number % 2:
                 server.checkpoint()
@@ -414,7 +410,7 @@ def test_lost_redis_data_neither_doubles_nor_goes_back(make: Make, bus: MemoryBu
     close(server)
     empty = MemoryBus()
     server = make(on=empty)
-    assert server.epoch == 2  # above the one in the ring, though this bus has never seen a replay server
+    assert server.holder.epoch == 2  # above the one in the ring, though this bus has never seen a replay server
     sender.bus, sender.seq = empty, 0
     sender.greet()
     sender.send_rows(make_rows(4))  # seq 1 again: the ack was lost with the data, so the actor sends it again
@@ -459,7 +455,7 @@ def test_policy_lag_is_measured(make: Make, bus: MemoryBus) -> None:
 @pytest.mark.parametrize(
     ("option", "value"),
     [("capacity", 0), ("replay_ratio", 0.0), ("replay_ratio", float("nan")), ("warmup_steps", -1),
-     ("priority_exponent", -0.1), ("importance_exponent", 1.1)],
+     ("priority_exponent", -0.1)],
 )  # fmt: skip
 def test_nonsense_options_are_named(option: str, value: float) -> None:
     with pytest.raises(ConfigError, match=option.replace("_", "-")):

@@ -23,7 +23,7 @@ from tests.replay_server.support import SPEC, Sender, make_rows
 
 SECRET = b"a secret of the run"
 MAX_BATCH = 4096
-BIG = MAX_BATCH * (SPEC.dtype.itemsize + 4)
+BIG = MAX_BATCH * (SPEC.dtype.itemsize + 8)
 
 
 class Served:
@@ -90,14 +90,14 @@ def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serve]:
 
 
 def draw(connection: Connection, batch_size: int = 32) -> tuple[Kind, np.ndarray, np.ndarray]:
-    connection.send(Kind.SAMPLE, {"batch_size": batch_size})
+    connection.send(Kind.SAMPLE, {"batch_size": batch_size, "elsewhere": 0})
     return receive(connection, batch_size)
 
 
 def receive(connection: Connection, batch_size: int) -> tuple[Kind, np.ndarray, np.ndarray]:
     header, _, body = connection.receive(memoryview(bytearray(BIG)))
     split = batch_size * SPEC.dtype.itemsize if header.kind is Kind.BATCH else 0
-    return header.kind, np.frombuffer(body[:split], SPEC.dtype), np.frombuffer(body[split:], np.float32)
+    return header.kind, np.frombuffer(body[:split], SPEC.dtype), np.frombuffer(body[split:], np.float64)
 
 
 def works(served: Served) -> None:
@@ -116,14 +116,14 @@ def test_pipelined_draws_are_what_a_server_in_the_same_thread_gives(serve: Serve
     served, twin = serve(address=address), serve()
     connection = served.connect()
     for _ in range(5):
-        connection.send(Kind.SAMPLE, {"batch_size": 64})
+        connection.send(Kind.SAMPLE, {"batch_size": 64, "elsewhere": 0})
     for _ in range(5):
-        kind, rows, importance = receive(connection, 64)
+        kind, rows, values = receive(connection, 64)
         sample = twin.replay.sample(64)
         assert kind is Kind.BATCH
         assert sample.rows is not None
         assert rows.tobytes() == sample.rows.tobytes()
-        assert np.array_equal(importance, sample.importance)
+        assert np.array_equal(values, sample.values)
     connection.close()
 
 
@@ -245,6 +245,8 @@ def test_a_stranger_who_talks_nonsense(serve: Serve, sent: bytes, reason: str) -
         (HEADER.pack(MAGIC, VERSION, Kind.PRIORITIES, 0, 5, 0, 12 * MAX_BATCH + 1), "too-large"),
         (encode_frame(Kind.SAMPLE, {"batch_size": MAX_BATCH + 1}), "batch-size"),
         (encode_frame(Kind.SAMPLE, {"batch_size": True}), "batch-size"),
+        (encode_frame(Kind.SAMPLE, {"batch_size": 8}), "elsewhere"),
+        (encode_frame(Kind.SAMPLE, {"batch_size": 8, "elsewhere": -1}), "elsewhere"),
         (encode_frame(Kind.SAMPLE, {}), "batch-size"),
         (encode_frame(Kind.PRIORITIES, {"count": 3}, (b"1234",)) + b"1234", "length"),
         (encode_frame(Kind.PRIORITIES, {"count": -1}), "length"),
@@ -279,7 +281,7 @@ def test_a_client_that_does_not_read_keeps_nobody_waiting_and_gets_its_own_batch
     silent, busy = served.connect(), served.connect()
     silent._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     for _ in range(30):  # more than the kernel's buffers take
-        silent.send(Kind.SAMPLE, {"batch_size": MAX_BATCH})
+        silent.send(Kind.SAMPLE, {"batch_size": MAX_BATCH, "elsewhere": 0})
     for _ in range(20):
         assert draw(busy, MAX_BATCH)[0] is Kind.BATCH  # each takes the buffer that a batch unsent may lie in
     for _ in range(30):
@@ -357,7 +359,7 @@ def test_a_taken_port_an_old_file_and_an_empty_secret(serve: Serve, tmp_path: Pa
 def test_bytes_one_by_one(serve: Serve) -> None:
     served = serve()
     connection = served.connect()
-    for byte in encode_frame(Kind.SAMPLE, {"batch_size": 8}):
+    for byte in encode_frame(Kind.SAMPLE, {"batch_size": 8, "elsewhere": 0}):
         connection._socket.sendall(struct.pack("B", byte))
         time.sleep(0.001)
     assert receive(connection, 8)[0] is Kind.BATCH

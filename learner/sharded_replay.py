@@ -1,0 +1,131 @@
+"""Several replay servers as one: each gives its part of a batch, in proportion to the mass of its priorities.
+
+Shapes: B windows in a batch, S shards. A window's chance is its value over the mass of all shards, as if one server
+held them all: a shard's part of a batch is how many of B equal strata of the whole mass fall to it, and within it
+the shard draws by its own values. Serials become ``serial * S + shard`` here, so that priorities find their way back.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from common.replay import Draw, ObservationStatistics, Replay, Sample
+from common.window import Rows, WindowSpec
+
+NOTHING_YET = Sample(Draw.WAIT, None, None, 0.0, 0, 0, 0)
+
+
+class _Stock:
+    """Windows that a shard has drawn and that are in no batch yet."""
+
+    def __init__(self, replay: Replay, spec: WindowSpec, chunk: int) -> None:
+        self.replay, self.last = replay, NOTHING_YET
+        self._chunk = chunk  # windows of one draw
+        self._rows: Rows = np.empty(0, spec.dtype)
+        self._values = np.empty(0)
+
+    def fill(self, count: int, elsewhere: int) -> Draw:
+        """Draw until there are ``count`` windows; else why there are not."""
+        while len(self._rows) < count:
+            self.last = self.replay.sample(self._chunk, elsewhere)
+            if self.last.rows is None or self.last.values is None:
+                return self.last.draw
+            self._rows = np.concatenate([self._rows, self.last.rows])
+            self._values = np.concatenate([self._values, self.last.values])
+        return Draw.BATCH
+
+    def take(self, rows: Rows, values: NDArray[np.float64]) -> None:
+        """Fill both with the oldest."""
+        count = len(rows)
+        rows[:], values[:] = self._rows[:count], self._values[:count]
+        self._rows, self._values = self._rows[count:], self._values[count:]
+
+
+class ShardedReplay:
+    """The Replay protocol over S of them. A shard that holds back holds the batch back."""
+
+    def __init__(
+        self, shards: Sequence[Replay], spec: WindowSpec, batch_size: int, seed: int, pinned: bool = False
+    ) -> None:
+        """The shards are asked for B // S windows at a time."""
+        self._batch_size, self._random = batch_size, np.random.default_rng(seed)
+        self._stocks = [_Stock(shard, spec, max(1, batch_size // len(shards))) for shard in shards]
+        size = (batch_size, spec.dtype.itemsize)
+        tensors = [torch.empty(size, dtype=torch.uint8, pin_memory=pinned) for _ in range(2)]
+        self._buffers: list[Rows] = [tensor.numpy().view(spec.dtype).reshape(-1) for tensor in tensors]
+        self._parts: NDArray[np.int64] | None = None  # (S,) windows of each in the batch that is being gathered
+
+    def sample(self, batch_size: int, elsewhere: int = 0) -> Sample:
+        """A batch once every shard has given its part. ``rows`` stay valid until the next draw but one.
+
+        Shards finish one after the other, within a batch or the last steps of an actor; the rest fill the batch then.
+        """
+        assert batch_size == self._batch_size, (batch_size, self._batch_size)
+        while (live := self._live()).any():
+            parts = live.astype(np.int64) if self._parts is None else self._parts  # one of each: masses are known then
+            draws = [
+                stock.fill(part, elsewhere + self._drawn_outside(stock))
+                for stock, part in zip(self._stocks, parts.tolist(), strict=True)
+            ]
+            if Draw.FINISHED in draws:
+                self._parts = None
+            elif Draw.WAIT in draws:
+                return self._sample(Draw.WAIT)
+            elif self._parts is None:
+                self._parts = self._apportion(live)
+            else:
+                return self._gathered()
+        return self._sample(Draw.FINISHED)
+
+    def _live(self) -> NDArray[np.bool_]:
+        """(S,) which shards have not finished."""
+        return np.array([stock.last.draw is not Draw.FINISHED for stock in self._stocks])
+
+    def _drawn_outside(self, stock: _Stock) -> int:
+        """Trained steps drawn from the other shards."""
+        return sum(other.last.drawn_steps for other in self._stocks if other is not stock)
+
+    def _apportion(self, live: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """(S,) how many of B strata of the whole mass fall to each shard."""
+        ends = np.cumsum([stock.last.mass for stock in self._stocks] * live)
+        strata = (np.arange(self._batch_size) + self._random.random(self._batch_size)) / self._batch_size
+        owners = np.minimum(np.searchsorted(ends, strata * ends[-1], side="right"), len(ends) - 1)
+        return np.bincount(owners, minlength=len(ends))
+
+    def _gathered(self) -> Sample:
+        assert self._parts is not None
+        self._buffers.reverse()
+        rows, values, start = self._buffers[0], np.empty(self._batch_size), 0
+        for shard, (stock, count) in enumerate(zip(self._stocks, self._parts.tolist(), strict=True)):
+            part = slice(start, start + count)
+            stock.take(rows[part], values[part])
+            rows["serial"][part] = rows["serial"][part] * len(self._stocks) + shard
+            start += count
+        self._parts = None
+        return self._sample(Draw.BATCH, rows, values)
+
+    def _sample(self, draw: Draw, rows: Rows | None = None, values: NDArray[np.float64] | None = None) -> Sample:
+        last = [stock.last for stock in self._stocks]
+        mass, windows, env_steps, drawn_steps = (
+            sum(getattr(sample, name) for sample in last) for name in ("mass", "windows", "env_steps", "drawn_steps")
+        )
+        return Sample(draw, rows, values, mass, windows, env_steps, drawn_steps)
+
+    def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
+        """Give priorities back to the shards that the windows came from."""
+        for shard, stock in enumerate(self._stocks):
+            own = serials % len(self._stocks) == shard
+            stock.replay.update_priorities(serials[own] // len(self._stocks), priorities[own])
+
+    def statistics(self) -> ObservationStatistics:
+        """The sums over all shards."""
+        found = [stock.replay.statistics() for stock in self._stocks]
+        totals, squares = (np.sum([getattr(x, name) for x in found], axis=0) for name in ("total", "total_square"))
+        return ObservationStatistics(sum(x.count for x in found), totals, squares)
+
+    def episode(self, serial: int) -> Rows | None:
+        """The windows of one episode, which are all in one shard."""
+        shards = len(self._stocks)
+        return self._stocks[serial % shards].replay.episode(serial // shards)
