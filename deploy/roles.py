@@ -160,8 +160,9 @@ def run_learner(place: Place, folder: Path, device: str) -> None:
     torch.set_num_threads(config.learner.threads or max(1, cores() - 1))
     check_device(device)
 
-    clients = replay_clients(config, bus, secret, pinned=device.startswith("cuda"))
-    replay = clients[0] if len(clients) == 1 else ShardedReplay(clients, spec, config.learner.batch_size, config.seed)
+    pinned, batch = device.startswith("cuda"), config.learner.batch_size
+    clients = replay_clients(config, bus, secret, pinned)
+    replay = clients[0] if len(clients) == 1 else ShardedReplay(clients, spec, batch, config.seed, pinned)
     checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
     learner = Learner(spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device)
     run_role(learner, bus, process.stop, lambda: learner.finished)

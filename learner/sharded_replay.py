@@ -2,7 +2,8 @@
 
 Shapes: B windows in a batch, S shards. A window's chance is its value over the mass of all shards, as if one server
 held them all: a shard's part of a batch is how many of B equal strata of the whole mass fall to it, and within it
-the shard draws by its own values. Serials become ``serial * S + shard`` here, so that priorities find their way back.
+the shard draws by its own values. A mass is that of a shard's newest draw. Serials become ``serial * S + shard`` here,
+so that priorities find their way back.
 """
 
 from collections.abc import Sequence

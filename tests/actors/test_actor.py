@@ -372,7 +372,7 @@ def test_a_replaced_actor_ends(bus: Bus) -> None:
 @pytest.mark.parametrize(
     ("config", "option"),
     [
-        (ActorConfig(stride=0), "--stride"),
+        (ActorConfig(stride=-1), "--stride"),
         (ActorConfig(stride=7), "--stride"),
         (ActorConfig(stride=6, envs_per_actor=0), "--envs-per-actor"),
         (ActorConfig(stride=6, chunk_windows=0), "--chunk-windows"),

@@ -56,7 +56,7 @@ def test_a_sound_environment(capsys):
 def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
     status, text = said("Odd-v0", capsys, "--steps", "300")
     assert status == 0
-    for words in ("observations [1] never changed", "observations reach", "--reward-scale 0.001", "--time-limit"):
+    for words in ("observations 1 never changed", "observations reach", "--reward-scale 0.001", "--time-limit"):
         assert words in text
     assert "the same seed and actions gave other observations" in text
     assert "--curiosity" in said("Unrewarded-v0", capsys, "--steps", "100")[1]

@@ -169,8 +169,9 @@ def test_a_whole_run_with_two_shards(tmp_path: Path) -> None:
     with Training(folder, *options) as training:
         assert training.finish(170) == 0, training.text() + training.logs()
     result = json.loads((folder / "result.json").read_text())
-    assert result["env_steps"] == 1500
-    assert result["replay_ratio"] == pytest.approx(32.0, rel=0.05)
+    assert 1500 <= result["env_steps"] < 1500 + 3 * 2  # an actor passes its grant by less than its environments
+    slack = 2 * 15 * 2 * 3  # two windows of each of two environments of three actors, which a learner may run ahead
+    assert -1.0 <= result["replay_ratio"] - 32.0 <= 32.0 * slack / (1500 - 500) + 1.0
     assert result["restarts"] == 0
     assert (folder / "replay-0" / "ring").exists()
     assert (folder / "replay-1" / "ring").exists()
