@@ -4,6 +4,7 @@ import logging
 import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Protocol
 
 from common.bus import Bus
@@ -67,12 +68,16 @@ class _Pulse:
                     return True
             if now >= self._next_metrics:
                 self._next_metrics = now + METRICS_PERIOD
-                self._bus.emit(self._role.name, {"time": time.time(), **self._role.metrics(), **self._clock.shares()})
+                self._bus.emit(self._role.name, self.record())
         except (BusUnavailable, BusFull) as error:
             log.warning("%s: waiting for Redis: %s", self._role.name, error)
             self._clock.wait("redis")
             self._next_stop = self._next_metrics = time.monotonic() + RECONNECT_SLEEP
         return False
+
+    def record(self) -> dict[str, Any]:
+        """What the role has to say now."""
+        return {"time": time.time(), **self._role.metrics(), **self._clock.shares()}
 
 
 def run_role(
@@ -101,5 +106,8 @@ def run_role(
                 log.warning("%s: waiting for Redis: %s", role.name, error)
                 time.sleep(RECONNECT_SLEEP)
                 clock.wait("redis")
+        last = pulse.record()
     finally:
         role.close()
+    with suppress(BusUnavailable, BusFull):  # said last, so that a Redis that hangs delays nothing
+        bus.emit(role.name, last)

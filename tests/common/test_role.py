@@ -67,3 +67,11 @@ def test_says_its_metrics_and_hears_the_stop():
     bus.clear_stop()
     run_role(role, bus, stop, lambda: role.taken >= 5)
     assert bus.stats()["counting"].keys() >= {"time", "taken", "busy_share", "waiting_share", "waiting_for"}
+
+
+def test_the_last_state_is_said_after_closing():
+    stop, bus = StopSignal(), MemoryBus()
+    role = Counting(stop, 7)
+    run_role(role, bus, stop)
+    assert role.closed
+    assert bus.stats()["counting"]["taken"] == 7
