@@ -54,7 +54,7 @@ class ActorConfig:
     """Most bytes kept to be sent again; the actor waits when they are reached."""
 
 
-class Rates(Protocol):
+class Rater(Protocol):
     """Gives windows their initial priority."""
 
     def load(self, blob: bytes) -> None:
@@ -88,16 +88,16 @@ class Actor:
         config: ActorConfig,
         bus: Bus,
         clock: Callable[[], float] = time.monotonic,
-        rates: Rates | None = None,
+        rater: Rater | None = None,
     ) -> None:
         """``clock`` times polls and the chunk's timer; a lockstep run passes one that counts calls.
 
-        Without ``rates`` windows enter the replay with the largest priority seen.
+        Without a ``rater`` windows enter the replay with the largest priority seen.
         """
         _check(config, spec)
         self.name = f"actor-{index}"
         self._index, self._seed, self._spec, self._config = index, seed, spec, config
-        self._bus, self._clock, self._rates = bus, clock, rates
+        self._bus, self._clock, self._rater = bus, clock, rater
         n = config.envs_per_actor
         self._make_env, self._envs = make_env, [make_env() for _ in range(n)]
         self._faults: dict[int, Exception] = {}  # of this step, by environment
@@ -212,8 +212,8 @@ class Actor:
             if found is not None:
                 self._version, blob = found
                 self._runner.load(blob)
-                if self._rates is not None:
-                    self._rates.load(blob)
+                if self._rater is not None:
+                    self._rater.load(blob)
 
     def _poll_ack(self) -> None:
         ack, now = self._bus.ack(self._index), self._clock()
@@ -340,9 +340,9 @@ class Actor:
     def _flush(self) -> None:
         if self._builder.count:
             rows = self._builder.take()
-            if self._rates is not None:
+            if self._rater is not None:
                 learnt = rows["weights_update"] > 0  # what the first weights think of a window says nothing
-                rows["initial_priority"] = np.where(learnt, self._rates(rows), 0.0)
+                rows["initial_priority"] = np.where(learnt, self._rater(rows), 0.0)
             self._outbox.put(rows)
         self._send()
 

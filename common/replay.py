@@ -62,6 +62,9 @@ class Sample:
     drawn_steps: int  # trained steps drawn so far
 
 
+NOTHING_YET = Sample(Draw.WAIT, None, None, 0.0, 0, 0, 0)  # of a server that was not heard yet
+
+
 @dataclass(frozen=True)
 class ObservationStatistics:
     """Sums over every real, non-blank observation inserted once; ``total`` and ``total_square`` (O,) float64."""

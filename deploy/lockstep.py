@@ -53,7 +53,7 @@ class Lockstep:
                 config.actor,
                 self.bus,
                 clock=lambda: float(next(ticks)),
-                rates=initial_priority(config, index),
+                rater=initial_priority(config, index),
             )
             for index in range(config.actors)
         ]

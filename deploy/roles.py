@@ -110,8 +110,8 @@ def run_actor(place: Place, index: int) -> None:
     if not 0 <= index < config.actors:
         raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
     torch.set_num_threads(1)
-    spec, rates = config.window_spec(), initial_priority(config, index)
-    actor = Actor(index, config.seed, process.make_env, spec, config.agent, config.actor, process.bus, rates=rates)
+    spec, rater = config.window_spec(), initial_priority(config, index)
+    actor = Actor(index, config.seed, process.make_env, spec, config.agent, config.actor, process.bus, rater=rater)
     watchdog = Watchdog(config.env.env_timeout)
     run_role(actor, process.bus, process.stop, beat=watchdog.beat)
     watchdog.close()

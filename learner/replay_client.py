@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from common.errors import AuthenticationError, MessageError, RmcError
-from common.replay import EPISODE_BYTES, Draw, ObservationStatistics, Sample
+from common.replay import EPISODE_BYTES, NOTHING_YET, Draw, ObservationStatistics, Sample
 from common.window import Rows, WindowSpec
 from common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame, proof
 
@@ -130,7 +130,7 @@ class ReplayClient:
         self._buffers = [tensor.numpy().data for tensor in tensors]
         self._answer = memoryview(bytearray(max(EPISODE_BYTES, spec.dtype.itemsize, 2 * 8 * spec.obs_dim)))
         self._turn = self._in_flight = 0
-        self._last = Sample(Draw.WAIT, None, None, 0.0, 0, 0, 0)
+        self._last = NOTHING_YET
         self._batches: Connection | None = None
         self._control: Connection | None = None
         self._is_away = False  # said in the log already

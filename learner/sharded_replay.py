@@ -12,10 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from common.replay import Draw, ObservationStatistics, Replay, Sample
+from common.replay import NOTHING_YET, Draw, ObservationStatistics, Replay, Sample
 from common.window import Rows, WindowSpec
-
-NOTHING_YET = Sample(Draw.WAIT, None, None, 0.0, 0, 0, 0)
 
 
 class _Stock:

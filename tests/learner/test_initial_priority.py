@@ -24,12 +24,12 @@ def test_it_is_the_learners_own_priority(n_step: int, shortcut: bool) -> None:
     with torch.no_grad():
         agent.log_alpha.fill_(-1.0)
     update = UpdateConfig(n_step=n_step, gamma=0.9, eta=0.6)
-    rates = InitialPriority(SPEC, config, update, seed=3)
-    rates.load(safetensors.torch.save(agent.broadcast_weights()))
+    rater = InitialPriority(SPEC, config, update, seed=3)
+    rater.load(safetensors.torch.save(agent.broadcast_weights()))
     rows = random_rows(6)
     learner = make_update(agent, SPEC.burn_in, update, seed=3)
     expected = learner.forward(to_batch(rows), torch.zeros(()))[1].priorities
-    np.testing.assert_allclose(rates(rows), expected, rtol=1e-5)
+    np.testing.assert_allclose(rater(rows), expected, rtol=1e-5)
 
 
 def test_critics_are_broadcast_only_where_they_are_needed() -> None:
