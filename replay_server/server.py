@@ -226,7 +226,7 @@ class ReplayServer:
         progress.evicted_priorities += int((~present).sum())
         self._refused_priorities += int((present & ~usable).sum())
         kept = np.maximum(priorities[present & usable], PRIORITY_FLOOR, dtype=np.float32)
-        self._store.set_priorities(serials[present & usable] % self.config.capacity, kept)
+        self._store.set_priorities(serials[present & usable] % self._store.ring.capacity, kept)
         progress.max_priority = max(progress.max_priority, float(kept.max(initial=0.0)))
 
     def statistics(self) -> ObservationStatistics:
@@ -252,7 +252,7 @@ class ReplayServer:
         return {
             "env_steps": progress.env_steps,
             "windows": progress.next_serial,
-            "ring_fill": progress.windows / self.config.capacity,
+            "ring_fill": progress.windows / self._store.ring.capacity,
             "draws": progress.draws,
             "drawn_steps": progress.drawn_steps,
             "replay_ratio": limiter.ratio(progress.env_steps, self._drawn) * self._share,

@@ -19,6 +19,7 @@ from tests.replay_server.support import SPEC, Sender
 ACTORS, BATCH = 4, 32
 WINDOWS = [40, 10, 25, 5]  # of each actor: shards are not equal
 FREE = ReplayConfig(capacity=400, replay_ratio=1e9, warmup_steps=0)
+FREE_AND_SMALL = ReplayConfig(capacity=40, replay_ratio=1e9, warmup_steps=0)
 
 
 class Whole:
@@ -122,6 +123,26 @@ def test_an_episode_is_found_in_its_shard(wholes: list[Whole]) -> None:
         episode = whole.replay.episode(int(row["serial"]))
         assert episode is not None
         assert [name(window) for window in episode] == [name(row)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_priorities_find_their_windows_in_rings_that_wrap(count: int, tmp_path: Path) -> None:
+    whole = Whole(tmp_path, count, FREE_AND_SMALL)
+    for _ in range(7):
+        whole.send([3, 3, 3, 3])
+    for server in whole.servers:
+        assert 0.9 <= server.stats()["ring_fill"] <= 1.0
+    for _ in range(60):
+        sample = whole.replay.sample(BATCH)
+        assert sample.rows is not None
+        found = np.array([priority(*name(row)) for row in sample.rows], np.float32)
+        whole.replay.update_priorities(sample.rows["serial"].copy(), found)
+    assert sample.rows is not None
+    assert sample.values is not None
+    truth = np.array([priority(*name(row)) for row in sample.rows]) ** FREE_AND_SMALL.priority_exponent
+    np.testing.assert_allclose(sample.values, truth, rtol=1e-5)
+    for server in whole.servers:
+        server.close()
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])
