@@ -9,6 +9,7 @@ Every Redis key, R = ``rmc:{run}``:
 | R:actors                | set    | actors   | ids of the actors that said hello                        |
 | R:windows:ACTOR         | stream | actor    | entries ``epoch-seq``, field ``p`` = a wire entry        |
 | R:acks                  | hash   | replay   | ACTOR -> ``epoch seq granted_steps final``               |
+| R:progress              | hash   | replay   | ROLE of a shard -> its newest commit's counters          |
 | R:replay                | hash   | replay   | ROLE of a shard -> ``epoch address`` of its socket       |
 | R:weights               | string | learner  | ``epoch update pieces crc32`` of the newest weights      |
 | R:weights:EPOCH:UPDATE:I| string | learner  | piece I (256 KiB) of a policy, safetensors               |
@@ -109,8 +110,17 @@ class Bus(Protocol):
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
         """Up to ``count`` entries of each actor named in ``after``, past the id given, in order."""
 
-    def commit(self, holder: Holder, acks: Mapping[int, Ack]) -> None:
-        """Publish acks and trim what they cover, unless a newer replay has come. Raises FencedError."""
+    def commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
+        """Publish acks and trim what they cover, unless a newer replay has come. Raises FencedError.
+
+        ``progress``, where there is any, is kept for a replay server that has to begin with an empty ring.
+        """
+
+    def progress(self, role: str) -> bytes | None:
+        """What that replay server last committed, as it said then."""
+
+    def set_progress(self, role: str, progress: bytes) -> None:
+        """Say it in its place, where Redis has nothing."""
 
     def drop_stream(self, holder: Holder, actor: int) -> None:
         """Make an actor send everything again from its hello on, unless a newer replay has come. Raises FencedError."""
@@ -165,6 +175,7 @@ class MemoryBus:
         self._last_ids: dict[int, EntryId] = {}
         self._acks: dict[int, Ack] = {}
         self._replay: dict[str, ReplayAddress] = {}
+        self._progress: dict[str, bytes] = {}
         self._weights: dict[bool, tuple[Version, bytes]] = {}
         self._records: list[dict[str, Any]] = []
         self._forgotten = 0  # records that made room
@@ -206,14 +217,22 @@ class MemoryBus:
             found += [Entry(actor, key, stream[key]) for key in stream if key > cursor][:count]
         return found
 
-    def commit(self, holder: Holder, acks: Mapping[int, Ack]) -> None:
+    def commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
         self._check_replay(holder)
+        if progress:
+            self._progress[holder.role] = progress
         self._epochs[holder.role] = holder.epoch
         for actor, ack in acks.items():
             self._acks[actor] = ack
             stream = self._streams.get(actor, {})
             for key in [key for key in stream if key <= ack.id]:
                 del stream[key]
+
+    def progress(self, role: str) -> bytes | None:
+        return self._progress.get(role)
+
+    def set_progress(self, role: str, progress: bytes) -> None:
+        self._progress.setdefault(role, progress)
 
     def _check_replay(self, holder: Holder) -> None:
         newest = self.current_epoch(holder.role)

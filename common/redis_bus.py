@@ -15,6 +15,11 @@ from common.errors import BusFull, BusUnavailable, ConfigError, FencedError, Mes
 
 DEAD_LETTERS_KEPT = 1_000
 DEAD_LETTER_BYTES = 1_024
+TRIM_SCRIPT = """
+if tonumber(redis.call('GET', KEYS[1]) or '0') > tonumber(ARGV[1]) then return -1 end
+for i = 2, #KEYS do redis.call('XTRIM', KEYS[i], 'MINID', ARGV[i]) end
+return 0
+"""
 T = TypeVar("T")
 
 
@@ -119,16 +124,23 @@ class RedisBus:
             for raw_id, fields in entries
         ]
 
-    def commit(self, holder: Holder, acks: Mapping[int, Ack]) -> None:
+    def commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
         if not acks:
             return
         try:
-            self._commit(holder, acks, publish=True)
+            self._commit(holder, acks, progress)
         except BusFull:  # a full Redis has no room for the acks either, and only trimming makes some
-            self._commit(holder, acks, publish=False)
-            self._commit(holder, acks, publish=True)
+            self._trim(holder, acks)
+            self._commit(holder, acks, progress)
 
-    def _commit(self, holder: Holder, acks: Mapping[int, Ack], publish: bool) -> None:
+    def _trim(self, holder: Holder, acks: Mapping[int, Ack]) -> None:
+        """Trim alone, in a script: a full Redis refuses every transaction."""
+        keys = [self._key("epoch", holder.role), *(self._key("windows", actor) for actor in acks)]
+        words = [str(holder.epoch), *(f"{ack.id.epoch}-{ack.id.seq + 1}" for ack in acks.values())]
+        if self._call(lambda: self._redis.eval(TRIM_SCRIPT, len(keys), *keys, *words)) < 0:
+            raise FencedError(f"{holder.role} epoch {holder.epoch} was replaced")
+
+    def _commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes) -> None:
         key = self._key("epoch", holder.role)
 
         def transaction(pipe: Any) -> None:
@@ -136,10 +148,10 @@ class RedisBus:
             pipe.multi()
             for actor, ack in acks.items():
                 pipe.xtrim(self._key("windows", actor), minid=f"{ack.id.epoch}-{ack.id.seq + 1}", approximate=False)
-            if not publish:
-                return
             if held < holder.epoch:  # Redis lost its data
                 pipe.set(key, holder.epoch)
+            if progress:
+                pipe.hset(self._key("progress"), holder.role, progress)
             pipe.hset(
                 self._key("acks"),
                 mapping={
@@ -149,6 +161,13 @@ class RedisBus:
             )
 
         self._call(lambda: self._redis.transaction(transaction, key))
+
+    def progress(self, role: str) -> bytes | None:
+        raw: bytes | None = self._call(lambda: self._redis.hget(self._key("progress"), role))
+        return raw
+
+    def set_progress(self, role: str, progress: bytes) -> None:
+        self._call(lambda: self._redis.hsetnx(self._key("progress"), role, progress))
 
     def _held(self, pipe: Any, holder: Holder) -> int:
         """The newest epoch of this replay server that Redis knows. Raises FencedError where it is newer than ours."""

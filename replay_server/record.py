@@ -18,7 +18,7 @@ from common.errors import ConfigError
 
 MAX_STREAMS = 4096
 _HEADER = struct.Struct("<QII")
-_COUNTERS = struct.Struct("<8qdqq")  # the integers of Progress in order, largest priority, statistics count, streams
+_COUNTERS = struct.Struct("<10qdqq")  # the integers of Progress in order, largest priority, statistics count, streams
 _STREAM_BYTES = 4 * 8
 
 
@@ -42,6 +42,8 @@ class Progress:
     replay_epoch: int = 0  # the largest that has written here
     evicted_priorities: int = 0  # priorities that came back too late
     elsewhere_steps: int = 0  # trained steps drawn from the other shards, as the learner last said
+    begun_env_steps: int = 0  # environment steps that were in before this ring began, empty
+    begun_drawn_steps: int = 0  # and trained steps that were drawn, from all shards
     max_priority: float = 1.0  # the largest seen
     observations: int = 0  # count of the statistics
     total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (O,)
@@ -63,7 +65,8 @@ class Progress:
             raise ConfigError("--actors", len(self.streams), f"a replay server takes at most {MAX_STREAMS} streams")
         counters = _COUNTERS.pack(
             self.valid_from, self.next_serial, self.env_steps, self.drawn_steps, self.draws, self.replay_epoch,
-            self.evicted_priorities, self.elsewhere_steps, self.max_priority, self.observations, len(self.streams),
+            self.evicted_priorities, self.elsewhere_steps, self.begun_env_steps, self.begun_drawn_steps,
+            self.max_priority, self.observations, len(self.streams),
         )  # fmt: skip
         rows = [(actor, at.id.epoch, at.id.seq, at.settled_steps) for actor, at in self.streams.items()]
         streams = np.array(rows, np.int64).tobytes()
@@ -79,6 +82,16 @@ def decode_progress(payload: bytes, obs_dim: int) -> Progress:
     progress = Progress(obs_dim, *counters[:-1])
     progress.total, progress.total_square, progress.streams = sums[0], sums[1], positions
     return progress
+
+
+def decode_published(raw: bytes, obs_dim: int) -> Progress | None:
+    """``Progress.encode`` as a bus has kept it; None where it is not one of such observations."""
+    if len(raw) < _COUNTERS.size:
+        return None
+    streams = _COUNTERS.unpack_from(raw)[-1]
+    if len(raw) != _COUNTERS.size + 16 * obs_dim + streams * _STREAM_BYTES:
+        return None
+    return decode_progress(raw, obs_dim)
 
 
 def record_bytes(obs_dim: int) -> int:

@@ -23,7 +23,7 @@ from replay_server.record import Progress, RecordPair, record_bytes
 
 _IDENTITY = struct.Struct("<8s16sQQ")  # magic, fingerprint, capacity, row bytes; then its CRC
 _IDENTITY_BYTES = 4096
-_MAGIC = b"RMCRING2"
+_MAGIC = b"RMCRING3"
 Slots = NDArray[np.int64]
 
 

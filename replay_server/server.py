@@ -3,6 +3,7 @@
 Shapes: B batch, O observation. One thread does it all; ``step`` takes in one bounded round of entries.
 """
 
+import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +20,10 @@ from common.window import Rows, WindowSpec
 from replay_server.episode import find_episode
 from replay_server.intake import Intake, Round
 from replay_server.rate_limiter import RateLimiter
-from replay_server.recovery import open_store
+from replay_server.record import decode_published
+from replay_server.recovery import open_store, valid_leaves
 
+log = logging.getLogger(__name__)
 PRIORITY_FLOOR = 1e-6  # so that every window keeps a chance
 REPUBLISH_PERIOD = 5.0  # seconds between repeats of all acks, in case Redis lost its data
 
@@ -84,15 +87,10 @@ class ReplayServer:
         self._own_actors = [actor for actor in range(actors) if shard.owns(actor)]
         self._share = len(self._own_actors) / actors  # of all that is collected
         self._slack_steps = shard.part(slack_steps, actors)
-        self._limiter = RateLimiter(
-            config.replay_ratio / self._share,  # a shard's steps are a share, what is drawn from all is the whole
-            shard.part(config.warmup_steps, actors),
-            shard.part(total_steps, actors),
-            self._slack_steps,
-        )
         self._intake = Intake(spec, bus, actors, shard)
         self._store = open_store(folder, spec, -(-config.capacity // shard.count), config.priority_exponent)
         try:
+            self._go_on_from(bus.progress(self.name))
             epoch = bus.take_epoch(self.name, self._store.ring.progress.replay_epoch)
         except BaseException:
             self._store.close()
@@ -100,12 +98,38 @@ class ReplayServer:
         self.holder = Holder(self.name, epoch)
         self._store.ring.progress.replay_epoch = epoch
         self._store.ring.commit()
+        self._limiter = RateLimiter(
+            config.replay_ratio / self._share,  # a shard's steps are a share, what is drawn from all is the whole
+            shard.part(config.warmup_steps, actors),
+            shard.part(total_steps, actors) - self._store.ring.progress.begun_env_steps,
+            self._slack_steps,
+        )
         self._published: dict[int, Ack] = {}
         self._republish_at = 0.0
         self._buffers = [np.empty(0, spec.dtype)] * 2
         self._waiting_for, self._waiting_since = "", 0.0  # the learner, at the limiter
         self._refused_priorities = 0
         self._means, self._rates = Means(), {name: Rate() for name in ("env_steps", "windows", "draws")}
+
+    def _go_on_from(self, published: bytes | None) -> None:
+        """Where this ring is not the one committed last (its machine is lost), go on from what that one published.
+
+        What it holds, if anything, is older and goes: no serial may name two windows. The counters go on, and
+        warm-up is collected once more before the next draw.
+        """
+        ring = self._store.ring
+        newest = decode_published(published, self.spec.obs_dim) if published else None
+        if newest is None or newest.env_steps <= ring.progress.env_steps:
+            return
+        log.warning(
+            "%s: the ring that held %d windows is lost; begins empty at environment step %d",
+            self.name, newest.windows, newest.env_steps,
+        )  # fmt: skip
+        newest.valid_from = newest.next_serial
+        newest.begun_env_steps = newest.env_steps
+        newest.begun_drawn_steps = newest.drawn_steps + newest.elsewhere_steps
+        ring.progress = newest
+        self._store.tree.rebuild(valid_leaves(self._store))
 
     # -- in ---------------------------------------------------------------------------------------------
 
@@ -148,7 +172,7 @@ class ReplayServer:
     def _acks(self) -> dict[int, Ack]:
         """What every actor seen so far has committed, and how far it may step."""
         progress = self._store.ring.progress
-        shares = self._limiter.shares(progress.env_steps, self._drawn, len(self._own_actors))
+        shares = self._limiter.shares(self._inserted, self._drawn, len(self._own_actors))
         granted = dict(zip(self._own_actors, shares, strict=True))
         final = self._limiter.is_final(self._drawn)
         return {
@@ -156,9 +180,15 @@ class ReplayServer:
         }
 
     @property
+    def _inserted(self) -> int:
+        """Environment steps inserted since this ring began, which is where the limiter counts from."""
+        return self._store.ring.progress.env_steps - self._store.ring.progress.begun_env_steps
+
+    @property
     def _drawn(self) -> int:
-        """Trained steps drawn, from all shards."""
-        return self._store.ring.progress.drawn_steps + self._store.ring.progress.elsewhere_steps
+        """Trained steps drawn since this ring began, from all shards."""
+        progress = self._store.ring.progress
+        return progress.drawn_steps + progress.elsewhere_steps - progress.begun_drawn_steps
 
     def _publish(self, at_once: bool) -> None:
         """Publish acks that changed. Small changes wait, unless the learner does: then actors need all there is.
@@ -167,12 +197,12 @@ class ReplayServer:
         """
         if not self._published or time.monotonic() >= self._republish_at:
             self._republish_at = time.monotonic() + REPUBLISH_PERIOD
-            self.bus.commit(self.holder, self._published or self._acks())
+            self.bus.commit(self.holder, self._published or self._acks(), self._store.ring.progress.encode())
         acks = {actor: ack for actor, ack in self._acks().items() if self._published.get(actor) != ack}
         quantum = max(1, self._slack_steps // (8 * len(self._own_actors)))
         at_once = at_once or bool(self._waiting_for)
         if acks and (at_once or any(self._grown(actor, ack) >= quantum for actor, ack in acks.items())):
-            self.bus.commit(self.holder, acks)
+            self.bus.commit(self.holder, acks, self._store.ring.progress.encode())
             self._published.update(acks)
 
     def _grown(self, actor: int, ack: Ack) -> int:
@@ -189,7 +219,7 @@ class ReplayServer:
         """
         progress, tree = self._store.ring.progress, self._store.tree
         progress.elsewhere_steps = max(progress.elsewhere_steps, elsewhere)
-        draw = self._limiter.draw(progress.env_steps, self._drawn, batch_size * self.spec.train)
+        draw = self._limiter.draw(self._inserted, self._drawn, batch_size * self.spec.train)
         if draw is Draw.BATCH and progress.windows == 0:
             draw = Draw.WAIT
         self._note_waiting(draw)
@@ -213,7 +243,7 @@ class ReplayServer:
         return self._buffers[0][:batch_size]
 
     def _note_waiting(self, draw: Draw) -> None:
-        warming_up = self._store.ring.progress.env_steps < self.config.warmup_steps
+        warming_up = self._inserted < self._limiter.warmup_steps
         waiting_for = ("warm-up" if warming_up else "env_steps") if draw is Draw.WAIT else ""
         if waiting_for != self._waiting_for:
             self._waiting_for, self._waiting_since = waiting_for, time.monotonic()
@@ -255,8 +285,8 @@ class ReplayServer:
             "ring_fill": progress.windows / self._store.ring.capacity,
             "draws": progress.draws,
             "drawn_steps": progress.drawn_steps,
-            "replay_ratio": limiter.ratio(progress.env_steps, self._drawn) * self._share,
-            "credit_steps": max(0, limiter.limit(self._drawn) - progress.env_steps),
+            "replay_ratio": limiter.ratio(self._inserted, self._drawn) * self._share,
+            "credit_steps": max(0, limiter.limit(self._drawn) - self._inserted),
             "learner_waiting_for": self._waiting_for,
             "learner_waiting_s": time.monotonic() - self._waiting_since if self._waiting_for else 0.0,
             "max_priority": progress.max_priority,

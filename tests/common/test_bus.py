@@ -144,15 +144,20 @@ def test_a_full_redis_is_emptied_by_commits():
             assert bus.ack(0) == Ack(EntryId(1, seq - 1), 5)
             bus.append(0, EntryId(1, seq), b"and on it goes")
             assert len(bus.read({0: EntryId(0, 0)}, 1000)) == 1
+            fill(bus, seq + 1)
+            bus.take_epoch("replay")
+            with pytest.raises(FencedError):
+                bus.commit(holder, {0: Ack(EntryId(1, seq), 5)})  # replaced, and nothing is trimmed
+            assert len(bus.read({0: EntryId(0, 0)}, 1000)) > 10
             with pytest.raises(BusUnavailable, match="out of range"):
                 RedisBus(f"{server.url}?db=99", "full").ping()
     finally:
         shutil.rmtree(folder)
 
 
-def fill(bus: Bus) -> int:
+def fill(bus: Bus, start: int = 0) -> int:
     """Append until Redis is full; the number of the entry that it refused."""
-    for seq in itertools.count():
+    for seq in itertools.count(start):
         try:
             bus.append(0, EntryId(1, seq), b"x" * 200_000)
         except BusFull:

@@ -397,10 +397,76 @@ def test_an_empty_ring_goes_on_amid_a_life(make: Make, bus: MemoryBus) -> None:
     sender.send(2)
     drain(server)
     sender.send(3)
+    bus._progress.clear()  # nobody knows how far the lost one was
     server = make(folder="empty")
     drain(server)
     assert stored(server)["reward"][:, 0].tolist() == [2, 3, 4]
     assert server.stats()["entry_gaps"] == 1
+
+
+@pytest.mark.parametrize("kind", ["memory", "redis"])
+def test_a_lost_ring_takes_no_counter_back(make: Make, kind: str, redis_url: str, run_name: str) -> None:
+    bus: Bus = MemoryBus() if kind == "memory" else RedisBus(redis_url, run_name)
+    config = ReplayConfig(capacity=100, replay_ratio=2.0, warmup_steps=20)
+    server, sender = make(config, folder="lost", actors=1, on=bus), Sender(bus)
+    sender.send(12)
+    drain(server)
+    for _ in range(4):
+        assert server.sample(2).draw is Draw.BATCH
+    server.update_priorities(np.array([3]), np.array([9.0], np.float32))
+    sender.send(1)
+    drain(server)  # the commit publishes what was drawn before it
+    before, statistics = server.stats(), server.statistics()
+    assert before["env_steps"] == 52
+    assert before["drawn_steps"] == 32
+
+    server = make(config, folder="empty", actors=1, on=bus)
+    after = server.stats()
+    for name in ("env_steps", "drawn_steps", "draws", "windows", "max_priority"):
+        assert after[name] == before[name], name
+    assert after["ring_fill"] == 0
+    assert after["entry_gaps"] == 0
+    np.testing.assert_array_equal(server.statistics().total, statistics.total)
+    assert server.statistics().count == statistics.count
+    assert server.holder.epoch == 2
+    server.update_priorities(np.array([3]), np.array([5.0], np.float32))
+    assert server.stats()["evicted_priorities"] == before["evicted_priorities"] + 1
+
+    drain(server)
+    assert sender.granted() == 52 + 20 + 16  # a warm-up and the slack beyond what was in
+    sender.send(4)
+    drain(server)
+    assert server.sample(2).draw is Draw.WAIT  # 16 of 20 steps
+    sender.send(1)
+    drain(server)
+    sample = server.sample(2)
+    assert sample.rows is not None
+    assert sample.env_steps == 72
+    assert set(sample.rows["reward"][:, 0].tolist()) <= {13, 14, 15, 16, 17}
+    assert stored(server)["serial"].tolist() == [13, 14, 15, 16, 17]
+    close(server)
+    again = make(config, folder="empty", actors=1, on=bus)  # and that survives a restart of its own
+    assert again.stats()["env_steps"] == 72
+    assert len(stored(again)) == 5
+
+
+def test_a_ring_that_is_ahead_of_what_was_published_stays(make: Make, bus: MemoryBus) -> None:
+    server, sender = make(), Sender(bus)
+    sender.send(4)
+    drain(server)
+    published = bus.progress("replay")
+    assert published is not None
+    sender.send(2)
+    drain(server)
+    close(server)
+    bus._progress["replay"] = published
+    assert stored(make())["reward"][:, 0].tolist() == list(range(6))
+
+
+@pytest.mark.parametrize("published", [b"x", b"\0" * 200, b"\xff" * 128])
+def test_published_counters_that_make_no_sense_are_passed_over(make: Make, bus: MemoryBus, published: bytes) -> None:
+    bus.set_progress("replay", published)
+    assert make().stats()["env_steps"] == 0
 
 
 def test_lost_redis_data_neither_doubles_nor_goes_back(make: Make, bus: MemoryBus) -> None:
