@@ -50,9 +50,9 @@ trial_prioritized := --priority-exponent 0.6 --importance-exponent 0.4
 trial_ema_latent := --latent-target ema
 trial_ema_memory := --target-memory ema
 trial_curiosity := --curiosity 0.1 --curiosity-scale std
-trial_no_shortcut := --no-shortcut
+trial_shortcut := --shortcut
 trial_raw_observations := --no-normalize-observations
-TRIALS := base layer_norm prioritized ema_latent ema_memory curiosity no_shortcut raw_observations
+TRIALS := base layer_norm prioritized ema_latent ema_memory curiosity shortcut raw_observations
 
 trial: $(STAMP)
 	$(foreach name,$(TRIALS),$(foreach seed,1 2,$(BIN)/rmc train HalfCheetah-v5 --seed $(seed) --total-steps 100000 --run-dir runs/trial-$(name)-$(seed) $(trial_$(name)) && )) true

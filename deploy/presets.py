@@ -91,7 +91,7 @@ def robust(env: EnvConfig) -> RunConfig:
     return RunConfig(
         env=env,
         preset="robust",
-        agent=AgentConfig(shortcut=True, normalize_observations=True),
+        agent=AgentConfig(normalize_observations=True),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0),
         learner=LearnerConfig(batch_size=32, importance_exponent=0.0),
