@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo test test-dm-control lint results trial docs bench clean
+.PHONY: env demo test test-cluster test-dm-control lint results trial comparisons docs bench clean
 
 env: $(STAMP)
 
@@ -22,6 +22,13 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
+
+# Real ray up on three machines that are namespaces of this one: Linux, root, openssh-server, rsync, iproute2.
+ROUNDS ?= 5
+CUTS ?= 5 30 90
+
+test-cluster: $(STAMP)
+	for round in $$(seq $(ROUNDS)); do RMC_CUTS="$(CUTS)" $(BIN)/python -m pytest -x tests/cluster/on_machines.py || exit; done
 
 # In an environment of its own, .venv-dm-control: dm_control wants an older MuJoCo than the others' 4.
 test-dm-control:
@@ -56,6 +63,15 @@ TRIALS := base layer_norm prioritized ema_latent ema_memory curiosity shortcut r
 
 trial: $(STAMP)
 	$(foreach name,$(TRIALS),$(foreach seed,1 2,$(BIN)/rmc train HalfCheetah-v5 --seed $(seed) --total-steps 100000 --run-dir runs/trial-$(name)-$(seed) $(trial_$(name)) && )) true
+
+# With flicker, what the flag of blank frames is worth; and windows that begin with a stored state or with none.
+MEMORY40 := --hidden 64 --embedding 64 --heads 128 128 --shortcut --normalize-observations --learning-rate 5e-4 \
+	--polyak 0.99 --target-memory ema --batch-size 16 --capacity 5000 --warmup-steps 1000 --priority-exponent 0 \
+	--episodes 10 --replay-ratio 32 --alpha-learning-rate 5e-3 --trained-steps 42 --stride 14
+
+comparisons: $(STAMP)
+	for seed in 1 2 3 4 5; do for flag in no-blank-flag blank-flag; do $(BIN)/rmc train InvertedPendulum-v5 --flicker 0.5 --$$flag --seed $$seed --total-steps 30000 --run-dir runs/flicker-$$flag-$$seed || exit; done; done
+	for seed in 1 2 3; do for state in zero burn-in; do $(BIN)/rmc train tests.memory_env:Memory40-v0 $(MEMORY40) --state-strategy $$state --seed $$seed --total-steps 20000 --run-dir runs/memory40-$$state-$$seed || exit; done; done
 
 docs: $(STAMP)
 	$(BIN)/python -m docs.generate

@@ -9,6 +9,7 @@ import sys
 from deploy.lifeline import PARENT_VARIABLE, die_with
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
+ROLES = SINGLE_THREADED | {"learner", "launcher"}
 CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 
 
@@ -45,7 +46,7 @@ def run(words: list[str]) -> int:
     except KeyboardInterrupt:  # before the command took the signal over
         return INTERRUPTED_STATUS
     except RmcError as error:
-        if words[0] not in ("train", "evaluate", "export", "inspect", "check-env", "stats"):
+        if words[0] in ROLES:
             raise  # a role: the supervisor shows its traceback
         return _complain(str(error), FAILED_STATUS)
 

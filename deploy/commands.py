@@ -4,6 +4,7 @@ import dataclasses
 import json
 import logging
 import os
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from common.errors import ConfigError
-from deploy import env_check, export, inspection, options, roles, training, video
+from deploy import attachment, env_check, export, inspection, options, roles, training, video
 from deploy.evaluation import evaluate_checkpoint
 from deploy.policy import load_policy
 from deploy.run_folder import RunFolder
@@ -34,6 +35,14 @@ def execute(command: options.Command) -> int:
         return check_env(command)
     if isinstance(command, options.Stats):
         return stats(command)
+    if isinstance(command, options.Attach):
+        return attach(command)
+    if isinstance(command, options.Stop):
+        return stop(command)
+    if isinstance(command, options.Cluster):
+        return cluster(command)
+    if isinstance(command, options.LauncherRole):
+        return launch(command)
     return run_role(command)
 
 
@@ -45,11 +54,11 @@ def run_role(command: options.ActorRole | options.ReplayRole | options.LearnerRo
     if isinstance(command, options.ActorRole):
         roles.run_actor(roles.Place(command.run, url), command.index)
     elif isinstance(command, options.ReplayRole):
-        roles.run_replay(
-            roles.Place(command.run, url, command.secret_file), command.folder, command.listen, command.shard
-        )
+        place = roles.Place(command.run, url, command.secret_file, command.tls_folder)
+        roles.run_replay(place, command.folder, command.listen, command.shard)
     elif isinstance(command, options.LearnerRole):
-        roles.run_learner(roles.Place(command.run, url, command.secret_file), command.folder, command.device)
+        place = roles.Place(command.run, url, command.secret_file, command.tls_folder)
+        roles.run_learner(place, command.folder, command.device)
     else:
         roles.run_evaluator(roles.Place(command.run, url))
     return 0
@@ -127,6 +136,47 @@ def stats(command: options.Stats) -> int:
     if result is not None:
         console.print_json(data=result)
     return 0
+
+
+def attach(command: options.Attach) -> int:
+    """Watch a run until it ends, or until Ctrl-C."""
+    folder, console = RunFolder(command.run), Console()
+    attachment.trained_now(folder)
+    try:
+        attachment.watch(folder, console, attachment.Absence(folder))
+    except KeyboardInterrupt:
+        console.print(f"it goes on; rmc stop {command.run} ends it", soft_wrap=True, highlight=False)
+        return 0
+    return training.say_end(folder, console)
+
+
+def stop(command: options.Stop) -> int:
+    """End a run in order."""
+    folder = RunFolder(command.run)
+    attachment.stop(folder)
+    training.say_end(folder, Console())
+    return 0
+
+
+def cluster(command: options.Cluster) -> int:
+    """Bring a cluster up, or take it down."""
+    from deploy import machines  # needs what only the extra "ray" installs
+
+    act = machines.up if command.action == "up" else machines.down
+    act(command.config, Console())
+    return 0
+
+
+def launch(command: options.LauncherRole) -> int:
+    """Be the launcher of a run on Ray."""
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
+    folder = RunFolder(command.run)
+    config = folder.config()
+    folder.lock()
+    placement = training.Placement(
+        folder.path, "resume", "ray", command.device, None, command.ray_address, command.all_cpus, command.tls
+    )
+    return training.conduct(config, folder, placement, Console(width=400))
 
 
 def _records(path: Path) -> list[dict[str, object]]:

@@ -54,14 +54,14 @@ class LocalRun:
     def __init__(self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str) -> None:
         self._config = config
         self._leave = ExitStack()
-        _sweep()
+        sweep()
         self.sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))  # private, and short: see redis_server
         self._leave.callback(shutil.rmtree, self.sockets)
         try:
             self._server = None if redis_url else self._leave.enter_context(RedisServer(self.sockets))
             url = redis_url or f"unix://{self.sockets / 'redis.sock'}"
             self.bus = connect(url, folder.name)
-            _register(self.bus, config)
+            register(self.bus, config)
         except BaseException:
             self._leave.close()
             raise
@@ -89,7 +89,7 @@ class LocalRun:
             self._leave.close()
 
 
-def _sweep() -> None:
+def sweep() -> None:
     """Remove what launchers killed by force have left; their processes died with them."""
     for left in Path(tempfile.gettempdir()).glob(f"{PREFIX}*-*"):
         owner = left.name.removeprefix(PREFIX).partition("-")[0]
@@ -98,7 +98,8 @@ def _sweep() -> None:
                 shutil.rmtree(left, ignore_errors=True)
 
 
-def _register(bus: RedisBus, config: RunConfig) -> None:
+def register(bus: RedisBus, config: RunConfig) -> None:
+    """Make a run known to its roles, afresh."""
     bus.expire(None)
     bus.set_config(to_json(config).encode())
     bus.clear_stop()
@@ -121,10 +122,10 @@ def train(
         run.supervisor.start()
         while not stop.requested and not run.finished():
             run.tend()
-            _watch(monitor, run.bus)
+            watch(monitor, run.bus)
             time.sleep(TICK_SECONDS)
         run.supervisor.stop()
-        _watch(monitor, run.bus)  # what the roles said last
+        watch(monitor, run.bus)  # what the roles said last
         return monitor.learner_finished()
     finally:
         run.close()
@@ -133,21 +134,22 @@ def train(
 def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monitor, stop: StopSignal) -> bool:
     """Register a run whose roles are started by hand, watch it and end it; whether its total was reached."""
     bus = connect(redis_url, folder.name)
-    _register(bus, config)
+    register(bus, config)
     monitor.skip_old(bus)
     while not stop.requested and not monitor.learner_finished():
-        _watch(monitor, bus)
+        watch(monitor, bus)
         time.sleep(TICK_SECONDS)
     bus.request_stop("stopped by its launcher" if stop.requested else "finished")
     deadline = time.monotonic() + STOP_SECONDS
     while stop.requested and time.monotonic() < deadline:  # the learner saves; what it says then is still recorded
-        _watch(monitor, bus)
+        watch(monitor, bus)
         time.sleep(TICK_SECONDS)
     _expire(bus)
     return monitor.learner_finished()
 
 
-def _watch(monitor: Monitor, bus: RedisBus) -> None:
+def watch(monitor: Monitor, bus: RedisBus) -> None:
+    """Let the monitor see what is new; a Redis that is away for a while costs nothing but that."""
     try:
         monitor.watch(bus)
     except (BusUnavailable, BusFull) as error:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 from rich.console import Console
-from rich.live import Live
 from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
@@ -15,10 +14,8 @@ from common.bus import Bus
 from common.checkpoint import CheckpointFolder
 from deploy.presets import RunConfig
 from deploy.run_folder import RunFolder
-from deploy.view import Board, line, table
+from deploy.view import Board, View
 
-REFRESH_SECONDS = 0.5
-LINE_SECONDS = 10.0
 RECORD_SECONDS = 5.0  # between the launcher's own records
 PAGE = 1000  # records that the bus gives at a time
 
@@ -28,17 +25,14 @@ class Monitor:
 
     def __init__(self, folder: RunFolder, config: RunConfig, console: Console) -> None:
         self.board = Board(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
-        self._console = console
         self.restarts: Callable[[], dict[str, int]] = dict  # how often each role was started again
+        self.unplaced: Callable[[], list[str]] = list  # roles that run nowhere now
         self._checkpoints = CheckpointFolder(folder.checkpoints, config.learner.keep_checkpoints)
         self._cursor, self._started, self._wall_before = "0", time.monotonic(), folder.wall_seconds()
-        self._next_view = self._next_record = 0.0
+        self._next_record = 0.0
         self._lines = folder.metrics.open("a", buffering=1)
         self._events = EventFileWriter(str(folder.events))
-        self._live: Live | None = None
-        if console.is_terminal:
-            self._live = Live(table(self.board), console=console, auto_refresh=False)
-            self._live.start()
+        self.view = View(self.board, console)
 
     @property
     def wall_seconds(self) -> float:
@@ -62,9 +56,7 @@ class Monitor:
         if now >= self._next_record:
             self._next_record = now + RECORD_SECONDS
             self._record_launcher()
-        if now >= self._next_view:
-            self._next_view = now + (REFRESH_SECONDS if self._live else LINE_SECONDS)
-            self.show()
+        self.view.refresh()
 
     def _take_in(self, bus: Bus) -> None:
         while True:
@@ -86,7 +78,14 @@ class Monitor:
         restarts = {f"restarts_{role}": count for role, count in self.restarts().items()}
         total = sum(restarts.values())
         self.record(
-            {"role": "launcher", "time": time.time(), "wall_s": self.wall_seconds, "restarts": total, **restarts}
+            {
+                "role": "launcher",
+                "time": time.time(),
+                "wall_s": self.wall_seconds,
+                "restarts": total,
+                **restarts,
+                "not_running": " ".join(self.unplaced()),
+            }
         )
 
     def _write_events(self, record: dict[str, Any]) -> None:
@@ -99,18 +98,9 @@ class Monitor:
         when, step = record.get("time", time.time()), self.board.env_steps
         self._events.add_event(Event(wall_time=when, step=step, summary=Summary(value=values)))
 
-    def show(self) -> None:
-        """Refresh the view now."""
-        if self._live is not None:
-            self._live.update(table(self.board), refresh=True)
-        else:
-            self._console.print(line(self.board), soft_wrap=True, highlight=False)
-
     def close(self) -> None:
         """Show the last state and close the files."""
         self._record_launcher()
-        self.show()
-        if self._live is not None:
-            self._live.stop()
+        self.view.close()
         self._lines.close()
         self._events.close()

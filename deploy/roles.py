@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+import ssl
 import sys
 import time
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from common.replay import Shard
 from common.role import RECONNECT_SLEEP, StopSignal, run_role
 from common.watchdog import Watchdog
 from common.wrappers import Env
+from deploy import tls
 from deploy.presets import RunConfig, from_json
 from learner.initial_priority import InitialPriority
 from learner.learner import Learner
@@ -43,6 +45,7 @@ class Place:
     run: str
     redis_url: str
     secret_file: Path | None = None
+    tls_folder: Path | None = None
 
     def secret(self) -> bytes:
         """The run's secret, from its file or the environment. Raises ConfigError."""
@@ -85,7 +88,9 @@ class Process:
 
 
 def connect(url: str, run: str, patience_seconds: float = 0.0) -> RedisBus:
-    """A bus whose Redis answers, within so long. Raises ConfigError."""
+    """A bus whose Redis answers, within so long; ``file:PATH`` holds the URL. Raises ConfigError."""
+    if url.startswith("file:"):
+        url = _in_file(Path(url.removeprefix("file:")))
     bus, deadline = RedisBus(url, run), time.monotonic() + patience_seconds
     while True:
         try:
@@ -95,6 +100,13 @@ def connect(url: str, run: str, patience_seconds: float = 0.0) -> RedisBus:
             if time.monotonic() >= deadline:
                 raise ConfigError("--redis-url", without_password(url), f"no Redis answers there ({error})") from None
         time.sleep(RECONNECT_SLEEP)
+
+
+def _in_file(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except OSError as error:
+        raise ConfigError("--redis-url", f"file:{path}", f"cannot be read ({error.strerror})") from None
 
 
 def without_password(url: str) -> str:
@@ -148,7 +160,8 @@ def run_replay(place: Place, folder: Path, listen: str, index: int) -> None:
         spec, config.replay, folder, config.seed, config.total_steps, config.actors, config.slack_steps(), process.bus,
         shard,
     )  # fmt: skip
-    sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size)
+    context = tls.server_context(place.tls_folder) if place.tls_folder is not None else None
+    sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size, context)
     process.bus.announce_replay(server.holder, sockets.address)
     run_role(ReplayProcess(server, sockets), process.bus, process.stop)
 
@@ -161,7 +174,8 @@ def run_learner(place: Place, folder: Path, device: str) -> None:
     check_device(device)
 
     pinned, batch = device.startswith("cuda"), config.learner.batch_size
-    clients = replay_clients(config, bus, secret, pinned)
+    context = tls.client_context(place.tls_folder) if place.tls_folder is not None else None
+    clients = replay_clients(config, bus, secret, pinned, context)
     replay = clients[0] if len(clients) == 1 else ShardedReplay(clients, spec, batch, config.seed, pinned)
     checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
     learner = Learner(spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device)
@@ -172,7 +186,9 @@ def run_learner(place: Place, folder: Path, device: str) -> None:
         bus.emit(learner.name, {"time": time.time(), **learner.metrics(), "finished": 1})
 
 
-def replay_clients(config: RunConfig, bus: RedisBus, secret: bytes, pinned: bool) -> list[ReplayClient]:
+def replay_clients(
+    config: RunConfig, bus: RedisBus, secret: bytes, pinned: bool, context: ssl.SSLContext | None
+) -> list[ReplayClient]:
     """A client of each replay server. What one draws is its part of a batch, where there are several."""
 
     def address_of(role: str) -> Callable[[], str | None]:
@@ -185,7 +201,7 @@ def replay_clients(config: RunConfig, bus: RedisBus, secret: bytes, pinned: bool
     count = config.replay.replay_shards
     part = max(1, config.learner.batch_size // count)
     roles = [Shard(index, count).role for index in range(count)]
-    return [ReplayClient(address_of(role), secret, config.window_spec(), part, pinned) for role in roles]
+    return [ReplayClient(address_of(role), secret, config.window_spec(), part, pinned, context) for role in roles]
 
 
 def cores() -> int:

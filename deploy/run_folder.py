@@ -90,12 +90,39 @@ class RunFolder:
         except BlockingIOError:
             self.unlock()
             raise ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first") from None
+        self._note(f"training {os.getpid()}")
 
-    def unlock(self) -> None:
-        """Let another launcher in."""
+    def unlock(self, status: int | None = None) -> None:
+        """Let another launcher in; ``status`` is how this one ended, if it trained."""
         if self._lock is not None:
+            self._note("" if status is None else f"ended {status}")
             os.close(self._lock)
             self._lock = None
+
+    def _note(self, text: str) -> None:
+        assert self._lock is not None
+        os.ftruncate(self._lock, 0)
+        os.pwrite(self._lock, text.encode(), 0)
+
+    def trainer(self) -> int | None:
+        """The process of the launcher that trains this run now, if one does."""
+        try:
+            with (self.path / ".lock").open("rb") as file:
+                word, _, number = file.read().decode().partition(" ")
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except FileNotFoundError:
+            return None
+        except BlockingIOError:
+            return int(number) if word == "training" else None
+        return None
+
+    def ended(self) -> int | None:
+        """The exit status of the launcher that trained it last, if that came to an end of its own."""
+        try:
+            word, _, number = (self.path / ".lock").read_text().partition(" ")
+        except FileNotFoundError:
+            return None
+        return int(number) if word == "ended" else None
 
 
 def _wall(line: str) -> float:

@@ -38,7 +38,8 @@ class RoleProcess:
         if command.single_thread:
             self._environment |= SINGLE_THREAD
         self._process: subprocess.Popen[bytes] | None = None
-        self._log_start, self._started_at, self._start_at = 0, 0.0, 0.0
+        self.log_start = 0  # where in its log this start's words begin
+        self._started_at, self._start_at = 0.0, 0.0
         self._quick_deaths, self.finished = 0, False
 
     @property
@@ -51,9 +52,14 @@ class RoleProcess:
         """Its process, if it runs."""
         return self._process.pid if self._process is not None and self.running else None
 
+    @property
+    def status(self) -> int | None:
+        """Its exit status, negative for a signal; None while it runs."""
+        return self._process.poll() if self._process is not None else None
+
     def start(self) -> None:
         """Start its process, in a process group of its own: Ctrl-C is for the supervisor alone."""
-        self._log_start = self.log.stat().st_size if self.log.exists() else 0
+        self.log_start = self.log.stat().st_size if self.log.exists() else 0
         self._started_at = time.monotonic()
         words = [sys.executable, "-P", "-m", "deploy.cli", *self.command.words]
         with self.log.open("ab") as log:
@@ -88,7 +94,7 @@ class RoleProcess:
     def last_words(self) -> str:
         """The end of its log, of this start only: the traceback, if it left one."""
         with self.log.open("rb") as log:
-            log.seek(max(self._log_start, self.log.stat().st_size - TRACEBACK_BYTES))
+            log.seek(max(self.log_start, self.log.stat().st_size - TRACEBACK_BYTES))
             text = log.read().decode(errors="replace").rstrip()
         start = text.rfind("Traceback (most recent call last)")
         return text[start:] if start >= 0 else "\n".join(text.splitlines()[-20:]) or "(none)"

@@ -1,10 +1,14 @@
 """``rmc train`` from its checks to ``result.json``."""
 
+import dataclasses
+import json
 import logging
+import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
 from statistics import mean
 from typing import Any, Literal
@@ -14,17 +18,18 @@ from rich.console import Console
 
 from common.bus import Bus
 from common.checkpoint import CheckpointFolder
-from common.errors import ConfigError
+from common.errors import ConfigError, RoleDied
 from common.role import StopSignal
-from deploy import local, lockstep
+from deploy import attachment, local, lockstep
 from deploy.evaluation import evaluate_blob, evaluate_checkpoint, initial_policy
 from deploy.monitor import Monitor
 from deploy.presets import RunConfig, validate
 from deploy.resources import check_ring_fits
-from deploy.roles import check_device
+from deploy.roles import check_device, cores
 from deploy.run_folder import IfExists, RunFolder, open_run
+from deploy.supervisor import EXIT_CONFIG
 
-Launcher = Literal["local", "lockstep", "manual"]
+Launcher = Literal["local", "ray", "lockstep", "manual"]
 FINAL_EPISODES = 10  # of the last evaluation
 STOPPED = 130  # exit status after Ctrl-C, as shells have it
 log = logging.getLogger(__name__)
@@ -39,11 +44,21 @@ class Placement:
     launcher: Launcher
     device: str
     redis_url: str | None
+    ray_address: str = "auto"
+    all_cpus: bool = False
+    tls: bool = False
 
 
 def train(config: RunConfig, placement: Placement, console: Console) -> int:
     """Train to the end, or to a stop signal; the exit status. Raises ConfigError before anything is started."""
-    folder = prepare(config, placement)
+    if placement.launcher == "ray":
+        return _train_on_ray(config, placement, console)
+    return conduct(config, prepare(config, placement), placement, console)
+
+
+def conduct(config: RunConfig, folder: RunFolder, placement: Placement, console: Console) -> int:
+    """Be the launcher of a run whose folder is locked, from its first evaluation to its last."""
+    status = 1
     try:
         console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
         before = evaluate_blob(config, initial_policy(config), FINAL_EPISODES)
@@ -57,21 +72,82 @@ def train(config: RunConfig, placement: Placement, console: Console) -> int:
         finally:
             monitor.close()
         if not finished:
-            return _say_stopped(folder, config, monitor, console)
+            status = STOPPED
+            return _say_stopped(folder, config, monitor.board.env_steps, console)
         result = _result(config, folder, monitor, before)
         CheckpointFolder(folder.checkpoints).mark_best(result["updates"], result["eval_return_mean"])
         folder.write_result(result)
+        status = 0
+    except ConfigError:
+        status = EXIT_CONFIG
+        raise
     finally:
-        folder.unlock()
-    return _say_result(folder, before, console)
+        folder.unlock(status)
+    console.print(f"before training: {_said(before)}", highlight=False)
+    return _say_result(folder, console)
+
+
+def _train_on_ray(config: RunConfig, placement: Placement, console: Console) -> int:
+    """Hand a run to a launcher on the cluster's head, and watch it; Ctrl-C ends the run, a closed terminal does not."""
+    from deploy import cluster
+
+    enough = max(cores(), ceil(cluster.reserved_cpus(config)) + config.actors)  # of a cluster of our own
+    with cluster.joined(placement.ray_address, enough):
+        return _watched_on_ray(config, placement, console)
+
+
+def _watched_on_ray(config: RunConfig, placement: Placement, console: Console) -> int:
+    from deploy import cluster
+
+    fit = cluster.actors_that_fit(config)
+    learner = dataclasses.replace(config.learner, threads=cluster.learner_cpus(config))
+    config = dataclasses.replace(config, learner=learner, actors=fit if placement.all_cpus else config.actors)
+    folder = prepare(config, placement)
+    folder.unlock()
+    cluster.launch(config, folder, placement.device, placement.all_cpus, placement.tls)
+    console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
+    with _signals_caught(hangup=False) as stop:
+        attachment.watch(folder, console, _passes_on(stop, folder))
+    return say_end(folder, console)
+
+
+def _passes_on(stop: StopSignal, folder: RunFolder) -> Callable[[], bool]:
+    """Whether the run's launcher is gone; tells it to stop, once, when we are."""
+    from deploy import cluster
+
+    told = False
+
+    def gone() -> bool:
+        nonlocal told
+        if stop.requested and not told and (trainer := folder.trainer()) is not None:
+            told = True
+            os.kill(trainer, signal.SIGTERM)
+        return not cluster.is_there(folder)
+
+    return gone
+
+
+def say_end(folder: RunFolder, console: Console) -> int:
+    """Print how a run ended that another process trained; its exit status."""
+    status, config = folder.ended(), folder.config()
+    if status == 0:
+        return _say_result(folder, console)
+    if status == STOPPED:
+        found = CheckpointFolder(folder.checkpoints).latest()
+        steps = json.loads(found[1]["progress.json"])["env_steps"] if found else 0
+        return _say_stopped(folder, config, steps, console)
+    log_file = folder.logs / "launcher.log"
+    words = log_file.read_text(errors="replace").strip().splitlines()[-30:] if log_file.exists() else []
+    console.print("\n".join(words), soft_wrap=True, highlight=False, markup=False)
+    raise RoleDied(f"the launcher of {folder.path} ended with status {status}; the whole of its words: {log_file}")
 
 
 @contextmanager
-def _signals_caught() -> Iterator[StopSignal]:
+def _signals_caught(hangup: bool = True) -> Iterator[StopSignal]:
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
     stop = StopSignal()
     stop.install()
-    if before[signal.SIGHUP] != signal.SIG_IGN:  # nohup ignores it: the terminal may close
+    if hangup and before[signal.SIGHUP] != signal.SIG_IGN:  # nohup ignores it: the terminal may close
         signal.signal(signal.SIGHUP, lambda *_: stop.request())
     try:
         yield stop
@@ -84,7 +160,14 @@ def prepare(config: RunConfig, placement: Placement) -> RunFolder:
     """All checks that need no process, then the run's folder, locked. Raises ConfigError."""
     validate(config)
     spec = config.window_spec()
-    check_device(placement.device)
+    if placement.launcher != "ray":  # there, the learner's node has the device
+        check_device(placement.device)
+    elif placement.redis_url is not None:
+        raise ConfigError("--redis-url", placement.redis_url, "a run on Ray has a Redis of its own, on the head")
+    if placement.all_cpus and placement.launcher != "ray":
+        raise ConfigError("--all-cpus", True, "give --launcher ray; elsewhere say how many --actors")
+    if placement.tls and placement.launcher != "ray":
+        raise ConfigError("--tls", True, "give --launcher ray; elsewhere take a --redis-url of rediss://")
     if placement.launcher == "lockstep" and config.replay.replay_shards > 1:
         raise ConfigError(
             "--replay-shards", config.replay.replay_shards, "a lockstep run has one; use --launcher local"
@@ -103,6 +186,12 @@ def prepare(config: RunConfig, placement: Placement) -> RunFolder:
 def _launch(config: RunConfig, folder: RunFolder, placement: Placement, monitor: Monitor, stop: StopSignal) -> bool:
     if placement.launcher == "local":
         return local.train(config, folder, placement.redis_url, placement.device, monitor, stop)
+
+    if placement.launcher == "ray":
+        from deploy import cluster  # Ray is an extra, and slow to import
+
+        with cluster.joined(placement.ray_address):
+            return cluster.train(config, folder, placement.device, placement.all_cpus, placement.tls, monitor, stop)
 
     if placement.launcher == "manual":
         assert placement.redis_url is not None  # prepare has seen to it
@@ -132,17 +221,16 @@ def _said(evaluation: dict[str, Any]) -> str:
     return f"return {mean:,.1f} ± {deviation:,.1f} over {evaluation['eval_episodes']} deterministic episodes"
 
 
-def _say_stopped(folder: RunFolder, config: RunConfig, monitor: Monitor, console: Console) -> int:
+def _say_stopped(folder: RunFolder, config: RunConfig, env_steps: int, console: Console) -> int:
     command = f"rmc train {config.env.id} --preset {config.preset} --seed {config.seed} --run-dir {folder.path}"
-    console.print(f"stopped at environment step {monitor.board.env_steps:,}; to go on, give the same options and")
+    console.print(f"stopped at environment step {env_steps:,}; to go on, give the same options and")
     console.print(f"  {command}", soft_wrap=True, highlight=False)
     return STOPPED
 
 
-def _say_result(folder: RunFolder, before: dict[str, Any], console: Console) -> int:
+def _say_result(folder: RunFolder, console: Console) -> int:
     result = folder.result()
     assert result is not None
-    console.print(f"before training: {_said(before)}", highlight=False)
     console.print(f"after training:  {_said(result)}", highlight=False)
     facts = f"{result['env_steps']:,} environment steps, {result['updates']:,} updates, {result['wall_s']:,.0f} s"
     console.print(f"{facts}; {folder.result_file}", soft_wrap=True, highlight=False)

@@ -5,10 +5,13 @@ from collections.abc import Callable
 from statistics import mean
 from typing import Any
 
-from rich.console import Group
+from rich.console import Console, Group
+from rich.live import Live
 from rich.table import Table
 
 NONE_YET = "-"
+REFRESH_SECONDS = 0.5  # of a live view
+LINE_SECONDS = 10.0  # between plain lines
 SILENT_SECONDS = 5.0  # after which a role's silence is shown
 
 
@@ -124,6 +127,8 @@ def table(board: Board) -> Group:
     facts.add_column()
     for name, value in _facts(board):
         facts.add_row(name, value)
+    if board.get("launcher", "not_running"):
+        facts.add_row("not running", board.get("launcher", "not_running"))
     return Group(f"[bold]{board.env}[/] · {board.preset} · seed {board.seed}", facts, _stages(board))
 
 
@@ -151,4 +156,35 @@ def line(board: Board) -> str:
         f"lag {number(board.policy_lag, '.1f')}",
         f"restarts {board.get('launcher', 'restarts') or 0}",
     ]
+    missing = board.get("launcher", "not_running")
+    parts += [f"not running: {missing}"] if missing else []
     return " | ".join(parts) + (f" | waiting: {', '.join(waits)}" if waits else "")
+
+
+class View:
+    """A board shown on a console, live where that is a terminal. ``refresh`` as often as you like."""
+
+    def __init__(self, board: Board, console: Console) -> None:
+        self._board, self._console, self._due = board, console, 0.0
+        self._live: Live | None = None
+        if console.is_terminal:
+            self._live = Live(table(board), console=console, auto_refresh=False)
+            self._live.start()
+
+    def refresh(self) -> None:
+        """Show the newest state if it is time."""
+        if time.monotonic() >= self._due:
+            self._due = time.monotonic() + (REFRESH_SECONDS if self._live else LINE_SECONDS)
+            self._show()
+
+    def _show(self) -> None:
+        if self._live is not None:
+            self._live.update(table(self._board), refresh=True)
+        else:
+            self._console.print(line(self._board), soft_wrap=True, highlight=False)
+
+    def close(self) -> None:
+        """Show the last state, and leave it there."""
+        self._show()
+        if self._live is not None:
+            self._live.stop()

@@ -8,6 +8,7 @@ import hmac
 import logging
 import os
 import socket
+import ssl
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -32,10 +33,12 @@ RECEIVE_BUFFER = 8 << 20
 class Connection:
     """One authenticated connection. Blocking, with a timeout."""
 
-    def __init__(self, address: str, secret: bytes, fingerprint: str, max_body: int) -> None:
+    def __init__(
+        self, address: str, secret: bytes, fingerprint: str, max_body: int, tls: ssl.SSLContext | None = None
+    ) -> None:
         """``address``: ``unix:PATH`` or ``tcp:HOST:PORT``. Raises OSError, MessageError, AuthenticationError."""
         self._max_body = max_body
-        self._socket = _connect(address)
+        self._socket = _connect(address, tls)
         try:
             self._authenticate(secret, fingerprint)
         except BaseException:
@@ -93,7 +96,7 @@ class Connection:
         self._socket.close()
 
 
-def _connect(address: str) -> socket.socket:
+def _connect(address: str, tls: ssl.SSLContext | None) -> socket.socket:
     scheme, _, rest = address.partition(":")
     if scheme == "unix":
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -108,10 +111,10 @@ def _connect(address: str) -> socket.socket:
     connection.settimeout(TIMEOUT)
     try:
         connection.connect(target)
+        return connection if tls is None else tls.wrap_socket(connection)
     except BaseException:
         connection.close()
         raise
-    return connection
 
 
 class ReplayClient:
@@ -122,8 +125,15 @@ class ReplayClient:
     """
 
     def __init__(
-        self, address: Callable[[], str | None], secret: bytes, spec: WindowSpec, batch_size: int, pinned: bool = False
+        self,
+        address: Callable[[], str | None],
+        secret: bytes,
+        spec: WindowSpec,
+        batch_size: int,
+        pinned: bool = False,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
+        self._tls = tls
         self._address, self._secret, self._spec, self._batch_size = address, secret, spec, batch_size
         body = batch_size * (spec.dtype.itemsize + 8)  # rows, then float64 values
         tensors = [torch.empty(body, dtype=torch.uint8, pin_memory=pinned) for _ in range(AHEAD)]
@@ -176,7 +186,7 @@ class ReplayClient:
         if address is None:
             return None
         self._in_flight = 0
-        return Connection(address, self._secret, self._spec.fingerprint, self._buffers[0].nbytes)
+        return Connection(address, self._secret, self._spec.fingerprint, self._buffers[0].nbytes, self._tls)
 
     def _drop(self, error: Exception) -> None:
         if not self._is_away:
@@ -243,4 +253,4 @@ class ReplayClient:
         address = self._address()
         if address is None:
             raise ConnectionError("the replay server is not up yet")
-        return Connection(address, self._secret, self._spec.fingerprint, self._answer.nbytes)
+        return Connection(address, self._secret, self._spec.fingerprint, self._answer.nbytes, self._tls)

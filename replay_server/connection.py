@@ -1,6 +1,7 @@
 """One client's connection: bytes in, frames out, never blocking."""
 
 import socket
+import ssl
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -27,6 +28,7 @@ class Connection:
     def __init__(self, connection: socket.socket, challenge: bytes) -> None:
         connection.setblocking(False)
         self.socket, self.challenge = connection, challenge
+        self.encrypted = not isinstance(connection, ssl.SSLSocket)  # or need not be
         self.authenticated = False
         self.opened = time.monotonic()
         self._inbox = bytearray()
@@ -38,11 +40,23 @@ class Connection:
         """Whether something is still to be sent; until then nothing more is read from this client."""
         return bool(self._outbox)
 
+    def encrypt(self) -> bool:
+        """Go on with the handshake of a socket that needs one; whether it is over."""
+        assert isinstance(self.socket, ssl.SSLSocket)
+        try:
+            self.socket.do_handshake()
+        except ssl.SSLWantReadError:
+            return False
+        self.encrypted = True
+        return True
+
     def receive(self) -> None:
-        """Take what has arrived, at most 64 KiB."""
+        """Take what has arrived, at most 64 KiB, and what of it is decrypted already."""
         try:
             received = self.socket.recv(RECEIVE_BYTES)
-        except BlockingIOError:
+            while received and isinstance(self.socket, ssl.SSLSocket) and (left := self.socket.pending()):
+                received += self.socket.recv(left)
+        except (BlockingIOError, ssl.SSLWantReadError):
             return
         if not received:
             raise ConnectionError("closed by the client")
@@ -76,13 +90,18 @@ class Connection:
         """Go on sending."""
         while self._outbox:
             try:
-                sent = self.socket.sendmsg(self._outbox)
-            except BlockingIOError:
+                sent = self._send_some()
+            except (BlockingIOError, ssl.SSLWantWriteError, ssl.SSLWantReadError):
                 return
             while self._outbox and sent >= self._outbox[0].nbytes:
                 sent -= self._outbox.popleft().nbytes
             if self._outbox:
                 self._outbox[0] = self._outbox[0][sent:]
+
+    def _send_some(self) -> int:
+        if isinstance(self.socket, ssl.SSLSocket):  # which cannot gather
+            return self.socket.send(self._outbox[0])
+        return self.socket.sendmsg(self._outbox)
 
     def own(self) -> None:
         """Copy what is still unsent, because its buffer is about to be used again."""

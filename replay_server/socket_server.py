@@ -18,6 +18,7 @@ import logging
 import os
 import selectors
 import socket
+import ssl
 import time
 from collections import Counter
 from pathlib import Path
@@ -43,13 +44,22 @@ READ, WRITE = selectors.EVENT_READ, selectors.EVENT_WRITE
 class SocketServer:
     """Serves a replay server at ``address``: ``unix:PATH`` or ``tcp:HOST:PORT`` (port 0 takes a free one).
 
-    ``address`` afterwards names the port taken. Raises ConfigError where it cannot be listened on.
+    ``address`` afterwards names the port taken. With ``tls`` all is encrypted before the proofs. Raises ConfigError
+    where it cannot be listened on.
     """
 
-    def __init__(self, server: ReplayServer, spec: WindowSpec, address: str, secret: bytes, max_batch: int) -> None:
+    def __init__(
+        self,
+        server: ReplayServer,
+        spec: WindowSpec,
+        address: str,
+        secret: bytes,
+        max_batch: int,
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
         if not secret:
             raise ConfigError("secret", "", "the run's secret must not be empty")
-        self._server, self._spec, self._secret, self._max_batch = server, spec, secret, max_batch
+        self._server, self._spec, self._secret, self._max_batch, self._tls = server, spec, secret, max_batch, tls
         self._listener, self._path, self.address = _listen(address)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, READ)
@@ -81,16 +91,23 @@ class SocketServer:
         if accepted.family != socket.AF_UNIX:
             accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             accepted.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        if self._tls is not None:
+            accepted = self._tls.wrap_socket(accepted, server_side=True, do_handshake_on_connect=False)
         connection = Connection(accepted, os.urandom(NONCE_BYTES))
         self._connections[connection] = READ
         self._selector.register(accepted, READ, connection)
-        try:
-            connection.send(Kind.CHALLENGE, {"nonce": connection.challenge})
-        except OSError:
-            self._end(connection)
+        if connection.encrypted:
+            try:
+                connection.send(Kind.CHALLENGE, {"nonce": connection.challenge})
+            except OSError:
+                self._end(connection)
 
     def _serve(self, connection: Connection, events: int) -> None:
         try:
+            if not connection.encrypted:
+                if not connection.encrypt():
+                    return
+                connection.send(Kind.CHALLENGE, {"nonce": connection.challenge})
             if events & WRITE:
                 connection.flush()
             if events & READ:

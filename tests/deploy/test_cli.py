@@ -18,6 +18,7 @@ DEBUG = ["train", PENDULUM, "--preset", "debug"]
 TRAIN_FLAGS = """
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
     --env-timeout --run-dir --if-exists --launcher --device --redis-url
+    --ray-address --all-cpus --tls
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --shortcut --normalize-observations --grounding
     --blank-flag --initial-priority
@@ -36,9 +37,13 @@ OTHER_FLAGS = {
     "inspect": ["--out", "--checkpoint"],
     "check-env": [*ENV_FLAGS, "--steps"],
     "stats": [],
+    "attach": [],
+    "stop": [],
+    "cluster": [],
+    "launcher": ["--ray-address", "--device", "--all-cpus", "--tls"],
     "actor": ["--run", "--redis-url", "--index"],
-    "replay": ["--run", "--redis-url", "--folder", "--listen", "--shard", "--secret-file"],
-    "learner": ["--run", "--redis-url", "--folder", "--device", "--secret-file"],
+    "replay": ["--run", "--redis-url", "--folder", "--listen", "--shard", "--secret-file", "--tls-folder"],
+    "learner": ["--run", "--redis-url", "--folder", "--device", "--secret-file", "--tls-folder"],
     "evaluator": ["--run", "--redis-url"],
 }
 

@@ -1,0 +1,159 @@
+"""Where Redis and the replay servers saturate: simulated actors that send recorded windows at a set rate.
+
+    python -m benchmarks.scaling [--env ENV] [--actors 8] [--seconds 5] [--shards 1 2 4]
+
+Each simulated actor is a process with a bus of its own that sends one entry of 16 windows after another on a clock;
+what is offered doubles until less than 95 % of it is committed. CPU time is read from the processes themselves, so that
+it says what a core carries even where all share a few.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from benchmarks.harness import ENDLESS, RUN, random_rows
+from common.bus import EntryId
+from common.envs import EnvConfig, env_spaces
+from common.redis_bus import RedisBus
+from common.replay import Shard
+from common.window import WindowSpec
+from common.wire import encode_hello, encode_windows
+from deploy.presets import robust
+from deploy.redis_server import RedisServer
+from replay_server.server import ReplayConfig, ReplayServer
+
+CHUNK = 16  # windows an entry
+BEHIND = 64  # entries that a simulated actor sends ahead of what is acknowledged, as a real one's credit would have it
+KEPT_UP = 0.95  # of what is offered
+
+
+@dataclass(frozen=True)
+class Point:
+    """One load: windows a second offered and committed, and the share of a core that each process took."""
+
+    shards: int
+    actors: int
+    offered: float
+    committed: float
+    redis_core: float
+    replay_core: float  # of the busiest
+    actor_core: float  # of all simulated actors
+
+
+def _serve(url: str, folder: str, spec: WindowSpec, actors: int, shard: Shard) -> None:
+    bus = RedisBus(url, RUN)
+    config = ReplayConfig(capacity=4096 * shard.count, warmup_steps=ENDLESS)
+    server = ReplayServer(spec, config, Path(folder), 0, ENDLESS, actors, ENDLESS, bus, shard)
+    bus.announce_replay(server.holder, "nowhere")
+    while bus.stop_requested() is None:
+        end = time.monotonic() + 0.5
+        while time.monotonic() < end:
+            if not server.step():
+                time.sleep(0.002)
+    server.close()
+
+
+def _simulate(url: str, actor: int, spec: WindowSpec, rate: float) -> None:
+    """Send ``rate`` windows a second, as far as the acknowledged ones let it."""
+    bus, payload = RedisBus(url, RUN), encode_windows(random_rows(spec, CHUNK), spec)
+    epoch, seq, acknowledged = bus.take_epoch(f"actor-{actor}"), 0, 0
+    bus.append(actor, EntryId(epoch, 0), encode_hello(spec))
+    period, due = CHUNK / rate, time.monotonic()
+    while True:
+        while seq - acknowledged >= BEHIND:
+            ack = bus.ack(actor)
+            acknowledged = ack.id.seq if ack is not None and ack.id.epoch == epoch else 0
+            time.sleep(0.001)
+        due = max(due + period, time.monotonic() - 10 * period)
+        time.sleep(max(0.0, due - time.monotonic()))
+        seq += 1
+        bus.append(actor, EntryId(epoch, seq), payload)
+
+
+@contextmanager
+def _system(spec: WindowSpec, shards: int, actors: int, rate: float) -> Iterator[tuple[RedisBus, dict[str, list[int]]]]:
+    """Redis, replay servers and simulated actors as processes; their numbers by kind."""
+    spawn = multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory() as folder, RedisServer(Path(folder)) as redis:
+        bus = RedisBus(redis.url, RUN)
+        servers = [
+            spawn.Process(target=_serve, args=(redis.url, f"{folder}/{k}", spec, actors, Shard(k, shards)))
+            for k in range(shards)
+        ]
+        senders = [
+            spawn.Process(target=_simulate, args=(redis.url, k, spec, rate / actors), daemon=True)
+            for k in range(actors)
+        ]
+        for process in (*servers, *senders):
+            process.start()
+        while any(bus.replay_address(Shard(k, shards).role) is None for k in range(shards)):
+            time.sleep(0.05)
+        assert redis.process is not None
+        numbers = {"redis": [redis.process.pid], "replay": [one.pid or 0 for one in servers]}
+        yield bus, numbers | {"actor": [one.pid or 0 for one in senders]}
+        for process in senders:
+            process.kill()
+        bus.request_stop("done")
+        for process in (*senders, *servers):
+            process.join()
+
+
+def _cpu(numbers: list[int]) -> list[float]:
+    return [sum(psutil.Process(number).cpu_times()[:2]) for number in numbers]
+
+
+def _committed(bus: RedisBus, actors: int) -> int:
+    acks = [bus.ack(actor) for actor in range(actors)]
+    return CHUNK * sum(ack.id.seq for ack in acks if ack is not None)
+
+
+def measure(spec: WindowSpec, shards: int, actors: int, rate: float, seconds: float) -> Point:
+    """One load for so many seconds, after two to get going."""
+    with _system(spec, shards, actors, rate) as (bus, numbers):
+        while len(bus.actors()) < actors:
+            time.sleep(0.05)
+        time.sleep(2.0)
+        before = {kind: _cpu(found) for kind, found in numbers.items()}
+        windows, start = _committed(bus, actors), time.perf_counter()
+        time.sleep(seconds)
+        windows, elapsed = _committed(bus, actors) - windows, time.perf_counter() - start
+        used = {
+            kind: [(after - at) / elapsed for after, at in zip(_cpu(found), before[kind], strict=True)]
+            for kind, found in numbers.items()
+        }
+    return Point(shards, actors, rate, windows / elapsed, used["redis"][0], max(used["replay"]), sum(used["actor"]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--env", default="HalfCheetah-v5")
+    parser.add_argument("--actors", type=int, default=8)
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--shards", type=int, nargs="+", default=[1, 2, 4])
+    parser.add_argument("--first-rate", type=float, default=2000.0)
+    options = parser.parse_args()
+    obs_dim, action_dim, _ = env_spaces(EnvConfig(options.env))
+    spec = WindowSpec(obs_dim, action_dim, robust(EnvConfig(options.env)).agent.hidden)
+    path = Path(__file__).parent / "results" / "scaling.jsonl"
+    for shards in options.shards:
+        rate, kept_up = options.first_rate, True
+        while kept_up:
+            point = measure(spec, shards, options.actors, rate, options.seconds)
+            kept_up, rate = point.committed >= KEPT_UP * point.offered, 2 * rate
+            facts = {"env": options.env, "window_bytes": spec.dtype.itemsize, **vars(point), "cores": os.cpu_count()}
+            with path.open("a") as file:
+                file.write(json.dumps(facts) + "\n")
+            print(json.dumps(facts))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,487 @@
+"""A run on Ray: the roles of ``local.py`` as named, detached actors on the nodes of a cluster.
+
+Ray core starts again what dies, here or elsewhere. The launcher is such an actor itself, on the head, beside
+the run's Redis and folder; it places the others, gives new nodes actors, and hears why a role died.
+Learner, evaluator and a single replay server share a node; actors take a CPU each, anywhere.
+"""
+
+import dataclasses
+import hashlib
+import hmac
+import logging
+import os
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import msgpack
+
+try:
+    import ray
+    from ray.util.placement_group import placement_group, placement_group_table, remove_placement_group
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy, PlacementGroupSchedulingStrategy
+except ImportError as missing:
+    from common.errors import ConfigError
+
+    raise ConfigError("--launcher", "ray", "Ray is not installed; pip install 'rmc[ray]'") from missing
+
+from common.errors import BusFull, BusUnavailable, ConfigError, RoleDied
+from common.replay import Shard
+from common.role import StopSignal
+from deploy import tls
+from deploy.local import PREFIX, TICK_SECONDS, register, sweep, watch
+from deploy.monitor import Monitor
+from deploy.presets import RunConfig, to_json
+from deploy.ray_host import NAMESPACE, LauncherHost, LearnerHost, Report, RoleHost, Task, host_name
+from deploy.redis_server import Port, RedisServer
+from deploy.roles import URL_VARIABLE, connect
+from deploy.run_folder import RunFolder
+from deploy.supervisor import EXIT_CONFIG, QUICK_DEATHS, QUICK_SECONDS, RoleCommand
+
+REPLAY_CPUS = EVALUATOR_CPUS = 0.5
+POLL_SECONDS = 0.5  # between questions to each host
+NODES_SECONDS = 2.0  # between looks for nodes that came
+HOMELESS_SECONDS = 8.0  # without a node for the learner, after which actors make room
+STOP_SECONDS = 20.0  # for all roles to end in order and for the last checkpoint to reach the head
+KEEP_SECONDS = 10.0  # between copies of the replay servers' counters into the run's folder
+FIRST_PORT, LAST_PORT = 6380, 6479  # for Redis; 6379 is Ray's
+log = logging.getLogger(__name__)
+
+
+# -- Ray itself ---------------------------------------------------------------------------------------
+
+
+@contextmanager
+def joined(address: str, cpus: int | None = None) -> Iterator[None]:
+    """In a cluster as a driver; ``local`` starts one for this process alone. Raises ConfigError."""
+    quiet: dict[str, Any] = {"namespace": NAMESPACE, "log_to_driver": False, "logging_level": logging.ERROR}
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        if address == "local":
+            ray.init(address="local", num_cpus=cpus, include_dashboard=False, **quiet)
+        else:
+            ray.init(address=address, **quiet)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        said = str(error).strip().splitlines()[0]
+        fix = f"no Ray cluster answers ({said}); start one with ray start --head, or take local"
+        raise ConfigError("--ray-address", address, fix) from None
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def cpus() -> float:
+    """CPUs of all nodes that are alive."""
+    return float(sum(node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]))
+
+
+def learner_cpus(config: RunConfig) -> int:
+    """CPUs set aside for the learner: its threads, one by default."""
+    return max(1, config.learner.threads)
+
+
+def reserved_cpus(config: RunConfig) -> float:
+    """CPUs of everything but the actors."""
+    return learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS * config.replay.replay_shards
+
+
+def actors_that_fit(config: RunConfig) -> int:
+    """One for every CPU that is left. Raises ConfigError where there is none."""
+    left = int(cpus() - reserved_cpus(config))
+    if left < 1:
+        need = reserved_cpus(config) + 1
+        raise ConfigError(
+            "--launcher", "ray", f"the cluster has {cpus():g} CPUs and a run needs {need:g}; start more nodes"
+        )
+    return left
+
+
+# -- Where roles go -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Place:
+    """How Ray is asked for a role's host."""
+
+    kind: type[RoleHost]
+    command: RoleCommand
+    cpus: float
+    gpus: float = 0.0
+    packed: bool = False  # beside the learner
+
+
+def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[str, Place]:
+    """All roles of a run but its launcher, by name."""
+    place = ("--run", run)
+    secret: tuple[str, ...] = ("--secret-file", "{scratch}/secret")
+    if encrypted and config.replay.replay_shards > 1:  # one alone has a unix socket
+        secret += ("--tls-folder", "{scratch}")
+    learn = ("--folder", "{scratch}/checkpoints", "--device", device)
+    found = [
+        *_replays(config, (*place, *secret)),
+        Place(
+            LearnerHost, RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
+            learner_cpus(config), float(device.startswith("cuda")), packed=True,
+        ),
+        Place(RoleHost, RoleCommand("evaluator", ("evaluator", *place)), EVALUATOR_CPUS, packed=True),
+        *(
+            Place(RoleHost, RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))), 1.0)
+            for index in range(config.actors)
+        ),
+    ]  # fmt: skip
+    return {place.command.name: place for place in found}
+
+
+def _replays(config: RunConfig, words: tuple[str, ...]) -> list[Place]:
+    """One beside the learner on a unix socket, or several anywhere on the cluster's network."""
+    count = config.replay.replay_shards
+    found = []
+    for shard in (Shard(index, count) for index in range(count)):
+        listen = "unix:{scratch}/replay.sock" if count == 1 else "tcp:{ip}:0"
+        rest = ("--folder", f"{{scratch}}/{shard.role}", "--listen", listen, "--shard", str(shard.index))
+        found.append(
+            Place(RoleHost, RoleCommand(shard.role, ("replay", *words, *rest)), REPLAY_CPUS, packed=count == 1)
+        )
+    return found
+
+
+class Hosted:
+    """A role's host as the launcher sees it: asked how it is again and again, without waiting for it."""
+
+    def __init__(self, name: str, handle: Any) -> None:
+        self.name, self.handle = name, handle
+        self.report: Report | None = None  # the newest; None until the first
+        self.restarts = 0
+        self.dead = False  # for good: somebody killed it, or it could not begin
+        self._question: Any = None
+        self._asked_at = self._began_at = 0.0
+        self._quick_deaths, self._mourned = 0, ""
+
+    @property
+    def running(self) -> bool:
+        """Whether its role was running when last heard of."""
+        return self.report is not None and self.report.pid is not None
+
+    @property
+    def node(self) -> str:
+        """Where its role was last heard of."""
+        return self.report.node if self.report is not None else ""
+
+    def ask(self, logs: Path) -> None:
+        """Take in an answer that has come, and ask again. Raises RoleDied."""
+        if self._question is None:
+            if time.monotonic() >= self._asked_at + POLL_SECONDS:
+                self._asked_at = time.monotonic()
+                life, end = (self.report.life, self.report.log_end) if self.report else ("", 0)
+                self._question = self.handle.report.remote(life, end)
+            return
+        if not ray.wait([self._question], timeout=0)[0]:
+            return
+        question, self._question = self._question, None
+        try:
+            self._hear(ray.get(question), logs)
+        except ray.exceptions.ActorDiedError:
+            self.dead = True
+        except ray.exceptions.RayError:  # being started again
+            self.report = dataclasses.replace(self.report, pid=None) if self.report else None
+
+    def _hear(self, report: Report, logs: Path) -> None:
+        if self.report is None or report.life != self.report.life:
+            self.restarts += self._began_at > 0
+            self._began_at = time.monotonic()
+        self.report = report
+        if report.log:
+            with (logs / f"{self.name}.log").open("ab") as file:
+                file.write(report.log)
+        if report.status and self._mourned != report.life:
+            self._mourned = report.life
+            self._note_death(report)
+
+    def _note_death(self, report: Report) -> None:
+        quick = time.monotonic() - self._began_at < QUICK_SECONDS
+        self._quick_deaths = self._quick_deaths + 1 if quick else 0
+        if report.status == EXIT_CONFIG or self._quick_deaths >= QUICK_DEATHS:
+            often = f"{self._quick_deaths} times in a row soon after its start" if self._quick_deaths > 1 else "at once"
+            raise RoleDied(f"{self.name} ended {often} on {report.node}; its last words:\n{report.last_words}")
+
+
+class ClusterRun:
+    """A run's roles on Ray between ``start`` and ``close``. Ray must be connected."""
+
+    def __init__(self, config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> None:
+        self.config, self._folder, self._device, self._all_cpus = config, folder, device, all_cpus
+        self._encrypted = encrypted
+        self._leave = ExitStack()
+        sweep()
+        sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))
+        self._leave.callback(shutil.rmtree, sockets)
+        try:
+            ip = ray.util.get_node_ip_address()
+            if encrypted:
+                tls.make_certificate(folder.path)
+            port = Port(ip, _port(folder, ip), redis_password(folder), folder.path if encrypted else None)
+            self._server = RedisServer(sockets, port=port)
+            self._leave.enter_context(self._server)
+            self.bus = connect(self._server.url, folder.name)
+            register(self.bus, config)
+            _restore_counters(self.bus, folder)
+        except BaseException:
+            self._leave.close()
+            raise
+        self._hosts: dict[str, Hosted] = {}
+        self._group: Any = None
+        self._look_at = self._keep_at = 0.0
+        self._homeless_since: float | None = None
+
+    # -- placing --------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Place every role, or find again those that an earlier launcher of the run has placed."""
+        bundle = {"CPU": learner_cpus(self.config) + EVALUATOR_CPUS}
+        bundle["CPU"] += REPLAY_CPUS if self.config.replay.replay_shards == 1 else 0.0
+        if self._device.startswith("cuda"):
+            bundle["GPU"] = 1.0
+        name = f"{self._folder.name}:learner"
+        try:
+            self._group = ray.util.get_placement_group(name)
+        except ValueError:
+            self._group = placement_group([bundle], strategy="STRICT_PACK", name=name, lifetime="detached")
+        self._place_all()
+
+    def _place_all(self) -> None:
+        for name, place in places(self.config, self._folder.name, self._device, self._encrypted).items():
+            if name not in self._hosts:
+                self._hosts[name] = Hosted(name, self._create(name, place))
+
+    def _create(self, name: str, place: Place) -> Any:
+        strategy: Any = "SPREAD"
+        if place.packed:
+            strategy = PlacementGroupSchedulingStrategy(self._group, placement_group_bundle_index=0)
+        options = ray.remote(place.kind).options(
+            name=host_name(self._folder.name, name), namespace=NAMESPACE, lifetime="detached", get_if_exists=True,
+            max_restarts=-1, num_cpus=place.cpus, num_gpus=place.gpus, scheduling_strategy=strategy,
+        )  # fmt: skip
+        url = self._server.network_url(f"{{scratch}}/{tls.CERTIFICATE}")
+        secrets = {"secret": self._folder.secret(), "redis-url": url.encode()}
+        if self._encrypted:
+            secrets |= {file: (self._folder.path / file).read_bytes() for file in (tls.CERTIFICATE, tls.KEY)}
+        environment = {URL_VARIABLE: "file:{scratch}/redis-url"}
+        return options.remote(Task(self._folder.name, place.command, environment, secrets, os.getcwd()))
+
+    # -- tending --------------------------------------------------------------------------------------
+
+    def tend(self) -> None:
+        """Hear every host, and place what is not. Raises RoleDied."""
+        if not self._server.alive():
+            log.warning("the embedded Redis died; starting it again")
+            self._server.start()
+            register(self.bus, self.config)
+            _restore_counters(self.bus, self._folder)
+        for hosted in list(self._hosts.values()):
+            hosted.ask(self._folder.logs)
+            if hosted.dead:
+                del self._hosts[hosted.name]
+        now = time.monotonic()
+        if now >= self._look_at:
+            self._look_at = now + NODES_SECONDS
+            self._look_at_nodes()
+        if now >= self._keep_at:
+            self._keep_at = now + KEEP_SECONDS
+            self.keep_counters()
+
+    def _look_at_nodes(self) -> None:
+        if not self._at_home():
+            return
+        if self._all_cpus:
+            self._grow()
+        self._place_all()
+
+    def _at_home(self) -> bool:
+        """Whether the learner has a node; where it has none for long, actors make room for it."""
+        if placement_group_table(self._group)["state"] == "CREATED":
+            self._homeless_since = None
+            return True
+        self._homeless_since = self._homeless_since or time.monotonic()
+        if time.monotonic() >= self._homeless_since + HOMELESS_SECONDS:
+            self._make_room()
+        return False
+
+    def _make_room(self) -> None:
+        """End the actors that wait for a CPU, which would take what becomes free, and enough on the largest node."""
+        self._homeless_since = time.monotonic()
+        need = self._group.bundle_specs[0]
+        node = max(
+            (node for node in ray.nodes() if node["Alive"] and _holds(node, need)),
+            key=lambda node: float(node["Resources"]["CPU"]),
+            default=None,
+        )
+        if node is None:
+            log.warning("no node is large enough for the learner, which needs %s", need)
+            return
+        actors = [hosted for name, hosted in self._hosts.items() if name.startswith("actor-")]
+        there = [hosted for hosted in actors if hosted.running and hosted.node == node["NodeManagerAddress"]]
+        short = need["CPU"] - (node["Resources"]["CPU"] - len(there))
+        going = [hosted for hosted in actors if not hosted.running] + (there[-ceil(short) :] if short > 0 else [])
+        for hosted in going:
+            ray.kill(hosted.handle, no_restart=True)
+            self._hosts.pop(hosted.name)
+        log.warning("no node has room for the learner; ended for it: %s", ", ".join(one.name for one in going))
+
+    def _grow(self) -> None:
+        """Give CPUs that came an actor each; the replay servers start again to know of them."""
+        fit = int(cpus() - reserved_cpus(self.config))
+        if fit <= self.config.actors:
+            return
+        self.config = dataclasses.replace(self.config, actors=fit)
+        (self._folder.path / "config.json").write_text(to_json(self.config) + "\n")
+        self.bus.set_config(to_json(self.config).encode())
+        for name, hosted in self._hosts.items():
+            if name.startswith("replay"):
+                hosted.handle.again.remote()
+
+    def restarts(self) -> dict[str, int]:
+        """How often each role was started again."""
+        return {name: hosted.restarts for name, hosted in self._hosts.items()}
+
+    def waiting(self) -> list[str]:
+        """Roles that run nowhere now."""
+        return [name for name, hosted in self._hosts.items() if not hosted.running]
+
+    def finished(self) -> bool:
+        """Whether the learner has ended in order, and its last checkpoint is on the head."""
+        learner = self._hosts.get("learner")
+        return learner is not None and learner.report is not None and learner.report.status == 0
+
+    def keep_counters(self) -> None:
+        """Copy what the replay servers have published: with it, a run goes on though machine and Redis are lost."""
+        roles = [Shard(k, self.config.replay.replay_shards).role for k in range(self.config.replay.replay_shards)]
+        with suppress(BusUnavailable):
+            found = {role: raw for role in roles if (raw := self.bus.progress(role)) is not None}
+            temporary = _counters(self._folder).with_suffix(".new")
+            temporary.write_bytes(msgpack.packb(found))
+            temporary.rename(_counters(self._folder))
+
+    # -- the end --------------------------------------------------------------------------------------
+
+    def stop(self, reason: str) -> None:
+        """Ask every role to end, and wait until the learner's last checkpoint is on the head."""
+        with suppress(BusUnavailable, BusFull):
+            self.bus.request_stop(reason)
+        deadline = time.monotonic() + STOP_SECONDS
+        while time.monotonic() < deadline and any(hosted.running for hosted in self._hosts.values()):
+            for hosted in self._hosts.values():
+                with suppress(RoleDied):
+                    hosted.ask(self._folder.logs)
+            time.sleep(TICK_SECONDS)
+        self.keep_counters()
+
+    def close(self) -> None:
+        """End everything; nothing is left but the run's folder, and on the nodes the ring."""
+        try:
+            closing = [hosted.handle.close.remote() for hosted in self._hosts.values() if hosted.running]
+            if closing:
+                ray.wait(closing, num_returns=len(closing), timeout=STOP_SECONDS / 2)
+            for hosted in self._hosts.values():
+                ray.kill(hosted.handle, no_restart=True)
+            if self._group is not None:
+                remove_placement_group(self._group)
+        finally:
+            self._leave.close()
+
+
+def train(
+    config: RunConfig,
+    folder: RunFolder,
+    device: str,
+    all_cpus: bool,
+    encrypted: bool,
+    monitor: Monitor,
+    stop: StopSignal,
+) -> bool:
+    """Train until the total is reached or ``stop`` is set; whether it was reached. Raises RoleDied, ConfigError."""
+    run = ClusterRun(config, folder, device, all_cpus, encrypted)
+    monitor.restarts, monitor.unplaced = run.restarts, run.waiting
+    try:
+        monitor.skip_old(run.bus)
+        run.start()
+        while not stop.requested and not run.finished():
+            run.tend()
+            watch(monitor, run.bus)
+            time.sleep(TICK_SECONDS)
+        run.stop("stopped by its launcher" if stop.requested else "finished")
+        watch(monitor, run.bus)  # what the roles said last
+        return run.finished() and monitor.learner_finished()
+    finally:
+        run.close()
+
+
+# -- The launcher, from outside -----------------------------------------------------------------------
+
+
+def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> Any:
+    """Start a run's launcher on this node, which must be the head: its host. Raises ConfigError."""
+    context = ray.get_runtime_context()
+    head = next((node for node in ray.nodes() if "node:__internal_head__" in node["Resources"]), None)
+    if head is None or head["NodeID"] != context.get_node_id():
+        raise ConfigError(
+            "--launcher", "ray", "this is not the cluster's head; run it there, by ray attach or ray exec"
+        )
+    words = ["launcher", str(folder.path), "--ray-address", context.gcs_address, "--device", device]
+    words += ["--all-cpus"] * all_cpus + ["--tls"] * encrypted
+    command = RoleCommand("launcher", tuple(words), single_thread=False, ends=True)
+    options = ray.remote(LauncherHost).options(
+        name=host_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
+        max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
+    )  # fmt: skip
+    task = Task(folder.name, command, {}, {}, os.getcwd())
+    return options.remote(task, str(folder.path), config.learner.keep_checkpoints)
+
+
+def is_there(folder: RunFolder) -> bool:
+    """Whether the run's launcher has a host."""
+    try:
+        ray.get_actor(host_name(folder.name, "launcher"), NAMESPACE)
+    except ValueError:
+        return False
+    return True
+
+
+def _holds(node: dict[str, Any], bundle: dict[str, float]) -> bool:
+    return all(node["Resources"].get(name, 0.0) >= amount for name, amount in bundle.items())
+
+
+def redis_password(folder: RunFolder) -> str:
+    """Redis's password: follows from the run's secret, and does not give it away."""
+    return hmac.new(folder.secret(), b"redis", hashlib.sha256).hexdigest()
+
+
+def _port(folder: RunFolder, ip: str) -> int:
+    """A port for the run's Redis: the one it had before, where that is still free."""
+    note = folder.path / "redis-port"
+    wanted = [int(note.read_text())] if note.exists() else []
+    wanted += range(FIRST_PORT, LAST_PORT + 1)
+    for port in wanted:
+        with socket.socket() as probe, suppress(OSError):
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((ip, port))
+            note.write_text(f"{port}\n")
+            return port
+    raise ConfigError("--launcher", "ray", f"no port from {FIRST_PORT} to {LAST_PORT} is free on {ip} for Redis")
+
+
+def _counters(folder: RunFolder) -> Path:
+    return folder.path / "replay-counters"
+
+
+def _restore_counters(bus: Any, folder: RunFolder) -> None:
+    if _counters(folder).exists():
+        for role, raw in msgpack.unpackb(_counters(folder).read_bytes()).items():
+            bus.set_progress(role, raw)

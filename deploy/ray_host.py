@@ -1,0 +1,238 @@
+"""Ray actors that hold a role each: its process, its files and its end. Ray starts them again where they die."""
+
+import os
+import tempfile
+import threading
+import time
+import uuid
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import ray
+
+from common.checkpoint import CheckpointFolder
+from common.errors import CheckpointError
+from deploy.supervisor import EXIT_CONFIG, RoleCommand, RoleProcess
+
+NAMESPACE = "rmc"
+LAST_WORDS_SECONDS = 1.5  # a host outlives its role so long, for the launcher to hear why it died
+LOOK_SECONDS = 0.5  # between looks for new checkpoints
+LOG_BYTES = 64 << 10  # of a role's log in one report
+ENDED_IN_ORDER = 0
+STOP_SECONDS = 5.0
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a host runs. In its texts ``{scratch}`` is its folder on the node, and ``{ip}`` the address."""
+
+    run: str
+    command: RoleCommand
+    environment: dict[str, str]
+    secrets: dict[str, bytes]
+    """Text files that only the owner may read, by name, in the scratch folder."""
+    working_folder: str
+    """Where the launcher was started; roles start there, too, where the node has such a folder."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """How a host's role is."""
+
+    life: str
+    """Of the host, which Ray may have started again."""
+    node: str
+    """Its address."""
+    pid: int | None
+    status: int | None
+    """Exit status, once the role has ended and all that it left is put away."""
+    last_words: str
+    log: bytes
+    """What its log holds past where the last report ended."""
+    log_end: int
+
+
+def scratch_folder(run: str) -> Path:
+    """Where this node keeps what a run's roles need at hand. Raises RuntimeError where it is somebody else's.
+
+    Short, for the sockets in it; the run's folder itself lies with its launcher, on the head.
+    """
+    folder = Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{run[-8:]}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise RuntimeError(f"{folder} is not private; remove it")
+    return folder
+
+
+def host_name(run: str, role: str) -> str:
+    """The Ray actor's name of a role."""
+    return f"{run}:{role}"
+
+
+class RoleHost:
+    """Holds a role. Where it dies this actor ends, too, and Ray starts both again, here or on another node."""
+
+    def __init__(self, task: Task) -> None:
+        self._task, self._life, self._stopping = task, uuid.uuid4().hex, False
+        self.scratch = scratch_folder(task.run)
+        for name, content in task.secrets.items():
+            _write_private(self.scratch / name, self._filled(content.decode()).encode())
+        self._status: int | None = None
+        self.prepare()
+        logs = self.log_folder()
+        logs.mkdir(exist_ok=True)
+        self._role = RoleProcess(self._here(task.command), self._environment(), logs)
+        self._start()
+
+    def _here(self, command: RoleCommand) -> RoleCommand:
+        return replace(command, words=tuple(map(self._filled, command.words)))
+
+    def _filled(self, text: str) -> str:
+        return text.replace("{scratch}", str(self.scratch)).replace("{ip}", ray.util.get_node_ip_address())
+
+    def _environment(self) -> dict[str, str]:
+        """Without what Ray says to its own workers: a role is none, and the launcher begins a job of its own."""
+        for name in ("RAY_JOB_ID", "RAY_RAYLET_PID", "OMP_NUM_THREADS"):
+            os.environ.pop(name, None)
+        if os.path.isdir(self._task.working_folder):
+            os.chdir(self._task.working_folder)
+        return {name: self._filled(value) for name, value in self._task.environment.items()}
+
+    def _start(self) -> None:
+        self._role.start()
+        threading.Thread(target=self._watch, args=(self._role.pid,), daemon=True).start()
+
+    # What a role's host does beyond holding it.
+
+    def prepare(self) -> None:
+        """Before the role starts."""
+
+    def settle(self) -> None:
+        """After it has ended in order."""
+
+    def tend(self) -> None:
+        """Once in a while meanwhile."""
+
+    def log_folder(self) -> Path:
+        """Where the role's log goes."""
+        return self.scratch / "logs"
+
+    def over(self, status: int) -> bool:
+        """Whether such an end is the last one; after any other, all starts again."""
+        return status in (ENDED_IN_ORDER, EXIT_CONFIG)
+
+    def _watch(self, pid: int | None) -> None:
+        while not self._role.reap(LOOK_SECONDS):
+            if self._role.pid not in (pid, None):  # started again on purpose: another thread watches
+                return
+            with suppress(ray.exceptions.RayError, CheckpointError, OSError):  # the next look tries again
+                self.tend()
+        status = self._role.status
+        assert status is not None
+        if self._stopping:
+            return
+        if self.over(status):
+            self.settle()
+            self._status = status
+        else:
+            self._status = status
+            time.sleep(LAST_WORDS_SECONDS)
+            os._exit(1)
+
+    def report(self, life: str, log_start: int) -> Report:
+        """How the role is, and its log from there on; of another life's, from this one's start on."""
+        start = log_start if life == self._life else self._role.log_start
+        log = b""
+        with suppress(FileNotFoundError), self._role.log.open("rb") as file:
+            file.seek(start)
+            log = file.read(LOG_BYTES)
+        words = self._role.last_words() if self._status else ""
+        return Report(
+            self._life, ray.util.get_node_ip_address(), self._role.pid, self._status, words, log, start + len(log)
+        )
+
+    def again(self) -> None:
+        """End the role in order and start it again, because the run's config has changed."""
+        self._stopping = True
+        self._end()
+        self._stopping = False
+        self._start()
+
+    def _end(self) -> None:
+        self._role.signal(15)
+        if not self._role.reap(STOP_SECONDS):
+            self._role.signal(9)
+            self._role.reap(STOP_SECONDS)
+
+    def close(self) -> None:
+        """End the role, whatever it does; this actor is killed next."""
+        self._stopping = True
+        self._end()
+
+
+class LearnerHost(RoleHost):
+    """The learner's: brings the newest checkpoint from the head before, and takes every new one there."""
+
+    def prepare(self) -> None:
+        self._folder = CheckpointFolder(self.scratch / "checkpoints")
+        found = ray.get(self._launcher().newest.remote(max(self._folder.numbers(), default=-1)))
+        if found is not None:
+            self._folder.save(*found)
+        self._archived = set(self._folder.numbers())
+
+    def _launcher(self) -> Any:
+        return ray.get_actor(host_name(self._task.run, "launcher"), NAMESPACE)
+
+    def tend(self) -> None:
+        for number in self._folder.numbers():
+            if number not in self._archived:
+                ray.get(self._launcher().archive.remote(number, self._folder.load(number)))
+                self._archived.add(number)
+
+    def settle(self) -> None:
+        deadline = time.monotonic() + STOP_SECONDS
+        while time.monotonic() < deadline:
+            try:
+                self.tend()
+                return
+            except (ray.exceptions.RayError, CheckpointError, OSError):
+                time.sleep(LOOK_SECONDS)
+
+
+class LauncherHost(RoleHost):
+    """The launcher's, on the head: keeps the run's checkpoints in its folder, and ends itself with the run."""
+
+    def __init__(self, task: Task, folder: str, keep: int) -> None:
+        self._folder = Path(folder)
+        self._checkpoints = CheckpointFolder(self._folder / "checkpoints", keep)
+        super().__init__(task)
+
+    def log_folder(self) -> Path:
+        return self._folder / "logs"
+
+    def over(self, status: int) -> bool:
+        """Only a launcher that was killed begins again: any other end is the run's."""
+        return status >= 0
+
+    def settle(self) -> None:
+        ray.kill(ray.get_runtime_context().current_actor, no_restart=True)
+
+    def archive(self, number: int, files: dict[str, bytes]) -> None:
+        """Keep a checkpoint."""
+        self._checkpoints.save(number, files)
+
+    def newest(self, above: int) -> tuple[int, dict[str, bytes]] | None:
+        """The newest whole checkpoint, if it is newer than that."""
+        found = self._checkpoints.latest() if max(self._checkpoints.numbers(), default=-1) > above else None
+        return found if found is not None and found[0] > above else None
+
+
+def _write_private(path: Path, content: bytes) -> None:
+    temporary = path.with_name(f".{path.name}")
+    temporary.unlink(missing_ok=True)
+    with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(content)
+    temporary.rename(path)

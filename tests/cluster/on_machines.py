@@ -1,0 +1,273 @@
+"""``ray up`` on three machines: a run learns on them, loses processes, networks and nodes, and is taken down.
+
+The machines are namespaces of this one (``machines.py``). Not collected by ``make test``: ``make test-cluster`` makes
+five rounds with every cut, ``make test-cluster ROUNDS=1 CUTS=5`` a short one.
+"""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import deploy
+from tests.cluster import machines
+from tests.cluster.machines import Machine, Machines
+from tests.integration.test_learning import FAST, SMALL
+
+pytestmark = [pytest.mark.skipif(bool(machines.missing()), reason=machines.missing()), pytest.mark.timeout(900)]
+PROJECT = Path(deploy.__file__).parents[1]
+PYTHON = Path(sys.executable).parent  # the environment that the machines use, too
+CUTS = [int(word) for word in os.environ.get("RMC_CUTS", "5 30 90").split()]  # seconds without a network
+SHOWN = os.environ.get("RMC_CLUSTER_RESULTS")  # a file for the figures
+RMC = f"cd {PROJECT} && {PYTHON}/python -P -m deploy.cli"
+RAY = "RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0"
+CPUS = {"head": 0, "alpha": 3, "beta": 3}  # as Ray is told: the learner's group takes two of one worker's
+LEARNING = (*SMALL, *FAST)
+
+
+def note(**figures: Any) -> None:
+    """Keep a figure for the closing table."""
+    print(figures)
+    if SHOWN:
+        with Path(SHOWN).open("a") as file:
+            file.write(json.dumps(figures) + "\n")
+
+
+class Site:
+    """A cluster of three such machines, brought up by the project's own file for machines of one's own."""
+
+    def __init__(self, folder: Path) -> None:
+        keep = [PROJECT, Path(sys.prefix), Path(sys.base_prefix)]
+        environment = {"PATH": f"{PYTHON}:$PATH", "RAY_AUTH_MODE": "token", "RAY_USAGE_STATS_ENABLED": "0"}
+        environment["PYTHONPATH"] = str(PROJECT)
+        self.machines = Machines(folder, list(CPUS), keep, environment)
+        self.head, self.alpha, self.beta = self.machines.machines
+        self.config = folder / "cluster.yaml"
+        self.config.write_text(
+            yaml.safe_dump(self._edited(yaml.safe_load((PROJECT / "deploy/cluster/on-premise.yaml").read_text())))
+        )
+
+    def _edited(self, config: dict[str, Any]) -> dict[str, Any]:
+        """With these addresses, and the environment that is here already in place of its setup."""
+        config["provider"] |= {"head_ip": self.head.ip, "worker_ips": [self.alpha.ip, self.beta.ip]}
+        config["auth"] = {"ssh_user": "root", "ssh_private_key": str(self.machines.key)}
+        config["file_mounts"].pop("~/rmc")
+        config["setup_commands"] = ["chmod 600 ~/.ray/auth_token"]
+        for name in ("head_start_ray_commands", "worker_start_ray_commands"):
+            commands = [command.replace("~/rmc-env/bin", str(PYTHON)) for command in config[name]]
+            cpus = CPUS["head" if name.startswith("head") else "alpha"]
+            config[name] = [*commands[:-1], f"{commands[-1]} --num-cpus={cpus} --object-store-memory=100000000"]
+        return config
+
+    def join(self, machine: Machine) -> None:
+        """As the cluster's file starts a worker."""
+        machine.run(
+            f"{RAY} {PYTHON}/ray start --address={self.head.ip}:6379 --node-ip-address={machine.ip} "
+            f"--num-cpus={CPUS.get(machine.name, 1)} "
+            "--object-store-memory=100000000"
+        )
+
+    def alive(self) -> int:
+        code = (
+            "import ray; ray.init(address='auto', logging_level='ERROR'); print(sum(n['Alive'] for n in ray.nodes()))"
+        )
+        return int(self.head.run(f'{PYTHON}/python -c "{code}"').stdout.split()[-1])
+
+
+class Run:
+    """A run on the head of such a site."""
+
+    def __init__(self, site: Site, name: str, *options: str) -> None:
+        self.site, self.folder = site, f"/root/{name}"
+        words = f"train InvertedPendulum-v5 --run-dir {self.folder} --launcher ray {' '.join(options)}"
+        self.process = site.head.background(f"{RMC} {words}")
+
+    def records(self, role: str) -> list[dict[str, Any]]:
+        text = self.site.head.run(f"cat {self.folder}/metrics.jsonl", check=False).stdout
+        found = [json.loads(line) for line in text.splitlines() if line.endswith("}")]
+        return [record for record in found if record["role"] == role]
+
+    def newest(self, role: str, name: str, default: Any = 0) -> Any:
+        values = [record[name] for record in self.records(role) if name in record]
+        return values[-1] if values else default
+
+    def actors(self) -> int:
+        return int(json.loads(self.site.head.run(f"cat {self.folder}/config.json").stdout)["actors"])
+
+    def wait_for(self, condition: Callable[[], Any], seconds: float = 120.0) -> float:
+        """Until it holds, while the run goes on; how long it took."""
+        began = time.monotonic()
+        while not condition():
+            assert self.process.poll() is None, self.text()
+            assert time.monotonic() - began < seconds, f"in vain for {seconds} s\n{self.logs()}"
+            time.sleep(0.2)
+        return time.monotonic() - began
+
+    def text(self) -> str:
+        assert self.process.stdout is not None
+        return self.process.stdout.read() + self.logs()
+
+    def logs(self) -> str:
+        return self.site.head.run(f"tail -n 15 {self.folder}/logs/*.log", check=False).stdout
+
+    def wait_for_updates(self, more: int) -> float:
+        goal = self.newest("learner", "updates") + more
+        return self.wait_for(lambda: self.newest("learner", "updates") >= goal)
+
+    def check_counters(self) -> None:
+        """Nothing went back, and no acknowledged window was lost or asked for twice."""
+        steps = [record["env_steps"] for record in self.records("replay")]
+        assert steps == sorted(steps)
+        assert self.newest("replay", "entry_gaps") == self.newest("replay", "dead_letters") == 0
+
+    def stop(self) -> str:
+        said = self.site.head.run(f"{RMC} stop {self.folder}").stdout
+        self.process.wait(60)
+        return said
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    made = Site(tmp_path_factory.mktemp("site"))
+    try:
+        began = time.monotonic()
+        environment = f"{RAY} HOME=/root"
+        up = made.head.run(f"{environment} {RMC} cluster up {made.config}", seconds=180)
+        note(test="up", seconds=time.monotonic() - began)
+        assert "3 nodes are up" in up.stdout
+        yield made
+    finally:
+        made.machines.close()
+
+
+@pytest.fixture(scope="module")
+def endless(site: Site) -> Run:
+    run = Run(site, "endless", "--preset", "debug", "--total-steps", "10000000", "--replay-ratio", "8", "--all-cpus")
+    run.wait_for(lambda: not run.newest("launcher", "not_running", "x"))
+    run.wait_for_updates(100)
+    return run
+
+
+def where(run: Run, role: str) -> Machine:
+    """The machine whose processes a role's is one of."""
+    found = [machine for machine in run.site.machines.machines if machine.processes(f"deploy.cli {role}")]
+    assert len(found) == 1, (role, [machine.name for machine in found])
+    return found[0]
+
+
+def test_every_node_is_there(site: Site) -> None:
+    assert site.alive() == 3
+    assert site.head.run("stat -c %a /root/.ray/auth_token").stdout.strip() == "600"
+
+
+def test_a_run_learns_is_stopped_and_goes_on(site: Site) -> None:
+    began = time.monotonic()
+    run = Run(site, "learning", *LEARNING, "--actors", "2", "--total-steps", "60000")
+    run.wait_for(lambda: run.newest("evaluator", "eval_return_mean") >= 1000.0, seconds=600)
+    workers = [machine for machine in (site.alpha, site.beta) if machine.processes("deploy.cli actor")]
+    assert len(workers) == 2
+    note(test="reached 1000", seconds=time.monotonic() - began, updates=run.newest("evaluator", "eval_update"))
+    steps = run.newest("replay", "env_steps")
+    assert "to go on, give the same options" in run.stop()
+    for machine in site.machines.machines:
+        assert not machine.processes("deploy.cli"), machine.name
+    again = Run(site, "learning", *LEARNING, "--actors", "2", "--total-steps", "60000")
+    again.wait_for(lambda: again.records("replay")[-1]["env_steps"] > steps)
+    again.check_counters()
+    again.stop()
+
+
+def test_a_killed_raylet_costs_no_acknowledged_window(endless: Run) -> None:
+    learner, site = where(endless, "learner"), endless.site
+    worker = site.beta if learner is site.alpha else site.alpha
+    before = endless.newest("replay", "env_steps")
+    worker.kill("raylet/raylet")
+    ended = endless.wait_for(lambda: not worker.processes("deploy.cli actor"))
+    endless.wait_for_updates(20)
+    site.join(worker)
+    back = endless.wait_for(lambda: len(worker.processes("deploy.cli actor")) >= 3)
+    endless.wait_for(lambda: endless.newest("replay", "env_steps") > before + 500)
+    endless.check_counters()
+    note(test="raylet killed", roles_ended_s=ended, back_s=back)
+
+
+@pytest.mark.parametrize("seconds", CUTS)
+def test_a_cut_network_heals(endless: Run, seconds: int) -> None:
+    learner, site = where(endless, "learner"), endless.site
+    worker = site.beta if learner is site.alpha else site.alpha
+    worker.cut()
+    time.sleep(seconds)
+    worker.heal()
+    if seconds >= 90:  # Ray has given the node up
+        endless.wait_for(lambda: not worker.processes("raylet/raylet"))
+        site.join(worker)
+    healed = time.monotonic()
+    heard = time.time()
+
+    def all_there() -> bool:
+        return min(endless.newest(f"actor-{k}", "time") for k in range(endless.actors())) > heard
+
+    endless.wait_for(all_there)
+    endless.check_counters()
+    note(test=f"network cut for {seconds} s", back_s=time.monotonic() - healed)
+
+
+@pytest.mark.parametrize("role", ["learner", "replay"])
+def test_a_killed_process_resumes(endless: Run, role: str) -> None:
+    machine = where(endless, role)
+    before = machine.processes(f"deploy.cli {role}")
+    machine.kill(f"deploy.cli {role}")
+    back = endless.wait_for(lambda: (now := machine.processes(f"deploy.cli {role}")) and now != before)
+    endless.wait_for_updates(50)
+    endless.check_counters()
+    note(test=f"{role} killed", back_s=back)
+
+
+def test_a_node_that_joins_gets_actors(endless: Run) -> None:
+    site = endless.site
+    new = site.machines.add("gamma")
+    began = time.monotonic()
+    site.join(new)
+    endless.wait_for(lambda: len(new.processes("deploy.cli actor")) >= 1)
+    joined = time.monotonic() - began
+    assert joined < 30.0
+    endless.wait_for(lambda: endless.newest("launcher", "not_running", "x") == "")
+    endless.wait_for_updates(50)
+    endless.check_counters()
+    note(test="node joined", actors_after_s=joined)
+
+
+def test_the_learners_node_is_lost(endless: Run) -> None:
+    site, lost = endless.site, where(endless, "learner")
+    steps, updates = endless.newest("replay", "env_steps"), endless.newest("learner", "updates")
+    checkpoint = int(site.head.run(f"ls {endless.folder}/checkpoints | grep -v best | tail -n 1").stdout)
+    lost.kill("raylet/raylet")
+    away = endless.wait_for(lambda: not lost.processes("deploy.cli learner"))
+    back = endless.wait_for(
+        lambda: any(m.processes("deploy.cli learner") for m in site.machines.machines if m is not lost), seconds=180
+    )
+    endless.wait_for_updates(50)
+    assert where(endless, "learner") is not lost
+    assert endless.newest("replay", "env_steps") >= steps
+    assert checkpoint <= endless.newest("learner", "updates")
+    assert "is lost; begins empty at environment step" in site.head.run(f"cat {endless.folder}/logs/replay.log").stdout
+    endless.check_counters()
+    note(test="learner's node lost", away_s=away, back_s=back, updates_before=updates, checkpoint=checkpoint)
+
+
+def test_the_run_ends_and_nothing_is_left(endless: Run) -> None:
+    site = endless.site
+    endless.stop()
+    for machine in site.machines.machines:
+        assert not machine.processes("deploy.cli"), machine.name
+    began = time.monotonic()
+    site.head.run(f"{RMC} cluster down {site.config}", seconds=180)
+    note(test="down", seconds=time.monotonic() - began)
+    for machine in (site.head, site.alpha, site.beta):
+        assert not machine.processes("ray"), machine.name

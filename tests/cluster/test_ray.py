@@ -1,0 +1,131 @@
+"""Runs on Ray without ssh: one of its own, and several nodes as raylets of this machine."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+import ray
+from ray.cluster_utils import Cluster
+
+from deploy.run_folder import RunFolder
+from tests.integration.running import ENVIRONMENT, Training
+
+ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
+
+
+@pytest.fixture(autouse=True)
+def leaves_nothing_behind() -> Iterator[None]:
+    """Ray keeps a few files of its own for later; no process may stay."""
+    yield
+    deadline = time.monotonic() + 20.0
+    while left := _left():
+        assert time.monotonic() < deadline, left
+        time.sleep(0.2)
+
+
+def _left() -> list[str]:
+    found = []
+    for process in psutil.process_iter():
+        try:
+            words = " ".join(process.cmdline())
+        except psutil.Error:
+            continue
+        if "raylet/raylet" in words or "gcs_server" in words or ("deploy.cli" in words and "rmct-" in words):
+            found.append(f"{process.pid} {words[:150]}")
+    return found
+
+
+def test_a_run_on_a_ray_of_its_own(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with Training(folder, "--launcher", "ray", "--ray-address", "local") as training:
+        assert training.finish(240) == 0, training.text() + training.logs()
+    result = json.loads((folder / "result.json").read_text())
+    assert result["env_steps"] == 4_000
+    assert result["updates"] > 100
+    assert result["restarts"] == 0
+    assert "after training:" in training.text()
+    for role in ("actor-0", "replay", "learner", "evaluator", "launcher"):
+        assert training.records(role), role
+    assert (folder / "checkpoints" / "best.json").exists()
+    assert {path.name for path in (folder / "logs").iterdir()} >= {"launcher.log", "learner.log", "replay.log"}
+
+
+def test_more_than_the_cluster_holds_is_refused(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "deploy.cli", "train", "InvertedPendulum-v5", "--launcher", "ray"]
+    done = subprocess.run(
+        [*words, "--run-dir", str(tmp_path / "run")], env=ENVIRONMENT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("rmc: --ray-address='auto': no Ray cluster answers")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.fixture
+def nodes() -> Iterator[Cluster]:
+    """A head with room for all but the actors, and two nodes with room for one each."""
+    os.environ["RAY_AUTH_MODE"] = "disabled"  # cluster_utils makes no token
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False})
+    try:
+        yield cluster
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+        del os.environ["RAY_AUTH_MODE"]
+
+
+def test_a_node_is_lost_and_another_comes(nodes: Cluster, tmp_path: Path) -> None:
+    first, _ = nodes.add_node(num_cpus=1), nodes.add_node(num_cpus=1)
+    folder = tmp_path / "run"
+    os.environ["RAY_AUTH_MODE"] = "disabled"
+    with Training(folder, *ENDLESS, "--launcher", "ray", "--ray-address", nodes.address, "--actors", "2") as training:
+        training.wait_for_updates(50)
+        training.wait_for(lambda: all(training.newest(f"actor-{k}", "env_steps") > 0 for k in range(2)))
+
+        nodes.remove_node(first, allow_graceful=False)
+        training.wait_for(lambda: len(training.newest("launcher", "not_running", "").split()) == 1)
+        lost = training.newest("launcher", "not_running")
+        training.wait_for_updates(100)  # the other goes on
+
+        nodes.add_node(num_cpus=1)
+        began = time.monotonic()
+        before = len(training.records(lost))
+        training.wait_for(lambda: len(training.records(lost)) > before + 2)
+        assert time.monotonic() - began < 30.0
+        training.wait_for(lambda: training.newest("launcher", "not_running", "") == "")
+        training.wait_for_updates(100)
+        steps = [record["env_steps"] for record in training.records("replay")]
+        assert steps == sorted(steps)
+        assert training.newest("replay", "entry_gaps") == training.newest("replay", "dead_letters") == 0
+
+        trainer = RunFolder(folder).trainer()
+        assert trainer is not None
+        done = subprocess.run(
+            [sys.executable, "-m", "deploy.cli", "stop", str(folder)], env=ENVIRONMENT, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        assert "to go on, give the same options" in done.stdout
+        assert training.finish(60) == 130
+    assert max(RunFolder(folder).checkpoints.glob("[0-9]*")).is_dir()
+
+
+def test_a_killed_launcher_comes_back(nodes: Cluster, tmp_path: Path) -> None:
+    nodes.add_node(num_cpus=1)
+    folder = RunFolder(tmp_path / "run")
+    with Training(folder.path, *ENDLESS, "--launcher", "ray", "--ray-address", nodes.address) as training:
+        training.wait_for_updates(50)
+        before = folder.trainer()
+        assert before is not None
+        os.kill(before, signal.SIGKILL)
+        training.wait_for(lambda: folder.trainer() not in (None, before))
+        steps = training.newest("replay", "env_steps")
+        training.wait_for(lambda: training.newest("replay", "env_steps") > steps + 200)
+        training.wait_for_updates(100)
+        training.interrupt()
+    assert training.process.returncode == 130

