@@ -11,9 +11,11 @@ import hmac
 import logging
 import os
 import shutil
+import signal
 import socket
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -41,7 +43,7 @@ from deploy.monitor import Monitor
 from deploy.presets import RunConfig, to_json
 from deploy.ray_host import NAMESPACE, LauncherHost, LearnerHost, Report, RoleHost, Task, host_name
 from deploy.redis_server import Port, RedisServer
-from deploy.roles import URL_VARIABLE, connect
+from deploy.roles import PATIENCE_VARIABLE, URL_VARIABLE, connect
 from deploy.run_folder import RunFolder
 from deploy.supervisor import EXIT_CONFIG, QUICK_DEATHS, QUICK_SECONDS, RoleCommand
 
@@ -50,6 +52,7 @@ POLL_SECONDS = 0.5  # between questions to each host
 NODES_SECONDS = 2.0  # between looks for nodes that came
 HOMELESS_SECONDS = 8.0  # without a node for the learner, after which actors make room
 STOP_SECONDS = 20.0  # for all roles to end in order and for the last checkpoint to reach the head
+PATIENCE_SECONDS = 120.0  # of a role that starts while launcher and Redis are being started again
 KEEP_SECONDS = 10.0  # between copies of the replay servers' counters into the run's folder
 FIRST_PORT, LAST_PORT = 6380, 6479  # for Redis; 6379 is Ray's
 log = logging.getLogger(__name__)
@@ -63,15 +66,21 @@ def joined(address: str, cpus: int | None = None) -> Iterator[None]:
     """In a cluster as a driver; ``local`` starts one for this process alone. Raises ConfigError."""
     quiet: dict[str, Any] = {"namespace": NAMESPACE, "log_to_driver": False, "logging_level": logging.ERROR}
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    mask = os.umask(0o077)  # Ray may write its token, and lets everyone read it
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         if address == "local":
             ray.init(address="local", num_cpus=cpus, include_dashboard=False, **quiet)
         else:
             ray.init(address=address, **quiet)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        said = str(error).strip().splitlines()[0]
+    except (ConnectionError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
+        said = (str(error).strip() or type(error).__name__).splitlines()[0]
         fix = f"no Ray cluster answers ({said}); start one with ray start --head, or take local"
         raise ConfigError("--ray-address", address, fix) from None
+    finally:
+        os.umask(mask)
+        for number, handler in handlers.items():  # Ray takes SIGTERM for itself
+            signal.signal(number, handler)
     try:
         yield
     finally:
@@ -91,6 +100,22 @@ def learner_cpus(config: RunConfig) -> int:
 def reserved_cpus(config: RunConfig) -> float:
     """CPUs of everything but the actors."""
     return learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS * config.replay.replay_shards
+
+
+def bundle(config: RunConfig, device: str) -> dict[str, float]:
+    """What the node of the learner must hold."""
+    beside = REPLAY_CPUS if config.replay.replay_shards == 1 else 0.0
+    found = {"CPU": learner_cpus(config) + EVALUATOR_CPUS + beside}
+    return found | {"GPU": 1.0} if device.startswith("cuda") else found
+
+
+def check_room(config: RunConfig, device: str) -> None:
+    """Raises ConfigError where no node can hold the learner."""
+    need = bundle(config, device)
+    if not any(node["Alive"] and _holds(node, need) for node in ray.nodes()):
+        wanted = ", ".join(f"{amount:g} {name}" for name, amount in need.items())
+        fix = f"no node of the cluster has {wanted}, which the learner and what is beside it take; start one that has"
+        raise ConfigError("--device", device, fix)
 
 
 def actors_that_fit(config: RunConfig) -> int:
@@ -115,7 +140,8 @@ class Place:
     command: RoleCommand
     cpus: float
     gpus: float = 0.0
-    packed: bool = False  # beside the learner
+    group: str = ""  # of bundles that a node is found for: the learner's or the replay servers'
+    index: int = 0  # which of them
 
 
 def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[str, Place]:
@@ -129,9 +155,9 @@ def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[st
         *_replays(config, (*place, *secret)),
         Place(
             LearnerHost, RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
-            learner_cpus(config), float(device.startswith("cuda")), packed=True,
+            learner_cpus(config), float(device.startswith("cuda")), group="learner",
         ),
-        Place(RoleHost, RoleCommand("evaluator", ("evaluator", *place)), EVALUATOR_CPUS, packed=True),
+        Place(RoleHost, RoleCommand("evaluator", ("evaluator", *place)), EVALUATOR_CPUS, group="learner"),
         *(
             Place(RoleHost, RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))), 1.0)
             for index in range(config.actors)
@@ -147,20 +173,21 @@ def _replays(config: RunConfig, words: tuple[str, ...]) -> list[Place]:
     for shard in (Shard(index, count) for index in range(count)):
         listen = "unix:{scratch}/replay.sock" if count == 1 else "tcp:{ip}:0"
         rest = ("--folder", f"{{scratch}}/{shard.role}", "--listen", listen, "--shard", str(shard.index))
-        found.append(
-            Place(RoleHost, RoleCommand(shard.role, ("replay", *words, *rest)), REPLAY_CPUS, packed=count == 1)
-        )
+        group, index = ("learner", 0) if count == 1 else ("replay", shard.index)
+        command = RoleCommand(shard.role, ("replay", *words, *rest))
+        found.append(Place(RoleHost, command, REPLAY_CPUS, group=group, index=index))
     return found
 
 
 class Hosted:
     """A role's host as the launcher sees it: asked how it is again and again, without waiting for it."""
 
-    def __init__(self, name: str, handle: Any) -> None:
-        self.name, self.handle = name, handle
+    def __init__(self, name: str, handle: Any, cpus: float) -> None:
+        self.name, self.handle, self.cpus = name, handle, cpus
         self.report: Report | None = None  # the newest; None until the first
         self.restarts = 0
-        self.dead = False  # for good: somebody killed it, or it could not begin
+        self.dead = ""  # for good, and why: somebody killed it, or it could not begin
+        self.waits_since = time.monotonic()  # for a CPU, or to be started again; unless it runs
         self._question: Any = None
         self._asked_at = self._began_at = 0.0
         self._quick_deaths, self._mourned = 0, ""
@@ -188,9 +215,10 @@ class Hosted:
         question, self._question = self._question, None
         try:
             self._hear(ray.get(question), logs)
-        except ray.exceptions.ActorDiedError:
-            self.dead = True
+        except ray.exceptions.ActorDiedError as error:
+            self.dead = str(error)
         except ray.exceptions.RayError:  # being started again
+            self.waits_since = time.monotonic() if self.running else self.waits_since
             self.report = dataclasses.replace(self.report, pid=None) if self.report else None
 
     def _hear(self, report: Report, logs: Path) -> None:
@@ -198,7 +226,7 @@ class Hosted:
             self.restarts += self._began_at > 0
             self._began_at = time.monotonic()
         self.report = report
-        if report.log:
+        if report.log or not (logs / f"{self.name}.log").exists():
             with (logs / f"{self.name}.log").open("ab") as file:
                 file.write(report.log)
         if report.status and self._mourned != report.life:
@@ -226,7 +254,7 @@ class ClusterRun:
         try:
             ip = ray.util.get_node_ip_address()
             if encrypted:
-                tls.make_certificate(folder.path)
+                tls.make_certificate(folder.path, ip)
             port = Port(ip, _port(folder, ip), redis_password(folder), folder.path if encrypted else None)
             self._server = RedisServer(sockets, port=port)
             self._leave.enter_context(self._server)
@@ -237,7 +265,8 @@ class ClusterRun:
             self._leave.close()
             raise
         self._hosts: dict[str, Hosted] = {}
-        self._group: Any = None
+        self._groups: dict[str, Any] = {}
+        self._lost: Counter[str] = Counter()  # hosts that died for good, by role
         self._look_at = self._keep_at = 0.0
         self._homeless_since: float | None = None
 
@@ -245,35 +274,41 @@ class ClusterRun:
 
     def start(self) -> None:
         """Place every role, or find again those that an earlier launcher of the run has placed."""
-        bundle = {"CPU": learner_cpus(self.config) + EVALUATOR_CPUS}
-        bundle["CPU"] += REPLAY_CPUS if self.config.replay.replay_shards == 1 else 0.0
-        if self._device.startswith("cuda"):
-            bundle["GPU"] = 1.0
-        name = f"{self._folder.name}:learner"
-        try:
-            self._group = ray.util.get_placement_group(name)
-        except ValueError:
-            self._group = placement_group([bundle], strategy="STRICT_PACK", name=name, lifetime="detached")
+        self._groups["learner"] = self._group("learner", [bundle(self.config, self._device)], "STRICT_PACK")
+        if (count := self.config.replay.replay_shards) > 1:  # a ring stays on its node: so does its server
+            self._groups["replay"] = self._group("replay", [{"CPU": REPLAY_CPUS}] * count, "SPREAD")
         self._place_all()
+
+    def _group(self, name: str, bundles: list[dict[str, float]], strategy: str) -> Any:
+        name = host_name(self._folder.name, name)
+        try:
+            return ray.util.get_placement_group(name)
+        except ValueError:
+            return placement_group(bundles, strategy=strategy, name=name, lifetime="detached")
 
     def _place_all(self) -> None:
         for name, place in places(self.config, self._folder.name, self._device, self._encrypted).items():
             if name not in self._hosts:
-                self._hosts[name] = Hosted(name, self._create(name, place))
+                self._hosts[name] = Hosted(name, self._create(name, place), place.cpus)
 
     def _create(self, name: str, place: Place) -> Any:
         strategy: Any = "SPREAD"
-        if place.packed:
-            strategy = PlacementGroupSchedulingStrategy(self._group, placement_group_bundle_index=0)
+        if place.group:
+            strategy = PlacementGroupSchedulingStrategy(
+                self._groups[place.group], placement_group_bundle_index=place.index
+            )
         options = ray.remote(place.kind).options(
             name=host_name(self._folder.name, name), namespace=NAMESPACE, lifetime="detached", get_if_exists=True,
             max_restarts=-1, num_cpus=place.cpus, num_gpus=place.gpus, scheduling_strategy=strategy,
         )  # fmt: skip
         url = self._server.network_url(f"{{scratch}}/{tls.CERTIFICATE}")
-        secrets = {"secret": self._folder.secret(), "redis-url": url.encode()}
+        secrets = {"redis-url": url.encode()}
+        if name == "learner" or name.startswith("replay"):
+            secrets["secret"] = self._folder.secret()
         if self._encrypted:
-            secrets |= {file: (self._folder.path / file).read_bytes() for file in (tls.CERTIFICATE, tls.KEY)}
-        environment = {URL_VARIABLE: "file:{scratch}/redis-url"}
+            files = (tls.CERTIFICATE, tls.KEY) if name.startswith("replay") else (tls.CERTIFICATE,)
+            secrets |= {file: (self._folder.path / file).read_bytes() for file in files}
+        environment = {URL_VARIABLE: "file:{scratch}/redis-url", PATIENCE_VARIABLE: str(PATIENCE_SECONDS)}
         return options.remote(Task(self._folder.name, place.command, environment, secrets, os.getcwd()))
 
     # -- tending --------------------------------------------------------------------------------------
@@ -288,7 +323,7 @@ class ClusterRun:
         for hosted in list(self._hosts.values()):
             hosted.ask(self._folder.logs)
             if hosted.dead:
-                del self._hosts[hosted.name]
+                self._mourn(hosted)
         now = time.monotonic()
         if now >= self._look_at:
             self._look_at = now + NODES_SECONDS
@@ -297,16 +332,38 @@ class ClusterRun:
             self._keep_at = now + KEEP_SECONDS
             self.keep_counters()
 
+    def _mourn(self, hosted: Hosted) -> None:
+        """Let go of a host that Ray does not start again; the next look at the nodes makes another."""
+        log.warning("the host of %s is gone: %s", hosted.name, hosted.dead)
+        del self._hosts[hosted.name]
+        self._lost[hosted.name] += 1
+        if self._lost[hosted.name] >= QUICK_DEATHS:
+            raise RoleDied(f"the host of {hosted.name} could not be held:\n{hosted.dead}")
+
     def _look_at_nodes(self) -> None:
         if not self._at_home():
             return
-        if self._all_cpus:
+        if self._all_cpus and not self.waiting():
             self._grow()
         self._place_all()
+        self._keep_low_actors()
+
+    def _keep_low_actors(self) -> None:
+        """Where CPUs are lost for good, it is the highest actors that wait: the run's last steps go to the lowest."""
+        actors = [self._hosts[name] for name in self._hosts if name.startswith("actor-")]
+        actors.sort(key=lambda hosted: int(hosted.name.removeprefix("actor-")))
+        waiting = [one for one in actors if not one.running and time.monotonic() > one.waits_since + HOMELESS_SECONDS]
+        if waiting and actors[-1].running:
+            log.warning("%s waits for a CPU; %s gives it its own", waiting[0].name, actors[-1].name)
+            self._end_host(actors[-1])
+
+    def _end_host(self, hosted: Hosted) -> None:
+        ray.kill(hosted.handle, no_restart=True)
+        self._hosts.pop(hosted.name)
 
     def _at_home(self) -> bool:
         """Whether the learner has a node; where it has none for long, actors make room for it."""
-        if placement_group_table(self._group)["state"] == "CREATED":
+        if placement_group_table(self._groups["learner"])["state"] == "CREATED":
             self._homeless_since = None
             return True
         self._homeless_since = self._homeless_since or time.monotonic()
@@ -317,7 +374,7 @@ class ClusterRun:
     def _make_room(self) -> None:
         """End the actors that wait for a CPU, which would take what becomes free, and enough on the largest node."""
         self._homeless_since = time.monotonic()
-        need = self._group.bundle_specs[0]
+        need = bundle(self.config, self._device)
         node = max(
             (node for node in ray.nodes() if node["Alive"] and _holds(node, need)),
             key=lambda node: float(node["Resources"]["CPU"]),
@@ -328,11 +385,11 @@ class ClusterRun:
             return
         actors = [hosted for name, hosted in self._hosts.items() if name.startswith("actor-")]
         there = [hosted for hosted in actors if hosted.running and hosted.node == node["NodeManagerAddress"]]
-        short = need["CPU"] - (node["Resources"]["CPU"] - len(there))
+        taken = sum(one.cpus for one in self._hosts.values() if one.running and one.node == node["NodeManagerAddress"])
+        short = need["CPU"] - (node["Resources"]["CPU"] - taken)
         going = [hosted for hosted in actors if not hosted.running] + (there[-ceil(short) :] if short > 0 else [])
         for hosted in going:
-            ray.kill(hosted.handle, no_restart=True)
-            self._hosts.pop(hosted.name)
+            self._end_host(hosted)
         log.warning("no node has room for the learner; ended for it: %s", ", ".join(one.name for one in going))
 
     def _grow(self) -> None:
@@ -341,8 +398,9 @@ class ClusterRun:
         if fit <= self.config.actors:
             return
         self.config = dataclasses.replace(self.config, actors=fit)
-        (self._folder.path / "config.json").write_text(to_json(self.config) + "\n")
-        self.bus.set_config(to_json(self.config).encode())
+        self._folder.write_config(self.config)
+        with suppress(BusUnavailable, BusFull):  # a Redis that comes back is given it anyway
+            self.bus.set_config(to_json(self.config).encode())
         for name, hosted in self._hosts.items():
             if name.startswith("replay"):
                 hosted.handle.again.remote()
@@ -376,7 +434,7 @@ class ClusterRun:
         with suppress(BusUnavailable, BusFull):
             self.bus.request_stop(reason)
         deadline = time.monotonic() + STOP_SECONDS
-        while time.monotonic() < deadline and any(hosted.running for hosted in self._hosts.values()):
+        while time.monotonic() < deadline and any(map(_awaited, self._hosts.values())):
             for hosted in self._hosts.values():
                 with suppress(RoleDied):
                     hosted.ask(self._folder.logs)
@@ -386,13 +444,13 @@ class ClusterRun:
     def close(self) -> None:
         """End everything; nothing is left but the run's folder, and on the nodes the ring."""
         try:
-            closing = [hosted.handle.close.remote() for hosted in self._hosts.values() if hosted.running]
+            closing = [hosted.handle.close.remote() for hosted in self._hosts.values() if _awaited(hosted)]
             if closing:
                 ray.wait(closing, num_returns=len(closing), timeout=STOP_SECONDS / 2)
             for hosted in self._hosts.values():
                 ray.kill(hosted.handle, no_restart=True)
-            if self._group is not None:
-                remove_placement_group(self._group)
+            for group in self._groups.values():
+                remove_placement_group(group)
         finally:
             self._leave.close()
 
@@ -443,6 +501,17 @@ def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, en
     )  # fmt: skip
     task = Task(folder.name, command, {}, {}, os.getcwd())
     return options.remote(task, str(folder.path), config.learner.keep_checkpoints)
+
+
+def _awaited(hosted: Hosted) -> bool:
+    """Whether its role runs, or what it left is not yet put away."""
+    return hosted.report is not None and hosted.report.status is None
+
+
+def check_not_there(folder: RunFolder) -> None:
+    """Raises ConfigError where the run has a launcher, if only one that is being started again."""
+    if is_there(folder):
+        raise ConfigError("--run-dir", str(folder.path), "this run is being trained; rmc attach watches it")
 
 
 def is_there(folder: RunFolder) -> bool:

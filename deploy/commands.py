@@ -4,6 +4,7 @@ import dataclasses
 import json
 import logging
 import os
+import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -170,6 +171,7 @@ def cluster(command: options.Cluster) -> int:
 def launch(command: options.LauncherRole) -> int:
     """Be the launcher of a run on Ray."""
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends it in order while no role is there yet, too
     folder = RunFolder(command.run)
     config = folder.config()
     folder.lock()

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from common.errors import ConfigError, RmcError
 
-UP_SECONDS = 60.0  # of Ray, for all nodes to have joined once the head is up
+UP_SECONDS = 900.0  # for all nodes to have joined once the head is up: new machines install everything first
 LOOK_SECONDS = 2.0
 TOKEN = Path("~/.ray/auth_token")
 # Counts what is alive; run on the head.
@@ -31,7 +31,7 @@ def up(path: Path, console: Console) -> None:
     _ray("up", "-y", str(path))
     expected = expected_nodes(config)
     deadline = time.monotonic() + UP_SECONDS
-    while (alive := _alive(path)) != expected:
+    while (alive := _alive(path)) < expected:
         if time.monotonic() > deadline:
             fix = "look at the workers' setup by ray monitor, and mend or take them out of the file"
             raise RmcError(f"{path}: {alive} of {expected} nodes are there after {UP_SECONDS:.0f} s; {fix}")
@@ -81,8 +81,14 @@ def expected_nodes(config: dict[str, Any]) -> int:
 def secure_token() -> None:
     """Make Ray's token where there is none, and let only its owner read it."""
     path = TOKEN.expanduser()
+    mask = os.umask(0o077)
+    try:
+        if not path.exists():
+            _ray("get-auth-token", "--generate", quiet=True)
+    finally:
+        os.umask(mask)
     if not path.exists():
-        _ray("get-auth-token", "--generate", quiet=True)
+        raise ConfigError("cluster", str(path), "Ray made no token there; unset RAY_AUTH_TOKEN and RAY_AUTH_TOKEN_PATH")
     path.chmod(0o600)
 
 

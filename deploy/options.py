@@ -180,7 +180,7 @@ class Cluster:
 
 @dataclass(frozen=True)
 class LauncherRole:
-    """Be the launcher of a run on Ray; rmc train --launcher ray starts it on the head."""
+    """Be the launcher of a run on Ray; rmc train starts it on the head."""
 
     run: Positional[Path]
     """The run's folder."""

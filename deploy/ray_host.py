@@ -1,20 +1,22 @@
 """Ray actors that hold a role each: its process, its files and its end. Ray starts them again where they die."""
 
 import os
+import shutil
 import tempfile
 import threading
 import time
 import uuid
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import ray
+from ray.util.placement_group import remove_placement_group
 
 from common.checkpoint import CheckpointFolder
 from common.errors import CheckpointError
-from deploy.supervisor import EXIT_CONFIG, RoleCommand, RoleProcess
+from deploy.supervisor import EXIT_CONFIG, QUICK_DEATHS, QUICK_SECONDS, RoleCommand, RoleProcess
 
 NAMESPACE = "rmc"
 LAST_WORDS_SECONDS = 1.5  # a host outlives its role so long, for the launcher to hear why it died
@@ -22,6 +24,7 @@ LOOK_SECONDS = 0.5  # between looks for new checkpoints
 LOG_BYTES = 64 << 10  # of a role's log in one report
 ENDED_IN_ORDER = 0
 STOP_SECONDS = 5.0
+SETTLE_SECONDS = 10.0  # for the last checkpoint to reach the head
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class Task:
     run: str
     command: RoleCommand
     environment: dict[str, str]
-    secrets: dict[str, bytes]
+    secrets: dict[str, bytes] = field(repr=False)
     """Text files that only the owner may read, by name, in the scratch folder."""
     working_folder: str
     """Where the launcher was started; roles start there, too, where the node has such a folder."""
@@ -128,7 +131,7 @@ class RoleHost:
         while not self._role.reap(LOOK_SECONDS):
             if self._role.pid not in (pid, None):  # started again on purpose: another thread watches
                 return
-            with suppress(ray.exceptions.RayError, CheckpointError, OSError):  # the next look tries again
+            with suppress(ray.exceptions.RayError, ValueError, CheckpointError, OSError):  # the next look tries again
                 self.tend()
         status = self._role.status
         assert status is not None
@@ -168,37 +171,44 @@ class RoleHost:
             self._role.reap(STOP_SECONDS)
 
     def close(self) -> None:
-        """End the role, whatever it does; this actor is killed next."""
-        self._stopping = True
-        self._end()
+        """End the role, whatever it does, and put away what it left; this actor is killed next."""
+        if self._status is None:
+            self._stopping = True
+            self._end()
+            self.settle()
 
 
 class LearnerHost(RoleHost):
     """The learner's: brings the newest checkpoint from the head before, and takes every new one there."""
 
     def prepare(self) -> None:
-        self._folder = CheckpointFolder(self.scratch / "checkpoints")
-        found = ray.get(self._launcher().newest.remote(max(self._folder.numbers(), default=-1)))
-        if found is not None:
-            self._folder.save(*found)
-        self._archived = set(self._folder.numbers())
+        folder, place = self.scratch / "checkpoints", ray.get_runtime_context().get_node_id()
+        self._folder, launcher = CheckpointFolder(folder), self._launcher()
+        if not ray.get(launcher.claim.remote(self._life, place)):
+            shutil.rmtree(folder, ignore_errors=True)  # of an earlier stay on this node: the run has gone on elsewhere
+        found = self._folder.latest()
+        newest = ray.get(launcher.newest.remote(found[0] if found is not None else -1))
+        if newest is not None:
+            self._folder.save(*newest)
+        self._archived = set(ray.get(launcher.numbers.remote()))
 
     def _launcher(self) -> Any:
         return ray.get_actor(host_name(self._task.run, "launcher"), NAMESPACE)
 
     def tend(self) -> None:
+        newest = max(self._archived, default=-1)
         for number in self._folder.numbers():
-            if number not in self._archived:
-                ray.get(self._launcher().archive.remote(number, self._folder.load(number)))
+            if number > newest and number not in self._archived:
+                ray.get(self._launcher().archive.remote(self._life, number, self._folder.load(number)))
                 self._archived.add(number)
 
     def settle(self) -> None:
-        deadline = time.monotonic() + STOP_SECONDS
+        deadline = time.monotonic() + SETTLE_SECONDS
         while time.monotonic() < deadline:
             try:
                 self.tend()
                 return
-            except (ray.exceptions.RayError, CheckpointError, OSError):
+            except (ray.exceptions.RayError, ValueError, CheckpointError, OSError):
                 time.sleep(LOOK_SECONDS)
 
 
@@ -208,26 +218,58 @@ class LauncherHost(RoleHost):
     def __init__(self, task: Task, folder: str, keep: int) -> None:
         self._folder = Path(folder)
         self._checkpoints = CheckpointFolder(self._folder / "checkpoints", keep)
+        self._claim = self._folder / "learner-at"  # the node and the life of the host that holds the learner
         super().__init__(task)
 
     def log_folder(self) -> Path:
         return self._folder / "logs"
 
     def over(self, status: int) -> bool:
-        """Only a launcher that was killed begins again: any other end is the run's."""
-        return status >= 0
+        """Only a launcher that was killed begins again, and not for ever; any other end is the run's."""
+        if status >= 0:
+            return True
+        deaths = self._folder / "launcher-deaths"
+        recent = [float(word) for word in deaths.read_text().split()] if deaths.exists() else []
+        recent = [when for when in recent if time.time() - when < QUICK_SECONDS * QUICK_DEATHS]
+        deaths.write_text(" ".join(map(str, [*recent, time.time()])))
+        return len(recent) + 1 >= QUICK_DEATHS
 
     def settle(self) -> None:
-        ray.kill(ray.get_runtime_context().current_actor, no_restart=True)
+        """End all that the run still has on the cluster, whatever its launcher left, and this host."""
+        run = host_name(self._task.run, "")
+        own = ray.get_runtime_context().current_actor
+        for found in ray.util.list_named_actors(all_namespaces=True):
+            if (
+                found["namespace"] == NAMESPACE
+                and found["name"].startswith(run)
+                and not found["name"].endswith("launcher")
+            ):
+                with suppress(ValueError):
+                    ray.kill(ray.get_actor(found["name"], NAMESPACE), no_restart=True)
+        for name in (f"{run}learner", f"{run}replay"):
+            with suppress(ValueError):
+                remove_placement_group(ray.util.get_placement_group(name))
+        ray.kill(own, no_restart=True)
 
-    def archive(self, number: int, files: dict[str, bytes]) -> None:
-        """Keep a checkpoint."""
-        self._checkpoints.save(number, files)
+    def claim(self, life: str, node: str) -> bool:
+        """Be the host of the learner: no other's checkpoints are taken from now on. Whether the last was there, too."""
+        before = self._claim.read_text().split() if self._claim.exists() else []
+        self._claim.write_text(f"{node} {life}")
+        return before[:1] == [node]
+
+    def archive(self, life: str, number: int, files: dict[str, bytes]) -> None:
+        """Keep a checkpoint, if it comes from the learner's present host."""
+        if self._claim.read_text().split()[1:] == [life]:
+            self._checkpoints.save(number, files)
 
     def newest(self, above: int) -> tuple[int, dict[str, bytes]] | None:
         """The newest whole checkpoint, if it is newer than that."""
-        found = self._checkpoints.latest() if max(self._checkpoints.numbers(), default=-1) > above else None
+        found = self._checkpoints.latest() if max(self.numbers(), default=-1) > above else None
         return found if found is not None and found[0] > above else None
+
+    def numbers(self) -> list[int]:
+        """Of the checkpoints that are kept here."""
+        return self._checkpoints.numbers()
 
 
 def _write_private(path: Path, content: bytes) -> None:

@@ -74,7 +74,7 @@ class RedisServer:
         place = f":{self.port.password}@{self.port.host}:{self.port.number}"
         if self.port.tls is None:
             return f"redis://{place}"
-        return f"rediss://{place}?ssl_ca_certs={certificate}&ssl_check_hostname=false"
+        return f"rediss://{place}?ssl_ca_certs={certificate}"
 
     def start(self) -> None:
         """Start it, and wait until it answers."""

@@ -33,7 +33,8 @@ from replay_server.server import ReplayServer
 from replay_server.socket_server import SocketServer
 
 SECRET_VARIABLE, URL_VARIABLE = "RMC_SECRET", "RMC_REDIS_URL"
-PATIENCE_SECONDS = 5.0  # of a role that starts while Redis is just coming back
+PATIENCE_VARIABLE = "RMC_PATIENCE"  # seconds that a role which starts while Redis is coming back waits for it
+PATIENCE_SECONDS = float(os.environ.get(PATIENCE_VARIABLE, 5.0))
 EVALUATOR_NICENESS = 10  # it must not take the learner's core
 log = logging.getLogger(__name__)
 

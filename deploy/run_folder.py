@@ -17,6 +17,7 @@ from common.checkpoint import CheckpointFolder
 from common.errors import CheckpointError, ConfigError
 from deploy.presets import RunConfig, from_json, option, to_json
 
+LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
 IfExists = Literal["resume", "fail", "new"]
 MAY_CHANGE = {
     "total_steps",
@@ -49,6 +50,12 @@ class RunFolder:
             return from_json((self.path / "config.json").read_bytes())
         except OSError:
             raise ConfigError("RUN", str(self.path), "no config.json there; give the folder of a run") from None
+
+    def write_config(self, config: RunConfig) -> None:
+        """Write ``config.json``, whole or not at all."""
+        temporary = self.path / ".config.json"
+        temporary.write_text(to_json(config) + "\n")
+        temporary.rename(self.path / "config.json")
 
     def result(self) -> dict[str, Any] | None:
         """What ``result.json`` says, once the run has ended."""
@@ -85,11 +92,13 @@ class RunFolder:
     def lock(self) -> None:
         """Be the one launcher of this run. Raises ConfigError where another one is."""
         self._lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self.unlock()
-            raise ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first") from None
+        deadline = time.monotonic() + LOCK_SECONDS
+        while not _locked(self._lock, fcntl.LOCK_EX):
+            if time.monotonic() >= deadline:
+                os.close(self._lock)
+                self._lock = None
+                raise ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first")
+            time.sleep(0.05)
         self._note(f"training {os.getpid()}")
 
     def unlock(self, status: int | None = None) -> None:
@@ -109,12 +118,10 @@ class RunFolder:
         try:
             with (self.path / ".lock").open("rb") as file:
                 word, _, number = file.read().decode().partition(" ")
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                free = _locked(file.fileno(), fcntl.LOCK_SH)
         except FileNotFoundError:
             return None
-        except BlockingIOError:
-            return int(number) if word == "training" else None
-        return None
+        return None if free or word != "training" else int(number)
 
     def ended(self) -> int | None:
         """The exit status of the launcher that trained it last, if that came to an end of its own."""
@@ -123,6 +130,14 @@ class RunFolder:
         except FileNotFoundError:
             return None
         return int(number) if word == "ended" else None
+
+
+def _locked(handle: int, kind: int) -> bool:
+    try:
+        fcntl.flock(handle, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _wall(line: str) -> float:
@@ -145,7 +160,7 @@ def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> Ru
         raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
     _make(folder)
     folder.lock()
-    (folder.path / "config.json").write_text(to_json(config) + "\n")
+    folder.write_config(config)
     folder.secret()
     return folder
 

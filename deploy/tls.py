@@ -1,6 +1,7 @@
 """Encryption between a run's machines: one certificate of its own, which both ends know beforehand."""
 
 import datetime
+import ipaddress
 import os
 import ssl
 from pathlib import Path
@@ -9,8 +10,8 @@ CERTIFICATE, KEY = "tls-cert.pem", "tls-key.pem"
 VALID = datetime.timedelta(days=3650)
 
 
-def make_certificate(folder: Path) -> None:
-    """Write a self-signed certificate and its key into a run's folder, unless they are there."""
+def make_certificate(folder: Path, address: str = "127.0.0.1") -> None:
+    """Write a self-signed certificate for a Redis at that address, and its key, into a folder, if none is there."""
     from cryptography import x509  # comes with Ray, which alone needs this
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -29,6 +30,7 @@ def make_certificate(folder: Path) -> None:
         .not_valid_before(now - datetime.timedelta(days=1))  # for clocks that differ
         .not_valid_after(now + VALID)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(address))]), critical=False)
         .sign(key, hashes.SHA256())
     )
     plain = serialization.NoEncryption()

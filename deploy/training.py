@@ -81,6 +81,9 @@ def conduct(config: RunConfig, folder: RunFolder, placement: Placement, console:
     except ConfigError:
         status = EXIT_CONFIG
         raise
+    except KeyboardInterrupt:
+        status = STOPPED
+        raise
     finally:
         folder.unlock(status)
     console.print(f"before training: {_said(before)}", highlight=False)
@@ -99,6 +102,9 @@ def _train_on_ray(config: RunConfig, placement: Placement, console: Console) -> 
 def _watched_on_ray(config: RunConfig, placement: Placement, console: Console) -> int:
     from deploy import cluster
 
+    if placement.run_dir is not None and (placement.run_dir / "secret").exists():
+        cluster.check_not_there(RunFolder(placement.run_dir))
+    cluster.check_room(config, placement.device)
     fit = cluster.actors_that_fit(config)
     learner = dataclasses.replace(config.learner, threads=cluster.learner_cpus(config))
     config = dataclasses.replace(config, learner=learner, actors=fit if placement.all_cpus else config.actors)
@@ -115,12 +121,12 @@ def _passes_on(stop: StopSignal, folder: RunFolder) -> Callable[[], bool]:
     """Whether the run's launcher is gone; tells it to stop, once, when we are."""
     from deploy import cluster
 
-    told = False
+    told: int | None = None  # which of the launchers, if it is started again
 
     def gone() -> bool:
         nonlocal told
-        if stop.requested and not told and (trainer := folder.trainer()) is not None:
-            told = True
+        if stop.requested and (trainer := folder.trainer()) not in (None, told):
+            told = trainer
             os.kill(trainer, signal.SIGTERM)
         return not cluster.is_there(folder)
 

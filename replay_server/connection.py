@@ -45,7 +45,7 @@ class Connection:
         assert isinstance(self.socket, ssl.SSLSocket)
         try:
             self.socket.do_handshake()
-        except ssl.SSLWantReadError:
+        except (ssl.SSLWantReadError, ssl.SSLWantWriteError):
             return False
         self.encrypted = True
         return True

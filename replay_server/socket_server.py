@@ -86,13 +86,11 @@ class SocketServer:
             self.refused["too-many"] += 1
             accepted.close()
             return
-        with contextlib.suppress(OSError):  # macOS refuses more than its limit, Linux takes what it allows
-            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        if accepted.family != socket.AF_UNIX:
-            accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        if self._tls is not None:
-            accepted = self._tls.wrap_socket(accepted, server_side=True, do_handshake_on_connect=False)
+        try:
+            accepted = self._prepared(accepted)
+        except OSError:  # it went away again, or has begun by something that is no handshake
+            accepted.close()
+            return
         connection = Connection(accepted, os.urandom(NONCE_BYTES))
         self._connections[connection] = READ
         self._selector.register(accepted, READ, connection)
@@ -101,6 +99,16 @@ class SocketServer:
                 connection.send(Kind.CHALLENGE, {"nonce": connection.challenge})
             except OSError:
                 self._end(connection)
+
+    def _prepared(self, accepted: socket.socket) -> socket.socket:
+        with contextlib.suppress(OSError):  # macOS refuses more than its limit, Linux takes what it allows
+            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        if accepted.family != socket.AF_UNIX:
+            accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        if self._tls is None:
+            return accepted
+        return self._tls.wrap_socket(accepted, server_side=True, do_handshake_on_connect=False)
 
     def _serve(self, connection: Connection, events: int) -> None:
         try:

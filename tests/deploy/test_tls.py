@@ -38,10 +38,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_certificate_is_made_once_and_private(folder: Path) -> None:
-    before = (folder / tls.CERTIFICATE).read_bytes()
-    tls.make_certificate(folder)
-    assert (folder / tls.CERTIFICATE).read_bytes() == before
+def test_the_key_is_private(folder: Path) -> None:
     assert stat.S_IMODE((folder / tls.KEY).stat().st_mode) == 0o600
 
 
