@@ -16,7 +16,8 @@ from pathlib import Path
 
 SSHD = "/usr/sbin/sshd"
 NEEDED = ["ip", "unshare", "ssh", "ssh-keygen", "rsync"]
-BRIDGE, SUBNET, HERE = "rmcbridge", "10.78.0", 254  # this host's end of the bridge
+BRIDGE = "rmcbridge"
+SUBNET, HERE = "10.78.0", 254  # this host's end of the bridge
 START_SECONDS = 15.0
 SSHD_CONFIG = """
 Port 22
@@ -147,6 +148,7 @@ class Machine:
         left = subprocess.run(["ip", "netns", "pids", self.name], capture_output=True, text=True).stdout.split()
         for pid in left:
             os.kill(int(pid), signal.SIGKILL)
+        _quiet("ip", "link", "del", f"v{self.name}")  # the namespace itself goes when the kernel finds the time
         _quiet("ip", "netns", "del", self.name)
 
 
@@ -158,6 +160,7 @@ class Machines:
         self._folder, self._keep, self._environment = folder, keep, environment
         self.machines: list[Machine] = []
         _quiet("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(self.key))
+        _clear(names)
         _quiet("ip", "link", "add", BRIDGE, "type", "bridge")
         _quiet("ip", "addr", "add", f"{SUBNET}.{HERE}/24", "dev", BRIDGE)
         _quiet("ip", "link", "set", BRIDGE, "up")
@@ -185,3 +188,14 @@ class Machines:
 
 def _quiet(*words: str) -> None:
     subprocess.run(words, check=True, stdin=subprocess.DEVNULL, capture_output=True)
+
+
+def _clear(names: list[str]) -> None:
+    """What a test that was killed has left."""
+    for name in [*names, "gamma"]:
+        left = subprocess.run(["ip", "netns", "pids", name], capture_output=True, text=True).stdout.split()
+        for pid in left:
+            os.kill(int(pid), signal.SIGKILL)
+        subprocess.run(["ip", "link", "del", f"v{name}"], capture_output=True)
+        subprocess.run(["ip", "netns", "del", name], capture_output=True)
+    subprocess.run(["ip", "link", "del", BRIDGE], capture_output=True)

@@ -18,7 +18,7 @@ import yaml
 import deploy
 from tests.cluster import machines
 from tests.cluster.machines import Machine, Machines
-from tests.integration.test_learning import FAST, SMALL
+from tests.integration.test_learning import DATA, FAST, SMALL
 
 pytestmark = [pytest.mark.skipif(bool(machines.missing()), reason=machines.missing()), pytest.mark.timeout(900)]
 PROJECT = Path(deploy.__file__).parents[1]
@@ -28,7 +28,7 @@ SHOWN = os.environ.get("RMC_CLUSTER_RESULTS")  # a file for the figures
 RMC = f"cd {PROJECT} && {PYTHON}/python -P -m deploy.cli"
 RAY = "RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0"
 CPUS = {"head": 0, "alpha": 3, "beta": 3}  # as Ray is told: the learner's group takes two of one worker's
-LEARNING = (*SMALL, *FAST)
+LEARNING = (*SMALL, *FAST, *DATA, "--replay-ratio", "240", "--alpha-learning-rate", "1e-3", "--total-steps", "60000")
 
 
 def note(**figures: Any) -> None:
@@ -67,6 +67,8 @@ class Site:
 
     def join(self, machine: Machine) -> None:
         """As the cluster's file starts a worker."""
+        token = self.head.run("cat ~/.ray/auth_token").stdout.strip()
+        machine.run(f"umask 077; mkdir -p ~/.ray; echo {token} > ~/.ray/auth_token")
         machine.run(
             f"{RAY} {PYTHON}/ray start --address={self.head.ip}:6379 --node-ip-address={machine.ip} "
             f"--num-cpus={CPUS.get(machine.name, 1)} "
@@ -129,7 +131,14 @@ class Run:
     def stop(self) -> str:
         said = self.site.head.run(f"{RMC} stop {self.folder}").stdout
         self.process.wait(60)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
         return said
+
+
+@pytest.fixture(autouse=True)
+def leaves_nothing_behind() -> None:
+    """Not after each of these tests, which share a cluster: the last one looks."""
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +177,7 @@ def test_every_node_is_there(site: Site) -> None:
 
 def test_a_run_learns_is_stopped_and_goes_on(site: Site) -> None:
     began = time.monotonic()
-    run = Run(site, "learning", *LEARNING, "--actors", "2", "--total-steps", "60000")
+    run = Run(site, "learning", *LEARNING, "--actors", "2")
     run.wait_for(lambda: run.newest("evaluator", "eval_return_mean") >= 1000.0, seconds=600)
     workers = [machine for machine in (site.alpha, site.beta) if machine.processes("deploy.cli actor")]
     assert len(workers) == 2
@@ -177,8 +186,11 @@ def test_a_run_learns_is_stopped_and_goes_on(site: Site) -> None:
     assert "to go on, give the same options" in run.stop()
     for machine in site.machines.machines:
         assert not machine.processes("deploy.cli"), machine.name
-    again = Run(site, "learning", *LEARNING, "--actors", "2", "--total-steps", "60000")
-    again.wait_for(lambda: again.records("replay")[-1]["env_steps"] > steps)
+    stopped = time.time()
+    again = Run(site, "learning", *LEARNING, "--actors", "2")
+    again.wait_for(
+        lambda: again.newest("learner", "time") > stopped + 1.0 and again.newest("replay", "env_steps") > steps
+    )
     again.check_counters()
     again.stop()
 
