@@ -442,11 +442,16 @@ class ClusterRun:
         self.keep_counters()
 
     def close(self) -> None:
-        """End everything; nothing is left but the run's folder, and on the nodes the ring."""
+        """End everything; nothing is left but the run's folder and, on its node, the ring of a run that may go on."""
         try:
             closing = [hosted.handle.close.remote() for hosted in self._hosts.values() if _awaited(hosted)]
             if closing:
                 ray.wait(closing, num_returns=len(closing), timeout=STOP_SECONDS / 2)
+            if self.finished():
+                clearing = [
+                    hosted.handle.clear.remote() for hosted in self._hosts.values() if hosted.report is not None
+                ]
+                ray.wait(clearing, num_returns=len(clearing), timeout=STOP_SECONDS / 4)
             for hosted in self._hosts.values():
                 ray.kill(hosted.handle, no_restart=True)
             for group in self._groups.values():

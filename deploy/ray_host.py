@@ -157,6 +157,10 @@ class RoleHost:
             self._life, ray.util.get_node_ip_address(), self._role.pid, self._status, words, log, start + len(log)
         )
 
+    def clear(self) -> None:
+        """Remove what the run keeps on this node."""
+        shutil.rmtree(self.scratch, ignore_errors=True)
+
     def again(self) -> None:
         """End the role in order and start it again, because the run's config has changed."""
         self._stopping = True

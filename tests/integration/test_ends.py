@@ -1,6 +1,8 @@
 """Ends that nobody asked for: the launcher killed by force, a role that dies again and again."""
 
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -53,3 +55,21 @@ class Broken(InvertedPendulumEnv):
 
 gymnasium.register("Broken-v0", Broken, max_episode_steps=100)
 """
+
+
+def test_a_run_is_watched_and_stopped_from_another_terminal(tmp_path: Path) -> None:
+    with Training(tmp_path / "run", "--total-steps", "10000000") as training:
+        training.wait_for_updates()
+        words = [sys.executable, "-m", "deploy.cli"]
+        with subprocess.Popen([*words, "attach", str(tmp_path / "run")], stdout=subprocess.PIPE, text=True) as watcher:
+            assert watcher.stdout is not None
+            assert watcher.stdout.readline().startswith("steps ")
+            done = subprocess.run([*words, "stop", str(tmp_path / "run")], capture_output=True, text=True, timeout=60)
+            assert (done.returncode, done.stderr) == (0, "")
+            assert "to go on, give the same options" in done.stdout
+            assert training.finish(30) == 130
+            assert "to go on, give the same options" in watcher.stdout.read()
+            assert watcher.wait(30) == 130
+    done = subprocess.run([*words, "attach", str(tmp_path / "run")], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert "nobody trains it now" in done.stderr

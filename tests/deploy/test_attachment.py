@@ -1,0 +1,81 @@
+"""Who trains a run, seen from outside its launcher."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from common.envs import EnvConfig
+from common.errors import ConfigError
+from deploy.attachment import Tail, stop, trained_now
+from deploy.presets import debug
+from deploy.run_folder import RunFolder, open_run
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from deploy.run_folder import RunFolder
+folder = RunFolder(Path(sys.argv[1]))
+folder.lock()
+print("locked", flush=True)
+sys.stdin.readline()
+folder.unlock(int(sys.argv[2]))
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    made = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    made.unlock()
+    return made
+
+
+def test_a_trainer_is_known_until_it_ends(folder: RunFolder) -> None:
+    assert (folder.trainer(), folder.ended()) == (None, None)
+    words = [sys.executable, "-c", HOLDER, str(folder.path), "130"]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        assert folder.trainer() == holder.pid == trained_now(folder)
+        with pytest.raises(ConfigError, match="this run is being trained; stop it first"):
+            folder.lock()
+        assert folder.trainer() == holder.pid  # who was refused has changed nothing
+        assert folder.ended() is None
+        holder.communicate("\n")
+    assert (folder.trainer(), folder.ended()) == (None, 130)
+
+
+def test_a_trainer_that_was_killed_has_not_ended(folder: RunFolder) -> None:
+    words = [sys.executable, "-c", HOLDER, str(folder.path), "0"]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        holder.kill()
+    assert (folder.trainer(), folder.ended()) == (None, None)
+    folder.lock()
+    assert folder.trainer() == os.getpid()
+    folder.unlock()
+
+
+def test_nobody_to_stop_is_said(folder: RunFolder, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nobody trains it now"):
+        stop(folder)
+    with pytest.raises(ConfigError, match=r"no config\.json there"):
+        stop(RunFolder(tmp_path))
+
+
+def test_records_are_taken_once_and_whole(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    tail = Tail(path)
+    assert tail.take() == []
+    with path.open("a") as file:
+        file.write(json.dumps({"role": "a"}) + "\n" + '{"torn": \n' + '{"role": "b"')
+        file.flush()
+        assert tail.take() == [{"role": "a"}]
+        file.write(', "x": 1}\n')
+        file.flush()
+        assert tail.take() == [{"role": "b", "x": 1}]
+    assert tail.take() == []
