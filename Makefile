@@ -26,9 +26,10 @@ test: $(STAMP)
 # Real ray up on three machines that are namespaces of this one: Linux, root, openssh-server, rsync, iproute2.
 ROUNDS ?= 5
 CUTS ?= 5 30 90
+ONLY ?= test
 
 test-cluster: $(STAMP)
-	for round in $$(seq $(ROUNDS)); do RMC_CUTS="$(CUTS)" $(BIN)/python -m pytest -x tests/cluster/on_machines.py || exit; done
+	for round in $$(seq $(ROUNDS)); do RMC_CUTS="$(CUTS)" $(BIN)/python -m pytest -x tests/cluster/on_machines.py -k "$(ONLY)" || exit; done
 
 # In an environment of its own, .venv-dm-control: dm_control wants an older MuJoCo than the others' 4.
 test-dm-control:

@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -23,28 +24,13 @@ from deploy.view import Board, table
 
 def execute(command: options.Command) -> int:
     """Run a parsed command; its exit status. Raises RmcError."""
-    if isinstance(command, options.Train):
-        logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
-        return training.train(command.config(), command.placement(), Console())
-    if isinstance(command, options.Evaluate):
-        return evaluate(command)
-    if isinstance(command, options.Export):
-        return export_policy(command)
-    if isinstance(command, options.Inspect):
-        return inspect(command)
-    if isinstance(command, options.CheckEnv):
-        return check_env(command)
-    if isinstance(command, options.Stats):
-        return stats(command)
-    if isinstance(command, options.Attach):
-        return attach(command)
-    if isinstance(command, options.Stop):
-        return stop(command)
-    if isinstance(command, options.Cluster):
-        return cluster(command)
-    if isinstance(command, options.LauncherRole):
-        return launch(command)
-    return run_role(command)
+    return ACTIONS.get(type(command), run_role)(command)
+
+
+def train(command: options.Train) -> int:
+    """Train a run."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    return training.train(command.config(), command.placement(), Console())
 
 
 def run_role(command: options.ActorRole | options.ReplayRole | options.LearnerRole | options.EvaluatorRole) -> int:
@@ -187,3 +173,17 @@ def _records(path: Path) -> list[dict[str, object]]:
         with suppress(ValueError):  # torn by a crash
             records.append(json.loads(line))
     return records
+
+
+ACTIONS: dict[type, Callable[[Any], int]] = {  # any other is a role
+    options.Train: train,
+    options.Evaluate: evaluate,
+    options.Export: export_policy,
+    options.Inspect: inspect,
+    options.CheckEnv: check_env,
+    options.Stats: stats,
+    options.Attach: attach,
+    options.Stop: stop,
+    options.Cluster: cluster,
+    options.LauncherRole: launch,
+}

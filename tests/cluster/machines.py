@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 SSHD = "/usr/sbin/sshd"
@@ -145,9 +146,7 @@ class Machine:
         """End it with all its processes."""
         os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        left = subprocess.run(["ip", "netns", "pids", self.name], capture_output=True, text=True).stdout.split()
-        for pid in left:
-            os.kill(int(pid), signal.SIGKILL)
+        _kill_all(self.name)
         _quiet("ip", "link", "del", f"v{self.name}")  # the namespace itself goes when the kernel finds the time
         _quiet("ip", "netns", "del", self.name)
 
@@ -193,9 +192,14 @@ def _quiet(*words: str) -> None:
 def _clear(names: list[str]) -> None:
     """What a test that was killed has left."""
     for name in [*names, "gamma"]:
-        left = subprocess.run(["ip", "netns", "pids", name], capture_output=True, text=True).stdout.split()
-        for pid in left:
-            os.kill(int(pid), signal.SIGKILL)
+        _kill_all(name)
         subprocess.run(["ip", "link", "del", f"v{name}"], capture_output=True)
         subprocess.run(["ip", "netns", "del", name], capture_output=True)
     subprocess.run(["ip", "link", "del", BRIDGE], capture_output=True)
+
+
+def _kill_all(name: str) -> None:
+    """Every process in a network namespace; the first takes the others along."""
+    for pid in subprocess.run(["ip", "netns", "pids", name], capture_output=True, text=True).stdout.split():
+        with suppress(ProcessLookupError):
+            os.kill(int(pid), signal.SIGKILL)

@@ -15,6 +15,7 @@ import ray
 from ray.cluster_utils import Cluster
 
 from deploy.run_folder import RunFolder
+from tests.deploy.test_tls import lacks_tls
 from tests.integration.running import ENVIRONMENT, Training
 
 ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
@@ -55,6 +56,22 @@ def test_a_run_on_a_ray_of_its_own(tmp_path: Path) -> None:
         assert training.records(role), role
     assert (folder / "checkpoints" / "best.json").exists()
     assert {path.name for path in (folder / "logs").iterdir()} >= {"launcher.log", "learner.log", "replay.log"}
+
+
+def test_two_shards_speak_over_the_network_and_encrypted_where_redis_can(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    options = ["--replay-shards", "2", "--actors", "2", "--total-steps", "2000", *([] if lacks_tls() else ["--tls"])]
+    with Training(folder, *options, "--launcher", "ray", "--ray-address", "local") as training:
+        training.wait_for_updates(1)
+        secret = RunFolder(folder).secret().decode()
+        commands = [" ".join(process.info["cmdline"] or []) for process in psutil.process_iter(["cmdline"])]
+        assert any("--listen tcp:" in words for words in commands)
+        assert not any(secret in words for words in commands)
+        assert training.finish(240) == 0, training.text() + training.logs()
+    assert json.loads((folder / "result.json").read_text())["env_steps"] == 2_000
+    for role in ("replay-0", "replay-1"):
+        assert training.newest(role, "refused_clients") == 0
+        assert training.newest(role, "drawn_steps") > 0
 
 
 def test_more_than_the_cluster_holds_is_refused(tmp_path: Path) -> None:

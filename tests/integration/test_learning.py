@@ -1,5 +1,6 @@
 """It learns: a pendulum balanced to the time limit, and a task that only a memory solves."""
 
+import time
 from pathlib import Path
 
 import pytest
@@ -18,17 +19,23 @@ pytestmark = pytest.mark.timeout(SECONDS + 30)
 
 def test_one_actor_and_one_learner_balance_the_pendulum(tmp_path: Path) -> None:
     pace = ["--total-steps", "8000", "--replay-ratio", "240", "--alpha-learning-rate", "1e-3"]
-    assert best_return(tmp_path / "run", "InvertedPendulum-v5", pace) == 1000.0
+    assert best_return(tmp_path / "run", "InvertedPendulum-v5", pace, 1000.0) == 1000.0
 
 
 def test_a_cue_is_remembered_over_twelve_steps(tmp_path: Path) -> None:
     pace = ["--total-steps", "8000", "--replay-ratio", "32", "--alpha-learning-rate", "5e-3"]
-    assert best_return(tmp_path / "run", "tests.memory_env:Memory12-v0", pace) > SOLVED_RETURN
+    assert best_return(tmp_path / "run", "tests.memory_env:Memory12-v0", pace, SOLVED_RETURN + 0.2) > SOLVED_RETURN
 
 
-def best_return(folder: Path, env: str, pace: list[str]) -> float:
-    """Mean return of the best checkpoint of a whole ``rmc train``, over ten deterministic episodes."""
+def best_return(folder: Path, env: str, pace: list[str], enough: float) -> float:
+    """Mean return of a run's best checkpoint over ten deterministic episodes; the run ends once it has ``enough``."""
     with Training(folder, *SMALL, *FAST, *DATA, *pace, env=env) as training:
-        assert training.finish(SECONDS) == 0, training.text() + training.logs()
+        deadline = time.monotonic() + SECONDS
+        while (
+            training.process.poll() is None and training.newest("evaluator", "eval_return_mean", -1e9) <= enough - 1e-6
+        ):
+            assert time.monotonic() < deadline, training.text() + training.logs()
+            time.sleep(1.0)
+        training.interrupt()
     run = RunFolder(folder)
     return float(evaluate_checkpoint(run, run.config(), "best", 10)["eval_return_mean"])
