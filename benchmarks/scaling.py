@@ -32,7 +32,7 @@ from deploy.redis_server import RedisServer
 from replay_server.server import ReplayConfig, ReplayServer
 
 CHUNK = 16  # windows an entry
-BEHIND = 64  # entries that a simulated actor sends ahead of what is acknowledged, as a real one's credit would have it
+BEHIND = 1024  # entries that a simulated actor sends ahead of what is acknowledged
 KEPT_UP = 0.95  # of what is offered
 
 
