@@ -68,11 +68,11 @@ trial: $(STAMP)
 # With flicker, what the flag of blank frames is worth; and windows that begin with a stored state or with none.
 MEMORY40 := --hidden 64 --embedding 64 --heads 128 128 --shortcut --normalize-observations --learning-rate 5e-4 \
 	--polyak 0.99 --target-memory ema --batch-size 16 --capacity 5000 --warmup-steps 1000 --priority-exponent 0 \
-	--episodes 10 --replay-ratio 32 --alpha-learning-rate 5e-3 --trained-steps 42 --stride 14
+	--episodes 10 --replay-ratio 96 --alpha-learning-rate 5e-3 --trained-steps 42 --stride 14
 
 comparisons: $(STAMP)
 	for seed in 1 2 3 4 5; do for flag in no-blank-flag blank-flag; do $(BIN)/rmc train InvertedPendulum-v5 --flicker 0.5 --$$flag --seed $$seed --total-steps 30000 --run-dir runs/flicker-$$flag-$$seed || exit; done; done
-	for seed in 1 2 3; do for state in zero burn-in; do $(BIN)/rmc train tests.memory_env:Memory40-v0 $(MEMORY40) --state-strategy $$state --seed $$seed --total-steps 20000 --run-dir runs/memory40-$$state-$$seed || exit; done; done
+	for seed in 1 2 3; do for state in zero burn-in; do $(BIN)/rmc train tests.memory_env:Memory40-v0 $(MEMORY40) --state-strategy $$state --seed $$seed --total-steps 60000 --run-dir runs/memory40-$$state-$$seed || exit; done; done
 
 docs: $(STAMP)
 	$(BIN)/python -m docs.generate
