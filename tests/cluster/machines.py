@@ -53,7 +53,11 @@ def missing() -> str:
         return "needs root on Linux, for network namespaces"
     lacking = [program for program in NEEDED if shutil.which(program) is None]
     lacking += [] if Path(SSHD).exists() else ["sshd"]
-    return f"needs {', '.join(lacking)} (Debian: openssh-server rsync iproute2)" if lacking else ""
+    if lacking:
+        return f"needs {', '.join(lacking)} (Debian: openssh-server rsync iproute2)"
+    tried = ["unshare", "--mount", "--net", "--pid", "--uts", "--ipc", "--fork", "ip", "link", "add", "rmcprobe"]
+    done = subprocess.run([*tried, "type", "bridge"], capture_output=True, text=True)
+    return f"no namespaces or bridges may be made here ({done.stderr.strip()})" if done.returncode else ""
 
 
 class Machine:
