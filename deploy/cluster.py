@@ -441,13 +441,13 @@ class ClusterRun:
             time.sleep(TICK_SECONDS)
         self.keep_counters()
 
-    def close(self) -> None:
+    def close(self, over: bool) -> None:
         """End everything; nothing is left but the run's folder and, on its node, the ring of a run that may go on."""
         try:
             closing = [hosted.handle.close.remote() for hosted in self._hosts.values() if _awaited(hosted)]
             if closing:
                 ray.wait(closing, num_returns=len(closing), timeout=STOP_SECONDS / 2)
-            if self.finished():
+            if over:
                 clearing = [
                     hosted.handle.clear.remote() for hosted in self._hosts.values() if hosted.report is not None
                 ]
@@ -472,6 +472,7 @@ def train(
     """Train until the total is reached or ``stop`` is set; whether it was reached. Raises RoleDied, ConfigError."""
     run = ClusterRun(config, folder, device, all_cpus, encrypted)
     monitor.restarts, monitor.unplaced = run.restarts, run.waiting
+    over = False
     try:
         monitor.skip_old(run.bus)
         run.start()
@@ -481,9 +482,10 @@ def train(
             time.sleep(TICK_SECONDS)
         run.stop("stopped by its launcher" if stop.requested else "finished")
         watch(monitor, run.bus)  # what the roles said last
-        return run.finished() and monitor.learner_finished()
+        over = monitor.learner_finished()  # one that was stopped has ended in order, too
+        return over
     finally:
-        run.close()
+        run.close(over)
 
 
 # -- The launcher, from outside -----------------------------------------------------------------------
@@ -497,6 +499,8 @@ def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, en
         raise ConfigError(
             "--launcher", "ray", "this is not the cluster's head; run it there, by ray attach or ray exec"
         )
+    for file in (tls.CERTIFICATE, tls.KEY):  # for the address that the head has now
+        (folder.path / file).unlink(missing_ok=True)
     words = ["launcher", str(folder.path), "--ray-address", context.gcs_address, "--device", device]
     words += ["--all-cpus"] * all_cpus + ["--tls"] * encrypted
     command = RoleCommand("launcher", tuple(words), single_thread=False, ends=True)

@@ -42,7 +42,7 @@ WHEN = {
     "embedding": "0 for the paper's raw input",
     "heads": "rarely",
     "layer_norm": "rarely: it cost return in the [trial](results.md)",
-    "shortcut": "off where nothing but the memory may be read, as in the paper",
+    "shortcut": "rarely: it cost return in the [trial](results.md)",
     "normalize_observations": "off where observations are scaled already and their statistics keep moving",
     "grounding": "off for the paper's model; without it the latent can collapse in other schemes than 1",
     "blank_flag": "with flicker, to see what the flag is worth; the paper has none",

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,11 +44,19 @@ def _left() -> list[str]:
     return found
 
 
+def ring(folder: Path) -> Path:
+    """Where the replay server's node keeps it."""
+    return Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{RunFolder(folder).name[-8:]}" / "replay" / "ring"
+
+
 def test_a_run_on_a_ray_of_its_own(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with Training(folder, "--launcher", "ray", "--ray-address", "local") as training:
+        training.wait_for_updates()
+        assert ring(folder).exists()
         assert training.finish(240) == 0, training.text() + training.logs()
     result = json.loads((folder / "result.json").read_text())
+    assert not ring(folder).exists()  # the run is over
     assert result["env_steps"] == 4_000
     assert result["updates"] > 100
     assert result["restarts"] == 0
@@ -146,3 +155,4 @@ def test_a_killed_launcher_comes_back(nodes: Cluster, tmp_path: Path) -> None:
         training.wait_for_updates(100)
         training.interrupt()
     assert training.process.returncode == 130
+    assert ring(folder.path).exists()  # it may go on from there
