@@ -18,7 +18,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -41,14 +40,14 @@ from deploy import tls
 from deploy.local import PREFIX, TICK_SECONDS, register, sweep, watch
 from deploy.monitor import Monitor
 from deploy.presets import RunConfig, to_json
-from deploy.ray_host import NAMESPACE, LauncherHost, LearnerHost, Report, RoleHost, Task, host_name
+from deploy.ray_host import NAMESPACE, LauncherHost, Task, host_name
+from deploy.ray_hosted import Hosted
+from deploy.ray_places import REPLAY_CPUS, Place, bundle, cpus, holds, places, reserved_cpus
 from deploy.redis_server import Port, RedisServer
 from deploy.roles import PATIENCE_VARIABLE, URL_VARIABLE, connect
 from deploy.run_folder import RunFolder
-from deploy.supervisor import EXIT_CONFIG, QUICK_DEATHS, QUICK_SECONDS, RoleCommand
+from deploy.supervisor import QUICK_DEATHS, RoleCommand
 
-REPLAY_CPUS = EVALUATOR_CPUS = 0.5
-POLL_SECONDS = 0.5  # between questions to each host
 NODES_SECONDS = 2.0  # between looks for nodes that came
 HOMELESS_SECONDS = 8.0  # without a node for the learner, after which actors make room
 STOP_SECONDS = 20.0  # for all roles to end in order and for the last checkpoint to reach the head
@@ -85,160 +84,6 @@ def joined(address: str, cpus: int | None = None) -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
-
-
-def cpus() -> float:
-    """CPUs of all nodes that are alive."""
-    return float(sum(node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]))
-
-
-def learner_cpus(config: RunConfig) -> int:
-    """CPUs set aside for the learner: its threads, one by default."""
-    return max(1, config.learner.threads)
-
-
-def reserved_cpus(config: RunConfig) -> float:
-    """CPUs of everything but the actors."""
-    return learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS * config.replay.replay_shards
-
-
-def bundle(config: RunConfig, device: str) -> dict[str, float]:
-    """What the node of the learner must hold."""
-    beside = REPLAY_CPUS if config.replay.replay_shards == 1 else 0.0
-    found = {"CPU": learner_cpus(config) + EVALUATOR_CPUS + beside}
-    return found | {"GPU": 1.0} if device.startswith("cuda") else found
-
-
-def check_room(config: RunConfig, device: str) -> None:
-    """Raises ConfigError where no node can hold the learner."""
-    need = bundle(config, device)
-    if not any(node["Alive"] and _holds(node, need) for node in ray.nodes()):
-        wanted = ", ".join(f"{amount:g} {name}" for name, amount in need.items())
-        fix = f"no node of the cluster has {wanted}, which the learner and what is beside it take; start one that has"
-        raise ConfigError("--device", device, fix)
-
-
-def actors_that_fit(config: RunConfig) -> int:
-    """One for every CPU that is left. Raises ConfigError where there is none."""
-    left = int(cpus() - reserved_cpus(config))
-    if left < 1:
-        need = reserved_cpus(config) + 1
-        raise ConfigError(
-            "--launcher", "ray", f"the cluster has {cpus():g} CPUs and a run needs {need:g}; start more nodes"
-        )
-    return left
-
-
-# -- Where roles go -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Place:
-    """How Ray is asked for a role's host."""
-
-    kind: type[RoleHost]
-    command: RoleCommand
-    cpus: float
-    gpus: float = 0.0
-    group: str = ""  # of bundles that a node is found for: the learner's or the replay servers'
-    index: int = 0  # which of them
-
-
-def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[str, Place]:
-    """All roles of a run but its launcher, by name."""
-    place = ("--run", run)
-    secret: tuple[str, ...] = ("--secret-file", "{scratch}/secret")
-    if encrypted and config.replay.replay_shards > 1:  # one alone has a unix socket
-        secret += ("--tls-folder", "{scratch}")
-    learn = ("--folder", "{scratch}/checkpoints", "--device", device)
-    found = [
-        *_replays(config, (*place, *secret)),
-        Place(
-            LearnerHost, RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
-            learner_cpus(config), float(device.startswith("cuda")), group="learner",
-        ),
-        Place(RoleHost, RoleCommand("evaluator", ("evaluator", *place)), EVALUATOR_CPUS, group="learner"),
-        *(
-            Place(RoleHost, RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))), 1.0)
-            for index in range(config.actors)
-        ),
-    ]  # fmt: skip
-    return {place.command.name: place for place in found}
-
-
-def _replays(config: RunConfig, words: tuple[str, ...]) -> list[Place]:
-    """One beside the learner on a unix socket, or several anywhere on the cluster's network."""
-    count = config.replay.replay_shards
-    found = []
-    for shard in (Shard(index, count) for index in range(count)):
-        listen = "unix:{scratch}/replay.sock" if count == 1 else "tcp:{ip}:0"
-        rest = ("--folder", f"{{scratch}}/{shard.role}", "--listen", listen, "--shard", str(shard.index))
-        group, index = ("learner", 0) if count == 1 else ("replay", shard.index)
-        command = RoleCommand(shard.role, ("replay", *words, *rest))
-        found.append(Place(RoleHost, command, REPLAY_CPUS, group=group, index=index))
-    return found
-
-
-class Hosted:
-    """A role's host as the launcher sees it: asked how it is again and again, without waiting for it."""
-
-    def __init__(self, name: str, handle: Any, cpus: float) -> None:
-        self.name, self.handle, self.cpus = name, handle, cpus
-        self.report: Report | None = None  # the newest; None until the first
-        self.restarts = 0
-        self.dead = ""  # for good, and why: somebody killed it, or it could not begin
-        self.waits_since = time.monotonic()  # for a CPU, or to be started again; unless it runs
-        self._question: Any = None
-        self._asked_at = self._began_at = 0.0
-        self._quick_deaths, self._mourned = 0, ""
-
-    @property
-    def running(self) -> bool:
-        """Whether its role was running when last heard of."""
-        return self.report is not None and self.report.pid is not None
-
-    @property
-    def node(self) -> str:
-        """Where its role was last heard of."""
-        return self.report.node if self.report is not None else ""
-
-    def ask(self, logs: Path) -> None:
-        """Take in an answer that has come, and ask again. Raises RoleDied."""
-        if self._question is None:
-            if time.monotonic() >= self._asked_at + POLL_SECONDS:
-                self._asked_at = time.monotonic()
-                life, end = (self.report.life, self.report.log_end) if self.report else ("", 0)
-                self._question = self.handle.report.remote(life, end)
-            return
-        if not ray.wait([self._question], timeout=0)[0]:
-            return
-        question, self._question = self._question, None
-        try:
-            self._hear(ray.get(question), logs)
-        except ray.exceptions.ActorDiedError as error:
-            self.dead = str(error)
-        except ray.exceptions.RayError:  # being started again
-            self.waits_since = time.monotonic() if self.running else self.waits_since
-            self.report = dataclasses.replace(self.report, pid=None) if self.report else None
-
-    def _hear(self, report: Report, logs: Path) -> None:
-        if self.report is None or report.life != self.report.life:
-            self.restarts += self._began_at > 0
-            self._began_at = time.monotonic()
-        self.report = report
-        if report.log or not (logs / f"{self.name}.log").exists():
-            with (logs / f"{self.name}.log").open("ab") as file:
-                file.write(report.log)
-        if report.status and self._mourned != report.life:
-            self._mourned = report.life
-            self._note_death(report)
-
-    def _note_death(self, report: Report) -> None:
-        quick = time.monotonic() - self._began_at < QUICK_SECONDS
-        self._quick_deaths = self._quick_deaths + 1 if quick else 0
-        if report.status == EXIT_CONFIG or self._quick_deaths >= QUICK_DEATHS:
-            often = f"{self._quick_deaths} times in a row soon after its start" if self._quick_deaths > 1 else "at once"
-            raise RoleDied(f"{self.name} ended {often} on {report.node}; its last words:\n{report.last_words}")
 
 
 class ClusterRun:
@@ -376,7 +221,7 @@ class ClusterRun:
         self._homeless_since = time.monotonic()
         need = bundle(self.config, self._device)
         node = max(
-            (node for node in ray.nodes() if node["Alive"] and _holds(node, need)),
+            (node for node in ray.nodes() if node["Alive"] and holds(node, need)),
             key=lambda node: float(node["Resources"]["CPU"]),
             default=None,
         )
@@ -434,7 +279,7 @@ class ClusterRun:
         with suppress(BusUnavailable, BusFull):
             self.bus.request_stop(reason)
         deadline = time.monotonic() + STOP_SECONDS
-        while time.monotonic() < deadline and any(map(_awaited, self._hosts.values())):
+        while time.monotonic() < deadline and any(hosted.awaited for hosted in self._hosts.values()):
             for hosted in self._hosts.values():
                 with suppress(RoleDied):
                     hosted.ask(self._folder.logs)
@@ -444,7 +289,7 @@ class ClusterRun:
     def close(self, over: bool) -> None:
         """End everything; nothing is left but the run's folder and, on its node, the ring of a run that may go on."""
         try:
-            closing = [hosted.handle.close.remote() for hosted in self._hosts.values() if _awaited(hosted)]
+            closing = [hosted.handle.close.remote() for hosted in self._hosts.values() if hosted.awaited]
             if closing:
                 ray.wait(closing, num_returns=len(closing), timeout=STOP_SECONDS / 2)
             if over:
@@ -512,11 +357,6 @@ def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, en
     return options.remote(task, str(folder.path), config.learner.keep_checkpoints)
 
 
-def _awaited(hosted: Hosted) -> bool:
-    """Whether its role runs, or what it left is not yet put away."""
-    return hosted.report is not None and hosted.report.status is None
-
-
 def check_not_there(folder: RunFolder) -> None:
     """Raises ConfigError where the run has a launcher, if only one that is being started again."""
     if is_there(folder):
@@ -530,10 +370,6 @@ def is_there(folder: RunFolder) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _holds(node: dict[str, Any], bundle: dict[str, float]) -> bool:
-    return all(node["Resources"].get(name, 0.0) >= amount for name, amount in bundle.items())
 
 
 def redis_password(folder: RunFolder) -> str:

@@ -92,21 +92,21 @@ def conduct(config: RunConfig, folder: RunFolder, placement: Placement, console:
 
 def _train_on_ray(config: RunConfig, placement: Placement, console: Console) -> int:
     """Hand a run to a launcher on the cluster's head, and watch it; Ctrl-C ends the run, a closed terminal does not."""
-    from deploy import cluster
+    from deploy import cluster, ray_places
 
-    enough = max(cores(), ceil(cluster.reserved_cpus(config)) + config.actors)  # of a cluster of our own
+    enough = max(cores(), ceil(ray_places.reserved_cpus(config)) + config.actors)  # of a cluster of our own
     with cluster.joined(placement.ray_address, enough):
         return _watched_on_ray(config, placement, console)
 
 
 def _watched_on_ray(config: RunConfig, placement: Placement, console: Console) -> int:
-    from deploy import cluster
+    from deploy import cluster, ray_places
 
     if placement.run_dir is not None and (placement.run_dir / "secret").exists():
         cluster.check_not_there(RunFolder(placement.run_dir))
-    cluster.check_room(config, placement.device)
-    fit = cluster.actors_that_fit(config)
-    learner = dataclasses.replace(config.learner, threads=cluster.learner_cpus(config))
+    ray_places.check_room(config, placement.device)
+    fit = ray_places.actors_that_fit(config)
+    learner = dataclasses.replace(config.learner, threads=ray_places.learner_cpus(config))
     config = dataclasses.replace(config, learner=learner, actors=fit if placement.all_cpus else config.actors)
     folder = prepare(config, placement)
     folder.unlock()
