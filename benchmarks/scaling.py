@@ -1,10 +1,11 @@
 """Where Redis and the replay servers saturate: simulated actors that send recorded windows at a set rate.
 
-    python -m benchmarks.scaling [--env ENV] [--actors 8] [--seconds 5] [--shards 1 2 4]
+    python -m benchmarks.scaling [--env ENV] [--actors 8] [--seconds 5] [--shards 1 2 4] [--alone replay]
 
 Each simulated actor is a process with a bus of its own that sends one entry of 16 windows after another on a clock;
 what is offered doubles until less than 95 % of it is committed. CPU time is read from the processes themselves, so that
-it says what a core carries even where all share a few.
+it says what a core carries even where all share a few. ``--alone`` gives Redis or the replay servers the first core for
+themselves, and all others the rest: what saturates then is known.
 """
 
 import argparse
@@ -42,11 +43,14 @@ class Point:
 
     shards: int
     actors: int
+    alone: str  # what has the first core for itself
     offered: float
     committed: float
     redis_core: float
     replay_core: float  # of the busiest
     actor_core: float  # of all simulated actors
+    idle: float  # cores of the machine
+    stolen: float  # cores that the host kept to itself
 
 
 def _serve(url: str, folder: str, spec: WindowSpec, actors: int, shard: Shard) -> None:
@@ -111,26 +115,48 @@ def _cpu(numbers: list[int]) -> list[float]:
     return [sum(psutil.Process(number).cpu_times()[:2]) for number in numbers]
 
 
+def _unused() -> tuple[float, float]:
+    """Seconds of all cores that were idle, and that were stolen."""
+    machine = psutil.cpu_times()
+    return machine.idle + machine.iowait, machine.steal
+
+
 def _committed(bus: RedisBus, actors: int) -> int:
     acks = [bus.ack(actor) for actor in range(actors)]
     return CHUNK * sum(ack.id.seq for ack in acks if ack is not None)
 
 
-def measure(spec: WindowSpec, shards: int, actors: int, rate: float, seconds: float) -> Point:
+def _pin(numbers: dict[str, list[int]], alone: str) -> None:
+    """The first core for one kind of process, the others for the rest."""
+    first, *others = sorted(os.sched_getaffinity(0))
+    for kind, found in numbers.items():
+        for number in found:
+            for thread in psutil.Process(number).threads():
+                os.sched_setaffinity(thread.id, {first} if kind == alone else others)
+
+
+def measure(spec: WindowSpec, shards: int, actors: int, alone: str, rate: float, seconds: float) -> Point:
     """One load for so many seconds, after two to get going."""
     with _system(spec, shards, actors, rate) as (bus, numbers):
+        if alone:
+            _pin(numbers, alone)
         while len(bus.actors()) < actors:
             time.sleep(0.05)
         time.sleep(2.0)
         before = {kind: _cpu(found) for kind, found in numbers.items()}
+        unused = _unused()
         windows, start = _committed(bus, actors), time.perf_counter()
         time.sleep(seconds)
         windows, elapsed = _committed(bus, actors) - windows, time.perf_counter() - start
+        idle, stolen = ((now - then) / elapsed for now, then in zip(_unused(), unused, strict=True))
         used = {
             kind: [(after - at) / elapsed for after, at in zip(_cpu(found), before[kind], strict=True)]
             for kind, found in numbers.items()
         }
-    return Point(shards, actors, rate, windows / elapsed, used["redis"][0], max(used["replay"]), sum(used["actor"]))
+    return Point(
+        shards, actors, alone, rate, windows / elapsed,
+        used["redis"][0], max(used["replay"]), sum(used["actor"]), idle, stolen,
+    )  # fmt: skip
 
 
 def main() -> None:
@@ -140,6 +166,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--shards", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--first-rate", type=float, default=2000.0)
+    parser.add_argument("--alone", choices=["redis", "replay"], default="", help="what has the first core for itself")
     options = parser.parse_args()
     obs_dim, action_dim, _ = env_spaces(EnvConfig(options.env))
     spec = WindowSpec(obs_dim, action_dim, robust(EnvConfig(options.env)).agent.hidden)
@@ -147,7 +174,7 @@ def main() -> None:
     for shards in options.shards:
         rate, kept_up = options.first_rate, True
         while kept_up:
-            point = measure(spec, shards, options.actors, rate, options.seconds)
+            point = measure(spec, shards, options.actors, options.alone, rate, options.seconds)
             kept_up, rate = point.committed >= KEPT_UP * point.offered, 2 * rate
             facts = {"env": options.env, "window_bytes": spec.dtype.itemsize, **vars(point), "cores": os.cpu_count()}
             with path.open("a") as file:

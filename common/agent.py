@@ -81,7 +81,10 @@ class Remembered(NamedTuple):
 
 
 class Memory(nn.Module):
-    """h_t = GRU(h_{t-1}, e_t), e_t = ReLU(Linear([o_t, a_{t-1}])) or the raw input; where asked, with a blank flag."""
+    """Eq. 6: h_t = GRU(h_{t-1}, e_t), e_t = ReLU(Linear([o_t, a_{t-1}])) or the raw input.
+
+    Where asked, with a blank flag beside o_t.
+    """
 
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
@@ -139,7 +142,7 @@ class Prediction(NamedTuple):
 
 
 class WorldModel(nn.Module):
-    """f(h_t, a_t): predicts the change of the hidden state, and the grounding signals if asked."""
+    """Eq. 7: f(h_t, a_t): predicts the change of the hidden state, and the grounding signals if asked."""
 
     def __init__(self, inputs: int, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
@@ -167,7 +170,7 @@ class _StackedLinear(nn.Module):
 
 
 class TwinQ(nn.Module):
-    """Q_1(h, a) and Q_2(h, a), stacked."""
+    """Eq. 9: Q_1(h, a) and Q_2(h, a), stacked."""
 
     def __init__(self, inputs: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
@@ -202,7 +205,7 @@ class Policy(nn.Module):
 
 
 def squashed_sample(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Eq. 11: a = tanh(u), u = mean + std * noise, and its log density; (..., A) -> (..., A), (...).
+    """Eq. 10: a = tanh(u), u = mean + std * noise, and its log density; (..., A) -> (..., A), (...).
 
     log pi(a) = sum log N(u) - log(1 - tanh(u)^2), the latter as 2 (log 2 - u - softplus(-2u)), which
     does not overflow (SAC, appendix C, in its stable form).

@@ -60,7 +60,9 @@ class Place:
                     "--secret-file", str(self.secret_file), f"cannot be read ({error.strerror})"
                 ) from None
         if not secret:
-            raise ConfigError("--secret-file", None, f"give the run's secret file, or set {SECRET_VARIABLE}")
+            raise ConfigError(
+                "--secret-file", None, f"give the file secret of the run's folder, or set {SECRET_VARIABLE}"
+            )
         return secret
 
 

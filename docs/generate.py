@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from common.envs import EnvConfig
+from deploy.options import Train
 from deploy.presets import option, paper, robust
+from deploy.run_folder import MAY_CHANGE
 
 PAGE = Path(__file__).parent / "configuration.md"
 TITLES = {
@@ -23,12 +25,22 @@ TITLES = {
     "learner": "The learner",
     "evaluator": "Evaluation",
 }
+HEAD, RULE = "| option | default | what it is | when to touch it |", "|---|---|---|---|"
+PLACEMENT = ["run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls"]
 # When a user should touch an option; what it does is said where it is defined.
 WHEN = {
     "preset": "`paper` to compare with the paper, `debug` to see everything run within a minute",
     "seed": "for every repetition",
     "total_steps": "always: it is the length of the run, and also where a finished one goes on to",
     "actors": "when the learner waits for experience; on two cores one actor is enough",
+    "run_dir": "to name a run, and to go on with one",
+    "if_exists": "`fail` or `new` where a script must not go on with an old run by chance",
+    "launcher": "`ray` for several machines, `lockstep` for the same bits again, `manual` to start the roles yourself",
+    "device": "`cuda` where there is a GPU",
+    "redis_url": "with `--launcher manual`, or to keep a run in a Redis of yours",
+    "ray_address": "`local` to try Ray on one machine",
+    "all_cpus": "on a cluster that is there for this run",
+    "tls": "where others are on the cluster's network",
     "flicker": "for trials of partial observation",
     "hide": "for trials of partial observation",
     "noise": "for trials of partial observation",
@@ -55,7 +67,7 @@ WHEN = {
     "chunk_windows": "up on a slow network",
     "chunk_seconds": "rarely",
     "unacked_bytes": "down where actors have little memory",
-    "capacity": "down for a small disk; a window is about two kilobytes for HalfCheetah",
+    "capacity": "down for a small disk or memory: a window takes 3.6 kB for HalfCheetah, 39 kB for Humanoid",
     "replay_ratio": "up for more learning from each step, down for more steps a second: the learner is what takes time",
     "warmup_steps": "up where random actions rarely meet a reward",
     "priority_exponent": "0.6 for R2D2's prioritized replay, 0 for uniform",
@@ -102,9 +114,16 @@ def page() -> str:
     ]
     ours, theirs = robust(EnvConfig("")), paper(EnvConfig(""))
     for part, title in TITLES.items():
-        lines += ["", f"## {title}", "", "| option | default | what it is | when to touch it |", "|---|---|---|---|"]
+        lines += ["", f"## {title}", "", HEAD, RULE]
         configs = (ours, theirs) if part == "run" else (getattr(ours, part), getattr(theirs, part))
         lines += _rows(*configs)
+        if part == "run":
+            changeable = ", ".join(f"`{option(name)}`" for name in sorted(MAY_CHANGE))
+            lines += [
+                "",
+                f"Where a run goes on, these may be others than before: {changeable}, and those of the next table.",
+            ]
+            lines += ["", "## Where it runs", "", HEAD, RULE, *_placement()]
     return "\n".join(lines) + "\n"
 
 
@@ -120,6 +139,15 @@ def _rows(ours: Any, theirs: Any) -> list[str]:
     return rows
 
 
+def _placement() -> list[str]:
+    said = _docstrings(Train)
+    defaults = {item.name: item.default for item in dataclasses.fields(Train)}
+    return [
+        f"| `--{name.replace('_', '-')}` | {_text(defaults[name])} | {said[name]} | {WHEN[name]} |"
+        for name in PLACEMENT
+    ]
+
+
 def _docstrings(kind: type[Any]) -> dict[str, str]:
     """What stands under each field in the source."""
     tree = ast.parse(inspect.getsource(importlib.import_module(kind.__module__)))
@@ -133,6 +161,8 @@ def _docstrings(kind: type[Any]) -> dict[str, str]:
 
 
 def _text(value: Any) -> str:
+    if value is None:
+        return "none"
     if isinstance(value, bool):
         return "on" if value else "off"
     if isinstance(value, tuple):

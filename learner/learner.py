@@ -48,7 +48,8 @@ class LearnerConfig:
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     """Matrix products in bfloat16 (auto: where this CPU or GPU has instructions for it) or float32."""
     threads: int = 0
-    """CPU threads of the learner; 0 takes all cores but one, which is left to the other roles."""
+    """CPU threads of the learner; 0 takes all cores but one, which is left to the other roles; on Ray and in lockstep
+    it takes one."""
 
 
 def bf16_is_native(device: torch.device) -> bool:

@@ -38,7 +38,7 @@ def model_loss(error: Tensor, d: Tensor, m: Tensor) -> Tensor:
 
 
 def curiosity(error: Tensor, d: Tensor, m: Tensor) -> Tensor:
-    """Eq. 8: i_t: the model's own error of the step, without gradient, zero at terminations and padding."""
+    """Eq. 8: i_t of R_t = r_t + beta i_t: the model's own error, without gradient, zero at terminations and padding."""
     return error.detach() * (1.0 - d) * m
 
 
@@ -68,7 +68,7 @@ def q_loss(q: Tensor, y: Tensor, importance: Tensor, m: Tensor) -> Tensor:
 
 
 def policy_loss(log_pi: Tensor, q: Tensor, alpha: Tensor, m: Tensor) -> Tensor:
-    """Eq. 10: alpha log pi(a|sg(h_t)) - Q(sg(h_t), a), (B, T) each. (The paper prints the sign the other way round.)"""
+    """Eq. 11: alpha log pi(a|sg(h_t)) - Q(sg(h_t), a), (B, T) each. (The paper prints the sign the other way round.)"""
     return masked_mean(alpha.detach() * log_pi - q, m)
 
 

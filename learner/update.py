@@ -38,7 +38,7 @@ class UpdateConfig:
     alpha_learning_rate: float = 3e-4
     """Adam's step size for the temperature."""
     gamma: float = 0.99
-    """Discount per environment step."""
+    """Discount per step of the agent."""
     polyak: float = 0.995
     """Share of itself that a target network keeps at every update."""
     clip_norm: float = 40.0

@@ -24,6 +24,7 @@ pytestmark = [pytest.mark.skipif(bool(machines.missing()), reason=machines.missi
 PROJECT = Path(deploy.__file__).parents[1]
 PYTHON = Path(sys.executable).parent  # the environment that the machines use, too
 CUTS = [int(word) for word in os.environ.get("RMC_CUTS", "5 30 90").split()]  # seconds without a network
+BACK_SECONDS = 10.0  # after a network is back
 SHOWN = os.environ.get("RMC_CLUSTER_RESULTS")  # a file for the figures
 RMC = f"cd {PROJECT} && {PYTHON}/python -P -m deploy.cli"
 RAY = "RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0"
@@ -98,6 +99,20 @@ class Run:
     def newest(self, role: str, name: str, default: Any = 0) -> Any:
         values = [record[name] for record in self.records(role) if name in record]
         return values[-1] if values else default
+
+    def epochs(self) -> dict[str, dict[str, Any]]:
+        """Of every actor, and whether Redis refuses an older one's entries (``epochs.py``)."""
+        words = f"{PYTHON}/python -P -m tests.cluster.epochs {self.folder} {self.site.head.ip}"
+        found: dict[str, dict[str, Any]] = json.loads(self.site.head.run(words).stdout)
+        return found
+
+    def check_replaced_are_fenced(self, before: dict[str, dict[str, Any]]) -> list[str]:
+        """Actors replaced since: all that is acknowledged is their newest life's, and an older one is refused."""
+        self.wait_for(lambda: all(at["acked"] == at["epoch"] for at in self.epochs().values()))
+        now = self.epochs()
+        replaced = [actor for actor in before if now[actor]["epoch"] > before[actor]["epoch"]]
+        assert all(now[actor]["refused"] for actor in replaced), now
+        return replaced
 
     def actors(self) -> int:
         return int(json.loads(self.site.head.run(f"cat {self.folder}/config.json").stdout)["actors"])
@@ -198,7 +213,7 @@ def test_a_run_learns_is_stopped_and_goes_on(site: Site) -> None:
 def test_a_killed_raylet_costs_no_acknowledged_window(endless: Run) -> None:
     learner, site = where(endless, "learner"), endless.site
     worker = site.beta if learner is site.alpha else site.alpha
-    before = endless.newest("replay", "env_steps")
+    before, epochs = endless.newest("replay", "env_steps"), endless.epochs()
     worker.kill("raylet/raylet")
     ended = endless.wait_for(lambda: not worker.processes("deploy.cli actor"))
     endless.wait_for_updates(20)
@@ -206,13 +221,16 @@ def test_a_killed_raylet_costs_no_acknowledged_window(endless: Run) -> None:
     back = endless.wait_for(lambda: len(worker.processes("deploy.cli actor")) >= 3)
     endless.wait_for(lambda: endless.newest("replay", "env_steps") > before + 500)
     endless.check_counters()
-    note(test="raylet killed", roles_ended_s=ended, back_s=back)
+    replaced = endless.check_replaced_are_fenced(epochs)
+    assert replaced
+    note(test="raylet killed", roles_ended_s=ended, back_s=back, replaced=len(replaced))
 
 
 @pytest.mark.parametrize("seconds", CUTS)
 def test_a_cut_network_heals(endless: Run, seconds: int) -> None:
     learner, site = where(endless, "learner"), endless.site
     worker = site.beta if learner is site.alpha else site.alpha
+    epochs = endless.epochs()
     worker.cut()
     time.sleep(seconds)
     worker.heal()
@@ -226,8 +244,12 @@ def test_a_cut_network_heals(endless: Run, seconds: int) -> None:
         return min(endless.newest(f"actor-{k}", "time") for k in range(endless.actors())) > heard
 
     endless.wait_for(all_there)
+    back = time.monotonic() - healed
     endless.check_counters()
-    note(test=f"network cut for {seconds} s", back_s=time.monotonic() - healed)
+    replaced = endless.check_replaced_are_fenced(epochs)
+    assert replaced or seconds < 90
+    note(test=f"network cut for {seconds} s", back_s=back, replaced=len(replaced))
+    assert back < BACK_SECONDS
 
 
 @pytest.mark.parametrize("role", ["learner", "replay"])
