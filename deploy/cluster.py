@@ -15,14 +15,12 @@ import signal
 import socket
 import tempfile
 import time
-from collections import Counter
+import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from math import ceil
 from pathlib import Path
 from typing import Any
-
-import msgpack
 
 try:
     import ray
@@ -34,26 +32,40 @@ except ImportError as missing:
     raise ConfigError("--launcher", "ray", "Ray is not installed; pip install 'rmc[ray]'") from missing
 
 from common.errors import BusFull, BusUnavailable, ConfigError, RoleDied
-from common.replay import Shard
+from common.replay import WHOLE
 from common.role import StopSignal
 from deploy import tls
+from deploy.counters import Counters
 from deploy.local import PREFIX, TICK_SECONDS, register, sweep, watch
 from deploy.monitor import Monitor
 from deploy.presets import RunConfig, to_json
 from deploy.ray_host import NAMESPACE, LauncherHost, Task, host_name
 from deploy.ray_hosted import Hosted
-from deploy.ray_places import REPLAY_CPUS, Place, bundle, cpus, holds, places, reserved_cpus
+from deploy.ray_places import (
+    SHARD_CPUS,
+    Place,
+    bundle,
+    cpus,
+    free_cpus,
+    holds,
+    places,
+    reserved_cpus,
+    whole_shares,
+)  # fmt: skip
 from deploy.redis_server import Port, RedisServer
+from deploy.rings import Rings
 from deploy.roles import PATIENCE_VARIABLE, URL_VARIABLE, connect
 from deploy.run_folder import RunFolder
 from deploy.supervisor import QUICK_DEATHS, RoleCommand
 
 NODES_SECONDS = 2.0  # between looks for nodes that came
 HOMELESS_SECONDS = 8.0  # without a node for the learner, after which actors make room
+LOST_SECONDS = 120.0  # within which a role's host may be lost for good twice
 STOP_SECONDS = 20.0  # for all roles to end in order and for the last checkpoint to reach the head
 PATIENCE_SECONDS = 120.0  # of a role that starts while launcher and Redis are being started again
-KEEP_SECONDS = 10.0  # between copies of the replay servers' counters into the run's folder
 FIRST_PORT, LAST_PORT = 6380, 6479  # for Redis; 6379 is Ray's
+TOLD_SECONDS = 2.0  # for hosts to hear that the run ends
+BEGIN_SECONDS = 60.0  # of the launcher's host
 log = logging.getLogger(__name__)
 
 
@@ -91,7 +103,8 @@ class ClusterRun:
 
     def __init__(self, config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> None:
         self.config, self._folder, self._device, self._all_cpus = config, folder, device, all_cpus
-        self._encrypted = encrypted
+        self._encrypted, self._rings = encrypted, Rings(folder)
+        self._counters = Counters(folder, config.replay.replay_shards)
         self._leave = ExitStack()
         sweep()
         sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))
@@ -100,47 +113,63 @@ class ClusterRun:
             ip = ray.util.get_node_ip_address()
             if encrypted:
                 tls.make_certificate(folder.path, ip)
-            port = Port(ip, _port(folder, ip), redis_password(folder), folder.path if encrypted else None)
+            number, self._moved = _port(folder, ip)
+            port = Port(ip, number, redis_password(folder), folder.path if encrypted else None)
             self._server = RedisServer(sockets, port=port)
             self._leave.enter_context(self._server)
             self.bus = connect(self._server.url, folder.name)
             register(self.bus, config)
-            _restore_counters(self.bus, folder)
+            self._counters.restore(self.bus)
         except BaseException:
             self._leave.close()
             raise
         self._hosts: dict[str, Hosted] = {}
         self._groups: dict[str, Any] = {}
-        self._lost: Counter[str] = Counter()  # hosts that died for good, by role
-        self._look_at = self._keep_at = 0.0
+        self._bundles: dict[str, int] = {}  # of the replay servers' group
+        self._lost: dict[str, list[float]] = {}  # when hosts died for good, by role
+        self._look_at = 0.0
         self._homeless_since: float | None = None
 
     # -- placing --------------------------------------------------------------------------------------
 
     def start(self) -> None:
         """Place every role, or find again those that an earlier launcher of the run has placed."""
-        self._groups["learner"] = self._group("learner", [bundle(self.config, self._device)], "STRICT_PACK")
-        if (count := self.config.replay.replay_shards) > 1:  # a ring stays on its node: so does its server
-            self._groups["replay"] = self._group("replay", [{"CPU": REPLAY_CPUS}] * count, "SPREAD")
+        if self._moved:
+            self._end_left_hosts()
+        near = self._rings.node(WHOLE.role)
+        self._groups["learner"] = self._group("learner", [bundle(self.config, self._device)], "STRICT_PACK", near)
+        if self.config.replay.replay_shards > 1:  # a ring stays on its node: so does its server
+            roles = [shard.role for shard in self.config.shards()]
+            self._groups["replay"] = self._group("replay", [{"CPU": SHARD_CPUS}] * len(roles), "SPREAD")
+            self._bundles = self._rings.bundles(self._groups["replay"], roles)
         self._place_all()
 
-    def _group(self, name: str, bundles: list[dict[str, float]], strategy: str) -> Any:
+    def _group(self, name: str, bundles: list[dict[str, float]], strategy: str, near: str | None = None) -> Any:
         name = host_name(self._folder.name, name)
         try:
             return ray.util.get_placement_group(name)
         except ValueError:
-            return placement_group(bundles, strategy=strategy, name=name, lifetime="detached")
+            return placement_group(
+                bundles, strategy=strategy, name=name, lifetime="detached", _soft_target_node_id=near
+            )
+
+    def _end_left_hosts(self) -> None:
+        """Those of an earlier launcher, where Redis could not have its port again: they would never find it."""
+        for name in places(self.config, self._folder.name, self._device, self._encrypted):
+            with suppress(ValueError):
+                ray.kill(ray.get_actor(host_name(self._folder.name, name), NAMESPACE), no_restart=True)
 
     def _place_all(self) -> None:
         for name, place in places(self.config, self._folder.name, self._device, self._encrypted).items():
             if name not in self._hosts:
                 self._hosts[name] = Hosted(name, self._create(name, place), place.cpus)
+                self._hosts[name].handle.stopping.remote(False)  # one that was found may have heard otherwise
 
     def _create(self, name: str, place: Place) -> Any:
         strategy: Any = "SPREAD"
         if place.group:
             strategy = PlacementGroupSchedulingStrategy(
-                self._groups[place.group], placement_group_bundle_index=place.index
+                self._groups[place.group], placement_group_bundle_index=self._bundles.get(name, 0)
             )
         options = ray.remote(place.kind).options(
             name=host_name(self._folder.name, name), namespace=NAMESPACE, lifetime="detached", get_if_exists=True,
@@ -164,25 +193,26 @@ class ClusterRun:
             log.warning("the embedded Redis died; starting it again")
             self._server.start()
             register(self.bus, self.config)
-            _restore_counters(self.bus, self._folder)
+            self._counters.restore(self.bus)
         for hosted in list(self._hosts.values()):
             hosted.ask(self._folder.logs)
             if hosted.dead:
                 self._mourn(hosted)
-        now = time.monotonic()
-        if now >= self._look_at:
-            self._look_at = now + NODES_SECONDS
+            elif hosted.name.startswith("replay") and hosted.running:
+                self._rings.note(hosted.name, hosted.node)
+        self._counters.keep(self.bus)
+        if time.monotonic() >= self._look_at:
+            self._look_at = time.monotonic() + NODES_SECONDS
             self._look_at_nodes()
-        if now >= self._keep_at:
-            self._keep_at = now + KEEP_SECONDS
-            self.keep_counters()
 
     def _mourn(self, hosted: Hosted) -> None:
         """Let go of a host that Ray does not start again; the next look at the nodes makes another."""
         log.warning("the host of %s is gone: %s", hosted.name, hosted.dead)
         del self._hosts[hosted.name]
-        self._lost[hosted.name] += 1
-        if self._lost[hosted.name] >= QUICK_DEATHS:
+        now = time.monotonic()
+        lost = [when for when in self._lost.get(hosted.name, []) if now - when < LOST_SECONDS]
+        self._lost[hosted.name] = [*lost, now]
+        if len(lost) + 1 >= QUICK_DEATHS:
             raise RoleDied(f"the host of {hosted.name} could not be held:\n{hosted.dead}")
 
     def _look_at_nodes(self) -> None:
@@ -195,6 +225,8 @@ class ClusterRun:
 
     def _keep_low_actors(self) -> None:
         """Where CPUs are lost for good, it is the highest actors that wait: the run's last steps go to the lowest."""
+        if cpus() >= reserved_cpus(self.config) + self.config.actors:  # they are only being started again
+            return
         actors = [self._hosts[name] for name in self._hosts if name.startswith("actor-")]
         actors.sort(key=lambda hosted: int(hosted.name.removeprefix("actor-")))
         waiting = [one for one in actors if not one.running and time.monotonic() > one.waits_since + HOMELESS_SECONDS]
@@ -239,13 +271,16 @@ class ClusterRun:
 
     def _grow(self) -> None:
         """Give CPUs that came an actor each; the replay servers start again to know of them."""
-        fit = int(cpus() - reserved_cpus(self.config))
+        fit = whole_shares(self.config.actors + free_cpus(), self.config)
         if fit <= self.config.actors:
             return
-        self.config = dataclasses.replace(self.config, actors=fit)
-        self._folder.write_config(self.config)
-        with suppress(BusUnavailable, BusFull):  # a Redis that comes back is given it anyway
-            self.bus.set_config(to_json(self.config).encode())
+        grown = dataclasses.replace(self.config, actors=fit)
+        try:
+            self.bus.set_config(to_json(grown).encode())
+        except (BusUnavailable, BusFull):  # the next look tries again
+            return
+        self.config = grown
+        self._folder.write_config(grown)
         for name, hosted in self._hosts.items():
             if name.startswith("replay"):
                 hosted.handle.again.remote()
@@ -263,19 +298,13 @@ class ClusterRun:
         learner = self._hosts.get("learner")
         return learner is not None and learner.report is not None and learner.report.status == 0
 
-    def keep_counters(self) -> None:
-        """Copy what the replay servers have published: with it, a run goes on though machine and Redis are lost."""
-        roles = [Shard(k, self.config.replay.replay_shards).role for k in range(self.config.replay.replay_shards)]
-        with suppress(BusUnavailable):
-            found = {role: raw for role in roles if (raw := self.bus.progress(role)) is not None}
-            temporary = _counters(self._folder).with_suffix(".new")
-            temporary.write_bytes(msgpack.packb(found))
-            temporary.rename(_counters(self._folder))
-
     # -- the end --------------------------------------------------------------------------------------
 
     def stop(self, reason: str) -> None:
         """Ask every role to end, and wait until the learner's last checkpoint is on the head."""
+        told = [hosted.handle.stopping.remote(True) for hosted in self._hosts.values() if hosted.running]
+        if told:
+            ray.wait(told, num_returns=len(told), timeout=TOLD_SECONDS)
         with suppress(BusUnavailable, BusFull):
             self.bus.request_stop(reason)
         deadline = time.monotonic() + STOP_SECONDS
@@ -284,7 +313,7 @@ class ClusterRun:
                 with suppress(RoleDied):
                     hosted.ask(self._folder.logs)
             time.sleep(TICK_SECONDS)
-        self.keep_counters()
+        self._counters.keep(self.bus, at_once=True)
 
     def close(self, over: bool) -> None:
         """End everything; nothing is left but the run's folder and, on its node, the ring of a run that may go on."""
@@ -294,7 +323,9 @@ class ClusterRun:
                 ray.wait(closing, num_returns=len(closing), timeout=STOP_SECONDS / 2)
             if over:
                 clearing = [
-                    hosted.handle.clear.remote() for hosted in self._hosts.values() if hosted.report is not None
+                    hosted.handle.clear.remote()
+                    for hosted in self._hosts.values()
+                    if hosted.report is not None and not hosted.report.trouble
                 ]
                 ray.wait(clearing, num_returns=len(clearing), timeout=STOP_SECONDS / 4)
             for hosted in self._hosts.values():
@@ -336,8 +367,8 @@ def train(
 # -- The launcher, from outside -----------------------------------------------------------------------
 
 
-def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> Any:
-    """Start a run's launcher on this node, which must be the head: its host. Raises ConfigError."""
+def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> None:
+    """Start a run's launcher on this node, which must be the head. Raises ConfigError."""
     context = ray.get_runtime_context()
     head = next((node for node in ray.nodes() if "node:__internal_head__" in node["Resources"]), None)
     if head is None or head["NodeID"] != context.get_node_id():
@@ -354,7 +385,12 @@ def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, en
         max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
     )  # fmt: skip
     task = Task(folder.name, command, {}, {}, os.getcwd())
-    return options.remote(task, str(folder.path), config.learner.keep_checkpoints)
+    host = options.remote(task, str(folder.path), config.learner.keep_checkpoints)
+    try:
+        ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)
+    except ray.exceptions.RayError as error:
+        said = str(error).strip().splitlines()[-1]
+        raise ConfigError("--launcher", "ray", f"the run's launcher could not begin on the head ({said})") from None
 
 
 def check_not_there(folder: RunFolder) -> None:
@@ -377,25 +413,17 @@ def redis_password(folder: RunFolder) -> str:
     return hmac.new(folder.secret(), b"redis", hashlib.sha256).hexdigest()
 
 
-def _port(folder: RunFolder, ip: str) -> int:
-    """A port for the run's Redis: the one it had before, where that is still free."""
+def _port(folder: RunFolder, ip: str) -> tuple[int, bool]:
+    """A port for the run's Redis, and whether it had another before, which is taken now."""
     note = folder.path / "redis-port"
-    wanted = [int(note.read_text())] if note.exists() else []
-    wanted += range(FIRST_PORT, LAST_PORT + 1)
+    had = int(note.read_text()) if note.exists() else None
+    ports = list(range(FIRST_PORT, LAST_PORT + 1))
+    own = zlib.crc32(folder.name.encode()) % len(ports)  # runs that begin together do not want the same
+    wanted = [*([had] if had else []), *ports[own:], *ports[:own]]
     for port in wanted:
         with socket.socket() as probe, suppress(OSError):
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((ip, port))
             note.write_text(f"{port}\n")
-            return port
+            return port, had not in (None, port)
     raise ConfigError("--launcher", "ray", f"no port from {FIRST_PORT} to {LAST_PORT} is free on {ip} for Redis")
-
-
-def _counters(folder: RunFolder) -> Path:
-    return folder.path / "replay-counters"
-
-
-def _restore_counters(bus: Any, folder: RunFolder) -> None:
-    if _counters(folder).exists():
-        for role, raw in msgpack.unpackb(_counters(folder).read_bytes()).items():
-            bus.set_progress(role, raw)

@@ -14,6 +14,7 @@ from common.errors import BusFull, BusUnavailable
 from common.redis_bus import RedisBus
 from common.replay import Shard
 from common.role import StopSignal
+from deploy.counters import Counters
 from deploy.monitor import Monitor
 from deploy.presets import RunConfig, to_json
 from deploy.redis_server import RedisServer
@@ -31,11 +32,10 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
     """How each role of the run is started here; the same commands start them by hand."""
     place = ("--run", folder.name)
     secret = ("--secret-file", str(folder.secret_file))
-    shards = [Shard(index, config.replay.replay_shards) for index in range(config.replay.replay_shards)]
     learn = ("--folder", str(folder.checkpoints), "--device", device)
     actors = [RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))) for index in range(config.actors)]
     return [
-        *(_replay_command(shard, folder, sockets, (*place, *secret)) for shard in shards),
+        *(_replay_command(shard, folder, sockets, (*place, *secret)) for shard in config.shards()),
         RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
         RoleCommand("evaluator", ("evaluator", *place)),
         *actors,
@@ -52,7 +52,7 @@ class LocalRun:
     """A run's processes between ``start`` and ``close``."""
 
     def __init__(self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str) -> None:
-        self._config = config
+        self._config, self._counters = config, Counters(folder, config.replay.replay_shards)
         self._leave = ExitStack()
         sweep()
         self.sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))  # private, and short: see redis_server
@@ -62,6 +62,7 @@ class LocalRun:
             url = redis_url or f"unix://{self.sockets / 'redis.sock'}"
             self.bus = connect(url, folder.name)
             register(self.bus, config)
+            self._counters.restore(self.bus)
         except BaseException:
             self._leave.close()
             raise
@@ -73,6 +74,8 @@ class LocalRun:
             log.warning("the embedded Redis died; starting it again")
             self._server.start()
             self.bus.set_config(to_json(self._config).encode())
+            self._counters.restore(self.bus)
+        self._counters.keep(self.bus)
         self.supervisor.tend()
 
     def finished(self) -> bool:
@@ -83,6 +86,7 @@ class LocalRun:
         """End everything; nothing is left but the run's folder."""
         try:
             self.supervisor.stop()
+            self._counters.keep(self.bus, at_once=True)
             if self._server is None:
                 _expire(self.bus)
         finally:

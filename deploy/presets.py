@@ -16,6 +16,7 @@ from actors.evaluator import EvaluatorConfig
 from common.agent import AgentConfig
 from common.envs import EnvConfig, env_spaces
 from common.errors import ConfigError
+from common.replay import Shard
 from common.window import WindowSpec
 from learner.learner import LearnerConfig
 from learner.update import UpdateConfig
@@ -72,6 +73,11 @@ class RunConfig:
                 )
             train = time_limit
         return WindowSpec(obs_dim, action_dim, self.agent.hidden, burn_in if strategy == "burn-in" else 0, train)
+
+    def shards(self) -> list[Shard]:
+        """The replay servers."""
+        count = self.replay.replay_shards
+        return [Shard(index, count) for index in range(count)]
 
     def slack_steps(self) -> int:
         """How far actors may run ahead of the replay ratio: two windows of every environment.
@@ -242,6 +248,9 @@ def validate(config: RunConfig) -> None:
     if config.replay.replay_shards > config.actors:
         fix = f"every shard needs an actor: take at most --actors={config.actors}"
         raise ConfigError("--replay-shards", config.replay.replay_shards, fix)
+    if config.actors % config.replay.replay_shards:
+        fix = f"every shard has as many actors: take a multiple of --replay-shards={config.replay.replay_shards}"
+        raise ConfigError("--actors", config.actors, fix)
     if not 0 <= config.actor.stride <= config.window.trained_steps:
         raise ConfigError("--stride", config.actor.stride, f"take 0 to --trained-steps={config.window.trained_steps}")
     if config.actor.stride and config.actor.state_strategy == "episode":

@@ -24,7 +24,9 @@ LOOK_SECONDS = 0.5  # between looks for new checkpoints
 LOG_BYTES = 64 << 10  # of a role's log in one report
 ENDED_IN_ORDER = 0
 STOP_SECONDS = 5.0
-SETTLE_SECONDS = 10.0  # for the last checkpoint to reach the head
+SETTLE_SECONDS = 60.0  # for the last checkpoint to reach the head
+CLAIM_SECONDS = 60.0  # for a launcher that is being started again
+AWAY = (ray.exceptions.RayError, ValueError, CheckpointError, OSError)  # of who keeps the checkpoints
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ class Report:
     log: bytes
     """What its log holds past where the last report ended."""
     log_end: int
+    trouble: str
+    """What keeps it from bringing to the head what belongs there; empty where all is there."""
 
 
 def scratch_folder(run: str) -> Path:
@@ -79,7 +83,9 @@ class RoleHost:
     """Holds a role. Where it dies this actor ends, too, and Ray starts both again, here or on another node."""
 
     def __init__(self, task: Task) -> None:
-        self._task, self._life, self._stopping = task, uuid.uuid4().hex, False
+        self._task, self._life = task, uuid.uuid4().hex
+        self._replaced = self._run_ends = False
+        self.trouble = ""
         self.scratch = scratch_folder(task.run)
         for name, content in task.secrets.items():
             _write_private(self.scratch / name, self._filled(content.decode()).encode())
@@ -125,17 +131,24 @@ class RoleHost:
 
     def over(self, status: int) -> bool:
         """Whether such an end is the last one; after any other, all starts again."""
-        return status in (ENDED_IN_ORDER, EXIT_CONFIG)
+        ended = status == ENDED_IN_ORDER and (self._task.command.ends or self._run_ends)
+        return ended or status == EXIT_CONFIG
+
+    def stopping(self, now: bool) -> None:
+        """Whether the run is being ended; where it is not after all, a role that has heard so begins again."""
+        self._run_ends = now
+        if not now and self._status == ENDED_IN_ORDER and not self._task.command.ends:
+            os._exit(1)
 
     def _watch(self, pid: int | None) -> None:
         while not self._role.reap(LOOK_SECONDS):
             if self._role.pid not in (pid, None):  # started again on purpose: another thread watches
                 return
-            with suppress(ray.exceptions.RayError, ValueError, CheckpointError, OSError):  # the next look tries again
+            with suppress(*AWAY):  # the next look tries again
                 self.tend()
         status = self._role.status
         assert status is not None
-        if self._stopping:
+        if self._replaced:
             return
         if self.over(status):
             self.settle()
@@ -154,8 +167,9 @@ class RoleHost:
             log = file.read(LOG_BYTES)
         words = self._role.last_words() if self._status else ""
         return Report(
-            self._life, ray.util.get_node_ip_address(), self._role.pid, self._status, words, log, start + len(log)
-        )
+            self._life, ray.util.get_node_ip_address(), self._role.pid, self._status, words, log, start + len(log),
+            self.trouble,
+        )  # fmt: skip
 
     def clear(self) -> None:
         """Remove what the run keeps on this node."""
@@ -163,9 +177,9 @@ class RoleHost:
 
     def again(self) -> None:
         """End the role in order and start it again, because the run's config has changed."""
-        self._stopping = True
+        self._replaced = True
         self._end()
-        self._stopping = False
+        self._replaced = False
         self._start()
 
     def _end(self) -> None:
@@ -177,7 +191,7 @@ class RoleHost:
     def close(self) -> None:
         """End the role, whatever it does, and put away what it left; this actor is killed next."""
         if self._status is None:
-            self._stopping = True
+            self._replaced = True
             self._end()
             self.settle()
 
@@ -187,8 +201,9 @@ class LearnerHost(RoleHost):
 
     def prepare(self) -> None:
         folder, place = self.scratch / "checkpoints", ray.get_runtime_context().get_node_id()
-        self._folder, launcher = CheckpointFolder(folder), self._launcher()
-        if not ray.get(launcher.claim.remote(self._life, place)):
+        self._folder = CheckpointFolder(folder)
+        launcher, was_here = self._claim(place)
+        if not was_here:
             shutil.rmtree(folder, ignore_errors=True)  # of an earlier stay on this node: the run has gone on elsewhere
         found = self._folder.latest()
         newest = ray.get(launcher.newest.remote(found[0] if found is not None else -1))
@@ -196,10 +211,30 @@ class LearnerHost(RoleHost):
             self._folder.save(*newest)
         self._archived = set(ray.get(launcher.numbers.remote()))
 
+    def _claim(self, place: str) -> tuple[Any, bool]:
+        """The launcher, and whether the learner was here before."""
+        deadline = time.monotonic() + CLAIM_SECONDS
+        while True:
+            try:
+                launcher = self._launcher()
+                return launcher, ray.get(launcher.claim.remote(self._life, place))
+            except AWAY:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(LOOK_SECONDS)
+
     def _launcher(self) -> Any:
         return ray.get_actor(host_name(self._task.run, "launcher"), NAMESPACE)
 
     def tend(self) -> None:
+        try:
+            self._bring()
+            self.trouble = ""
+        except AWAY as error:
+            self.trouble = f"checkpoints do not reach the head: {str(error).strip().splitlines()[-1]}"
+            raise
+
+    def _bring(self) -> None:
         newest = max(self._archived, default=-1)
         for number in self._folder.numbers():
             if number > newest and number not in self._archived:
@@ -212,7 +247,7 @@ class LearnerHost(RoleHost):
             try:
                 self.tend()
                 return
-            except (ray.exceptions.RayError, ValueError, CheckpointError, OSError):
+            except AWAY:
                 time.sleep(LOOK_SECONDS)
 
 
@@ -277,8 +312,7 @@ class LauncherHost(RoleHost):
 
 
 def _write_private(path: Path, content: bytes) -> None:
-    temporary = path.with_name(f".{path.name}")
-    temporary.unlink(missing_ok=True)
-    with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)  # a run's hosts begin together
+    with os.fdopen(handle, "wb") as file:
         file.write(content)
-    temporary.rename(path)
+    os.replace(temporary, path)

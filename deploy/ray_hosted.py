@@ -1,6 +1,7 @@
 """A role's host on a Ray cluster, as its launcher sees it."""
 
 import dataclasses
+import logging
 import time
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from deploy.ray_host import Report
 from deploy.supervisor import EXIT_CONFIG, QUICK_DEATHS, QUICK_SECONDS
 
 POLL_SECONDS = 0.5  # between questions to each host
+log = logging.getLogger(__name__)
 
 
 class Hosted:
@@ -25,7 +27,7 @@ class Hosted:
         self.waits_since = time.monotonic()  # for a CPU, or to be started again; unless it runs
         self._question: Any = None
         self._asked_at = self._began_at = 0.0
-        self._quick_deaths, self._mourned = 0, ""
+        self._quick_deaths, self._mourned, self._trouble = 0, "", ""
 
     @property
     def running(self) -> bool:
@@ -65,7 +67,12 @@ class Hosted:
         if self.report is None or report.life != self.report.life:
             self.restarts += self._began_at > 0
             self._began_at = time.monotonic()
+        if self.running and report.pid is None:
+            self.waits_since = time.monotonic()
         self.report = report
+        if report.trouble != self._trouble:
+            self._trouble = report.trouble
+            log.warning("%s: %s", self.name, report.trouble or "they do again")
         if report.log or not (logs / f"{self.name}.log").exists():
             with (logs / f"{self.name}.log").open("ab") as file:
                 file.write(report.log)

@@ -1,17 +1,20 @@
 """Where a run's roles go on a Ray cluster, and what each of them takes."""
 
+import time
 from dataclasses import dataclass
+from math import ceil
 from typing import Any
 
 import ray
 
 from common.errors import ConfigError
-from common.replay import Shard
 from deploy.presets import RunConfig
 from deploy.ray_host import LearnerHost, RoleHost
 from deploy.supervisor import RoleCommand
 
-REPLAY_CPUS = EVALUATOR_CPUS = 0.5
+REPLAY_CPUS = EVALUATOR_CPUS = 0.5  # beside the learner
+SHARD_CPUS = 1.0  # of a replay server among several, wherever it is: whole ones, so that what is left is whole, too
+FREE_SECONDS = 10.0  # for what ran before to give back its CPUs
 
 
 def cpus() -> float:
@@ -26,13 +29,13 @@ def learner_cpus(config: RunConfig) -> int:
 
 def reserved_cpus(config: RunConfig) -> float:
     """CPUs of everything but the actors."""
-    return learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS * config.replay.replay_shards
+    shards = config.replay.replay_shards
+    return bundle(config, "cpu")["CPU"] + (SHARD_CPUS * shards if shards > 1 else 0.0)
 
 
 def bundle(config: RunConfig, device: str) -> dict[str, float]:
     """What the node of the learner must hold."""
-    beside = REPLAY_CPUS if config.replay.replay_shards == 1 else 0.0
-    found = {"CPU": learner_cpus(config) + EVALUATOR_CPUS + beside}
+    found = {"CPU": float(ceil(learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS))}
     return found | {"GPU": 1.0} if device.startswith("cuda") else found
 
 
@@ -47,13 +50,26 @@ def check_room(config: RunConfig, device: str) -> None:
 
 def actors_that_fit(config: RunConfig) -> int:
     """One for every CPU that is left. Raises ConfigError where there is none."""
-    left = int(cpus() - reserved_cpus(config))
-    if left < 1:
-        need = reserved_cpus(config) + 1
-        raise ConfigError(
-            "--launcher", "ray", f"the cluster has {cpus():g} CPUs and a run needs {need:g}; start more nodes"
-        )
-    return left
+    need = reserved_cpus(config) + config.replay.replay_shards
+    deadline = time.monotonic() + FREE_SECONDS
+    while free_cpus() < need:
+        if time.monotonic() > deadline:
+            free = f"{free_cpus()} of the cluster's {cpus():g} CPUs are free"
+            raise ConfigError(
+                "--launcher", "ray", f"{free} and a run needs {need:g}; start more nodes, or end other runs"
+            )
+        time.sleep(0.2)
+    return whole_shares(free_cpus() - int(reserved_cpus(config)), config)
+
+
+def free_cpus() -> int:
+    """CPUs that nothing on the cluster has taken."""
+    return int(ray.available_resources().get("CPU", 0.0))
+
+
+def whole_shares(actors: int, config: RunConfig) -> int:
+    """As many of them as give every replay server the same share."""
+    return actors - actors % config.replay.replay_shards
 
 
 def holds(node: dict[str, Any], bundle: dict[str, float]) -> bool:
@@ -70,7 +86,6 @@ class Place:
     cpus: float
     gpus: float = 0.0
     group: str = ""  # of bundles that a node is found for: the learner's or the replay servers'
-    index: int = 0  # which of them
 
 
 def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[str, Place]:
@@ -99,10 +114,10 @@ def _replays(config: RunConfig, words: tuple[str, ...]) -> list[Place]:
     """One beside the learner on a unix socket, or several anywhere on the cluster's network."""
     count = config.replay.replay_shards
     found = []
-    for shard in (Shard(index, count) for index in range(count)):
+    for shard in config.shards():
         listen = "unix:{scratch}/replay.sock" if count == 1 else "tcp:{ip}:0"
         rest = ("--folder", f"{{scratch}}/{shard.role}", "--listen", listen, "--shard", str(shard.index))
-        group, index = ("learner", 0) if count == 1 else ("replay", shard.index)
         command = RoleCommand(shard.role, ("replay", *words, *rest))
-        found.append(Place(RoleHost, command, REPLAY_CPUS, group=group, index=index))
+        cpus, group = (REPLAY_CPUS, "learner") if count == 1 else (SHARD_CPUS, "replay")
+        found.append(Place(RoleHost, command, cpus, group=group))
     return found

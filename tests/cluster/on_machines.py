@@ -208,6 +208,7 @@ def test_a_run_learns_is_stopped_and_goes_on(site: Site) -> None:
     )
     again.check_counters()
     again.stop()
+    assert "is lost" not in site.head.run(f"cat {again.folder}/logs/replay.log").stdout
 
 
 def test_a_killed_raylet_costs_no_acknowledged_window(endless: Run) -> None:

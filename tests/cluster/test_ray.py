@@ -44,6 +44,10 @@ def _left() -> list[str]:
     return found
 
 
+def _pids(words: str) -> list[int]:
+    return [one.pid for one in psutil.process_iter(["cmdline"]) if words in " ".join(one.info["cmdline"] or [])]
+
+
 def ring(folder: Path) -> Path:
     """Where the replay server's node keeps it."""
     return Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{RunFolder(folder).name[-8:]}" / "replay" / "ring"
@@ -141,7 +145,7 @@ def test_a_node_is_lost_and_another_comes(nodes: Cluster, tmp_path: Path) -> Non
     assert max(RunFolder(folder).checkpoints.glob("[0-9]*")).is_dir()
 
 
-def test_a_killed_launcher_comes_back(nodes: Cluster, tmp_path: Path) -> None:
+def test_a_killed_launcher_and_a_role_that_somebody_ended_come_back(nodes: Cluster, tmp_path: Path) -> None:
     nodes.add_node(num_cpus=1)
     folder = RunFolder(tmp_path / "run")
     with Training(folder.path, *ENDLESS, "--launcher", "ray", "--ray-address", nodes.address) as training:
@@ -152,6 +156,10 @@ def test_a_killed_launcher_comes_back(nodes: Cluster, tmp_path: Path) -> None:
         training.wait_for(lambda: folder.trainer() not in (None, before))
         steps = training.newest("replay", "env_steps")
         training.wait_for(lambda: training.newest("replay", "env_steps") > steps + 200)
+        training.wait_for_updates(100)
+        (replay,) = _pids(f"deploy.cli replay --run {folder.name}")
+        os.kill(replay, signal.SIGTERM)  # it ends in order, though nobody wants the run to end
+        training.wait_for(lambda: _pids(f"deploy.cli replay --run {folder.name}") not in ([], [replay]))
         training.wait_for_updates(100)
         training.interrupt()
     assert training.process.returncode == 130

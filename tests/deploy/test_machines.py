@@ -49,6 +49,12 @@ def test_versions_are_the_pinned_ones(config: dict[str, Any]) -> None:
     assert config["file_mounts"]["~/rmc"] == "."
 
 
+def test_every_cloud_machine_says_its_image(config: dict[str, Any]) -> None:
+    for kind in config.get("available_node_types", {}).values():
+        if config["provider"]["type"] != "local":
+            assert "ubuntu" in str(kind["node_config"])  # with a Python that is new enough
+
+
 def test_the_nodes_that_there_must_be() -> None:
     found = {path.stem: machines.expected_nodes(machines.read(path)) for path in FILES}
     assert found == {"aws": 3, "gcp": 3, "on-premise": 3}

@@ -117,5 +117,7 @@ def test_values_that_do_not_go_together_are_refused() -> None:
         validate(with_value(config, "update.policy_through_q", False))
     with pytest.raises(ConfigError, match=r"--replay-shards=2: .*--actors=1"):
         validate(with_value(config, "replay.replay_shards", 2))
+    with pytest.raises(ConfigError, match=r"--actors=3: .*multiple of --replay-shards=2"):
+        validate(with_value(with_value(config, "actors", 3), "replay.replay_shards", 2))
     with pytest.raises(ConfigError, match="--heads"):
         validate(with_value(config, "agent.heads", (400, 0)))

@@ -1,0 +1,44 @@
+"""Where the rings of a run lie on a cluster, so that one that goes on finds them again."""
+
+import json
+
+import ray
+from ray.util.placement_group import PlacementGroup, placement_group_table
+
+from deploy.run_folder import RunFolder
+
+READY_SECONDS = 5.0
+
+
+class Rings:
+    """The address of every replay server's node, kept in the run's folder."""
+
+    def __init__(self, folder: RunFolder) -> None:
+        self._path = folder.path / "rings-at"
+        self._at: dict[str, str] = json.loads(self._path.read_text()) if self._path.exists() else {}
+
+    def note(self, role: str, address: str) -> None:
+        """A replay server runs there now."""
+        if self._at.get(role) != address:
+            self._at[role] = address
+            temporary = self._path.with_suffix(".new")
+            temporary.write_text(json.dumps(self._at))
+            temporary.rename(self._path)
+
+    def node(self, role: str) -> str | None:
+        """Ray's id of the node that holds a ring, while that node is alive."""
+        address = self._at.get(role)
+        found = [node["NodeID"] for node in ray.nodes() if node["Alive"] and node["NodeManagerAddress"] == address]
+        return found[0] if address and found else None
+
+    def bundles(self, group: PlacementGroup, roles: list[str]) -> dict[str, int]:
+        """A bundle of the group for each role: one on its ring's node where there is one, else any."""
+        ray.wait([group.ready()], timeout=READY_SECONDS)
+        nodes = dict(placement_group_table(group)["bundles_to_node_id"])
+        free = list(range(len(roles)))
+        chosen = {}
+        for role in sorted(roles, key=lambda role: self.node(role) is None):
+            there = [index for index in free if nodes.get(index) == self.node(role) is not None]
+            chosen[role] = there[0] if there else free[0]
+            free.remove(chosen[role])
+        return chosen
