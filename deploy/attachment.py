@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -75,16 +76,24 @@ class Absence:
 
 def trained_now(folder: RunFolder) -> int:
     """The launcher's process. Raises ConfigError where nobody trains this run."""
-    trainer = folder.trainer()
-    if trainer is None:
-        folder.config()
-        raise ConfigError("RUN", str(folder.path), "nobody trains it now; rmc train with its --run-dir goes on with it")
+    comes_back = (folder.path / "learner-at").exists() and folder.ended() is None  # on Ray, where it was killed
+    deadline = time.monotonic() + AWAY_SECONDS * comes_back
+    while (trainer := folder.trainer()) is None:
+        if time.monotonic() >= deadline:
+            folder.config()
+            fix = "nobody trains it now; rmc train with its --run-dir goes on with it"
+            raise ConfigError("RUN", str(folder.path), fix)
+        time.sleep(LOOK_SECONDS)
     return trainer
 
 
 def stop(folder: RunFolder) -> int:
     """Ask the launcher to end the run in order, and wait until it has; its exit status. Raises ConfigError."""
-    os.kill(trained_now(folder), signal.SIGTERM)
+    trainer = trained_now(folder)
+    if folder.trainer_host() != socket.gethostname():
+        raise ConfigError("RUN", str(folder.path), f"is trained on {folder.trainer_host()}; stop it there")
+    with suppress(ProcessLookupError):  # it has just ended
+        os.kill(trainer, signal.SIGTERM)
     deadline = time.monotonic() + STOP_SECONDS
     while folder.trainer() is not None:
         if time.monotonic() > deadline:

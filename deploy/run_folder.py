@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import secrets
+import socket
 import time
 from pathlib import Path
 from typing import Any, Literal
@@ -99,7 +100,7 @@ class RunFolder:
                 self._lock = None
                 raise ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first")
             time.sleep(0.05)
-        self._note(f"training {os.getpid()}")
+        self._note(f"training {os.getpid()} {socket.gethostname()}")
 
     def unlock(self, status: int | None = None) -> None:
         """Let another launcher in; ``status`` is how this one ended, if it trained."""
@@ -114,14 +115,18 @@ class RunFolder:
         os.pwrite(self._lock, text.encode(), 0)
 
     def trainer(self) -> int | None:
-        """The process of the launcher that trains this run now, if one does."""
+        """The process of the launcher that trains this run now, if one does; on ``trainer_host``."""
         try:
             with (self.path / ".lock").open("rb") as file:
-                word, _, number = file.read().decode().partition(" ")
+                word, *rest = file.read().decode().split()
                 free = _locked(file.fileno(), fcntl.LOCK_SH)
-        except FileNotFoundError:
+        except (FileNotFoundError, ValueError):
             return None
-        return None if free or word != "training" else int(number)
+        return None if free or word != "training" else int(rest[0])
+
+    def trainer_host(self) -> str:
+        """The machine whose launcher locked this run last, if it trains it."""
+        return " ".join((self.path / ".lock").read_text().split()[2:])
 
     def ended(self) -> int | None:
         """The exit status of the launcher that trained it last, if that came to an end of its own."""

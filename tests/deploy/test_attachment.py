@@ -60,6 +60,14 @@ def test_a_trainer_that_was_killed_has_not_ended(folder: RunFolder) -> None:
     folder.unlock()
 
 
+def test_a_trainer_on_another_machine_is_not_ours_to_stop(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder.lock()
+    monkeypatch.setattr("socket.gethostname", lambda: "elsewhere")
+    with pytest.raises(ConfigError, match=r"is trained on .*; stop it there"):
+        stop(folder)
+    folder.unlock()
+
+
 def test_nobody_to_stop_is_said(folder: RunFolder, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="nobody trains it now"):
         stop(folder)
