@@ -271,7 +271,8 @@ class ClusterRun:
 
     def _grow(self) -> None:
         """Give CPUs that came an actor each; the replay servers start again to know of them."""
-        fit = whole_shares(self.config.actors + free_cpus(), self.config)
+        room = int(cpus() - reserved_cpus(self.config))  # what is free may be an old view of it
+        fit = whole_shares(min(self.config.actors + free_cpus(), room), self.config)
         if fit <= self.config.actors:
             return
         grown = dataclasses.replace(self.config, actors=fit)
