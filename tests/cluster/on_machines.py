@@ -80,9 +80,11 @@ class Site:
 
     def alive(self) -> int:
         code = (
-            "import ray; ray.init(address='auto', logging_level='ERROR'); print(sum(n['Alive'] for n in ray.nodes()))"
+            "import ray; ray.init(address='auto', logging_level='ERROR', log_to_driver=False); "
+            "print('alive', sum(n['Alive'] for n in ray.nodes()))"
         )
-        return int(self.head.run(f'{PYTHON}/python -c "{code}"').stdout.split()[-1])
+        said = self.head.run(f'{PYTHON}/python -c "{code}"').stdout  # Ray's autoscaler may say something, too
+        return int(next(line for line in said.splitlines() if line.startswith("alive ")).split()[1])
 
 
 class Run:

@@ -39,7 +39,11 @@ def _left() -> list[str]:
             words = " ".join(process.cmdline())
         except psutil.Error:
             continue
-        if "raylet/raylet" in words or "gcs_server" in words or ("deploy.cli" in words and "rmct-" in words):
+        if (
+            "raylet/raylet" in words
+            or "gcs_server" in words
+            or ("deploy.cli" in words and tempfile.gettempdir() in words)
+        ):
             found.append(f"{process.pid} {words[:150]}")
     return found
 
