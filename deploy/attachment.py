@@ -90,8 +90,8 @@ def trained_now(folder: RunFolder) -> int:
 def stop(folder: RunFolder) -> int:
     """Ask the launcher to end the run in order, and wait until it has; its exit status. Raises ConfigError."""
     trainer = trained_now(folder)
-    if folder.trainer_host() != socket.gethostname():
-        raise ConfigError("RUN", str(folder.path), f"is trained on {folder.trainer_host()}; stop it there")
+    if (host := folder.trainer_host()) not in ("", socket.gethostname()):
+        raise ConfigError("RUN", str(folder.path), f"is trained on {host}; stop it there")
     with suppress(ProcessLookupError):  # it has just ended
         os.kill(trainer, signal.SIGTERM)
     deadline = time.monotonic() + STOP_SECONDS

@@ -39,7 +39,7 @@ from deploy.counters import Counters
 from deploy.local import PREFIX, TICK_SECONDS, register, sweep, watch
 from deploy.monitor import Monitor
 from deploy.presets import RunConfig, to_json
-from deploy.ray_host import NAMESPACE, LauncherHost, Task, host_name
+from deploy.ray_host import NAMESPACE, LauncherHost, Task, host_name, last_line
 from deploy.ray_hosted import Hosted
 from deploy.ray_places import (
     SHARD_CPUS,
@@ -51,7 +51,7 @@ from deploy.ray_places import (
     places,
     reserved_cpus,
     whole_shares,
-)  # fmt: skip
+)
 from deploy.redis_server import Port, RedisServer
 from deploy.rings import Rings
 from deploy.roles import PATIENCE_VARIABLE, URL_VARIABLE, connect
@@ -316,17 +316,22 @@ class ClusterRun:
             time.sleep(TICK_SECONDS)
         self._counters.keep(self.bus, at_once=True)
 
+    def _kept_elsewhere(self) -> bool:
+        """Whether something of the run is on a node alone, where its hosts share a folder."""
+        troubled = [hosted for hosted in self._hosts.values() if hosted.trouble]
+        for hosted in troubled:
+            log.warning("what %s left stays on %s: %s", hosted.name, hosted.node, hosted.trouble)
+        return bool(troubled)
+
     def close(self, over: bool) -> None:
         """End everything; nothing is left but the run's folder and, on its node, the ring of a run that may go on."""
         try:
             closing = [hosted.handle.close.remote() for hosted in self._hosts.values() if hosted.awaited]
             if closing:
                 ray.wait(closing, num_returns=len(closing), timeout=STOP_SECONDS / 2)
-            if over:
+            if over and not self._kept_elsewhere():
                 clearing = [
-                    hosted.handle.clear.remote()
-                    for hosted in self._hosts.values()
-                    if hosted.report is not None and not hosted.report.trouble
+                    hosted.handle.clear.remote() for hosted in self._hosts.values() if hosted.report is not None
                 ]
                 ray.wait(clearing, num_returns=len(clearing), timeout=STOP_SECONDS / 4)
             for hosted in self._hosts.values():
@@ -390,8 +395,8 @@ def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, en
     try:
         ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)
     except ray.exceptions.RayError as error:
-        said = str(error).strip().splitlines()[-1]
-        raise ConfigError("--launcher", "ray", f"the run's launcher could not begin on the head ({said})") from None
+        fix = f"the run's launcher could not begin on the head ({last_line(error)})"
+        raise ConfigError("--launcher", "ray", fix) from None
 
 
 def check_not_there(folder: RunFolder) -> None:

@@ -74,6 +74,11 @@ def scratch_folder(run: str) -> Path:
     return folder
 
 
+def last_line(error: BaseException) -> str:
+    """What an error says in the end; Ray puts whole tracebacks before that."""
+    return (str(error).strip() or type(error).__name__).splitlines()[-1]
+
+
 def host_name(run: str, role: str) -> str:
     """The Ray actor's name of a role."""
     return f"{run}:{role}"
@@ -231,7 +236,7 @@ class LearnerHost(RoleHost):
             self._bring()
             self.trouble = ""
         except AWAY as error:
-            self.trouble = f"checkpoints do not reach the head: {str(error).strip().splitlines()[-1]}"
+            self.trouble = f"checkpoints do not reach the head: {last_line(error)}"
             raise
 
     def _bring(self) -> None:

@@ -27,7 +27,7 @@ class Hosted:
         self.waits_since = time.monotonic()  # for a CPU, or to be started again; unless it runs
         self._question: Any = None
         self._asked_at = self._began_at = 0.0
-        self._quick_deaths, self._mourned, self._trouble = 0, "", ""
+        self._quick_deaths, self._mourned = 0, ""
 
     @property
     def running(self) -> bool:
@@ -43,6 +43,11 @@ class Hosted:
     def node(self) -> str:
         """Where its role was last heard of."""
         return self.report.node if self.report is not None else ""
+
+    @property
+    def trouble(self) -> str:
+        """What kept it, when last heard of, from bringing to the head what belongs there."""
+        return self.report.trouble if self.report is not None else ""
 
     def ask(self, logs: Path) -> None:
         """Take in an answer that has come, and ask again. Raises RoleDied."""
@@ -69,10 +74,9 @@ class Hosted:
             self._began_at = time.monotonic()
         if self.running and report.pid is None:
             self.waits_since = time.monotonic()
+        if report.trouble != self.trouble:
+            log.warning("%s: %s", self.name, report.trouble or "checkpoints reach the head again")
         self.report = report
-        if report.trouble != self._trouble:
-            self._trouble = report.trouble
-            log.warning("%s: %s", self.name, report.trouble or "they do again")
         if report.log or not (logs / f"{self.name}.log").exists():
             with (logs / f"{self.name}.log").open("ab") as file:
                 file.write(report.log)

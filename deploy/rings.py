@@ -35,10 +35,11 @@ class Rings:
         """A bundle of the group for each role: one on its ring's node where there is one, else any."""
         ray.wait([group.ready()], timeout=READY_SECONDS)
         nodes = dict(placement_group_table(group)["bundles_to_node_id"])
+        homes = {role: node for role in roles if (node := self.node(role)) is not None}
         free = list(range(len(roles)))
         chosen = {}
-        for role in sorted(roles, key=lambda role: self.node(role) is None):
-            there = [index for index in free if nodes.get(index) == self.node(role) is not None]
-            chosen[role] = there[0] if there else free[0]
+        for role in sorted(roles, key=lambda role: role not in homes):  # who has a home chooses first
+            there = [index for index in free if role in homes and nodes.get(index) == homes[role]]
+            chosen[role] = (there or free)[0]
             free.remove(chosen[role])
         return chosen

@@ -125,7 +125,7 @@ class RunFolder:
         return None if free or word != "training" else int(rest[0])
 
     def trainer_host(self) -> str:
-        """The machine whose launcher locked this run last, if it trains it."""
+        """The machine whose launcher trains this run; empty where none does."""
         return " ".join((self.path / ".lock").read_text().split()[2:])
 
     def ended(self) -> int | None:

@@ -91,6 +91,20 @@ def test_two_shards_speak_over_the_network_and_encrypted_where_redis_can(tmp_pat
         assert training.newest(role, "drawn_steps") > 0
 
 
+def test_checkpoints_that_do_not_reach_the_head_are_said_and_brought_later(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run")
+    launcher_log = folder.logs / "launcher.log"
+    with Training(folder.path, *ENDLESS, "--launcher", "ray", "--ray-address", "local") as training:
+        training.wait_for_updates(1)
+        folder.checkpoints.rename(tmp_path / "aside")
+        folder.checkpoints.write_text("in the way")
+        training.wait_for(lambda: "learner: checkpoints do not reach the head" in launcher_log.read_text())
+        folder.checkpoints.unlink()
+        (tmp_path / "aside").rename(folder.checkpoints)
+        training.wait_for(lambda: "learner: checkpoints reach the head again" in launcher_log.read_text())
+        training.interrupt()
+
+
 def test_more_than_the_cluster_holds_is_refused(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "deploy.cli", "train", "InvertedPendulum-v5", "--launcher", "ray"]
     done = subprocess.run(
