@@ -1,15 +1,20 @@
-"""What every benchmark needs: alternating pairs, medians with their range, and a real replay process."""
+"""What every benchmark needs: rounds in which ours, its peers and the ceiling take turns, and a file of what came."""
 
+import argparse
 import json
 import multiprocessing
 import os
+import shlex
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import TracebackType
 
 import numpy as np
 
@@ -20,44 +25,99 @@ from replay_server.process import ReplayProcess
 from replay_server.server import ReplayConfig, ReplayServer
 from replay_server.socket_server import SocketServer
 
+HERE = Path(__file__).parent
 SECRET = b"benchmark"
 RUN = "benchmark"
 ENDLESS = 10**12
+START_SECONDS = 120.0  # TensorFlow takes its time
+Measure = Callable[[], float]
 
 
 @dataclass(frozen=True)
 class Row:
-    """One measurement: medians over the pairs, (min, max) as the spread."""
+    """One measurement: medians over the rounds."""
 
     name: str
     unit: str
     ours: float
-    ours_range: tuple[float, float]
-    ceiling: float
-    ceiling_range: tuple[float, float]
-    ceiling_is: str
-    ratio: float  # median of the pairs' own ratios
-    pairs: int
+    peer: str  # what ours is compared with; "" where there is none
+    peer_value: float | None  # None: it is not installed
+    ratio: float | None  # how many times better ours is: median of the rounds' own ratios
+    limit: float | None  # the ceiling
+    limit_is: str
+    spread: dict[str, tuple[float, float]]  # least and largest of ours, peer and limit
+    rounds: int
+    command: str
 
     def show(self) -> str:
         """One line for people."""
-        return (
-            f"{self.name:32s} {self.ours:12,.1f} {self.unit:12s} {100 * self.ratio:5.1f} % of {self.ceiling:,.1f} "
-            f"({self.ceiling_is}); range {self.ours_range[0]:,.1f} to {self.ours_range[1]:,.1f}, {self.pairs} pairs"
+        least, largest = self.spread["ours"]
+        text = f"{self.name:44s} {self.ours:12,.1f} {self.unit} ({least:,.1f} to {largest:,.1f})"
+        if self.peer:
+            text += f"; {self.peer}: " + ("not installed, see make peers" if self.peer_value is None else "")
+        if self.peer_value is not None:
+            text += f"{self.peer_value:,.1f}, ours {self.ratio:.2f} times better"
+        return text + (f"; {self.limit_is}: {self.limit:,.1f}" if self.limit is not None else "")
+
+
+def compare(
+    name: str,
+    unit: str,
+    ours: Measure,
+    peers: dict[str, Measure | None],
+    limit: tuple[str, Measure] | None = None,
+    rounds: int = 5,
+    less_is_better: bool = False,
+) -> list[Row]:
+    """Ours, each peer and the ceiling in turn, so many rounds; a row a peer. A peer that is None is not installed."""
+    columns: dict[str, Measure | None] = {"ours": ours, **peers}
+    if limit is not None:
+        columns["limit"] = limit[1]
+    values: dict[str, list[float]] = {key: [] for key in columns}
+    for _ in range(rounds):
+        for key, measure in columns.items():
+            if measure is not None:
+                values[key].append(measure())
+    rows = []
+    for peer in peers or {"": None}:
+        pairs = list(zip(values["ours"], values.get(peer, []), strict=False))
+        ratios = [b / a if less_is_better else a / b for a, b in pairs]
+        found = {"ours": values["ours"], "peer": values.get(peer, []), "limit": values.get("limit", [])}
+        medians = {key: statistics.median(seen) if seen else None for key, seen in found.items()}
+        assert medians["ours"] is not None
+        rows.append(
+            Row(
+                name, unit, medians["ours"], peer, medians["peer"],
+                statistics.median(ratios) if ratios else None,
+                medians["limit"], limit[0] if limit else "",
+                {key: (min(seen), max(seen)) for key, seen in found.items() if seen},
+                rounds, shlex.join(["python", "-m", _module(), *sys.argv[1:]]),
+            )  # fmt: skip
         )
+    return rows
 
 
-def alternate(
-    name: str, unit: str, ours: Callable[[], float], ceiling: Callable[[], float], ceiling_is: str, pairs: int
-) -> Row:
-    """Measure A B A B …; each callable runs for some seconds and returns its speed."""
-    a, b = [], []
-    for _ in range(pairs):
-        a.append(ours())
-        b.append(ceiling())
-    ratio = statistics.median(x / y for x, y in zip(a, b, strict=True))
-    medians = statistics.median(a), statistics.median(b)
-    return Row(name, unit, medians[0], (min(a), max(a)), medians[1], (min(b), max(b)), ceiling_is, ratio, pairs)
+def _module() -> str:
+    return f"benchmarks.{Path(sys.argv[0]).stem}"
+
+
+def save(rows: list[Row]) -> None:
+    """Into today's file of results, in place of what was measured before under the same name; and print them."""
+    path = HERE / "results" / f"{time.strftime('%Y-%m-%d')}.json"
+    before = json.loads(path.read_text()) if path.exists() else []
+    new = {(row.name, row.peer) for row in rows}
+    kept = [row for row in before if (row["name"], row["peer"]) not in new]
+    path.write_text(json.dumps([*kept, *(asdict(row) for row in rows)], indent=1) + "\n")
+    for row in rows:
+        print(row.show(), flush=True)
+
+
+def parser(doc: str | None) -> argparse.ArgumentParser:
+    """With what every benchmark takes."""
+    made = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
+    made.add_argument("--rounds", type=int, default=5, help="in each of which ours and all peers take a turn")
+    made.add_argument("--seconds", type=float, default=4.0, help="of one turn")
+    return made
 
 
 def speed(work: Callable[[], int], seconds: float) -> float:
@@ -66,6 +126,57 @@ def speed(work: Callable[[], int], seconds: float) -> float:
     while time.perf_counter() - start < seconds:
         done += work()
     return done / (time.perf_counter() - start)
+
+
+class Peer:
+    """Another project's code in an environment of its own: a process that measures once for each line it is sent.
+
+    ``benchmarks/peers/SCRIPT.py`` prints ``{"ready": true}`` once it can, and ``{"value": speed}`` for each line, the
+    seconds to measure for. Both may stand amid other output, on lines of their own.
+    """
+
+    def __init__(self, python: Path, script: str, *words: str) -> None:
+        command = [str(python), str(HERE / "peers" / f"{script}.py"), *words]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._answer()
+
+    def measure(self, seconds: float) -> float:
+        """One turn."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{seconds}\n")
+        self._process.stdin.flush()
+        return float(self._answer()["value"])
+
+    def _answer(self) -> dict[str, float]:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if line.startswith("{"):
+                return dict(json.loads(line))
+        raise RuntimeError(f"{self._process.args!r} ended with {self._process.wait()}")
+
+    def __enter__(self) -> "Peer":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._process.kill()
+        self._process.wait()
+
+
+def peer_python(environment: str) -> Path | None:
+    """The Python of a peer's environment, as ``make peers`` made it, or None."""
+    python = HERE.parent / f".venv-{environment}" / "bin" / "python"
+    return python if python.exists() else None
+
+
+@contextmanager
+def on_cores(cores: set[int]) -> Iterator[None]:
+    """This process, and those that it starts meanwhile, on these cores only."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 def random_rows(spec: WindowSpec, count: int) -> Rows:
@@ -98,24 +209,14 @@ def replay_process(spec: WindowSpec, config: ReplayConfig, actors: int = 1) -> I
     with tempfile.TemporaryDirectory() as folder, RedisServer(Path(folder)) as redis:
         assert redis.process is not None
         os.sched_setaffinity(redis.process.pid, {cores[-1]})
-        os.sched_setaffinity(0, {cores[0]})
-        bus = RedisBus(redis.url, RUN)
-        server = multiprocessing.get_context("spawn").Process(
-            target=_serve, args=(redis.url, folder, spec, config, actors, cores[-1])
-        )
-        server.start()
-        while bus.replay_address("replay") is None:
-            time.sleep(0.05)
-        yield bus
-        bus.request_stop("done")
-        server.join()
-        os.sched_setaffinity(0, set(cores))
-
-
-def record(rows: list[Row], path: Path, command: str) -> None:
-    """Append the rows to a JSON-lines file, and print them."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
-        for row in rows:
-            file.write(json.dumps({**asdict(row), "time": time.strftime("%Y-%m-%d %H:%M"), "command": command}) + "\n")
-            print(row.show())
+        with on_cores({cores[0]}):
+            bus = RedisBus(redis.url, RUN)
+            server = multiprocessing.get_context("spawn").Process(
+                target=_serve, args=(redis.url, folder, spec, config, actors, cores[-1])
+            )
+            server.start()
+            while bus.replay_address("replay") is None:
+                time.sleep(0.05)
+            yield bus
+            bus.request_stop("done")
+            server.join()

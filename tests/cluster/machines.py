@@ -134,6 +134,13 @@ class Machine:
         found = self.run(f"pgrep -f {shlex.quote(pattern)}", check=False).stdout.split()
         return [int(word) for word in found]
 
+    def wait_until_gone(self, pattern: str, seconds: float) -> None:
+        """Until no process has such a command line."""
+        deadline = time.monotonic() + seconds
+        while left := self.run(f"pgrep -fa {shlex.quote(pattern)}", check=False).stdout:
+            assert time.monotonic() < deadline, f"{self.name} still runs {left}"
+            time.sleep(0.5)
+
     def kill(self, pattern: str) -> None:
         """``kill -9`` them."""
         self.run(f"pkill -9 -f {shlex.quote(pattern)}", check=False)
