@@ -20,7 +20,9 @@ TOKEN = Path("~/.ray/auth_token")
 COUNT = (
     "import ray; ray.init(address='auto', logging_level='ERROR'); print('alive', sum(n['Alive'] for n in ray.nodes()))"
 )
-LEFT = "pgrep -fc '[r]aylet/raylet|[g]cs_server|[r]ay::' || true"  # processes of Ray on a machine
+# how many processes of Ray are on a machine, once they have had 10 s to end
+_RAYS = "[r]aylet/raylet|[g]cs_server|[r]ay::|/[r]ay/(dashboard|autoscaler|_private)/"
+LEFT = f"for i in $(seq 20); do n=$(pgrep -fc '{_RAYS}'); [ $n = 0 ] && break; sleep 0.5; done; echo $n"
 
 
 def up(path: Path, console: Console) -> None:
