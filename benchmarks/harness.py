@@ -87,12 +87,18 @@ def compare(
         assert medians["ours"] is not None
         rows.append(
             Row(
-                name, unit, medians["ours"], peer, medians["peer"],
+                name,
+                unit,
+                medians["ours"],
+                peer,
+                medians["peer"],
                 statistics.median(ratios) if ratios else None,
-                medians["limit"], limit[0] if limit else "",
+                medians["limit"],
+                limit[0] if limit else "",
                 {key: (min(seen), max(seen)) for key, seen in found.items() if seen},
-                rounds, shlex.join(["python", "-m", _module(), *sys.argv[1:]]),
-            )  # fmt: skip
+                rounds,
+                shlex.join(["python", "-m", _module(), *sys.argv[1:]]),
+            )
         )
     return rows
 

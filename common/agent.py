@@ -125,7 +125,7 @@ def _mlp(inputs: int, hidden: tuple[int, int], last: nn.Linear) -> nn.Sequential
     return nn.Sequential(nn.Linear(inputs, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU(), last)
 
 
-class _Float32Linear(nn.Linear):
+class Float32Linear(nn.Linear):
     """A last layer that stays float32 under autocast, for what bfloat16's 8 bits would round too much."""
 
     def forward(self, x: Tensor) -> Tensor:
@@ -156,7 +156,7 @@ class WorldModel(nn.Module):
         return Prediction(hidden_change, observation_change, reward.sum(-1))
 
 
-class _StackedLinear(nn.Module):
+class StackedLinear(nn.Module):
     """Two Linear layers side by side as one batched product: x (2, N, in) -> (2, N, out)."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
@@ -176,7 +176,7 @@ class TwinQ(nn.Module):
         super().__init__()
         first, second = config.heads
         self.layers = nn.ModuleList(
-            [_StackedLinear(inputs + action_dim, first), _StackedLinear(first, second), _StackedLinear(second, 1)]
+            [StackedLinear(inputs + action_dim, first), StackedLinear(first, second), StackedLinear(second, 1)]
         )
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
@@ -196,7 +196,7 @@ class Policy(nn.Module):
 
     def __init__(self, inputs: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
-        self.net = _mlp(inputs, config.heads, _Float32Linear(config.heads[1], 2 * action_dim))
+        self.net = _mlp(inputs, config.heads, Float32Linear(config.heads[1], 2 * action_dim))
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """(..., Z) -> mean and log standard deviation before the tanh, (..., A) each, float32."""

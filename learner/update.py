@@ -17,6 +17,7 @@ from torch.func import functional_call
 from common.agent import Agent, Memory, Remembered, squashed_sample
 from learner import losses
 from learner.batch import Batch
+from learner.fused import fuse
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 TRAINS_MEMORY = {  # the paper's table 1
@@ -92,9 +93,12 @@ class JointUpdate:
 
     def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> None:
         device = agent.log_alpha.device
+        if bf16 and device.type == "cpu":
+            fuse(agent)
         self.agent, self.burn_in, self.config, self.bf16 = agent, burn_in, config, bf16
         self.target_critic = _target_copy(agent.critic)
         self.target_memory = _target_copy(agent.memory)
+        self._has_target_memory = "ema" in (config.latent_target, config.target_memory)
         self.optimizers = self._make_optimizers()
         self.generator = torch.Generator(device).manual_seed(seed)
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
@@ -121,12 +125,12 @@ class JointUpdate:
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
             memory = remember(agent.memory, o, batch, self.burn_in)
-            z = agent.features(memory)
+            z = self._low(agent.features(memory))
             trains = TRAINS_MEMORY[c.scheme]
             z_model, z_value, z_policy = (z if loss in trains else z.detach() for loss in ("model", "value", "policy"))
 
             # Prediction, and curiosity from its error
-            target = self._remember_target(o, batch) if "ema" in (c.latent_target, c.target_memory) else memory
+            target = self._remember_target(o, batch) if self._has_target_memory else memory
             latent = (target if c.latent_target == "ema" else memory).hidden.detach().float()
             prediction = agent.world_model(z_model[:, :-1], a)
             change = latent[:, 1:] - latent[:, :-1]
@@ -137,7 +141,7 @@ class JointUpdate:
             mean, log_std = agent.policy(z_policy)
             pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean))
             with torch.no_grad():
-                next_z = (agent.features(target) if c.target_memory == "ema" else z)[:, 1:]
+                next_z = (self._low(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:]
                 next_q = self.target_critic(next_z, pi[:, 1:])
                 next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:])
                 y = losses.td_target(r + beta * i, c.gamma, d, next_value, m, c.n_step)
@@ -181,6 +185,10 @@ class JointUpdate:
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
 
+    def _low(self, z: Tensor) -> Tensor:
+        """What all heads read, rounded once for all where their products are in bfloat16."""
+        return z.bfloat16() if self.bf16 else z
+
     @torch.no_grad()
     def _remember_target(self, o: Tensor, batch: Batch) -> Remembered:
         return remember(self.target_memory, o, batch, self.burn_in)
@@ -209,7 +217,8 @@ class JointUpdate:
     def _follow(self, updated: Updated) -> None:
         """What follows the step: targets by Polyak, and the running variance."""
         self._polyak(self.target_critic.parameters(), self.agent.critic.parameters())
-        self._polyak(self.target_memory.parameters(), self.agent.memory.parameters())
+        if self._has_target_memory:
+            self._polyak(self.target_memory.parameters(), self.agent.memory.parameters())
         self.curiosity_variance.copy_(updated.curiosity_variance)
 
     @torch.no_grad()

@@ -1,0 +1,141 @@
+"""Trained transitions a second of the whole learner role, beside its bare update and stable-baselines3's SAC.
+
+    python -m benchmarks.learner [--env ENV] [--batches 32 64 256] [--rounds N] [--seconds S]
+
+A transition is trained when it is in a batch as a trained step: 15 for each window, B for each of SAC's batches. The
+learner has one thread on the first core and draws from a real replay server, which has the last one with Redis; SAC has
+its transitions in memory, one thread on the first core in one row, two on the first and the last in the other.
+"""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from benchmarks.harness import (
+    ENDLESS,
+    SECRET,
+    Measure,
+    Peer,
+    Row,
+    compare,
+    on_cores,
+    parser,
+    peer_python,
+    random_rows,
+    replay_process,
+    save,
+    speed,
+)  # fmt: skip
+from benchmarks.sender import CHUNK, Sender
+from common.agent import Agent
+from common.checkpoint import CheckpointFolder
+from common.envs import EnvConfig
+from common.redis_bus import RedisBus
+from common.window import WindowSpec
+from deploy.presets import RunConfig, robust
+from learner.batch import view_batch
+from learner.learner import Learner, LearnerConfig
+from learner.replay_client import ReplayClient
+from learner.update import make_update
+from replay_server.server import ReplayConfig
+
+PRECISIONS: tuple[Literal["bf16", "fp32"], ...] = ("bf16", "fp32")
+WINDOWS = 4800  # in the ring
+SAC_BATCH = 256
+
+
+@contextmanager
+def _role(run: RunConfig, bus: RedisBus, batch_size: int, precision: Literal["bf16", "fp32"]) -> Iterator[Learner]:
+    spec, address = run.window_spec(), bus.replay_address("replay")
+    assert address is not None
+    config = LearnerConfig(batch_size=batch_size, checkpoint_steps=ENDLESS, precision=precision)
+    client = ReplayClient(lambda: address.address, SECRET, spec, batch_size)
+    with tempfile.TemporaryDirectory() as at:
+        role = Learner(spec, run.agent, run.update, config, client, bus, CheckpointFolder(Path(at)), 0)
+        yield role
+        role.finished = True  # nothing to save
+        role.close()
+    client.close()
+
+
+def _bare(run: RunConfig, batch_size: int, precision: Literal["bf16", "fp32"], seconds: float) -> Measure:
+    """Forward and backward on one batch in place."""
+    spec = run.window_spec()
+    agent = Agent(spec.obs_dim, spec.action_dim, run.agent)
+    update, beta = make_update(agent, spec.burn_in, run.update, 0, precision == "bf16"), torch.zeros(())
+    rows = random_rows(spec, batch_size)
+    batch = view_batch(torch.from_numpy(rows.view("u1").reshape(batch_size, -1)), torch.ones(batch_size), spec)
+
+    def work() -> int:
+        parts, _ = update.forward(batch, beta)
+        agent.zero_grad(set_to_none=True)
+        sum(parts.values()).backward()  # type: ignore[union-attr]
+        return batch_size * spec.train
+
+    return lambda: speed(work, seconds)
+
+
+def measure(
+    run: RunConfig,
+    bus: RedisBus,
+    batch_size: int,
+    precision: Literal["bf16", "fp32"],
+    sac: dict[str, Measure | None],
+    seconds: float,
+    rounds: int,
+) -> list[Row]:
+    """One batch size in one precision."""
+    with _role(run, bus, batch_size, precision) as role:
+
+        def work() -> int:
+            return batch_size * run.window.trained_steps if role.step() else 0
+
+        speed(work, 1.0)
+        name = f"learner, {run.env.id}, batch {batch_size}, {precision}"
+        ceiling = "bare forward and backward", _bare(run, batch_size, precision, seconds)
+        return compare(name, "transitions/s", lambda: speed(work, seconds), sac, ceiling, rounds)
+
+
+def _sac(stack: ExitStack, spec: WindowSpec, threads: int, seconds: float) -> Measure | None:
+    """SAC in an environment of its own, on as many cores as it has threads."""
+    cores, python = sorted(os.sched_getaffinity(0)), peer_python("peers")
+    if python is None:
+        return None
+    words = [str(word) for word in (spec.obs_dim, spec.action_dim, SAC_BATCH, threads)]
+    with on_cores({cores[0]} if threads == 1 else {cores[0], cores[-1]}):
+        peer = stack.enter_context(Peer(python, "sb3_learner", *words))
+    return lambda: peer.measure(seconds)
+
+
+def main() -> None:
+    made = parser(__doc__)
+    made.add_argument("--env", default="HalfCheetah-v5")
+    made.add_argument("--batches", type=int, nargs="+", default=[32, 64, 256])
+    options = made.parse_args()
+    run = robust(EnvConfig(options.env))
+    torch.set_num_threads(1)
+    rows: list[Row] = []
+    with ExitStack() as stack:
+        spec = run.window_spec()
+        sac = {
+            f"stable-baselines3 SAC, {threads} threads": _sac(stack, spec, threads, options.seconds)
+            for threads in (1, 2)
+        }
+        bus = stack.enter_context(replay_process(spec, ReplayConfig(replay_ratio=1e9, warmup_steps=0)))
+        sender = Sender(bus, spec)
+        for _ in range(WINDOWS // CHUNK):
+            sender.send()
+        sender.wait()
+        for batch_size in options.batches:
+            for precision in PRECISIONS:
+                rows += measure(run, bus, batch_size, precision, sac, options.seconds, options.rounds)
+    save(rows)
+
+
+if __name__ == "__main__":
+    main()

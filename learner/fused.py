@@ -1,0 +1,212 @@
+"""The networks as fast as a CPU with bfloat16 products takes them: the same parameters, the same equations.
+
+``fuse`` swaps the GRU and the heads of an Agent for these. Under bfloat16 autocast each is one node of the gradient's
+graph: products by torch, all between them by ``learner/kernels.py``, weight gradients in one product over all steps.
+Without autocast, and on a GPU, they are what they were. Shapes: B batch, T time, N = B T, S nets side by side.
+"""
+
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from common.agent import Agent, Float32Linear, StackedLinear, TwinQ
+from learner import kernels
+
+LOW = torch.bfloat16
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
+
+
+def fuse(agent: Agent) -> None:
+    """Swap an agent's parts in place; parameters and their names stay."""
+    agent.memory.gru = _as(FusedGRU, agent.memory.gru)
+    agent.world_model.net = _as(FusedHead, agent.world_model.net)
+    agent.policy.net = _as(FusedHead, agent.policy.net)
+    agent.critic = _as(FusedTwinQ, agent.critic)
+
+
+def _as(kind: type[ModuleT], module: nn.Module) -> ModuleT:
+    """The same object's contents under another class, which adds nothing to them."""
+    made = kind.__new__(kind)
+    made.__dict__.update(module.__dict__)
+    return made
+
+
+def _applies(x: Tensor) -> bool:
+    return x.device.type == "cpu" and torch.is_autocast_enabled("cpu") and torch.get_autocast_dtype("cpu") is LOW
+
+
+class FusedGRU(nn.GRU):
+    """One layer, batch first."""
+
+    def forward(self, x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        """(B, T, E), (1, B, H) -> (B, T, H) and (1, B, H)."""
+        if not _applies(x):
+            plain: tuple[Tensor, Tensor] = super().forward(x, hidden)
+            return plain
+        with torch.autocast("cpu", enabled=False):
+            sequence: Tensor = _GRU.apply(  # type: ignore[no-untyped-call]
+                x, hidden[0], self.weight_ih_l0, self.weight_hh_l0, self.bias_ih_l0, self.bias_hh_l0
+            )
+        return sequence, sequence[:, -1].unsqueeze(0)
+
+
+class FusedHead(nn.Sequential):
+    """Linear, ReLU, Linear, ReLU, Linear."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., in) -> (..., out)."""
+        if not _applies(x):
+            plain: Tensor = super().forward(x)  # type: ignore[no-untyped-call]
+            return plain
+        layers = [layer for layer in self if isinstance(layer, nn.Linear)]
+        parameters = [part for one in layers for part in (one.weight.t().unsqueeze(0), one.bias.unsqueeze(0))]
+        return _heads(x, x.new_empty(*x.shape[:-1], 0), isinstance(layers[-1], Float32Linear), parameters)[0]
+
+
+class FusedTwinQ(TwinQ):
+    """Both critics."""
+
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """(B, T, Z), (B, T, A) -> (2, B, T) in float32."""
+        if not _applies(features):
+            return super().forward(features, action)
+        stacks = [layer for layer in self.layers if isinstance(layer, StackedLinear)]
+        parameters = [part for one in stacks for part in (one.weight, one.bias[:, 0])]
+        return _heads(features, action, True, parameters).squeeze(-1)
+
+
+def _heads(features: Tensor, action: Tensor, float32_last: bool, parameters: list[Tensor]) -> Tensor:
+    """(..., Z), (..., A) -> (S, ..., out)."""
+    flat = (x.flatten(0, -2) for x in (features, action))
+    with torch.autocast("cpu", enabled=False):
+        out: Tensor = _Heads.apply(*flat, float32_last, *parameters)  # type: ignore[no-untyped-call]
+    return out.reshape(out.shape[0], *features.shape[:-1], out.shape[-1])
+
+
+def _bits(x: Tensor) -> NDArray[np.uint16]:
+    bits: NDArray[np.uint16] = x.view(torch.uint16).numpy()
+    return bits
+
+
+class _GRU(torch.autograd.Function):
+    """h_t for all t, and the way back through time."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, hidden: Tensor, wi: Tensor, wh: Tensor, bi: Tensor, bh: Tensor) -> Tensor:
+        (b, t, e), h = x.shape, hidden.shape[1]
+        x_low = x.to(LOW).transpose(0, 1).reshape(t * b, e)
+        wi_low, wh_low = wi.to(LOW), wh.to(LOW)
+        gi, gh = torch.mm(x_low, wi_low.t()).view(t, b, 3 * h), torch.empty(b, 3 * h, dtype=LOW)
+        states, kept = torch.empty(t + 1, b, h), torch.empty(t, b, 4 * h)
+        states_low = torch.empty(t + 1, b, h, dtype=LOW)
+        states[0], states_low[0] = hidden, hidden
+        of_x, of_h, all_h, low, gates = _bits(gi), _bits(gh), states.numpy(), _bits(states_low), kept.numpy()
+        bias_i, bias_h = bi.detach().numpy(), bh.detach().numpy()
+        for k in range(t):
+            torch.mm(states_low[k], wh_low.t(), out=gh)
+            kernels.gru_step(of_x[k], of_h, bias_i, bias_h, all_h[k], gates[k], all_h[k + 1], low[k + 1])
+        ctx.save_for_backward(x_low, wi_low, wh_low, states, states_low, kept)
+        return states[1:].transpose(0, 1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        x_low, wi_low, wh_low, states, states_low, kept = ctx.saved_tensors
+        t, b, h = kept.shape[0], kept.shape[1], states.shape[2]
+        grads, d, through = grad.float().transpose(0, 1).contiguous(), torch.zeros(b, h), torch.zeros(b, h, dtype=LOW)
+        dgi, dgh = torch.empty(t, b, 3 * h, dtype=LOW), torch.empty(t, b, 3 * h, dtype=LOW)
+        dbi, dbn = torch.zeros(3 * h), torch.zeros(h)
+        let_through, by_product, biases = d.numpy(), _bits(through), (dbi.numpy(), dbn.numpy())
+        by_step = grads.numpy(), states.numpy(), kept.numpy(), _bits(dgi), _bits(dgh)
+        for k in reversed(range(t)):
+            out, h_before, gates, of_i, of_h = (array[k] for array in by_step)
+            kernels.gru_step_back(let_through, by_product, out, h_before, gates, of_i, of_h, *biases)
+            torch.mm(dgh[k], wh_low, out=through)
+        flat_i, flat_h = dgi.view(t * b, 3 * h), dgh.view(t * b, 3 * h)
+        dx = torch.mm(flat_i, wi_low).view(t, b, -1).transpose(0, 1) if ctx.needs_input_grad[0] else None
+        dwi, dwh = torch.mm(flat_i.t(), x_low).float(), torch.mm(flat_h.t(), states_low[:-1].view(t * b, h)).float()
+        return dx, d + through, dwi, dwh, dbi, torch.cat([dbi[: 2 * h], dbn])
+
+
+class _Heads(torch.autograd.Function):
+    """S nets that read the same (N, Z) and (N, A): weights (S, in, out), biases (S, out) -> (S, N, out) float32."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, action: Tensor, float32_last: bool, *parameters: Tensor) -> Tensor:
+        w1, b1, w2, b2, w3, b3 = parameters
+        x = torch.cat([features.to(LOW), action.to(LOW)], dim=1)
+        low = w1.to(LOW), w2.to(LOW), w3 if float32_last else w3.to(LOW)
+        hidden: list[Tensor] = []
+        out = torch.empty(w1.shape[0], len(x), w3.shape[2])
+        for net in range(w1.shape[0]):
+            first = _layer(x, low[0][net], b1[net])
+            second = _layer(first, low[1][net], b2[net])
+            _last_layer(second, low[2][net], b3[net], out[net])
+            hidden += [first, second]
+        ctx.save_for_backward(x, *low, *hidden)
+        ctx.split = features.shape[1]
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        x, w1, w2, w3, *hidden = ctx.saved_tensors
+        made = [torch.empty_like(w, dtype=torch.float32) for w in (w1, w2, w3)]
+        biases = [torch.zeros(w.shape[0], w.shape[2]) for w in (w1, w2, w3)]
+        wants_features, wants_action, _, wants_weights, *_ = ctx.needs_input_grad
+        # of the inputs only those asked for: where the policy climbs Q, that is the action alone
+        asked = slice(0 if wants_features else ctx.split, x.shape[1] if wants_action else ctx.split)
+        dx = torch.zeros_like(x[:, asked])
+        for net, (first, second) in enumerate(zip(hidden[::2], hidden[1::2], strict=True)):
+            d2 = _last_layer_back(grad[net], second, w3[net], made[2][net], biases[2][net], biases[1][net])
+            d1 = torch.mm(d2, w2[net].t())
+            kernels.relu_back(_bits(d1), _bits(first), biases[0][net].numpy())
+            if dx.shape[1]:
+                dx.addmm_(d1, w1[net][asked].t())
+            if wants_weights:
+                _product(first, d2, made[1][net])
+                _product(x, d1, made[0][net])
+        of_features = dx[:, : ctx.split] if wants_features else None
+        of_action = dx[:, ctx.split - x.shape[1] :] if wants_action else None
+        if not wants_weights:
+            return of_features, of_action, *[None] * 7
+        return of_features, of_action, None, made[0], biases[0], made[1], biases[1], made[2], biases[2]
+
+
+def _layer(x: Tensor, w: Tensor, b: Tensor) -> Tensor:
+    """ReLU(x w + b): (N, in), (in, out), (out,) -> (N, out) in bfloat16."""
+    y = torch.mm(x, w)
+    kernels.bias_relu(_bits(y), b.detach().numpy())
+    return y
+
+
+def _last_layer(x: Tensor, w: Tensor, b: Tensor, out: Tensor) -> None:
+    """out <- x w + b: (N, in), (in, out), (out,) -> (N, out); products in w's type."""
+    if w.shape[1] == 1:
+        kernels.dot(_bits(x), w.detach().numpy()[:, 0], b.detach().numpy(), out.numpy()[:, 0])
+    else:
+        torch.add(torch.mm(x.to(w.dtype), w), b, out=out)
+
+
+def _last_layer_back(grad: Tensor, x: Tensor, w: Tensor, dw: Tensor, db: Tensor, db_before: Tensor) -> Tensor:
+    """The gradient before the ReLU that gave x, (N, in) in bfloat16; fills those of w, b and of the bias before."""
+    torch.sum(grad, 0, out=db)
+    if w.shape[1] == 1:
+        back = torch.empty_like(x)
+        of_w, of_x = w.detach().numpy()[:, 0], _bits(x)
+        kernels.dot_back(grad.numpy()[:, 0], of_x, of_w, _bits(back), dw.numpy()[:, 0], db_before.numpy())
+        return back
+    d = grad.to(w.dtype)
+    _product(x.to(w.dtype), d, dw)
+    back = torch.mm(d, w.t()).to(LOW)
+    kernels.relu_back(_bits(back), _bits(x), db_before.numpy())
+    return back
+
+
+def _product(x: Tensor, d: Tensor, out: Tensor) -> None:
+    """out <- x^T d, in out's own layout: a Linear's weight lies transposed."""
+    out.copy_(torch.mm(x.t(), d) if out.is_contiguous() else torch.mm(d.t(), x).t())

@@ -1,0 +1,176 @@
+"""The fused networks against the plain ones they take the place of: values, gradients, names, NaN."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+from common.agent import Agent, AgentConfig
+from learner import kernels
+from learner.fused import FusedGRU, FusedHead, FusedTwinQ, fuse
+from learner.update import UpdateConfig, make_update
+from tests.learner.rows import SPEC, random_rows, to_batch
+
+B, T = 6, 5
+CONFIG = AgentConfig(hidden=24, embedding=20, heads=(40, 28), shortcut=True)
+
+
+def floats(bits):
+    return (bits.astype(np.uint32) << 16).view(np.float32)
+
+
+def bits(values):
+    return torch.tensor(values, dtype=torch.bfloat16).view(torch.uint16).numpy()
+
+
+@pytest.fixture
+def pair():
+    torch.manual_seed(0)
+    plain = Agent(3, 2, CONFIG)
+    fused = copy.deepcopy(plain)
+    fuse(fused)
+    return plain, fused
+
+
+def run_gru(agent, low, x, hidden):
+    with torch.autocast("cpu", torch.bfloat16, enabled=low):
+        return agent.memory.gru(x, hidden)[0]
+
+
+def run_critic(agent, low, x, action):
+    with torch.autocast("cpu", torch.bfloat16, enabled=low):
+        return agent.critic(x, action)
+
+
+def run_policy(agent, low, x):
+    with torch.autocast("cpu", torch.bfloat16, enabled=low):
+        return torch.cat(agent.policy(x), -1)
+
+
+def run_model(agent, low, x, action):
+    with torch.autocast("cpu", torch.bfloat16, enabled=low):
+        return torch.cat([part.flatten(2) if part.ndim > 2 else part for part in agent.world_model(x, action)[:2]], -1)
+
+
+CASES = {
+    "memory": (run_gru, [(B, T, 20), (1, B, 24)]),
+    "critic": (run_critic, [(B, T, 44), (B, T, 2)]),
+    "policy": (run_policy, [(B, T, 44)]),
+    "world_model": (run_model, [(B, T, 44), (B, T, 2)]),
+}
+
+
+def everything(agent, part, low):
+    """Output, gradients of the inputs and of the part's parameters."""
+    run, shapes = CASES[part]
+    generator = torch.Generator().manual_seed(1)
+    inputs = [torch.randn(shape, generator=generator).requires_grad_() for shape in shapes]
+    out = run(agent, low, *inputs).float()
+    weight = torch.randn(out.shape, generator=generator)
+    agent.zero_grad()
+    (out * weight).sum().backward()
+    module = getattr(agent, part)
+    named = {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
+    return {"out": out.detach(), **{f"input {k}": x.grad for k, x in enumerate(inputs)}, **named}
+
+
+def distance(found, expected):
+    return {name: float((found[name] - value).norm() / value.norm()) for name, value in expected.items()}
+
+
+@pytest.mark.parametrize("part", CASES)
+def test_values_and_gradients_are_as_near_to_float32_as_plain_bfloat16(pair, part):
+    plain, fused = pair
+    exact = everything(plain, part, low=False)
+    found, usual = (
+        distance(everything(fused, part, low=True), exact),
+        distance(everything(plain, part, low=True), exact),
+    )
+    assert len(found) > 4
+    for name, far in found.items():
+        assert far < 1.5 * usual[name] + 2e-3, (name, far, usual[name])
+    assert max(found.values()) > 1e-5  # it is bfloat16
+
+
+@pytest.mark.parametrize("part", CASES)
+def test_without_autocast_they_are_the_plain_ones_to_the_bit(pair, part):
+    plain, fused = pair
+    expected, found = everything(plain, part, low=False), everything(fused, part, low=False)
+    assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_parameters_keep_their_names_and_values(pair):
+    plain, fused = pair
+    assert isinstance(fused.memory.gru, FusedGRU)
+    assert isinstance(fused.policy.net, FusedHead)
+    assert isinstance(fused.world_model.net, FusedHead)
+    assert isinstance(fused.critic, FusedTwinQ)
+    ours, theirs = fused.state_dict(), plain.state_dict()
+    assert list(ours) == list(theirs)
+    assert all(torch.equal(ours[name], value) for name, value in theirs.items())
+
+
+@pytest.mark.parametrize("asked", ["features", "action", "neither"])
+def test_the_way_back_through_the_critics_gives_what_is_asked_for(pair, asked):
+    plain, fused = pair
+    generator = torch.Generator().manual_seed(2)
+    features, action = torch.randn(B, T, 44, generator=generator), torch.randn(B, T, 2, generator=generator)
+    grads = []
+    for agent in (plain, fused):
+        x, a = features.clone().requires_grad_(asked == "features"), action.clone().requires_grad_(asked == "action")
+        agent.critic.requires_grad_(asked == "neither")
+        run_critic(agent, agent is fused, x, a).sum().backward()
+        grads.append((x.grad, a.grad, agent.critic.layers[0].weight.grad))
+    for exact, found in zip(*grads, strict=True):
+        assert (exact is None) == (found is None)
+        if exact is not None:
+            assert float((found - exact).norm() / exact.norm()) < 0.05  # a ReLU near 0 may open or close by rounding
+
+
+def test_an_update_in_bfloat16_is_fused_and_one_in_float32_is_not():
+    for low in (True, False):
+        agent = Agent(SPEC.obs_dim, SPEC.action_dim, AgentConfig(hidden=SPEC.hidden, embedding=8, heads=(16, 12)))
+        update = make_update(agent, SPEC.burn_in, UpdateConfig(), 0, low)
+        assert isinstance(agent.memory.gru, FusedGRU) == low
+        assert isinstance(update.target_critic, FusedTwinQ) == low
+        before = {name: value.clone() for name, value in agent.state_dict().items()}
+        update(to_batch(random_rows(4)), torch.zeros(()))
+        moved = {name for name, value in agent.state_dict().items() if not torch.equal(value, before[name])}
+        assert {name for name, _ in agent.named_parameters()} <= moved
+
+
+@pytest.mark.parametrize("part", CASES)
+def test_a_nan_is_not_swallowed(pair, part):
+    _, fused = pair
+    run, shapes = CASES[part]
+    for spoilt in range(len(shapes)):
+        inputs = [torch.zeros(shape) for shape in shapes]
+        inputs[spoilt].view(-1)[0] = float("nan")
+        assert run(fused, True, *inputs).isnan().any()
+    bias = next(p for name, p in getattr(fused, part).named_parameters() if "bias" in name and "embed" not in name)
+    with torch.no_grad():
+        bias.view(-1)[0] = float("nan")
+    assert run(fused, True, *(torch.zeros(shape) for shape in shapes)).isnan().any()
+
+
+def test_rounding_is_torchs_own():
+    values = np.random.default_rng(0).normal(size=4096).astype(np.float32)
+    x = np.concatenate([values, values * 1e30, values * 1e-30, [0.0, -0.0, 1.0, 1.00390625, np.inf, -np.inf]])
+    x = x.astype(np.float32)
+    out = np.zeros(len(x), np.uint16)
+    kernels.lower(x, out)
+    assert np.array_equal(out, torch.from_numpy(x).to(torch.bfloat16).view(torch.uint16).numpy())
+
+
+def test_gates_saturate_without_overflow():
+    extreme = np.array([[-1e30, -100.0, 0.0, 100.0, 1e30, np.inf]], np.float32)
+    h = np.full((1, 2), 0.5, np.float32)
+    gi, kept = bits(extreme), np.zeros((1, 8), np.float32)
+    new, low, none = np.zeros((1, 2), np.float32), np.zeros((1, 2), np.uint16), np.zeros(6, np.float32)
+    kernels.gru_step(gi, bits(np.zeros((1, 6))), none, none, h, kept, new, low)
+    # r of both units, z of both, n of both: saturated low, middle, high
+    assert np.allclose(kept[0, :4], [0.0, 0.0, 0.5, 1.0], atol=1e-6)
+    assert np.allclose(kept[0, 4:6], [1.0, 1.0])
+    assert np.allclose(new, [[0.75, 0.5]])
+    assert np.array_equal(floats(low), new)
