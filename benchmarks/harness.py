@@ -97,14 +97,15 @@ def compare(
                 limit[0] if limit else "",
                 {key: (min(seen), max(seen)) for key, seen in found.items() if seen},
                 rounds,
-                shlex.join(["python", "-m", _module(), *sys.argv[1:]]),
+                command(),
             )
         )
     return rows
 
 
-def _module() -> str:
-    return f"benchmarks.{Path(sys.argv[0]).stem}"
+def command() -> str:
+    """What was typed to measure this."""
+    return shlex.join(["python", "-m", f"benchmarks.{Path(sys.argv[0]).stem}", *sys.argv[1:]])
 
 
 def save(rows: list[Row]) -> None:

@@ -1,0 +1,153 @@
+"""Wall time from the command to a policy of 2 000 and one of 4 000 on HalfCheetah, beside stable-baselines3's SAC.
+
+    python -m benchmarks.end_to_end [--env ENV] [--goals 2000 4000] [--seeds 1 2 3] [--every 5000]
+
+A goal is reached at the second of two consecutive evaluations above it, each of 5 deterministic episodes, every 5 000
+environment steps; the clock starts with the process. Ours is ``rmc train`` as it comes; SAC has its defaults. Each has
+all cores for itself. One run after another: what
+results/end-to-end.jsonl has already is not run again, so that an interrupted benchmark goes on where it was.
+"""
+
+import json
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from benchmarks.harness import HERE, Row, command, parser, peer_python, save
+
+CURVES = HERE / "results" / "end-to-end.jsonl"
+EPISODES = 5
+LIMIT_SECONDS = 3600.0
+SAC = "stable-baselines3 SAC, defaults"
+Point = tuple[float, float]  # seconds since the command, return
+
+
+def ours(env: str, seed: int, every: int) -> Iterator[Point]:
+    """A run's evaluations as they come; closing it ends the run."""
+    with tempfile.TemporaryDirectory() as folder:
+        run, began = Path(folder) / "run", time.time()
+        words = ["train", env, "--seed", str(seed), "--total-steps", "1000000", "--run-dir", str(run)]
+        process = _started([sys.executable, "-m", "deploy.cli", *words, "--checkpoint-steps", str(every)])
+        try:
+            for line in _lines(run / "metrics.jsonl", process):
+                found = json.loads(line)
+                if "eval_return_mean" in found:
+                    yield found["time"] - began, found["eval_return_mean"]
+        finally:
+            _end(process)
+
+
+def sac(python: Path, env: str, seed: int, every: int) -> Iterator[Point]:
+    """The same of the peer, which prints a line for each."""
+    began, script = time.time(), str(HERE / "peers" / "sb3_end_to_end.py")
+    process = _started([str(python), script, env, str(seed), str(every), str(EPISODES)])
+    assert process.stdout is not None
+    try:
+        for line in process.stdout:
+            if line.startswith("{"):
+                yield time.time() - began, json.loads(line)["return"]
+    finally:
+        _end(process)
+
+
+def _started(words: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    process.send_signal(signal.SIGINT)
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(60)
+    process.kill()
+
+
+def _lines(path: Path, process: subprocess.Popen[str]) -> Iterator[str]:
+    """Whole lines of a file that grows while a process runs."""
+    while not path.exists() and process.poll() is None:
+        time.sleep(0.1)
+    with path.open() as file:
+        text = ""
+        while process.poll() is None:
+            text += file.readline()
+            if text.endswith("\n"):
+                yield text
+                text = ""
+            else:
+                time.sleep(0.1)
+
+
+def reached(points: list[Point], goal: float) -> float | None:
+    """When two evaluations in a row were above it."""
+    for (_, before), (seconds, after) in zip(points, points[1:], strict=False):
+        if min(before, after) > goal:
+            return seconds
+    return None
+
+
+def run(points: Iterator[Point], goals: list[float]) -> list[Point]:
+    """Until the last goal is reached, or an hour has gone."""
+    seen: list[Point] = []
+    for point in points:
+        seen.append(point)
+        print(f"  {point[0]:6.0f} s {point[1]:8.0f}", flush=True)
+        if reached(seen, max(goals)) is not None or point[0] > LIMIT_SECONDS:
+            break
+    points.close()  # type: ignore[attr-defined]
+    return seen
+
+
+def _known(key: dict[str, object]) -> list[Point] | None:
+    for line in CURVES.read_text().splitlines() if CURVES.exists() else []:
+        found = json.loads(line)
+        if all(found[name] == value for name, value in key.items()):
+            return [(seconds, value) for seconds, value in found["points"]]
+    return None
+
+
+def _row(env: str, goal: float, times: dict[str, list[float | None]], seeds: int) -> Row:
+    """Medians over the seeds; a seed that did not get there counts as one that never does."""
+    found = {who: [float("inf") if one is None else one for one in all_] for who, all_ in times.items()}
+    middle = {who: statistics.median(all_) for who, all_ in found.items()}
+    theirs = middle.get(SAC)
+    spread = {
+        name: (min(found[who]), max(found[who])) for name, who in (("ours", "ours"), ("peer", SAC)) if who in found
+    }
+    ratio = None if theirs is None else theirs / middle["ours"]
+    return Row(f"time to {goal:g}, {env}", "s", middle["ours"], SAC, theirs, ratio, None, "", spread, seeds, command())
+
+
+def main() -> None:
+    made = parser(__doc__)
+    made.add_argument("--env", default="HalfCheetah-v5")
+    made.add_argument("--goals", type=float, nargs="+", default=[2000.0, 4000.0])
+    made.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    made.add_argument("--every", type=int, default=5000, help="environment steps between evaluations")
+    options = made.parse_args()
+    python = peer_python("peers")
+    curves: dict[str, list[list[Point]]] = {}
+    for seed in options.seeds:
+        for who in ("ours", *([SAC] if python else [])):
+            key = {"who": who, "env": options.env, "seed": seed, "every": options.every}
+            points = _known(key)
+            if points is None:
+                print(f"{who}, seed {seed}", flush=True)
+                source = ours if who == "ours" else (lambda *words: sac(python, *words))  # type: ignore[arg-type]
+                points = run(source(options.env, seed, options.every), options.goals)
+                with CURVES.open("a") as file:
+                    file.write(json.dumps({**key, "time": time.strftime("%Y-%m-%d %H:%M"), "points": points}) + "\n")
+            curves.setdefault(who, []).append(points)
+    rows = []
+    for goal in options.goals:
+        times = {who: [reached(points, goal) for points in all_] for who, all_ in curves.items()}
+        rows.append(_row(options.env, goal, times, len(options.seeds)))
+    save(rows)
+
+
+if __name__ == "__main__":
+    main()
