@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo test test-cluster test-dm-control lint results trial comparisons docs bench clean
+.PHONY: env demo test test-cluster test-dm-control lint results trial comparisons docs bench peers clean
 
 env: $(STAMP)
 
@@ -77,8 +77,28 @@ comparisons: $(STAMP)
 docs: $(STAMP)
 	$(BIN)/python -m docs.generate
 
-bench: $(STAMP)
-	$(BIN)/python -m benchmarks.throughput
+# Each beside what a user would pick instead, where make peers has installed that. Results: docs/performance.md.
+BENCHMARKS := replay ingest learner actor weights growth memory end-to-end
+
+bench: $(addprefix bench-,$(BENCHMARKS))
+
+bench-%: $(STAMP)
+	$(BIN)/python -m benchmarks.$(subst -,_,$*)
+	$(BIN)/python -m benchmarks.report
+
+# Environments of their own: dm-reverb wants another TensorFlow and numpy than anybody else.
+peers: $(VENV)-peers/.installed $(VENV)-reverb/.installed
+
+$(VENV)-peers/.installed: Makefile
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet torch==2.13.0
+	$(@D)/bin/python -m pip install --quiet stable-baselines3==2.9.2 cpprb==11.0.0 'gymnasium[mujoco]'
+	@touch $@
+
+$(VENV)-reverb/.installed: Makefile
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet dm-reverb==0.14.0 tensorflow-cpu==2.15.1 numpy==1.26.4
+	@touch $@
 
 clean:
-	rm -rf $(VENV) $(VENV)-dm-control build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-* build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 
 from benchmarks.harness import HERE, Row, command, parser, peer_python, save
@@ -84,7 +85,7 @@ def _lines(path: Path, process: subprocess.Popen[str]) -> Iterator[str]:
 
 def reached(points: list[Point], goal: float) -> float | None:
     """When two evaluations in a row were above it."""
-    for (_, before), (seconds, after) in zip(points, points[1:], strict=False):
+    for (_, before), (seconds, after) in pairwise(points):
         if min(before, after) > goal:
             return seconds
     return None
