@@ -11,13 +11,11 @@ import hmac
 import logging
 import os
 import shutil
-import signal
 import socket
 import tempfile
 import time
 import zlib
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,7 @@ from typing import Any
 try:
     import ray
     from ray.util.placement_group import placement_group, placement_group_table, remove_placement_group
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy, PlacementGroupSchedulingStrategy
+    from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 except ImportError as missing:
     from common.errors import ConfigError
 
@@ -39,7 +37,7 @@ from deploy.counters import Counters
 from deploy.local import PREFIX, TICK_SECONDS, register, sweep, watch
 from deploy.monitor import Monitor
 from deploy.presets import RunConfig, to_json
-from deploy.ray_host import NAMESPACE, LauncherHost, Task, host_name, last_line
+from deploy.ray_host import NAMESPACE, Task, host_name
 from deploy.ray_hosted import Hosted
 from deploy.ray_places import (
     SHARD_CPUS,
@@ -56,7 +54,7 @@ from deploy.redis_server import Port, RedisServer
 from deploy.rings import Rings
 from deploy.roles import PATIENCE_VARIABLE, URL_VARIABLE, connect
 from deploy.run_folder import RunFolder
-from deploy.supervisor import QUICK_DEATHS, RoleCommand
+from deploy.supervisor import QUICK_DEATHS
 
 NODES_SECONDS = 2.0  # between looks for nodes that came
 HOMELESS_SECONDS = 8.0  # without a node for the learner, after which actors make room
@@ -65,37 +63,7 @@ STOP_SECONDS = 20.0  # for all roles to end in order and for the last checkpoint
 PATIENCE_SECONDS = 120.0  # of a role that starts while launcher and Redis are being started again
 FIRST_PORT, LAST_PORT = 6380, 6479  # for Redis; 6379 is Ray's
 TOLD_SECONDS = 2.0  # for hosts to hear that the run ends
-BEGIN_SECONDS = 60.0  # of the launcher's host
 log = logging.getLogger(__name__)
-
-
-# -- Ray itself ---------------------------------------------------------------------------------------
-
-
-@contextmanager
-def joined(address: str, cpus: int | None = None) -> Iterator[None]:
-    """In a cluster as a driver; ``local`` starts one for this process alone. Raises ConfigError."""
-    quiet: dict[str, Any] = {"namespace": NAMESPACE, "log_to_driver": False, "logging_level": logging.ERROR}
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    mask = os.umask(0o077)  # Ray may write its token, and lets everyone read it
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        if address == "local":
-            ray.init(address="local", num_cpus=cpus, include_dashboard=False, **quiet)
-        else:
-            ray.init(address=address, **quiet)
-    except (ConnectionError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
-        said = (str(error).strip() or type(error).__name__).splitlines()[0]
-        fix = f"no Ray cluster answers ({said}); start one with ray start --head, or take local"
-        raise ConfigError("--ray-address", address, fix) from None
-    finally:
-        os.umask(mask)
-        for number, handler in handlers.items():  # Ray takes SIGTERM for itself
-            signal.signal(number, handler)
-    try:
-        yield
-    finally:
-        ray.shutdown()
 
 
 class ClusterRun:
@@ -368,50 +336,6 @@ def train(
         return over
     finally:
         run.close(over)
-
-
-# -- The launcher, from outside -----------------------------------------------------------------------
-
-
-def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> None:
-    """Start a run's launcher on this node, which must be the head. Raises ConfigError."""
-    context = ray.get_runtime_context()
-    head = next((node for node in ray.nodes() if "node:__internal_head__" in node["Resources"]), None)
-    if head is None or head["NodeID"] != context.get_node_id():
-        raise ConfigError(
-            "--launcher", "ray", "this is not the cluster's head; run it there, by ray attach or ray exec"
-        )
-    for file in (tls.CERTIFICATE, tls.KEY):  # for the address that the head has now
-        (folder.path / file).unlink(missing_ok=True)
-    words = ["launcher", str(folder.path), "--ray-address", context.gcs_address, "--device", device]
-    words += ["--all-cpus"] * all_cpus + ["--tls"] * encrypted
-    command = RoleCommand("launcher", tuple(words), single_thread=False, ends=True)
-    options = ray.remote(LauncherHost).options(
-        name=host_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
-        max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
-    )  # fmt: skip
-    task = Task(folder.name, command, {}, {}, os.getcwd())
-    host = options.remote(task, str(folder.path), config.learner.keep_checkpoints)
-    try:
-        ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)
-    except ray.exceptions.RayError as error:
-        fix = f"the run's launcher could not begin on the head ({last_line(error)})"
-        raise ConfigError("--launcher", "ray", fix) from None
-
-
-def check_not_there(folder: RunFolder) -> None:
-    """Raises ConfigError where the run has a launcher, if only one that is being started again."""
-    if is_there(folder):
-        raise ConfigError("--run-dir", str(folder.path), "this run is being trained; rmc attach watches it")
-
-
-def is_there(folder: RunFolder) -> bool:
-    """Whether the run's launcher has a host."""
-    try:
-        ray.get_actor(host_name(folder.name, "launcher"), NAMESPACE)
-    except ValueError:
-        return False
-    return True
 
 
 def redis_password(folder: RunFolder) -> str:

@@ -92,25 +92,25 @@ def conduct(config: RunConfig, folder: RunFolder, placement: Placement, console:
 
 def _train_on_ray(config: RunConfig, placement: Placement, console: Console) -> int:
     """Hand a run to a launcher on the cluster's head, and watch it; Ctrl-C ends the run, a closed terminal does not."""
-    from deploy import cluster, ray_places
+    from deploy import ray_launcher, ray_places
 
     enough = max(cores(), ceil(ray_places.reserved_cpus(config)) + config.actors)  # of a cluster of our own
-    with cluster.joined(placement.ray_address, enough):
+    with ray_launcher.joined(placement.ray_address, enough):
         return _watched_on_ray(config, placement, console)
 
 
 def _watched_on_ray(config: RunConfig, placement: Placement, console: Console) -> int:
-    from deploy import cluster, ray_places
+    from deploy import ray_launcher, ray_places
 
     if placement.run_dir is not None and (placement.run_dir / "secret").exists():
-        cluster.check_not_there(RunFolder(placement.run_dir))
+        ray_launcher.check_not_there(RunFolder(placement.run_dir))
     ray_places.check_room(config, placement.device)
     fit = ray_places.actors_that_fit(config)
     learner = dataclasses.replace(config.learner, threads=ray_places.learner_cpus(config))
     config = dataclasses.replace(config, learner=learner, actors=fit if placement.all_cpus else config.actors)
     folder = prepare(config, placement)
     folder.unlock()
-    cluster.launch(config, folder, placement.device, placement.all_cpus, placement.tls)
+    ray_launcher.launch(config, folder, placement.device, placement.all_cpus, placement.tls)
     console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
     with _signals_caught(hangup=False) as stop:
         attachment.watch(folder, console, _passes_on(stop, folder))
@@ -119,7 +119,7 @@ def _watched_on_ray(config: RunConfig, placement: Placement, console: Console) -
 
 def _passes_on(stop: StopSignal, folder: RunFolder) -> Callable[[], bool]:
     """Whether the run's launcher is gone; tells it to stop, once, when we are."""
-    from deploy import cluster
+    from deploy import ray_launcher
 
     told: int | None = None  # which of the launchers, if it is started again
 
@@ -128,7 +128,7 @@ def _passes_on(stop: StopSignal, folder: RunFolder) -> Callable[[], bool]:
         if stop.requested and (trainer := folder.trainer()) not in (None, told):
             told = trainer
             os.kill(trainer, signal.SIGTERM)
-        return not cluster.is_there(folder)
+        return not ray_launcher.is_there(folder)
 
     return gone
 
@@ -194,9 +194,9 @@ def _launch(config: RunConfig, folder: RunFolder, placement: Placement, monitor:
         return local.train(config, folder, placement.redis_url, placement.device, monitor, stop)
 
     if placement.launcher == "ray":
-        from deploy import cluster  # Ray is an extra, and slow to import
+        from deploy import cluster, ray_launcher  # Ray is an extra, and slow to import
 
-        with cluster.joined(placement.ray_address):
+        with ray_launcher.joined(placement.ray_address):
             return cluster.train(config, folder, placement.device, placement.all_cpus, placement.tls, monitor, stop)
 
     if placement.launcher == "manual":
