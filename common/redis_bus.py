@@ -38,7 +38,7 @@ class RedisBus:
             )
         except ValueError as error:
             raise ConfigError("--redis-url", url.split("@")[-1], f"not a Redis URL ({error})") from None
-        self._prefix = f"rmc:{run}"
+        self.url, self._prefix = url, f"rmc:{run}"
 
     def _key(self, *parts: object) -> str:
         return ":".join([self._prefix, *map(str, parts)])
