@@ -39,7 +39,7 @@ from common.redis_bus import RedisBus
 from common.replay import Draw
 from common.window import WindowSpec
 from common.wire import encode_hello, encode_windows
-from learner.batch import Batch, importance_weights, view_batch
+from learner.batch import Batch, clear_padding, importance_weights, view_batch
 from learner.learner import LearnerConfig
 from learner.replay_client import ReplayClient
 from replay_server.server import ReplayConfig
@@ -109,6 +109,7 @@ class Learner:
         assert sample.values is not None
         self.env_steps = sample.env_steps
         weights = importance_weights(sample.values, sample.mass, sample.windows, self._exponent)
+        clear_padding(sample.rows, self.spec)
         raw = torch.from_numpy(sample.rows.view("u1").reshape(BATCH, -1))
         self.batch: Batch = view_batch(raw, torch.from_numpy(weights), self.spec)
         priorities = self._random.uniform(0.1, 1.0, BATCH).astype(np.float32)

@@ -11,7 +11,6 @@ Socket frame  = header "<4sBBHIIQ" (magic, version, kind, 0, len(meta), crc32(me
 import hashlib
 import hmac
 import struct
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
@@ -20,6 +19,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
+from common.checksum import crc32
 from common.errors import MessageError
 from common.window import Rows, WindowSpec, first_fault
 
@@ -47,6 +47,8 @@ class Kind(IntEnum):
     STATS = 10  # client -> server, and its reply: the server's counters
     ERROR = 11  # server -> client: why the connection ends
     EPISODE = 12  # client -> server: serial, and its reply: count, then rows
+    SHARE = 13  # client -> server: batch_size, and its reply, with a descriptor where memory can be shared
+    SHARED = 14  # server -> client: BATCH without its body, which lies in shared memory: turn and crc32 with the rest
 
 
 def proof(secret: bytes, side: bytes, challenge: bytes, nonce: bytes) -> bytes:
@@ -58,7 +60,7 @@ def encode_windows(rows: Rows, spec: WindowSpec) -> bytes:
     """One stream entry that carries (n,) rows."""
     body = rows.tobytes()
     packed: bytes = msgpack.packb(
-        [VERSION, WINDOWS, spec.fingerprint, len(rows), zlib.crc32(body), body], use_bin_type=True
+        [VERSION, WINDOWS, spec.fingerprint, len(rows), crc32(body), body], use_bin_type=True
     )
     return packed
 
@@ -90,7 +92,7 @@ def decode_entry(payload: bytes, spec: WindowSpec) -> Rows:
         raise MessageError("kind", str(kind))
     if (kind == HELLO) != (count == 0) or len(body) != count * spec.dtype.itemsize:
         raise MessageError("length", f"{len(body)} bytes for {count} rows")
-    if zlib.crc32(body) != crc:
+    if crc32(body) != crc:
         raise MessageError("crc")
     rows = np.frombuffer(body, dtype=spec.dtype)
     fault = first_fault(rows, spec)
@@ -135,9 +137,9 @@ class FrameHeader:
 def encode_frame(kind: Kind, meta: Mapping[str, Any], body_parts: tuple[bytes | memoryview, ...] = ()) -> bytes:
     """Header and meta of a frame whose body is the parts in order; the parts are sent after it."""
     packed: bytes = msgpack.packb(dict(meta), use_bin_type=True)
-    crc = zlib.crc32(packed)
+    crc = crc32(packed)
     for part in body_parts:
-        crc = zlib.crc32(part, crc)
+        crc = crc32(part, crc)
     length = sum(memoryview(part).nbytes for part in body_parts)
     return HEADER.pack(MAGIC, VERSION, int(kind), 0, len(packed), crc, length) + packed
 
@@ -156,7 +158,7 @@ def decode_header(raw: bytes, max_body: int) -> FrameHeader:
 
 def decode_meta(raw: bytes, body: bytes | memoryview, header: FrameHeader) -> dict[str, Any]:
     """The meta map of a frame, its CRC checked with the body's. Raises MessageError."""
-    if zlib.crc32(body, zlib.crc32(raw)) != header.crc:
+    if crc32(body, crc32(raw)) != header.crc:
         raise MessageError("crc")
     try:
         meta = msgpack.unpackb(raw, raw=False, strict_map_key=True, max_map_len=256, max_array_len=4096, max_ext_len=0)
