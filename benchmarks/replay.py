@@ -18,7 +18,6 @@ import psutil
 import torch
 
 from benchmarks.harness import (
-    ENDLESS,
     RUN,
     SECRET,
     Measure,

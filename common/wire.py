@@ -59,9 +59,7 @@ def proof(secret: bytes, side: bytes, challenge: bytes, nonce: bytes) -> bytes:
 def encode_windows(rows: Rows, spec: WindowSpec) -> bytes:
     """One stream entry that carries (n,) rows."""
     body = rows.tobytes()
-    packed: bytes = msgpack.packb(
-        [VERSION, WINDOWS, spec.fingerprint, len(rows), crc32(body), body], use_bin_type=True
-    )
+    packed: bytes = msgpack.packb([VERSION, WINDOWS, spec.fingerprint, len(rows), crc32(body), body], use_bin_type=True)
     return packed
 
 

@@ -43,17 +43,26 @@ class Intake:
         self._entry_bytes = ROUND_BYTES  # the largest entry of the last round that had any
 
     def read(self, positions: Mapping[int, StreamPosition]) -> Round | None:
-        """The next entries of all streams, or None where there are none."""
+        """The next entries of all streams, or None where there are none; those after them are expected already."""
         if self._rounds % DISCOVERY_ROUNDS == 0:
             self._actors.update(filter(self._shard.owns, self.bus.actors()), positions)
         self._rounds += 1
-        cursors = {actor: positions[actor].id if actor in positions else BEFORE_ALL for actor in self._actors}
-        count = ROUND_BYTES // (self._entry_bytes * len(cursors))
-        entries = self.bus.read(cursors, min(max(count, 1), MAX_ENTRIES))
+        entries = self.bus.read(self._cursors(positions), self._count())
         if not entries:
+            self.bus.expect(self._cursors(positions), self._count())
             return None
         self._entry_bytes = max(len(entry.payload) for entry in entries) + 64
-        return self._round(entries, dict(positions))
+        found = self._round(entries, dict(positions))
+        if not found.broken:  # of a broken stream the same entries would come again, and then pass for all there is
+            self.bus.expect(self._cursors(found.positions), self._count())
+        return found
+
+    def _cursors(self, positions: Mapping[int, StreamPosition]) -> dict[int, EntryId]:
+        return {actor: positions[actor].id if actor in positions else BEFORE_ALL for actor in self._actors}
+
+    def _count(self) -> int:
+        """Entries of each stream."""
+        return min(max(ROUND_BYTES // (self._entry_bytes * len(self._actors)), 1), MAX_ENTRIES)
 
     def _round(self, entries: list[Entry], positions: dict[int, StreamPosition]) -> Round:
         entries, broken = self._in_order(entries, positions)

@@ -1,6 +1,6 @@
 """Sends windows to a Reverb server at a set rate, so many seconds for each line of standard input.
 
-    python reverb_sender.py PORT O A H LAYOUT RATE CHUNK
+python reverb_sender.py PORT O A H LAYOUT RATE CHUNK
 """
 
 import sys

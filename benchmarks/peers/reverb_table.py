@@ -1,6 +1,6 @@
 """A Reverb server with one prioritized table of whole windows, in this process or as one of its own.
 
-    python reverb_table.py O A H COUNT LAYOUT    prints its port
+python reverb_table.py O A H COUNT LAYOUT    prints its port
 """
 
 import sys
@@ -47,7 +47,9 @@ class Writer:
             at, self._next = self._next, (self._next + 1) % self._count
             self._writer.append({name: part[at] for name, part in self._columns.items()})
             history = self._writer.history
-            self._writer.create_item(TABLE, priority=1.0, trajectory={name: history[name][-1] for name in self._columns})
+            self._writer.create_item(
+                TABLE, priority=1.0, trajectory={name: history[name][-1] for name in self._columns}
+            )
         self._writer.flush()
 
 
