@@ -32,12 +32,11 @@ from benchmarks.harness import (
     speed,
 )
 from benchmarks.peers.turns import send_at
-from common.bus import EntryId
+from benchmarks.sender import CHUNK, Sender
 from common.envs import EnvConfig, env_spaces
 from common.redis_bus import RedisBus
 from common.replay import Draw
 from common.window import WindowSpec
-from common.wire import encode_hello, encode_windows
 from learner.batch import Batch, clear_padding, importance_weights, view_batch
 from learner.learner import LearnerConfig
 from learner.replay_client import ReplayClient
@@ -45,7 +44,6 @@ from replay_server.server import ReplayConfig
 
 BATCH = 256
 RATE = 500  # windows a second that come in
-CHUNK = 16  # windows an entry
 KEPT_UP = 0.95  # of what comes in, or the turn does not count
 WINDOWS = {"HalfCheetah-v5": 20_000, "Humanoid-v5": 4_000}  # in the ring
 HIDDEN = 256
@@ -59,28 +57,9 @@ REVERB = {
 }
 
 
-class Sender:
-    """Appends entries of windows, each with a number of its own."""
-
-    def __init__(self, url: str, spec: WindowSpec) -> None:
-        self.bus, self._payload = RedisBus(url, RUN), encode_windows(random_rows(spec, CHUNK), spec)
-        self._epoch, self.seq = self.bus.take_epoch("actor-0"), 0
-        self.bus.append(0, EntryId(self._epoch, 0), encode_hello(spec))
-
-    def send(self) -> None:
-        """One entry."""
-        self.seq += 1
-        self.bus.append(0, EntryId(self._epoch, self.seq), self._payload)
-
-    def wait(self, behind: int = 0) -> None:
-        """Until all but so many entries are committed."""
-        while (ack := self.bus.ack(0)) is None or ack.id < EntryId(self._epoch, self.seq - behind):
-            time.sleep(0.001)
-
-
 def _send(url: str, spec: WindowSpec, windows: int, orders: Connection) -> None:
     """Fill the ring, then for each order, seconds, send at the rate; answer by what came of it."""
-    sender = Sender(url, spec)
+    sender = Sender(RedisBus(url, RUN), spec)
     for _ in range(windows // CHUNK):
         sender.wait(64)
         sender.send()

@@ -12,9 +12,8 @@ import hashlib
 import hmac
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
@@ -122,8 +121,7 @@ def _unpack_entry(payload: bytes, spec: WindowSpec) -> tuple[int, int, str, int,
     return version, kind, fingerprint, count, crc, body
 
 
-@dataclass(frozen=True)
-class FrameHeader:
+class FrameHeader(NamedTuple):
     """The fixed part of a socket frame; ``body_length`` bytes follow ``meta_length`` bytes."""
 
     kind: Kind

@@ -4,6 +4,7 @@ Shapes: B batch, T steps, O observation, A action, H hidden; L_b burn-in.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -11,9 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from common.window import Rows, WindowSpec
-
-_TORCH_TYPES = {"<i8": torch.int64, "<i4": torch.int32, "<f4": torch.float32, "|u1": torch.uint8}
-
 
 @dataclass(frozen=True)
 class Batch:
@@ -39,13 +37,20 @@ def importance_weights(values: NDArray[np.float64], mass: float, windows: int, e
     return scaled
 
 
-def _field(raw: Tensor, spec: WindowSpec, name: str) -> Tensor:
-    fields = spec.dtype.fields
-    assert fields is not None
-    dtype, offset = fields[name][0], fields[name][1]
-    kind = _TORCH_TYPES[dtype.base.str]
-    flat = raw[:, offset : offset + dtype.itemsize].view(kind)
-    return flat.reshape(raw.shape[0], *dtype.shape) if dtype.shape else flat.reshape(-1)
+@cache
+def _places(spec: WindowSpec) -> dict[str, tuple[tuple[int, ...], tuple[int, ...], int]]:
+    """Shape, strides and offset of each four-byte field of a row, in steps of four bytes."""
+    places = {}
+    for name, (dtype, offset, *_) in (spec.dtype.fields or {}).items():
+        if dtype.base.itemsize == 4:
+            strides = tuple(int(np.prod(dtype.shape[axis + 1 :])) for axis in range(len(dtype.shape)))
+            places[name] = dtype.shape, strides, offset // 4
+    return places
+
+
+@cache
+def _times(count: int, device: torch.device) -> Tensor:
+    return torch.arange(count, dtype=torch.int32, device=device).unsqueeze(0)
 
 
 def clear_padding(rows: Rows, spec: WindowSpec) -> None:
@@ -67,23 +72,32 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec) -> Batch:
     The rows' padding must be zero: see ``clear_padding``.
     """
     assert raw.shape[1] == spec.dtype.itemsize, (raw.shape, spec.dtype.itemsize)
-    first, last = _field(raw, spec, "first"), _field(raw, spec, "last").unsqueeze(1)
-    t = torch.arange(spec.observations, device=raw.device).unsqueeze(0)
-    observation_valid = (first.unsqueeze(1) <= t) & (t <= last)
-    action, prev = _field(raw, spec, "action"), _field(raw, spec, "prev_action")
+    places, count, words = _places(spec), len(raw), raw.shape[1] // 4
+    floats, integers = raw.view(torch.float32), raw.view(torch.int32)
+
+    def field(kind: Tensor, name: str) -> Tensor:
+        shape, strides, offset = places[name]
+        return kind.as_strided((count, *shape), (words, *strides), kind.storage_offset() + offset)
+
+    first, last = field(integers, "first"), field(integers, "last").unsqueeze(1)
+    action, prev = field(floats, "action"), field(floats, "prev_action")
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
     prev_action.scatter_(1, first.long().view(-1, 1, 1).expand(-1, 1, prev.shape[1]), prev.unsqueeze(1))
-    ends = (t[:, :-1] == last - 1) & (_field(raw, spec, "terminated").unsqueeze(1) > 0)
+    t = _times(spec.observations, raw.device)
+    observation_valid = (first.unsqueeze(1) <= t) & (t <= last)
+    step_valid = observation_valid[:, :-1] & (t[:, :-1] < last)
+    ends = (t[:, :-1] == last - 1) & (field(integers, "terminated").unsqueeze(1) > 0)
+    at = spec.dtype.fields["blank"][1]
     return Batch(
-        observation=_field(raw, spec, "observation"),
+        observation=field(floats, "observation"),
         prev_action=prev_action,
         action=action,
-        reward=_field(raw, spec, "reward"),
+        reward=field(floats, "reward"),
         terminated=ends.float(),
-        hidden=_field(raw, spec, "hidden"),
-        blank=_field(raw, spec, "blank") > 0,
+        hidden=field(floats, "hidden"),
+        blank=raw[:, at : at + spec.observations] > 0,
         observation_valid=observation_valid,
-        step_valid=observation_valid[:, :-1] & (t[:, :-1] < last),
+        step_valid=step_valid,
         burned_in=first == 0,
         importance=importance,
     )

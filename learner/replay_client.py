@@ -32,6 +32,7 @@ AHEAD = 2  # draws in flight, so that the server gathers while the learner compu
 NONCE_BYTES = 32
 TIMEOUT = 10.0  # seconds until a silent server counts as gone
 RECEIVE_BUFFER = 8 << 20
+READ_AHEAD = 64 << 10  # bytes
 
 
 class Connection:
@@ -43,6 +44,8 @@ class Connection:
         """``address``: ``unix:PATH`` or ``tcp:HOST:PORT``. Raises OSError, MessageError, AuthenticationError."""
         self._max_body = max_body
         self._socket = _connect(address, tls)
+        self._reader = self._socket.makefile("rb", READ_AHEAD)  # a small frame comes by one call
+        self._unsent: list[bytes | memoryview] = []
         try:
             self._authenticate(secret, fingerprint)
         except BaseException:
@@ -68,8 +71,19 @@ class Connection:
             raise MessageError("fingerprint", f"{meta.get('fingerprint')}, this learner has {fingerprint}")
 
     def send(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...] = ()) -> None:
-        """Send a frame whose body is the parts in order."""
-        self._socket.sendall(b"".join([encode_frame(kind, meta, parts), *parts]))
+        """Send a frame whose body is the parts in order, after what was put off."""
+        self.put_off(kind, meta, parts)
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what was put off."""
+        if self._unsent:
+            self._socket.sendall(b"".join(self._unsent))
+            self._unsent.clear()
+
+    def put_off(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...]) -> None:
+        """Let a frame go with the next that is sent: the server is woken once for both."""
+        self._unsent += [encode_frame(kind, meta, parts), *parts]
 
     def share(self, spec: WindowSpec, batch_size: int) -> SharedBatches | None:
         """Memory in which the server puts batches from now on; None where it shares none."""
@@ -99,18 +113,20 @@ class Connection:
         return header, meta
 
     def _exactly(self, length: int) -> bytes:
-        raw = bytearray(length)
-        self._fill(memoryview(raw))
-        return bytes(raw)
+        raw = self._reader.read(length)
+        if len(raw) < length:
+            raise ConnectionError("the replay server closed the connection")
+        return raw
 
     def _fill(self, view: memoryview) -> None:
         while len(view):
-            received = self._socket.recv_into(view)
-            if received == 0:
+            received = self._reader.readinto(view)
+            if not received:
                 raise ConnectionError("the replay server closed the connection")
             view = view[received:]
 
     def close(self) -> None:
+        self._reader.close()
         self._socket.close()
 
 
@@ -233,14 +249,11 @@ class ReplayClient:
         self._batches = self._control = None
 
     def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
-        """Send priorities back; lost with a lost connection, as they only steer sampling."""
+        """Send priorities back, with the next request; lost with a lost connection, as they only steer sampling."""
         if self._batches is None:
             return
-        try:
-            parts = (serials.tobytes(), priorities.astype(np.float32).tobytes())
-            self._batches.send(Kind.PRIORITIES, {"count": len(serials)}, parts)
-        except OSError as error:
-            self._drop(error)
+        parts = (serials.tobytes(), priorities.astype(np.float32).tobytes())
+        self._batches.put_off(Kind.PRIORITIES, {"count": len(serials)}, parts)
 
     def statistics(self) -> ObservationStatistics:
         """Running observation statistics; a count of 0 while the server is away."""
@@ -271,6 +284,8 @@ class ReplayClient:
 
     def _ask(self, kind: Kind, question: dict[str, Any]) -> tuple[dict[str, Any], memoryview]:
         connection = self._control = self._control or self._open_control()
+        if self._batches is not None:
+            self._batches.flush()  # so that the answer takes into account what was sent before
         try:
             connection.send(kind, question)
             _, meta, body = connection.receive(self._answer)

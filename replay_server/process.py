@@ -4,6 +4,7 @@ import time
 from typing import Any
 
 from common.errors import BusFull, BusUnavailable
+from common.memory import keep_freed_memory
 from common.role import RECONNECT_SLEEP
 from replay_server.server import ReplayServer
 from replay_server.socket_server import SocketServer
@@ -17,6 +18,7 @@ class ReplayProcess:
     """The role ``replay``, or a shard of it, with its socket. The learner is served on while Redis is away."""
 
     def __init__(self, server: ReplayServer, sockets: SocketServer) -> None:
+        keep_freed_memory()
         self.server, self.sockets, self.name = server, sockets, server.name
         self._next_intake = self._next_announcement = self._wait = 0.0
         self._bus_is_away = False

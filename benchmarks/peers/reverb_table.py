@@ -11,6 +11,7 @@ from windows import Columns, Sizes, pack, random_columns
 
 TABLE = "windows"
 EXPONENT = 0.6
+AHEAD = 200  # windows that need not be confirmed yet
 
 
 def columns_of(sizes: Sizes, count: int, layout: str) -> Columns:
@@ -41,15 +42,17 @@ class Writer:
         self._writer = reverb.Client(f"localhost:{port}").trajectory_writer(num_keep_alive_refs=1)
         self._next = 0
 
-    def write(self, count: int) -> None:
-        """So many windows, and wait until the server has them."""
+    def write(self, count: int, wait: bool = True) -> None:
+        """So many windows; return once the server has them, or all but the last few."""
         for _ in range(count):
             at, self._next = self._next, (self._next + 1) % self._count
             self._writer.append({name: part[at] for name, part in self._columns.items()})
-            history = self._writer.history
-            self._writer.create_item(
-                TABLE, priority=1.0, trajectory={name: history[name][-1] for name in self._columns}
-            )
+            trajectory = {name: self._writer.history[name][-1] for name in self._columns}
+            self._writer.create_item(TABLE, priority=1.0, trajectory=trajectory)
+        self._writer.flush(0 if wait else AHEAD)
+
+    def wait(self) -> None:
+        """Until the server has all."""
         self._writer.flush()
 
 
