@@ -14,8 +14,19 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 import psutil
 
-from benchmarks.harness import ENDLESS, Measure, Peer, Row, compare, parser, peer_python, random_rows, replay_process
-from benchmarks.harness import save, speed
+from benchmarks.harness import (
+    ENDLESS,
+    Measure,
+    Peer,
+    Row,
+    compare,
+    parser,
+    peer_python,
+    random_rows,
+    replay_process,
+    save,
+    speed,
+)
 from benchmarks.sender import CHUNK, Sender
 from common.envs import EnvConfig, env_spaces
 from common.window import WindowSpec

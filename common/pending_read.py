@@ -14,7 +14,8 @@ class PendingRead:
     """One at a time, on a connection of its own. Methods raise what redis-py raises."""
 
     def __init__(self, pool: Any) -> None:  # Any: its annotations leave the connection open
-        self._pool, self._connection = pool, None
+        self._pool = pool
+        self._connection: Any = None  # made by the first question
         self._late = 0.0
         self.asked: Mapping[Any, Any] | None = None  # cursors by actor, while an answer is awaited
 
@@ -28,7 +29,6 @@ class PendingRead:
 
     def ready(self) -> bool:
         """Whether the answer has begun to come, or never will."""
-        assert self._connection is not None
         if self._connection.can_read(0):
             return True
         if time.monotonic() > self._late:
@@ -37,7 +37,6 @@ class PendingRead:
 
     def take(self) -> list[tuple[bytes, list[tuple[bytes, dict[bytes, bytes]]]]]:
         """Streams with their entries, as redis-py would give them."""
-        assert self._connection is not None
         self.asked = None
         reply = self._connection.read_response() or {}
         streams = reply.items() if isinstance(reply, dict) else reply  # RESP3 or RESP2

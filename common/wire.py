@@ -78,6 +78,15 @@ def decode_entry(payload: bytes, spec: WindowSpec) -> Rows:
 
     Raises MessageError with a countable reason; never anything else, whatever the bytes.
     """
+    rows = decode_rows(payload, spec)
+    fault = first_fault(rows, spec)
+    if fault is not None:
+        raise MessageError("window", fault)
+    return rows
+
+
+def decode_rows(payload: bytes, spec: WindowSpec) -> Rows:
+    """``decode_entry`` but for ``first_fault``, which is quicker for the rows of many entries at once."""
     if len(payload) > max_entry_bytes(spec):
         raise MessageError("too-large", f"{len(payload)} bytes, at most {max_entry_bytes(spec)}")
     version, kind, fingerprint, count, crc, body = _unpack_entry(payload, spec)
@@ -91,11 +100,7 @@ def decode_entry(payload: bytes, spec: WindowSpec) -> Rows:
         raise MessageError("length", f"{len(body)} bytes for {count} rows")
     if crc32(body) != crc:
         raise MessageError("crc")
-    rows = np.frombuffer(body, dtype=spec.dtype)
-    fault = first_fault(rows, spec)
-    if fault is not None:
-        raise MessageError("window", fault)
-    return rows
+    return np.frombuffer(body, dtype=spec.dtype)
 
 
 def _unpack_entry(payload: bytes, spec: WindowSpec) -> tuple[int, int, str, int, int, bytes]:

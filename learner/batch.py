@@ -13,6 +13,7 @@ from torch import Tensor
 
 from common.window import Rows, WindowSpec
 
+
 @dataclass(frozen=True)
 class Batch:
     """What the update reads; everything outside the masks is zero."""
@@ -39,12 +40,11 @@ def importance_weights(values: NDArray[np.float64], mass: float, windows: int, e
 
 @cache
 def _places(spec: WindowSpec) -> dict[str, tuple[tuple[int, ...], tuple[int, ...], int]]:
-    """Shape, strides and offset of each four-byte field of a row, in steps of four bytes."""
+    """Shape, strides and offset of each field of a row, in steps of its items."""
     places = {}
     for name, (dtype, offset, *_) in (spec.dtype.fields or {}).items():
-        if dtype.base.itemsize == 4:
-            strides = tuple(int(np.prod(dtype.shape[axis + 1 :])) for axis in range(len(dtype.shape)))
-            places[name] = dtype.shape, strides, offset // 4
+        strides = tuple(int(np.prod(dtype.shape[axis + 1 :])) for axis in range(len(dtype.shape)))
+        places[name] = dtype.shape, strides, offset // dtype.base.itemsize
     return places
 
 
@@ -72,12 +72,11 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec) -> Batch:
     The rows' padding must be zero: see ``clear_padding``.
     """
     assert raw.shape[1] == spec.dtype.itemsize, (raw.shape, spec.dtype.itemsize)
-    places, count, words = _places(spec), len(raw), raw.shape[1] // 4
-    floats, integers = raw.view(torch.float32), raw.view(torch.int32)
+    places, floats, integers = _places(spec), raw.view(torch.float32), raw.view(torch.int32)
 
-    def field(kind: Tensor, name: str) -> Tensor:
+    def field(items: Tensor, name: str) -> Tensor:
         shape, strides, offset = places[name]
-        return kind.as_strided((count, *shape), (words, *strides), kind.storage_offset() + offset)
+        return items.as_strided((len(raw), *shape), (items.stride(0), *strides), items.storage_offset() + offset)
 
     first, last = field(integers, "first"), field(integers, "last").unsqueeze(1)
     action, prev = field(floats, "action"), field(floats, "prev_action")
@@ -87,7 +86,6 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec) -> Batch:
     observation_valid = (first.unsqueeze(1) <= t) & (t <= last)
     step_valid = observation_valid[:, :-1] & (t[:, :-1] < last)
     ends = (t[:, :-1] == last - 1) & (field(integers, "terminated").unsqueeze(1) > 0)
-    at = spec.dtype.fields["blank"][1]
     return Batch(
         observation=field(floats, "observation"),
         prev_action=prev_action,
@@ -95,7 +93,7 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec) -> Batch:
         reward=field(floats, "reward"),
         terminated=ends.float(),
         hidden=field(floats, "hidden"),
-        blank=raw[:, at : at + spec.observations] > 0,
+        blank=field(raw, "blank") > 0,
         observation_valid=observation_valid,
         step_valid=step_valid,
         burned_in=first == 0,

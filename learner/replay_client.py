@@ -32,7 +32,6 @@ AHEAD = 2  # draws in flight, so that the server gathers while the learner compu
 NONCE_BYTES = 32
 TIMEOUT = 10.0  # seconds until a silent server counts as gone
 RECEIVE_BUFFER = 8 << 20
-READ_AHEAD = 64 << 10  # bytes
 
 
 class Connection:
@@ -44,7 +43,7 @@ class Connection:
         """``address``: ``unix:PATH`` or ``tcp:HOST:PORT``. Raises OSError, MessageError, AuthenticationError."""
         self._max_body = max_body
         self._socket = _connect(address, tls)
-        self._reader = self._socket.makefile("rb", READ_AHEAD)  # a small frame comes by one call
+        self._reader = self._socket.makefile("rb")  # a small frame comes by one call
         self._unsent: list[bytes | memoryview] = []
         try:
             self._authenticate(secret, fingerprint)
@@ -113,10 +112,9 @@ class Connection:
         return header, meta
 
     def _exactly(self, length: int) -> bytes:
-        raw = self._reader.read(length)
-        if len(raw) < length:
-            raise ConnectionError("the replay server closed the connection")
-        return raw
+        raw = bytearray(length)
+        self._fill(memoryview(raw))
+        return bytes(raw)
 
     def _fill(self, view: memoryview) -> None:
         while len(view):
@@ -208,12 +206,15 @@ class ReplayClient:
         if header.kind is Kind.ERROR:
             raise MessageError("replay", str(meta.get("error")))
         self._is_away = False
-        about = float(meta["mass"]), int(meta["windows"]), int(meta["env_steps"]), int(meta["drawn_steps"])
+        draw, rows, values = Draw.BATCH, None, None
         if header.kind is Kind.SHARED and self._shared is not None:
-            return Sample(Draw.BATCH, *self._shared.take(meta), *about)
-        if header.kind is Kind.BATCH:
-            return Sample(Draw.BATCH, *self._split(body), *about)
-        return Sample(Draw.FINISHED if header.kind is Kind.FINISHED else Draw.WAIT, None, None, *about)
+            rows, values = self._shared.take(meta)
+        elif header.kind is Kind.BATCH:
+            rows, values = self._split(body)
+        else:
+            draw = Draw.FINISHED if header.kind is Kind.FINISHED else Draw.WAIT
+        about = float(meta["mass"]), int(meta["windows"]), int(meta["env_steps"]), int(meta["drawn_steps"])
+        return Sample(draw, rows, values, *about)
 
     def _split(self, body: memoryview) -> tuple[Rows, NDArray[np.float64]]:
         split = self._batch_size * self._spec.dtype.itemsize

@@ -1,6 +1,6 @@
 """cpprb under mixed load in the learner's process: batches a second drawn by priority, windows coming in.
 
-    python cpprb_replay.py CORE O A H COUNT BATCH RATE CHUNK
+python cpprb_replay.py CORE O A H COUNT BATCH RATE CHUNK
 """
 
 import sys

@@ -1,6 +1,6 @@
 """Windows a second that a client on one core puts into a Reverb server on another, confirmed by it.
 
-    python reverb_ingest.py LAYOUT CORE SERVER_CORE O A H COUNT CHUNK
+python reverb_ingest.py LAYOUT CORE SERVER_CORE O A H COUNT CHUNK
 """
 
 import os
