@@ -108,7 +108,13 @@ class Bus(Protocol):
         """Ids of all actors that have appended anything."""
 
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
-        """Up to ``count`` entries of each actor named in ``after``, past the id given, in order."""
+        """Up to ``count`` entries of each actor named in ``after``, past the id given, in order.
+
+        None that is there already is missing, but after ``expect``: then only what has come of that.
+        """
+
+    def expect(self, after: Mapping[int, EntryId], count: int) -> None:
+        """Begin to read: ``read`` past the same ids takes what has come by then, without a wait."""
 
     def commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
         """Publish acks and trim what they cover, unless a newer replay has come. Raises FencedError.
@@ -216,6 +222,9 @@ class MemoryBus:
             stream = self._streams.get(actor, {})
             found += [Entry(actor, key, stream[key]) for key in stream if key > cursor][:count]
         return found
+
+    def expect(self, after: Mapping[int, EntryId], count: int) -> None:
+        """Nothing has to come from anywhere."""
 
     def commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
         self._check_replay(holder)

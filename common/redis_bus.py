@@ -12,6 +12,7 @@ from redis.retry import Retry
 
 from common.bus import METRICS_KEPT, Ack, Entry, EntryId, Holder, ReplayAddress, Version, join_pieces, split_pieces
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
+from common.pending_read import PendingRead
 
 DEAD_LETTERS_KEPT = 1_000
 DEAD_LETTER_BYTES = 1_024
@@ -38,7 +39,8 @@ class RedisBus:
             )
         except ValueError as error:
             raise ConfigError("--redis-url", url.split("@")[-1], f"not a Redis URL ({error})") from None
-        self._prefix = f"rmc:{run}"
+        self.url, self._prefix = url, f"rmc:{run}"
+        self._pending = PendingRead(self._redis.connection_pool)
 
     def _key(self, *parts: object) -> str:
         return ":".join([self._prefix, *map(str, parts)])
@@ -114,15 +116,26 @@ class RedisBus:
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
         if not after:
             return []
-        streams = {
-            self._key("windows", actor): f"{cursor.epoch}-{max(cursor.seq, 0)}" for actor, cursor in after.items()
-        }
-        reply = self._call(lambda: self._redis.xread(streams, count=count))
-        return [
-            Entry(int(name.rsplit(b":", 1)[1]), _entry_id(raw_id), fields.get(b"p", b""))
-            for name, entries in _stream_items(reply)
-            for raw_id, fields in entries
-        ]
+        asked = self._pending.asked
+        if asked is not None and asked.items() <= after.items():
+            return self._take_pending()
+        if asked is not None:
+            self._pending.drop()
+        return _entries(self._call(lambda: self._redis.xread(self._cursors(after), count=count)))
+
+    def _take_pending(self) -> list[Entry]:
+        try:
+            return _entries(self._call(self._pending.take)) if self._call(self._pending.ready) else []
+        except BusUnavailable:
+            self._pending.drop()
+            raise
+
+    def expect(self, after: Mapping[int, EntryId], count: int) -> None:
+        if after and self._pending.asked is None:
+            self._call(lambda: self._pending.send(dict(after), self._cursors(after), count))
+
+    def _cursors(self, after: Mapping[int, EntryId]) -> dict[str, str]:
+        return {self._key("windows", actor): f"{cursor.epoch}-{max(cursor.seq, 0)}" for actor, cursor in after.items()}
 
     def commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
         if not acks:
@@ -302,6 +315,14 @@ def _entry_id(raw: bytes | str) -> EntryId:
     text = raw.decode() if isinstance(raw, bytes) else raw
     epoch, seq = text.split("-")
     return EntryId(int(epoch), int(seq))
+
+
+def _entries(reply: Any) -> list[Entry]:
+    return [
+        Entry(int(name.rsplit(b":", 1)[1]), _entry_id(raw_id), fields.get(b"p", b""))
+        for name, entries in _stream_items(reply)
+        for raw_id, fields in entries
+    ]
 
 
 def _stream_items(reply: Any) -> list[tuple[bytes, list[tuple[bytes, dict[bytes, bytes]]]]]:

@@ -1,18 +1,17 @@
-"""A batch of rows as tensors: views into one block of bytes, copied only where padding becomes zero.
+"""A batch of rows as tensors: views into one block of bytes.
 
 Shapes: B batch, T steps, O observation, A action, H hidden; L_b burn-in.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.window import WindowSpec
-
-_TORCH_TYPES = {"<i8": torch.int64, "<i4": torch.int32, "<f4": torch.float32, "|u1": torch.uint8}
+from common.window import Rows, WindowSpec
 
 
 @dataclass(frozen=True)
@@ -39,44 +38,64 @@ def importance_weights(values: NDArray[np.float64], mass: float, windows: int, e
     return scaled
 
 
-def _field(raw: Tensor, spec: WindowSpec, name: str) -> Tensor:
-    fields = spec.dtype.fields
-    assert fields is not None
-    dtype, offset = fields[name][0], fields[name][1]
-    kind = _TORCH_TYPES[dtype.base.str]
-    flat = raw[:, offset : offset + dtype.itemsize].view(kind)
-    return flat.reshape(raw.shape[0], *dtype.shape) if dtype.shape else flat.reshape(-1)
+@cache
+def _places(spec: WindowSpec) -> dict[str, tuple[tuple[int, ...], tuple[int, ...], int]]:
+    """Shape, strides and offset of each field of a row, in steps of its items."""
+    places = {}
+    for name, (dtype, offset, *_) in (spec.dtype.fields or {}).items():
+        strides = tuple(int(np.prod(dtype.shape[axis + 1 :])) for axis in range(len(dtype.shape)))
+        places[name] = dtype.shape, strides, offset // dtype.base.itemsize
+    return places
+
+
+@cache
+def _times(count: int, device: torch.device) -> Tensor:
+    return torch.arange(count, dtype=torch.int32, device=device).unsqueeze(0)
+
+
+def clear_padding(rows: Rows, spec: WindowSpec) -> None:
+    """Zero in place what is not real in (B,) rows, so that not even a NaN there can reach a sum or a gradient."""
+    partial = np.flatnonzero((rows["first"] > 0) | (rows["last"] < spec.steps))
+    t = np.arange(spec.observations)
+    first, last = rows["first"][partial, None], rows["last"][partial, None]
+    unobserved = (t < first) | (t > last)
+    unstepped = (unobserved | (t == last))[:, :-1]
+    for absent, names in ((unobserved, ("observation", "blank")), (unstepped, ("action", "reward"))):
+        window, step = np.nonzero(absent)
+        for name in names:
+            rows[name][partial[window], step] = 0
 
 
 def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec) -> Batch:
     """(B, row bytes) uint8 and (B,) float32, on any device, to a Batch; static shapes, no host sync.
 
-    Padding is replaced by zeros here, so that not even a NaN in it can reach a sum or a gradient.
+    The rows' padding must be zero: see ``clear_padding``.
     """
     assert raw.shape[1] == spec.dtype.itemsize, (raw.shape, spec.dtype.itemsize)
-    first, last = _field(raw, spec, "first").unsqueeze(1), _field(raw, spec, "last").unsqueeze(1)
-    t = torch.arange(spec.observations, device=raw.device).unsqueeze(0)
-    observation_valid = (first <= t) & (t <= last)
+    places, floats, integers = _places(spec), raw.view(torch.float32), raw.view(torch.int32)
+
+    def field(items: Tensor, name: str) -> Tensor:
+        shape, strides, offset = places[name]
+        return items.as_strided((len(raw), *shape), (items.stride(0), *strides), items.storage_offset() + offset)
+
+    first, last = field(integers, "first"), field(integers, "last").unsqueeze(1)
+    action, prev = field(floats, "action"), field(floats, "prev_action")
+    prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
+    prev_action.scatter_(1, first.long().view(-1, 1, 1).expand(-1, 1, prev.shape[1]), prev.unsqueeze(1))
+    t = _times(spec.observations, raw.device)
+    observation_valid = (first.unsqueeze(1) <= t) & (t <= last)
     step_valid = observation_valid[:, :-1] & (t[:, :-1] < last)
-    action = _where(step_valid, _field(raw, spec, "action"))
-    shifted = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
-    at_first = (t == first).unsqueeze(-1)
-    prev_action = torch.where(at_first, _field(raw, spec, "prev_action").unsqueeze(1), shifted)
-    ends = (t[:, :-1] == last - 1) & (_field(raw, spec, "terminated").unsqueeze(1) > 0)
+    ends = (t[:, :-1] == last - 1) & (field(integers, "terminated").unsqueeze(1) > 0)
     return Batch(
-        observation=_where(observation_valid, _field(raw, spec, "observation")),
-        prev_action=_where(observation_valid, prev_action),
+        observation=field(floats, "observation"),
+        prev_action=prev_action,
         action=action,
-        reward=torch.where(step_valid, _field(raw, spec, "reward"), 0.0),
+        reward=field(floats, "reward"),
         terminated=ends.float(),
-        hidden=_field(raw, spec, "hidden"),
-        blank=(_field(raw, spec, "blank") > 0) & observation_valid,
+        hidden=field(floats, "hidden"),
+        blank=field(raw, "blank") > 0,
         observation_valid=observation_valid,
         step_valid=step_valid,
-        burned_in=(first == 0).squeeze(1),
+        burned_in=first == 0,
         importance=importance,
     )
-
-
-def _where(valid: Tensor, x: Tensor) -> Tensor:
-    return torch.where(valid.unsqueeze(-1), x, 0.0)

@@ -20,7 +20,7 @@ from common.errors import CheckpointError, FencedError, RmcError
 from common.metrics import Means, Rate
 from common.replay import Draw, Replay, Sample
 from common.window import Rows, WindowSpec
-from learner.batch import Batch, importance_weights, view_batch
+from learner.batch import Batch, clear_padding, importance_weights, view_batch
 from learner.staleness import SLICE, measurable, staleness
 from learner.update import UpdateConfig, Updated, make_update
 
@@ -136,6 +136,7 @@ class Learner:
         rows, values = sample.rows, sample.values
         assert rows is not None
         assert values is not None
+        clear_padding(rows, self.spec)
         weights = importance_weights(values, sample.mass, sample.windows, self.config.importance_exponent)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1)).to(self.device, non_blocking=True)
         importance = torch.from_numpy(weights).to(self.device, non_blocking=True)

@@ -1,5 +1,8 @@
 """The learner's end of the replay server's socket: two draws asked for ahead, received into fixed buffers.
 
+Where both are on one machine, batches lie in memory that they share, and the socket only says so; a learner with pinned
+buffers has them in those.
+
 Frames are those of ``common/wire.py``. A lost connection is found again through the bus; until then draws
 answer WAIT. Statistics travel on a connection of their own, so that they never queue behind batches.
 """
@@ -20,6 +23,7 @@ from numpy.typing import NDArray
 
 from common.errors import AuthenticationError, MessageError, RmcError
 from common.replay import EPISODE_BYTES, NOTHING_YET, Draw, ObservationStatistics, Sample
+from common.shared_batches import SharedBatches
 from common.window import Rows, WindowSpec
 from common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame, proof
 
@@ -39,6 +43,8 @@ class Connection:
         """``address``: ``unix:PATH`` or ``tcp:HOST:PORT``. Raises OSError, MessageError, AuthenticationError."""
         self._max_body = max_body
         self._socket = _connect(address, tls)
+        self._reader = self._socket.makefile("rb")  # a small frame comes by one call
+        self._unsent: list[bytes | memoryview] = []
         try:
             self._authenticate(secret, fingerprint)
         except BaseException:
@@ -64,8 +70,33 @@ class Connection:
             raise MessageError("fingerprint", f"{meta.get('fingerprint')}, this learner has {fingerprint}")
 
     def send(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...] = ()) -> None:
-        """Send a frame whose body is the parts in order."""
-        self._socket.sendall(b"".join([encode_frame(kind, meta, parts), *parts]))
+        """Send a frame whose body is the parts in order, after what was put off."""
+        self.put_off(kind, meta, parts)
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what was put off."""
+        if self._unsent:
+            self._socket.sendall(b"".join(self._unsent))
+            self._unsent.clear()
+
+    def put_off(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...]) -> None:
+        """Let a frame go with the next that is sent: the server is woken once for both."""
+        self._unsent += [encode_frame(kind, meta, parts), *parts]
+
+    def share(self, spec: WindowSpec, batch_size: int) -> SharedBatches | None:
+        """Memory in which the server puts batches from now on; None where it shares none."""
+        self.send(Kind.SHARE, {"batch_size": batch_size})
+        raw, descriptors, _, _ = socket.recv_fds(self._socket, HEADER.size, 1)
+        try:
+            header = decode_header(raw + self._exactly(HEADER.size - len(raw)), 0)
+            meta = decode_meta(self._exactly(header.meta_length), b"", header)
+            if header.kind is not Kind.SHARE:
+                raise MessageError("replay", str(meta.get("error")))
+            return SharedBatches(descriptors[0], spec, batch_size) if descriptors else None
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
 
     def receive(self, body_buffer: memoryview) -> tuple[FrameHeader, dict[str, Any], memoryview]:
         """The next frame, its body in the buffer given. Raises MessageError, OSError."""
@@ -87,12 +118,13 @@ class Connection:
 
     def _fill(self, view: memoryview) -> None:
         while len(view):
-            received = self._socket.recv_into(view)
-            if received == 0:
+            received = self._reader.readinto(view)
+            if not received:
                 raise ConnectionError("the replay server closed the connection")
             view = view[received:]
 
     def close(self) -> None:
+        self._reader.close()
         self._socket.close()
 
 
@@ -141,6 +173,8 @@ class ReplayClient:
         self._answer = memoryview(bytearray(max(EPISODE_BYTES, spec.dtype.itemsize, 2 * 8 * spec.obs_dim)))
         self._turn = self._in_flight = 0
         self._last = NOTHING_YET
+        self._may_share = not pinned and hasattr(os, "memfd_create")
+        self._shared: SharedBatches | None = None
         self._batches: Connection | None = None
         self._control: Connection | None = None
         self._is_away = False  # said in the log already
@@ -160,7 +194,7 @@ class ReplayClient:
         return replace(self._last, draw=Draw.WAIT, rows=None, values=None)
 
     def _receive_sample(self, elsewhere: int) -> Sample:
-        connection = self._batches = self._batches or self._open()
+        connection = self._batches = self._batches or self._open_batches()
         if connection is None:
             return self._away()
         while self._in_flight < AHEAD:
@@ -172,21 +206,35 @@ class ReplayClient:
         if header.kind is Kind.ERROR:
             raise MessageError("replay", str(meta.get("error")))
         self._is_away = False
+        draw, rows, values = Draw.BATCH, None, None
+        if header.kind is Kind.SHARED and self._shared is not None:
+            rows, values = self._shared.take(meta)
+        elif header.kind is Kind.BATCH:
+            rows, values = self._split(body)
+        else:
+            draw = Draw.FINISHED if header.kind is Kind.FINISHED else Draw.WAIT
         about = float(meta["mass"]), int(meta["windows"]), int(meta["env_steps"]), int(meta["drawn_steps"])
-        if header.kind is not Kind.BATCH:
-            return Sample(Draw.FINISHED if header.kind is Kind.FINISHED else Draw.WAIT, None, None, *about)
+        return Sample(draw, rows, values, *about)
+
+    def _split(self, body: memoryview) -> tuple[Rows, NDArray[np.float64]]:
         split = self._batch_size * self._spec.dtype.itemsize
         if len(body) != split + 8 * self._batch_size:
             raise MessageError("length", f"{len(body)} bytes for a batch of {self._batch_size}")
-        rows = np.frombuffer(body[:split], self._spec.dtype)
-        return Sample(Draw.BATCH, rows, np.frombuffer(body[split:], np.float64), *about)
+        return np.frombuffer(body[:split], self._spec.dtype), np.frombuffer(body[split:], np.float64)
 
-    def _open(self) -> Connection | None:
+    def _open_batches(self) -> Connection | None:
         address = self._address()
         if address is None:
             return None
         self._in_flight = 0
-        return Connection(address, self._secret, self._spec.fingerprint, self._buffers[0].nbytes, self._tls)
+        connection = Connection(address, self._secret, self._spec.fingerprint, self._buffers[0].nbytes, self._tls)
+        if self._may_share and address.startswith("unix:"):
+            try:
+                self._shared = connection.share(self._spec, self._batch_size)
+            except BaseException:
+                connection.close()
+                raise
+        return connection
 
     def _drop(self, error: Exception) -> None:
         if not self._is_away:
@@ -202,14 +250,11 @@ class ReplayClient:
         self._batches = self._control = None
 
     def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
-        """Send priorities back; lost with a lost connection, as they only steer sampling."""
+        """Send priorities back, with the next request; lost with a lost connection, as they only steer sampling."""
         if self._batches is None:
             return
-        try:
-            parts = (serials.tobytes(), priorities.astype(np.float32).tobytes())
-            self._batches.send(Kind.PRIORITIES, {"count": len(serials)}, parts)
-        except OSError as error:
-            self._drop(error)
+        parts = (serials.tobytes(), priorities.astype(np.float32).tobytes())
+        self._batches.put_off(Kind.PRIORITIES, {"count": len(serials)}, parts)
 
     def statistics(self) -> ObservationStatistics:
         """Running observation statistics; a count of 0 while the server is away."""
@@ -240,6 +285,8 @@ class ReplayClient:
 
     def _ask(self, kind: Kind, question: dict[str, Any]) -> tuple[dict[str, Any], memoryview]:
         connection = self._control = self._control or self._open_control()
+        if self._batches is not None:
+            self._batches.flush()  # so that the answer takes into account what was sent before
         try:
             connection.send(kind, question)
             _, meta, body = connection.receive(self._answer)

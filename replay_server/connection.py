@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from common.errors import MessageError
+from common.shared_batches import SharedBatches
 from common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame
 
 RECEIVE_BYTES = 64 << 10
@@ -33,6 +34,7 @@ class Connection:
         self.opened = time.monotonic()
         self._inbox = bytearray()
         self._outbox: deque[memoryview] = deque()
+        self.shared: SharedBatches | None = None  # where its batches lie, if not in the socket
         self._lent = False  # the outbox may hold views of the sender's buffers
 
     @property
@@ -85,6 +87,12 @@ class Connection:
         self._outbox += [memoryview(encode_frame(kind, meta, parts)), *(part for part in parts if part.nbytes)]
         self._lent = True
         self.flush()
+
+    def send_descriptor(self, kind: Kind, descriptor: int) -> None:
+        """Send an empty frame and a file descriptor with it."""
+        frame = encode_frame(kind, {})
+        sent = socket.send_fds(self.socket, [frame], [descriptor])
+        self._outbox += [memoryview(frame[sent:])] * (sent < len(frame))
 
     def flush(self) -> None:
         """Go on sending."""

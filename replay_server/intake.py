@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from common.bus import Bus, Entry, EntryId
 from common.errors import BusFull, MessageError
 from common.replay import WHOLE, Shard
-from common.window import Rows, WindowSpec
-from common.wire import decode_entry, max_entry_bytes
+from common.window import Rows, WindowSpec, first_fault
+from common.wire import decode_rows, max_entry_bytes
 from replay_server.record import StreamPosition
 
 ROUND_BYTES = 4 << 20  # read at most about this much in a round, so that the learner is served in between
@@ -43,23 +43,34 @@ class Intake:
         self._entry_bytes = ROUND_BYTES  # the largest entry of the last round that had any
 
     def read(self, positions: Mapping[int, StreamPosition]) -> Round | None:
-        """The next entries of all streams, or None where there are none."""
+        """The next entries of all streams, or None where there are none; those after them are expected already."""
         if self._rounds % DISCOVERY_ROUNDS == 0:
             self._actors.update(filter(self._shard.owns, self.bus.actors()), positions)
         self._rounds += 1
-        cursors = {actor: positions[actor].id if actor in positions else BEFORE_ALL for actor in self._actors}
-        count = ROUND_BYTES // (self._entry_bytes * len(cursors))
-        entries = self.bus.read(cursors, min(max(count, 1), MAX_ENTRIES))
+        entries = self.bus.read(self._cursors(positions), self._count())
         if not entries:
+            self.bus.expect(self._cursors(positions), self._count())
             return None
         self._entry_bytes = max(len(entry.payload) for entry in entries) + 64
-        return self._round(entries, dict(positions))
+        found = self._round(entries, dict(positions))
+        if not found.broken:  # of a broken stream the same entries would come again, and then pass for all there is
+            self.bus.expect(self._cursors(found.positions), self._count())
+        return found
+
+    def _cursors(self, positions: Mapping[int, StreamPosition]) -> dict[int, EntryId]:
+        return {actor: positions[actor].id if actor in positions else BEFORE_ALL for actor in self._actors}
+
+    def _count(self) -> int:
+        """Entries of each stream."""
+        return min(max(ROUND_BYTES // (self._entry_bytes * len(self._actors)), 1), MAX_ENTRIES)
 
     def _round(self, entries: list[Entry], positions: dict[int, StreamPosition]) -> Round:
         entries, broken = self._in_order(entries, positions)
         bodies = [self._decode(entry) for entry in entries]
-        good = [entry for entry, body in zip(entries, bodies, strict=True) if body is not None and len(body)]
-        rows = self._stamped(good, [body for body in bodies if body is not None and len(body)])
+        rows = self._stamped(entries, bodies)
+        if first_fault(rows, self.spec) is not None:  # of all at once; whose fault it is only now
+            bodies = [self._checked(entry, body) for entry, body in zip(entries, bodies, strict=True)]
+            rows = self._stamped(entries, bodies)
         for entry, body, steps in zip(entries, bodies, self._steps(bodies, rows["new_steps"]), strict=True):
             before = positions.get(entry.actor, StreamPosition(BEFORE_ALL, 0))
             settled = before.settled_steps if entry.id.epoch == before.id.epoch else 0  # an actor's new life
@@ -99,22 +110,34 @@ class Intake:
 
     def _decode(self, entry: Entry) -> Rows | None:
         try:
-            return decode_entry(entry.payload, self.spec)
+            return decode_rows(entry.payload, self.spec)
         except MessageError as error:
-            with suppress(BusFull):  # no room for it; the round that frees some must not wait for that
-                self.bus.dead_letter(entry, str(error))
-            self.refused[error.reason] += 1
+            self._refuse(entry, error)
             return None
 
-    def _stamped(self, entries: list[Entry], bodies: list[Rows]) -> Rows:
+    def _checked(self, entry: Entry, body: Rows | None) -> Rows | None:
+        fault = first_fault(body, self.spec) if body is not None else None
+        if fault is None:
+            return body
+        self._refuse(entry, MessageError("window", fault))
+        return None
+
+    def _refuse(self, entry: Entry, error: MessageError) -> None:
+        with suppress(BusFull):  # no room for it; the round that frees some must not wait for that
+            self.bus.dead_letter(entry, str(error))
+        self.refused[error.reason] += 1
+
+    def _stamped(self, entries: list[Entry], bodies: list[Rows | None]) -> Rows:
         """All bodies as one array; the origin comes from the entry ids, whatever the sender wrote."""
+        found = [(entry, body) for entry, body in zip(entries, bodies, strict=True) if body is not None and len(body)]
         block = np.dtype((np.void, self.spec.dtype.itemsize))  # copies whole rows rather than fields
-        rows: Rows = np.concatenate([np.empty(0, block), *(body.view(block) for body in bodies)]).view(self.spec.dtype)
-        counts = [len(body) for body in bodies]
+        blocks = [np.empty(0, block), *(body.view(block) for _, body in found)]
+        rows: Rows = np.concatenate(blocks).view(self.spec.dtype)
+        counts = [len(body) for _, body in found]
         starts = np.cumsum([0, *counts[:-1]]) if counts else np.zeros(0, np.int64)
-        rows["actor"] = np.repeat([entry.actor for entry in entries], counts)
-        rows["epoch"] = np.repeat([entry.id.epoch for entry in entries], counts)
-        rows["seq"] = np.repeat([entry.id.seq for entry in entries], counts)
+        rows["actor"] = np.repeat([entry.actor for entry, _ in found], counts)
+        rows["epoch"] = np.repeat([entry.id.epoch for entry, _ in found], counts)
+        rows["seq"] = np.repeat([entry.id.seq for entry, _ in found], counts)
         rows["k"] = np.arange(len(rows)) - np.repeat(starts, counts)
         return rows
 

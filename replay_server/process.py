@@ -4,11 +4,13 @@ import time
 from typing import Any
 
 from common.errors import BusFull, BusUnavailable
+from common.memory import keep_freed_memory
 from common.role import RECONNECT_SLEEP
 from replay_server.server import ReplayServer
 from replay_server.socket_server import SocketServer
 
 IDLE_WAIT = 0.005  # seconds between looks at the bus while nothing comes in
+FIRST_WAIT = 0.0005  # until the first look after something came
 ANNOUNCE_PERIOD = 5.0  # seconds between repeats of the address, in case Redis lost its data
 
 
@@ -16,8 +18,9 @@ class ReplayProcess:
     """The role ``replay``, or a shard of it, with its socket. The learner is served on while Redis is away."""
 
     def __init__(self, server: ReplayServer, sockets: SocketServer) -> None:
+        keep_freed_memory()
         self.server, self.sockets, self.name = server, sockets, server.name
-        self._next_intake = self._next_announcement = 0.0
+        self._next_intake = self._next_announcement = self._wait = 0.0
         self._bus_is_away = False
 
     def step(self) -> bool:
@@ -36,7 +39,8 @@ class ReplayProcess:
         except (BusUnavailable, BusFull):
             self._bus_is_away, self._next_intake = True, now + RECONNECT_SLEEP
             return False
-        self._bus_is_away, self._next_intake = False, now + (0.0 if took else IDLE_WAIT)
+        self._wait = 0.0 if took else min(2 * self._wait + FIRST_WAIT, IDLE_WAIT)  # what was asked for ahead is near
+        self._bus_is_away, self._next_intake = False, now + self._wait
         return took
 
     def waiting_for(self) -> str:

@@ -211,11 +211,11 @@ class ReplayServer:
 
     # -- out --------------------------------------------------------------------------------------------
 
-    def sample(self, batch_size: int, elsewhere: int = 0) -> Sample:
+    def sample(self, batch_size: int, elsewhere: int = 0, out: Rows | None = None) -> Sample:
         """Draw (B,) rows in proportion to priority ** exponent, if the limiter lets it.
 
-        The rows lie in one of two buffers that draws take in turn. A draw depends on the seed, its number
-        and the ring alone.
+        The rows lie in ``out``, else in one of two buffers that draws take in turn. A draw depends on the seed, its
+        number and the ring alone.
         """
         progress, tree = self._store.ring.progress, self._store.tree
         progress.elsewhere_steps = max(progress.elsewhere_steps, elsewhere)
@@ -228,7 +228,7 @@ class ReplayServer:
         number = progress.draws * self._shard.count + self._shard.index  # of the draw; no shard's like another's
         random = np.random.Generator(np.random.Philox(key=np.array([self._seed, number], np.uint64)))
         slots = tree.sample(batch_size, random)
-        rows = self._buffer(batch_size)
+        rows = self._buffer(batch_size) if out is None else out
         self._store.ring.gather(slots, rows)
         progress.draws += 1
         progress.drawn_steps += self.spec.trained_steps(rows)

@@ -28,6 +28,7 @@ import numpy as np
 
 from common.errors import AuthenticationError, ConfigError, MessageError
 from common.replay import Draw
+from common.shared_batches import SharedBatches, reserve_memory, shared_bytes
 from common.window import WindowSpec
 from common.wire import Kind, proof
 from replay_server.connection import Connection, Frame
@@ -165,6 +166,8 @@ class SocketServer:
             statistics = self._server.statistics()
             sums = (statistics.total.data.cast("B"), statistics.total_square.data.cast("B"))
             connection.send(Kind.STATISTICS, {"count": statistics.count}, sums)
+        elif frame.kind is Kind.SHARE:
+            self._share(connection, frame.meta.get("batch_size"))
         elif frame.kind is Kind.EPISODE:
             self._episode(connection, frame.meta.get("serial"))
         elif frame.kind is Kind.STATS:
@@ -172,20 +175,43 @@ class SocketServer:
         else:
             raise MessageError("kind", f"{frame.kind.name} is not a request")
 
-    def _sample(self, connection: Connection, batch_size: Any, elsewhere: Any) -> None:
+    def _share(self, connection: Connection, batch_size: Any) -> None:
+        """From now on its batches of that size lie in memory that it has, too, if it is on this machine."""
+        self._check_batch_size(batch_size)
+        if connection.socket.family != socket.AF_UNIX or connection.shared is not None:
+            raise MessageError("kind", "SHARE, on a unix socket and once")
+        descriptor = reserve_memory(shared_bytes(self._spec, batch_size))
+        if descriptor is None:
+            connection.send(Kind.SHARE, {})
+            return
+        try:
+            connection.shared = SharedBatches(descriptor, self._spec, batch_size)
+            connection.send_descriptor(Kind.SHARE, descriptor)
+        finally:
+            os.close(descriptor)
+
+    def _check_batch_size(self, batch_size: Any) -> None:
         if type(batch_size) is not int or not 1 <= batch_size <= self._max_batch:
             raise MessageError("batch-size", f"{batch_size!r}, want 1 to {self._max_batch}")
+
+    def _sample(self, connection: Connection, batch_size: Any, elsewhere: Any) -> None:
+        self._check_batch_size(batch_size)
         if type(elsewhere) is not int or not 0 <= elsewhere < 2**62:
             raise MessageError("elsewhere", f"{elsewhere!r}, want a number of steps")
-        for other in self._connections:
-            other.own()  # the draw takes a buffer that another client's batch may still lie in
-        sample = self._server.sample(batch_size, elsewhere)
+        shared = connection.shared
+        if shared is None or shared.batch_size != batch_size:
+            for other in self._connections:
+                other.own()  # the draw takes a buffer that another client's batch may still lie in
+            sample = self._server.sample(batch_size, elsewhere)
+        else:
+            sample = self._server.sample(batch_size, elsewhere, shared.rows[shared.turn])
         meta = {name: getattr(sample, name) for name in ("mass", "windows", "env_steps", "drawn_steps")}
         if sample.rows is None or sample.values is None:
             connection.send(Kind.FINISHED if sample.draw is Draw.FINISHED else Kind.WAIT, meta)
+        elif shared is None or shared.batch_size != batch_size:
+            connection.send(Kind.BATCH, meta, (sample.rows.view(np.uint8).data, sample.values.data.cast("B")))
         else:
-            parts = (sample.rows.view(np.uint8).data, sample.values.data.cast("B"))
-            connection.send(Kind.BATCH, meta, parts)
+            connection.send(Kind.SHARED, meta | shared.put(sample.values))
 
     def _episode(self, connection: Connection, serial: Any) -> None:
         if type(serial) is not int:

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from common.window import Rows, WindowSpec
-from learner.batch import Batch, view_batch
+from learner.batch import Batch, clear_padding, view_batch
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=4, train=5)
 
@@ -43,4 +43,5 @@ def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC) -> Rows:
 def to_batch(rows: Rows, spec: WindowSpec = SPEC, importance: np.ndarray | None = None) -> Batch:
     """Rows as the learner sees them."""
     weights = np.ones(len(rows), np.float32) if importance is None else importance
+    clear_padding(rows, spec)
     return view_batch(torch.from_numpy(rows.view("u1").reshape(len(rows), -1)), torch.from_numpy(weights), spec)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from learner.batch import importance_weights
-from tests.learner.rows import SPEC, random_rows, to_batch
+from learner.batch import clear_padding, importance_weights
+from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
 
 
 def test_fields_match_the_rows():
@@ -53,3 +53,14 @@ def test_importance_weights_against_the_formula():
     np.testing.assert_allclose(found, expected / expected.max(), rtol=1e-5)
     assert found.dtype == np.float32
     assert (importance_weights(values, mass, windows, 0.0) == 1).all()
+
+
+def test_padding_is_cleared_and_nothing_else_touched():
+    rows = random_rows(16)
+    clean = rows.copy()
+    observed, stepped = observation_valid(rows), step_valid(rows)
+    rows["observation"][~observed] = np.nan
+    rows["blank"][~observed] = 1
+    rows["action"][~stepped] = rows["reward"][~stepped] = np.inf
+    clear_padding(rows, SPEC)
+    assert (rows == clean).all()

@@ -14,6 +14,7 @@ import pytest
 from common.bus import MemoryBus
 from common.errors import AuthenticationError, ConfigError, MessageError
 from common.replay import Draw
+from common.shared_batches import TURNS
 from common.wire import HEADER, MAGIC, VERSION, Kind, encode_frame, proof
 from learner.replay_client import Connection, ReplayClient
 from replay_server import socket_server
@@ -125,6 +126,36 @@ def test_pipelined_draws_are_what_a_server_in_the_same_thread_gives(serve: Serve
         assert rows.tobytes() == sample.rows.tobytes()
         assert np.array_equal(values, sample.values)
     connection.close()
+
+
+@pytest.mark.parametrize("address", ["", "tcp:127.0.0.1:0"])
+@pytest.mark.parametrize("pinned", [False, True])
+def test_the_learners_client_gets_the_same_draws_however_they_come(serve: Serve, address: str, pinned: bool) -> None:
+    served, twin = serve(address=address), serve()
+    client = ReplayClient(lambda: served.address, SECRET, SPEC, 64)
+    client._may_share = client._may_share and not pinned  # pinned buffers need a device
+    before = None
+    for _ in range(3 * TURNS):
+        sample, expected = client.sample(64), twin.replay.sample(64)
+        assert sample.rows is not None
+        assert expected.rows is not None
+        assert np.array_equal(sample.values, expected.values)
+        if before is not None:  # a batch stays what it is until the next draw but one
+            assert before[0].tobytes() == before[1]
+        before = sample.rows, expected.rows.tobytes()
+        assert before[0].tobytes() == before[1]
+    assert (client._shared is not None) == (not pinned and not address and hasattr(os, "memfd_create"))
+    client.close()
+
+
+def test_memory_is_shared_once_and_with_this_machine_alone(serve: Serve) -> None:
+    near, far = serve(), serve(address="tcp:127.0.0.1:0")
+    twice, remote = near.connect(), far.connect()
+    assert (twice.share(SPEC, 8) is not None) == hasattr(os, "memfd_create")
+    for served, connection in ((near, twice), (far, remote)):
+        connection.send(Kind.SHARE, {"batch_size": 8})
+        served.refused("kind")
+        connection.close()
 
 
 def test_priorities_statistics_and_stats(serve: Serve) -> None:
@@ -248,6 +279,8 @@ def test_a_stranger_who_talks_nonsense(serve: Serve, sent: bytes, reason: str) -
         (encode_frame(Kind.SAMPLE, {"batch_size": 8}), "elsewhere"),
         (encode_frame(Kind.SAMPLE, {"batch_size": 8, "elsewhere": -1}), "elsewhere"),
         (encode_frame(Kind.SAMPLE, {}), "batch-size"),
+        (encode_frame(Kind.SHARE, {"batch_size": 0}), "batch-size"),
+        (encode_frame(Kind.SHARE, {"batch_size": MAX_BATCH + 1}), "batch-size"),
         (encode_frame(Kind.PRIORITIES, {"count": 3}, (b"1234",)) + b"1234", "length"),
         (encode_frame(Kind.PRIORITIES, {"count": -1}), "length"),
         (encode_frame(Kind.WELCOME, {}), "kind"),

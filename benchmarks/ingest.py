@@ -1,0 +1,107 @@
+"""Ingest: windows a second from an actor's rows to a replay server that has them for good.
+
+    python -m benchmarks.ingest [--env HalfCheetah-v5 Humanoid-v5] [--rounds 5] [--seconds 4]
+
+The sender has the first core; Redis and the replay server, or the peer's server, share the last one. Ours counts what
+is committed to the ring and acknowledged.
+"""
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+import psutil
+
+from benchmarks.harness import (
+    ENDLESS,
+    Measure,
+    Peer,
+    Row,
+    compare,
+    parser,
+    peer_python,
+    random_rows,
+    replay_process,
+    save,
+    speed,
+)
+from benchmarks.sender import CHUNK, Sender
+from common.envs import EnvConfig, env_spaces
+from common.window import WindowSpec
+from replay_server.server import ReplayConfig
+
+WINDOWS = {"HalfCheetah-v5": 20_000, "Humanoid-v5": 4_000}  # in the ring
+HIDDEN = 256
+BEHIND = 256  # entries sent ahead of what is acknowledged
+LAYOUTS = {"Reverb": "fields", "Reverb, packed windows": "packed"}
+
+
+@contextmanager
+def ours(spec: WindowSpec, windows: int, seconds: float) -> Iterator[Measure]:
+    """The product, its processes stopped outside of their turns."""
+    with replay_process(spec, ReplayConfig(capacity=windows, warmup_steps=ENDLESS)) as bus:
+        sender, processes = Sender(bus, spec), psutil.Process().children(recursive=True)
+
+        def one() -> int:
+            sender.send()
+            sender.wait(BEHIND)
+            return CHUNK
+
+        def measure() -> float:
+            for process in processes:
+                process.resume()
+            speed(one, 0.5)
+            sender.wait()
+            first, start = sender.seq, time.perf_counter()
+            speed(one, seconds)
+            sender.wait()
+            found = (sender.seq - first) * CHUNK / (time.perf_counter() - start)
+            for process in processes:
+                process.suspend()
+            return found
+
+        yield measure
+        for process in processes:
+            process.resume()
+
+
+def copy(spec: WindowSpec, seconds: float) -> Measure:
+    """The same rows copied once in memory: the ceiling."""
+    rows, target = random_rows(spec, 4096), np.zeros(4096, spec.dtype)
+
+    def once() -> int:
+        np.copyto(target, rows)
+        return len(rows)
+
+    return lambda: speed(once, seconds / 4)
+
+
+def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
+    """Windows of one environment."""
+    obs_dim, action_dim, _ = env_spaces(EnvConfig(env_id))
+    spec, cores = WindowSpec(obs_dim, action_dim, HIDDEN), sorted(os.sched_getaffinity(0))
+    words = [str(word) for word in (cores[0], cores[-1], obs_dim, action_dim, HIDDEN, WINDOWS[env_id], CHUNK)]
+    python, peers = peer_python("reverb"), dict[str, Measure | None]()
+    with ExitStack() as stack:
+        found = stack.enter_context(ours(spec, WINDOWS[env_id], seconds))
+        for name, layout in LAYOUTS.items():
+            peers[name] = None
+            if python is not None:
+                peer = stack.enter_context(Peer(python, "reverb_ingest", layout, *words))
+                peers[name] = lambda peer=peer: peer.measure(seconds)  # type: ignore[misc]
+        limit = ("one copy in memory", copy(spec, seconds))
+        return compare(f"ingest, {CHUNK} windows an entry, {env_id}", "windows/s", found, peers, limit, rounds)
+
+
+def main() -> None:
+    made = parser(__doc__)
+    made.add_argument("--env", nargs="+", choices=list(WINDOWS), default=list(WINDOWS))
+    options = made.parse_args()
+    for env_id in options.env:
+        save(measure(env_id, options.rounds, options.seconds))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""Reverb under mixed load on one core: batches a second drawn by priority, priorities sent back, windows coming in.
+
+    python reverb_replay.py PLACE READER LAYOUT IN_FLIGHT CORE O A H COUNT BATCH RATE CHUNK
+
+PLACE: ``server`` (a process of its own) or ``learner`` (in the learner's process). READER: ``dataset`` or ``client``.
+"""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import reverb
+import tensorflow as tf
+from reverb_table import TABLE, Writer, columns_of, serve
+from turns import pin, take_turns
+from windows import Columns, Sizes, random_columns, unpack
+
+IMPORTANCE = 0.4
+KEPT_UP = 0.95  # of the windows offered
+HERE = Path(__file__).parent
+Batch = tuple[np.ndarray, np.ndarray, int, Columns]  # keys, probabilities, windows, columns
+
+
+def start(script: str, *words: object) -> subprocess.Popen[str]:
+    """Another script of this folder, which says on a line of its own that it is there."""
+    command = [sys.executable, str(HERE / f"{script}.py"), *map(str, words)]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def read_dataset(port: int, batch: int, in_flight: int) -> Iterator[Batch]:
+    """Batches made by tf.data."""
+    dataset = reverb.TrajectoryDataset.from_table_signature(
+        f"localhost:{port}", TABLE, max_in_flight_samples_per_worker=in_flight
+    ).batch(batch, drop_remainder=True)
+    for info, data in dataset:
+        columns = {name: part.numpy() for name, part in data.items()}
+        yield info.key.numpy(), info.probability.numpy(), int(info.table_size[0]), columns
+
+
+def read_client(port: int, batch: int, names: list[str]) -> Iterator[Batch]:
+    """Batches stacked from the client's samples."""
+    client = reverb.Client(f"localhost:{port}")
+    while True:
+        found = list(client.sample(TABLE, batch, emit_timesteps=False))
+        columns = {name: np.stack([one.data[k] for one in found]) for k, name in enumerate(names)}
+        keys = np.array([one.info.key for one in found], np.uint64)
+        yield keys, np.array([one.info.probability for one in found]), found[0].info.table_size, columns
+
+
+def main() -> None:
+    place, reader, layout, *numbers = sys.argv[1:]
+    in_flight, core, observation, action, hidden, count, batch, rate, chunk = map(int, numbers)
+    sizes = Sizes(observation, action, hidden)
+    pin(core)
+    tf.config.threading.set_intra_op_parallelism_threads(1)
+    tf.config.threading.set_inter_op_parallelism_threads(1)
+    if place == "server":
+        server = start("reverb_table", *sizes, count, layout)
+        port = int(server.stdout.readline())
+    else:
+        server = serve(sizes, count, layout)
+        port = server.port
+    Writer(port, columns_of(sizes, min(count, 1024), layout)).write(count)
+    sender = start("reverb_sender", port, *sizes, layout, rate, chunk)
+    sender.stdout.readline()
+    like, client = random_columns(sizes, 1), reverb.Client(f"localhost:{port}")
+    names = sorted(columns_of(sizes, 1, layout))
+    batches = read_dataset(port, batch, in_flight) if reader == "dataset" else read_client(port, batch, names)
+    rng = np.random.default_rng(0)
+
+    def one() -> None:
+        keys, probabilities, windows, columns = next(batches)
+        if layout == "packed":
+            columns = unpack(columns["row"], like)
+        weights = (windows * probabilities) ** -IMPORTANCE
+        weights = (weights / weights.max()).astype(np.float32)
+        priorities = rng.uniform(0.1, 1.0, batch)
+        client.mutate_priorities(TABLE, dict(zip(keys.tolist(), priorities.tolist(), strict=True)))
+
+    def measure(seconds: float) -> float:
+        print(seconds + 0.2, file=sender.stdin, flush=True)
+        begin, done = time.perf_counter(), 0
+        while time.perf_counter() - begin < seconds:
+            one()
+            done += 1
+        speed = done / (time.perf_counter() - begin)
+        came = json.loads(sender.stdout.readline())["value"]
+        if came < KEPT_UP * rate:
+            raise RuntimeError(f"only {came:.0f} of {rate} windows a second came in")
+        return speed
+
+    one()
+    take_turns(measure)
+
+
+if __name__ == "__main__":
+    main()

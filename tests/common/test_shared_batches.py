@@ -1,0 +1,50 @@
+"""Memory that both ends see, which neither can cut short, and in which a fault is noticed."""
+
+import os
+
+import numpy as np
+import pytest
+
+from common.errors import MessageError
+from common.shared_batches import TURNS, SharedBatches, reserve_memory, shared_bytes
+from common.window import WindowSpec
+
+SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=4, burn_in=2, train=4)
+BATCH = 8
+pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="Linux")
+
+
+@pytest.fixture
+def descriptor():
+    made = reserve_memory(shared_bytes(SPEC, BATCH))
+    assert made is not None
+    yield made
+    os.close(made)
+
+
+def test_batches_take_turns_and_are_seen_by_the_other_side(descriptor):
+    server, learner = SharedBatches(descriptor, SPEC, BATCH), SharedBatches(descriptor, SPEC, BATCH)
+    said = []
+    for number in range(TURNS):
+        server.rows[server.turn]["serial"] = number
+        said.append(server.put(np.full(BATCH, float(number))))
+    for number, one in enumerate(said):
+        rows, values = learner.take(one)
+        assert (rows["serial"] == number).all()
+        assert (values == number).all()
+
+
+def test_a_torn_batch_and_a_wrong_turn_are_refused(descriptor):
+    server, learner = SharedBatches(descriptor, SPEC, BATCH), SharedBatches(descriptor, SPEC, BATCH)
+    said = server.put(np.ones(BATCH))
+    server.rows[0]["reward"][3, 1] = 5.0
+    with pytest.raises(MessageError, match="crc"):
+        learner.take(said)
+    for turn in (TURNS, -1, "0", None):
+        with pytest.raises(MessageError, match="turn"):
+            learner.take({**said, "turn": turn})
+
+
+def test_nobody_can_cut_it_short(descriptor):
+    with pytest.raises(PermissionError):
+        os.ftruncate(descriptor, 0)
