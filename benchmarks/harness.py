@@ -5,6 +5,7 @@ import json
 import multiprocessing
 import os
 import shlex
+import signal
 import statistics
 import subprocess
 import sys
@@ -144,7 +145,8 @@ class Peer:
 
     def __init__(self, python: Path, script: str, *words: str) -> None:
         command = [str(python), str(HERE / "peers" / f"{script}.py"), *words]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
         self._answer()
 
     def measure(self, seconds: float) -> float:
@@ -165,7 +167,7 @@ class Peer:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._process.kill()
+        os.killpg(self._process.pid, signal.SIGKILL)  # with the servers that it has started
         self._process.wait()
 
 

@@ -246,6 +246,8 @@ class ReplayClient:
         """End both connections; the next draw opens them again."""
         for connection in (self._batches, self._control):
             if connection is not None:
+                with suppress(OSError):
+                    connection.flush()  # the last batch's priorities
                 connection.close()
         self._batches = self._control = None
 
@@ -285,9 +287,9 @@ class ReplayClient:
 
     def _ask(self, kind: Kind, question: dict[str, Any]) -> tuple[dict[str, Any], memoryview]:
         connection = self._control = self._control or self._open_control()
-        if self._batches is not None:
-            self._batches.flush()  # so that the answer takes into account what was sent before
         try:
+            if self._batches is not None:
+                self._batches.flush()  # so that the answer takes into account what was sent before
             connection.send(kind, question)
             _, meta, body = connection.receive(self._answer)
         except (OSError, MessageError):
