@@ -26,9 +26,17 @@ class _Linear:
     weights or the transposed product take.
     """
 
-    def __init__(self, weight: Tensor, bias: Tensor, rows: int, relu: bool) -> None:
-        self._weight, self._bias, self._relu = weight.T.contiguous(), bias, relu
-        self.out = torch.empty(rows, len(bias))
+    def __init__(self, inputs: int, outputs: int, rows: int, relu: bool = False) -> None:
+        self._weight, self._bias, self._relu = torch.zeros(inputs, outputs), torch.zeros(outputs), relu
+        self.out = torch.zeros(rows, outputs)
+
+    def take(self, weights: dict[str, Tensor], name: str) -> None:
+        """Copy what is called ``name``, out of ``weights``. Raises KeyError, ValueError."""
+        weight, bias = weights.pop(name.format("weight")), weights.pop(name.format("bias"))
+        if weight.shape != self._weight.shape[::-1]:
+            raise ValueError(f"{name} has shape {tuple(weight.shape)}, expected {tuple(self._weight.shape[::-1])}")
+        self._weight.copy_(weight.T)
+        self._bias.copy_(bias)
 
     def __call__(self, x: Tensor) -> Tensor:
         torch.addmm(self._bias, x, self._weight, out=self.out)
@@ -40,9 +48,10 @@ class _GRU:
 
     def __init__(self, from_input: _Linear, from_hidden: _Linear, rows: int, size: int) -> None:
         self._from_input, self._from_hidden = from_input, from_hidden
-        self._gates, self._new = from_input.out.split([2 * size, size], 1)
-        self._hidden_gates, self._hidden_new = from_hidden.out.split([2 * size, size], 1)
-        self._r, self._z = self._gates.split(size, 1)
+        gates, new = slice(0, 2 * size), slice(2 * size, None)
+        self._gates, self._new = from_input.out[:, gates], from_input.out[:, new]
+        self._hidden_gates, self._hidden_new = from_hidden.out[:, gates], from_hidden.out[:, new]
+        self._r, self._z = self._gates[:, :size], self._gates[:, size:]
         self.out = torch.empty(rows, size)
 
     def __call__(self, x: Tensor, hidden: Tensor) -> Tensor:
@@ -59,9 +68,20 @@ class PolicyRunner:
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig, envs: int) -> None:
         self._config, self._envs = config, envs
         self._obs_dim, self._action_dim = obs_dim, action_dim
-        self._inputs = obs_dim + action_dim + config.blank_flag
-        self._input = np.empty((envs, self._inputs), np.float32)
-        self._embedding_dim = config.embedding or self._inputs
+        inputs = obs_dim + action_dim + config.blank_flag
+        embedding = config.embedding or inputs
+        features = config.hidden + (embedding if config.shortcut else 0)
+        self._input = np.zeros((envs, inputs), np.float32)
+        self._embed = _Linear(inputs, embedding, envs, relu=not config.layer_norm) if config.embedding else None
+        self._from_embedding = _Linear(embedding, 3 * config.hidden, envs)
+        self._from_hidden = _Linear(config.hidden, 3 * config.hidden, envs)
+        self._gru = _GRU(self._from_embedding, self._from_hidden, envs, config.hidden)
+        first, second = config.heads
+        self._head = (
+            _Linear(features, first, envs, relu=True),
+            _Linear(first, second, envs, relu=True),
+            _Linear(second, 2 * action_dim, envs),
+        )
 
     def start(self) -> tuple[Floats, Floats]:
         """Previous action (N, A) and hidden state (N, H) at the start of episodes: new zeros."""
@@ -81,34 +101,17 @@ class PolicyRunner:
             raise MessageError("weights", f"not a policy of this run (it also has {', '.join(left)})")
 
     def _take(self, weights: dict[str, Tensor]) -> None:
-        """Build the layers; takes what it uses out of ``weights``."""
-        config, embedding = self._config, self._embedding_dim
-        features = config.hidden + (embedding if config.shortcut else 0)
+        """Fill the layers; takes what it uses out of ``weights``."""
         self._mean, self._std = weights.pop("normalizer.mean").numpy(), weights.pop("normalizer.std").numpy()
-        self._embed, self._norm = None, None
-        if config.embedding:
-            self._embed = self._linear(
-                weights, "memory.embed.0.{}", self._inputs, embedding, relu=not config.layer_norm
-            )
-        if config.embedding and config.layer_norm:
-            self._norm = weights.pop("memory.embed.1.weight"), weights.pop("memory.embed.1.bias")
-        from_embedding = self._linear(weights, "memory.gru.{}_ih_l0", embedding, 3 * config.hidden)
-        from_hidden = self._linear(weights, "memory.gru.{}_hh_l0", config.hidden, 3 * config.hidden)
-        self._gru = _GRU(from_embedding, from_hidden, self._envs, config.hidden)
-        first, second = config.heads
-        self._head = (
-            self._linear(weights, "policy.net.0.{}", features, first, relu=True),
-            self._linear(weights, "policy.net.2.{}", first, second, relu=True),
-            self._linear(weights, "policy.net.4.{}", second, 2 * self._action_dim),
-        )
-
-    def _linear(
-        self, weights: dict[str, Tensor], name: str, inputs: int, outputs: int, relu: bool = False
-    ) -> _Linear:
-        weight, bias = weights.pop(name.format("weight")), weights.pop(name.format("bias"))
-        if weight.shape != (outputs, inputs):
-            raise ValueError(f"{name} has shape {tuple(weight.shape)}, expected {(outputs, inputs)}")
-        return _Linear(weight, bias, self._envs, relu)
+        self._norm = None
+        if self._embed is not None:
+            self._embed.take(weights, "memory.embed.0.{}")
+            if self._config.layer_norm:
+                self._norm = weights.pop("memory.embed.1.weight"), weights.pop("memory.embed.1.bias")
+        self._from_embedding.take(weights, "memory.gru.{}_ih_l0")
+        self._from_hidden.take(weights, "memory.gru.{}_hh_l0")
+        for place, layer in zip((0, 2, 4), self._head, strict=True):
+            layer.take(weights, f"policy.net.{place}.{{}}")
 
     def act(
         self, observation: Floats, prev_action: Floats, blank: BoolArray, hidden: Floats, noise: Floats | None
@@ -131,7 +134,7 @@ class PolicyRunner:
         if self._config.normalize_observations:
             np.subtract(observation, self._mean, out=normalized)
             np.divide(normalized, self._std, out=normalized)
-            np.minimum(normalized, NORMALIZED_CLIP, out=normalized)  # two of these take less than one clip
+            np.minimum(normalized, NORMALIZED_CLIP, out=normalized)  # the two take a third of one clip
             np.maximum(normalized, -NORMALIZED_CLIP, out=normalized)
         else:
             normalized[:] = observation
@@ -153,4 +156,6 @@ class PolicyRunner:
         mean, log_std = head[:, : self._action_dim], head[:, self._action_dim :]
         if noise is None:
             return np.tanh(mean)
-        return np.tanh(mean + np.exp(log_std.clip(*LOG_STD_RANGE)) * noise)
+        least, most = LOG_STD_RANGE
+        action: Floats = np.tanh(mean + np.exp(np.maximum(np.minimum(log_std, most), least)) * noise)
+        return action

@@ -23,7 +23,9 @@ class Collector:
 
     def __init__(self, env_id: str, envs: int) -> None:
         self._env = DummyVecEnv([lambda: gym.make(env_id) for _ in range(envs)])
-        self._model = SAC("MlpPolicy", self._env, policy_kwargs={"net_arch": [400, 300]}, buffer_size=1000, device="cpu")
+        self._model = SAC(
+            "MlpPolicy", self._env, policy_kwargs={"net_arch": [400, 300]}, buffer_size=1000, device="cpu"
+        )
         self._observation = self._env.reset()
         self._envs = envs
 
