@@ -279,9 +279,10 @@ class Actor:
 
     def _find_nonsense(self) -> None:
         """Whose observation or reward is not finite. What a broken environment left behind must not end an episode."""
-        sound = np.isfinite(self._observation).all(1) & np.isfinite(self._reward)
-        for i in np.flatnonzero(~sound).tolist():
-            self._faults.setdefault(i, ValueError("its observation or reward is not finite"))
+        if not (np.isfinite(self._observation).all() and np.isfinite(self._reward).all()):
+            sound = np.isfinite(self._observation).all(1) & np.isfinite(self._reward)
+            for i in np.flatnonzero(~sound).tolist():
+                self._faults.setdefault(i, ValueError("its observation or reward is not finite"))
         for i in self._faults:
             self._observation[i] = self._reward[i] = 0.0
             self._terminated[i] = self._truncated[i] = False

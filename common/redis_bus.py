@@ -258,11 +258,18 @@ class RedisBus:
     def _piece_keys(self, version: Version, pieces: int) -> list[str]:
         return [self._key("weights", version.epoch, version.update, index) for index in range(pieces)]
 
+    def _at_once(self, command: str, keys: list[str], *words: object) -> list[Any]:
+        """The same command for each key in one round trip; the replies stay apart."""
+        pipe = self._redis.pipeline(transaction=False)
+        for key in keys:
+            pipe.execute_command(command, key, *words)
+        replies: list[Any] = self._call(pipe.execute)
+        return replies
+
     def _drop_pieces(self, versions: set[tuple[Version, int]]) -> None:
         """Let replaced versions expire rather than vanish, so that a reader amid them can finish."""
         for version, pieces in versions:
-            for key in self._piece_keys(version, pieces):
-                self._call(self._redis.expire, key, 5)
+            self._at_once("expire", self._piece_keys(version, pieces), 5)
 
     def latest_version(self, evaluate: bool = False) -> Version | None:
         head = self._head(evaluate)
@@ -273,7 +280,7 @@ class RedisBus:
         if head is None:
             return None
         version, count, crc = head
-        pieces = [self._call(self._redis.get, key) for key in self._piece_keys(version, count)]
+        pieces = self._at_once("get", self._piece_keys(version, count))
         try:
             return version, join_pieces(pieces, crc)
         except MessageError:

@@ -1,0 +1,175 @@
+"""How the system grows: each size twice the one before, its speed, and the log-log slope between them.
+
+    python -m benchmarks.growth [actors] [batch] [ring] [window] [--seconds S] [--rounds N]
+
+A slope of 1 is in proportion, of 0 is no change. Actors are the simulated ones of ``benchmarks.scaling``, each of which
+offers 1 000 windows a second, more than a real one; they share the machine's cores with Redis and one replay server.
+"""
+
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks import harness
+from benchmarks.harness import ENDLESS, SECRET, Row, compare, random_rows, replay_process, speed
+from benchmarks.scaling import CHUNK, measure
+from common.bus import EntryId
+from common.checkpoint import CheckpointFolder
+from common.envs import EnvConfig, env_spaces
+from common.redis_bus import RedisBus
+from common.window import WindowSpec
+from common.wire import encode_hello, encode_windows
+from deploy.presets import robust
+from learner.learner import Learner, LearnerConfig
+from learner.replay_client import ReplayClient
+from replay_server.recovery import open_store
+from replay_server.server import ReplayConfig
+
+ENV = EnvConfig("HalfCheetah-v5")
+ENTRIES = 300  # of windows, in the replay before the learner draws
+SMALL = WindowSpec(obs_dim=4, action_dim=1, hidden=8, burn_in=2, train=3)  # a million of them fit the memory
+DRAWN = 256  # windows, of the ring
+OFFERED = 1_000.0  # windows a second, by each simulated actor
+Table = list[tuple[int, list[Row]]]  # size, its measurements
+
+
+def actors(rounds: int, seconds: float) -> Table:
+    """Windows a second committed."""
+    spec = robust(ENV).window_spec()
+
+    def committed(count: int) -> Callable[[], float]:
+        return lambda: measure(spec, 1, count, "", count * OFFERED, seconds).committed
+
+    sizes = (1, 2, 4, 8, 16, 32)
+    return [(n, compare(f"growth, {n} actors", "windows/s", committed(n), {}, rounds=rounds)) for n in sizes]
+
+
+def batch(rounds: int, seconds: float) -> Table:
+    """Updates a second, and the trained steps in them."""
+    spec = robust(ENV).window_spec()
+    return [(size, _learning(f"growth, batch {size}", spec, size, rounds, seconds)) for size in (32, 64, 128, 256, 512)]
+
+
+def window(rounds: int, seconds: float) -> Table:
+    """Updates a second at the default batch."""
+    size, table = robust(ENV).learner.batch_size, []
+    for steps in (25, 50, 75, 100):
+        spec = _spec(steps)
+        table.append((steps, _learning(f"growth, windows of {steps} steps", spec, size, rounds, seconds)))
+    return table
+
+
+def ring(rounds: int, seconds: float) -> Table:
+    """A draw's microseconds: sum tree and gather, then new priorities."""
+    table: Table = []
+    for capacity in (10_000, 32_000, 100_000, 320_000, 1_000_000):
+        with tempfile.TemporaryDirectory() as folder:
+            draw = _filled(Path(folder), capacity)
+            speed(draw, 0.5)
+            name = f"growth, draw and priorities of {DRAWN} of {capacity} windows"
+            table.append((capacity, compare(name, "us", lambda d=draw: 1e6 / speed(d, seconds), {}, rounds=rounds)))  # type: ignore[misc]
+    return table
+
+
+def _filled(folder: Path, capacity: int) -> Callable[[], int]:
+    """A full ring, of which each call draws and gives priorities back."""
+    store, rng = open_store(folder, SMALL, capacity, exponent=0.6), np.random.default_rng(0)
+    rows = random_rows(SMALL, capacity)
+    store.set_priorities(store.ring.write(rows), rng.uniform(0.1, 1.0, capacity).astype(np.float32))
+    store.ring.commit()
+    out, priorities = np.zeros(DRAWN, SMALL.dtype), rng.uniform(0.1, 1.0, DRAWN).astype(np.float32)
+
+    def draw() -> int:
+        slots = store.tree.sample(DRAWN, rng)
+        store.ring.gather(slots, out)
+        store.set_priorities(slots, priorities)
+        return 1
+
+    return draw
+
+
+def _spec(steps: int) -> WindowSpec:
+    obs_dim, action_dim, _ = env_spaces(ENV)
+    default = robust(ENV).window_spec()
+    return WindowSpec(obs_dim, action_dim, default.hidden, default.burn_in, steps - default.burn_in)
+
+
+def _learning(name: str, spec: WindowSpec, size: int, rounds: int, seconds: float) -> list[Row]:
+    """The whole role on one core: updates a second, and trained steps a second."""
+    with _learner(spec, size) as role:
+        speed(lambda: int(role.step()), 1.0)
+        updates = compare(name, "updates/s", lambda: speed(lambda: int(role.step()), seconds), {}, rounds=rounds)
+    return [*updates, *(_in_steps(row, size * spec.train) for row in updates)]
+
+
+def _in_steps(row: Row, steps: int) -> Row:
+    """The same measurement in trained steps."""
+    spread = {key: (least * steps, largest * steps) for key, (least, largest) in row.spread.items()}
+    facts = vars(row) | {"name": f"{row.name}, trained", "unit": "steps/s", "ours": row.ours * steps, "spread": spread}
+    return Row(**facts)
+
+
+@contextmanager
+def _learner(spec: WindowSpec, size: int) -> Iterator[Learner]:
+    """One that draws from a real replay server on the other core."""
+    run = robust(ENV)
+    config = LearnerConfig(batch_size=size, checkpoint_steps=ENDLESS, importance_exponent=0.0)
+    with (
+        replay_process(spec, ReplayConfig(replay_ratio=1e9, warmup_steps=0)) as bus,
+        tempfile.TemporaryDirectory() as at,
+    ):
+        _push(bus, spec)
+        address = bus.replay_address("replay")
+        assert address is not None
+        client = ReplayClient(lambda: address.address, SECRET, spec, size)
+        role = Learner(spec, run.agent, run.update, config, client, bus, CheckpointFolder(Path(at)), 0)
+        yield role
+        role.finished = True  # nothing to save
+        role.close()
+        client.close()
+
+
+def _push(bus: RedisBus, spec: WindowSpec) -> None:
+    """Fill the replay; returns once all is committed."""
+    payload = encode_windows(random_rows(spec, CHUNK), spec)
+    bus.append(0, EntryId(1, 0), encode_hello(spec))
+    for seq in range(1, ENTRIES + 1):
+        bus.append(0, EntryId(1, seq), payload)
+    while (ack := bus.ack(0)) is None or ack.id < EntryId(1, ENTRIES):
+        pass
+
+
+def slopes(table: Table) -> list[str]:
+    """Lines for people: each size with the slope from the one before, and where it bends most."""
+    lines = []
+    for series in zip(*(rows for _, rows in table), strict=True):
+        points = [(math.log(size), math.log(row.ours)) for (size, _), row in zip(table, series, strict=True)]
+        found = [(v - y) / (u - x) for (x, y), (u, v) in pairwise(points)]
+        for (size, _), row, slope in zip(table, series, [math.nan, *found], strict=True):
+            lines.append(f"{size:>9,} {row.ours:14,.1f} {row.unit:10s} slope {slope:6.2f}")
+        bends = [abs(after - before) for before, after in pairwise(found)]
+        whole = (points[-1][1] - points[0][1]) / (points[-1][0] - points[0][0])
+        lines.append(f"slope over all {whole:.2f}; bends most at {table[1 + int(np.argmax(bends))][0]:,}")
+    return lines
+
+
+def main() -> None:
+    tables = {"actors": actors, "batch": batch, "ring": ring, "window": window}
+    parser = harness.parser(__doc__)
+    parser.add_argument("what", nargs="*", default=list(tables), help=", ".join(tables))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    for name in options.what:
+        table = tables[name](options.rounds, options.seconds)
+        harness.save([row for _, rows in table for row in rows])
+        print(*slopes(table), sep="\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()
