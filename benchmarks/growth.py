@@ -8,8 +8,8 @@ offers 1 000 windows a second, more than a real one; they share the machine's co
 
 import math
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,22 +17,15 @@ import numpy as np
 import torch
 
 from benchmarks import harness
-from benchmarks.harness import ENDLESS, SECRET, Row, compare, random_rows, replay_process, speed
-from benchmarks.scaling import CHUNK, measure
-from common.bus import EntryId
-from common.checkpoint import CheckpointFolder
-from common.envs import EnvConfig, env_spaces
-from common.redis_bus import RedisBus
+from benchmarks.harness import Row, compare, random_rows, speed
+from benchmarks.learner import learner_role, replay_of
+from benchmarks.scaling import measure
+from common.envs import EnvConfig
 from common.window import WindowSpec
-from common.wire import encode_hello, encode_windows
-from deploy.presets import robust
-from learner.learner import Learner, LearnerConfig
-from learner.replay_client import ReplayClient
+from deploy.presets import RunConfig, robust
 from replay_server.recovery import open_store
-from replay_server.server import ReplayConfig
 
 ENV = EnvConfig("HalfCheetah-v5")
-ENTRIES = 300  # of windows, in the replay before the learner draws
 SMALL = WindowSpec(obs_dim=4, action_dim=1, hidden=8, burn_in=2, train=3)  # a million of them fit the memory
 DRAWN = 256  # windows, of the ring
 OFFERED = 1_000.0  # windows a second, by each simulated actor
@@ -52,16 +45,17 @@ def actors(rounds: int, seconds: float) -> Table:
 
 def batch(rounds: int, seconds: float) -> Table:
     """Updates a second, and the trained steps in them."""
-    spec = robust(ENV).window_spec()
-    return [(size, _learning(f"growth, batch {size}", spec, size, rounds, seconds)) for size in (32, 64, 128, 256, 512)]
+    run, sizes = robust(ENV), (32, 64, 128, 256, 512)
+    return [(size, _learning(f"growth, batch {size}", run, size, rounds, seconds)) for size in sizes]
 
 
 def window(rounds: int, seconds: float) -> Table:
     """Updates a second at the default batch."""
-    size, table = robust(ENV).learner.batch_size, []
+    run, table = robust(ENV), []
     for steps in (25, 50, 75, 100):
-        spec = _spec(steps)
-        table.append((steps, _learning(f"growth, windows of {steps} steps", spec, size, rounds, seconds)))
+        longer = replace(run, window=replace(run.window, trained_steps=steps - run.window.burn_in))
+        name = f"growth, windows of {steps} steps"
+        table.append((steps, _learning(name, longer, run.learner.batch_size, rounds, seconds)))
     return table
 
 
@@ -94,18 +88,12 @@ def _filled(folder: Path, capacity: int) -> Callable[[], int]:
     return draw
 
 
-def _spec(steps: int) -> WindowSpec:
-    obs_dim, action_dim, _ = env_spaces(ENV)
-    default = robust(ENV).window_spec()
-    return WindowSpec(obs_dim, action_dim, default.hidden, default.burn_in, steps - default.burn_in)
-
-
-def _learning(name: str, spec: WindowSpec, size: int, rounds: int, seconds: float) -> list[Row]:
+def _learning(name: str, run: RunConfig, size: int, rounds: int, seconds: float) -> list[Row]:
     """The whole role on one core: updates a second, and trained steps a second."""
-    with _learner(spec, size) as role:
+    with replay_of(run) as bus, learner_role(run, bus, size, "auto") as role:
         speed(lambda: int(role.step()), 1.0)
         updates = compare(name, "updates/s", lambda: speed(lambda: int(role.step()), seconds), {}, rounds=rounds)
-    return [*updates, *(_in_steps(row, size * spec.train) for row in updates)]
+    return [*updates, *(_in_steps(row, size * run.window.trained_steps) for row in updates)]
 
 
 def _in_steps(row: Row, steps: int) -> Row:
@@ -113,36 +101,6 @@ def _in_steps(row: Row, steps: int) -> Row:
     spread = {key: (least * steps, largest * steps) for key, (least, largest) in row.spread.items()}
     facts = vars(row) | {"name": f"{row.name}, trained", "unit": "steps/s", "ours": row.ours * steps, "spread": spread}
     return Row(**facts)
-
-
-@contextmanager
-def _learner(spec: WindowSpec, size: int) -> Iterator[Learner]:
-    """One that draws from a real replay server on the other core."""
-    run = robust(ENV)
-    config = LearnerConfig(batch_size=size, checkpoint_steps=ENDLESS, importance_exponent=0.0)
-    with (
-        replay_process(spec, ReplayConfig(replay_ratio=1e9, warmup_steps=0)) as bus,
-        tempfile.TemporaryDirectory() as at,
-    ):
-        _push(bus, spec)
-        address = bus.replay_address("replay")
-        assert address is not None
-        client = ReplayClient(lambda: address.address, SECRET, spec, size)
-        role = Learner(spec, run.agent, run.update, config, client, bus, CheckpointFolder(Path(at)), 0)
-        yield role
-        role.finished = True  # nothing to save
-        role.close()
-        client.close()
-
-
-def _push(bus: RedisBus, spec: WindowSpec) -> None:
-    """Fill the replay; returns once all is committed."""
-    payload = encode_windows(random_rows(spec, CHUNK), spec)
-    bus.append(0, EntryId(1, 0), encode_hello(spec))
-    for seq in range(1, ENTRIES + 1):
-        bus.append(0, EntryId(1, seq), payload)
-    while (ack := bus.ack(0)) is None or ack.id < EntryId(1, ENTRIES):
-        pass
 
 
 def slopes(table: Table) -> list[str]:

@@ -30,7 +30,7 @@ from benchmarks.harness import (
     replay_process,
     save,
     speed,
-)  # fmt: skip
+)
 from benchmarks.sender import CHUNK, Sender
 from common.agent import Agent
 from common.checkpoint import CheckpointFolder
@@ -44,13 +44,25 @@ from learner.replay_client import ReplayClient
 from learner.update import make_update
 from replay_server.server import ReplayConfig
 
-PRECISIONS: tuple[Literal["bf16", "fp32"], ...] = ("bf16", "fp32")
+Precision = Literal["auto", "bf16", "fp32"]
+PRECISIONS: tuple[Precision, ...] = ("bf16", "fp32")
 WINDOWS = 4800  # in the ring
 SAC_BATCH = 256
 
 
 @contextmanager
-def _role(run: RunConfig, bus: RedisBus, batch_size: int, precision: Literal["bf16", "fp32"]) -> Iterator[Learner]:
+def replay_of(run: RunConfig) -> Iterator[RedisBus]:
+    """A replay server with windows to draw, as fast as it is asked."""
+    with replay_process(run.window_spec(), ReplayConfig(replay_ratio=1e9, warmup_steps=0)) as bus:
+        sender = Sender(bus, run.window_spec())
+        for _ in range(WINDOWS // CHUNK):
+            sender.send()
+        sender.wait()
+        yield bus
+
+
+@contextmanager
+def learner_role(run: RunConfig, bus: RedisBus, batch_size: int, precision: Precision) -> Iterator[Learner]:
     spec, address = run.window_spec(), bus.replay_address("replay")
     assert address is not None
     config = LearnerConfig(batch_size=batch_size, checkpoint_steps=ENDLESS, precision=precision)
@@ -63,7 +75,7 @@ def _role(run: RunConfig, bus: RedisBus, batch_size: int, precision: Literal["bf
     client.close()
 
 
-def _bare(run: RunConfig, batch_size: int, precision: Literal["bf16", "fp32"], seconds: float) -> Measure:
+def _bare(run: RunConfig, batch_size: int, precision: Precision, seconds: float) -> Measure:
     """Forward and backward on one batch in place."""
     spec = run.window_spec()
     agent = Agent(spec.obs_dim, spec.action_dim, run.agent)
@@ -84,13 +96,13 @@ def measure(
     run: RunConfig,
     bus: RedisBus,
     batch_size: int,
-    precision: Literal["bf16", "fp32"],
+    precision: Precision,
     sac: dict[str, Measure | None],
     seconds: float,
     rounds: int,
 ) -> list[Row]:
     """One batch size in one precision."""
-    with _role(run, bus, batch_size, precision) as role:
+    with learner_role(run, bus, batch_size, precision) as role:
 
         def work() -> int:
             return batch_size * run.window.trained_steps if role.step() else 0
@@ -126,11 +138,7 @@ def main() -> None:
             f"stable-baselines3 SAC, {threads} threads": _sac(stack, spec, threads, options.seconds)
             for threads in (1, 2)
         }
-        bus = stack.enter_context(replay_process(spec, ReplayConfig(replay_ratio=1e9, warmup_steps=0)))
-        sender = Sender(bus, spec)
-        for _ in range(WINDOWS // CHUNK):
-            sender.send()
-        sender.wait()
+        bus = stack.enter_context(replay_of(run))
         for batch_size in options.batches:
             for precision in PRECISIONS:
                 rows += measure(run, bus, batch_size, precision, sac, options.seconds, options.rounds)
