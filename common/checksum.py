@@ -1,4 +1,4 @@
-"""CRC-32 as zlib computes it, by ISA-L where that is installed: 15 times as fast, so that a batch costs 11 us."""
+"""CRC-32 as zlib computes it, by ISA-L where that is installed: 7 times as fast, more within the caches."""
 
 try:
     from isal.isal_zlib import crc32

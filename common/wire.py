@@ -73,20 +73,18 @@ def max_entry_bytes(spec: WindowSpec) -> int:
     return max(MAX_ENTRY_BYTES, spec.dtype.itemsize) + 128
 
 
-def decode_entry(payload: bytes, spec: WindowSpec) -> Rows:
-    """Checked rows of an entry; a hello gives none.
-
-    Raises MessageError with a countable reason; never anything else, whatever the bytes.
-    """
-    rows = decode_rows(payload, spec)
+def check_rows(rows: Rows, spec: WindowSpec) -> None:
+    """Raises MessageError where one of them can be no window of this run."""
     fault = first_fault(rows, spec)
     if fault is not None:
         raise MessageError("window", fault)
-    return rows
 
 
 def decode_rows(payload: bytes, spec: WindowSpec) -> Rows:
-    """``decode_entry`` but for ``first_fault``, which is quicker for the rows of many entries at once."""
+    """Rows of an entry; a hello has none. ``check_rows`` is still to come, quicker for many entries at once.
+
+    Raises MessageError with a countable reason; never anything else, whatever the bytes.
+    """
     if len(payload) > max_entry_bytes(spec):
         raise MessageError("too-large", f"{len(payload)} bytes, at most {max_entry_bytes(spec)}")
     version, kind, fingerprint, count, crc, body = _unpack_entry(payload, spec)

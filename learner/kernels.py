@@ -43,7 +43,7 @@ def _down(x: np.float32) -> np.uint16:
 
 @_compiled
 def _exp(x: np.float32) -> np.float32:
-    """To 2e-7 of itself: 2^k times the series on the rest; libm's has no vector form here."""
+    """To 5e-7 of itself: 2^k times the series on the rest; libm's has no vector form here."""
     x = -EXP_RANGE if x < -EXP_RANGE else x
     x = EXP_RANGE if x > EXP_RANGE else x
     k = np.floor(x * LOG2_E + HALF)

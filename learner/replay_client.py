@@ -247,7 +247,7 @@ class ReplayClient:
         for connection in (self._batches, self._control):
             if connection is not None:
                 with suppress(OSError):
-                    connection.flush()  # the last batch's priorities
+                    connection.flush()  # the last priorities, if the server reads on before it hears of the end
                 connection.close()
         self._batches = self._control = None
 

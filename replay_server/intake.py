@@ -12,7 +12,7 @@ from common.bus import Bus, Entry, EntryId
 from common.errors import BusFull, MessageError
 from common.replay import WHOLE, Shard
 from common.window import Rows, WindowSpec, first_fault
-from common.wire import decode_rows, max_entry_bytes
+from common.wire import check_rows, decode_rows, max_entry_bytes
 from replay_server.record import StreamPosition
 
 ROUND_BYTES = 4 << 20  # read at most about this much in a round, so that the learner is served in between
@@ -116,11 +116,13 @@ class Intake:
             return None
 
     def _checked(self, entry: Entry, body: Rows | None) -> Rows | None:
-        fault = first_fault(body, self.spec) if body is not None else None
-        if fault is None:
-            return body
-        self._refuse(entry, MessageError("window", fault))
-        return None
+        try:
+            if body is not None:
+                check_rows(body, self.spec)
+        except MessageError as error:
+            self._refuse(entry, error)
+            return None
+        return body
 
     def _refuse(self, entry: Entry, error: MessageError) -> None:
         with suppress(BusFull):  # no room for it; the round that frees some must not wait for that

@@ -18,7 +18,7 @@ from common.envs import EnvConfig, make_env
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from common.redis_bus import RedisBus
 from common.window import Rows, WindowSpec
-from common.wire import decode_entry
+from common.wire import decode_rows
 from tests.actors.support import join_rows
 from tests.broken_env import FAULTS
 from tests.counting_env import ACTION_DIM, OBS_DIM, Step, audit
@@ -65,7 +65,7 @@ class Reader:
         self._bus.commit(self._holder, acks)
 
     def rows(self) -> Rows:
-        return join_rows([decode_entry(entry.payload, SPEC) for entry in self.entries], SPEC)
+        return join_rows([decode_rows(entry.payload, SPEC) for entry in self.entries], SPEC)
 
 
 def step_until_blocked(actor: Actor, limit: int = 10_000) -> int:

@@ -93,7 +93,7 @@ def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Pat
 
 def test_the_docs_name_options_that_exist() -> None:
     made = subprocess.run([sys.executable, "-m", "deploy.cli", "train", "--help"], capture_output=True, text=True)
-    others = {"--listen", "--run", "--pairs", "--seconds", "--episodes", "--json", "--checkpoint", "--steps", "--out"}
+    others = {"--listen", "--run", "--seconds", "--episodes", "--json", "--checkpoint", "--steps", "--out"}
     others |= {"--no-restart", "--node-ip-address", "--generate"}  # Ray's own
     others |= {"--folder", "--index", "--secret-file"}  # the roles'
     others |= {"--alone"}  # of benchmarks

@@ -2,6 +2,7 @@
 
 import copy
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -161,6 +162,18 @@ def test_rounding_is_torchs_own():
     out = np.zeros(len(x), np.uint16)
     kernels.lower(x, out)
     assert np.array_equal(out, torch.from_numpy(x).to(torch.bfloat16).view(torch.uint16).numpy())
+
+
+def test_the_exponential_is_right_to_5e_7():
+    @numba.njit
+    def exponentials(x, out):
+        for i in range(x.size):
+            out[i] = kernels._exp(x[i])
+
+    x = np.concatenate([np.linspace(-86.9, 86.9, 20_001), np.linspace(-1.0, 1.0, 5001)]).astype(np.float32)
+    out = np.empty_like(x)
+    exponentials(x, out)
+    assert np.abs(out / np.exp(x.astype(np.float64)) - 1.0).max() < 5e-7
 
 
 def test_gates_saturate_without_overflow():
