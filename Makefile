@@ -78,7 +78,7 @@ docs: $(STAMP)
 	$(BIN)/python -m docs.generate
 
 # Each beside what a user would pick instead, where make peers has installed that. Results: docs/performance.md.
-BENCHMARKS := replay ingest learner actor weights growth memory end-to-end
+BENCHMARKS := replay ingest learner actor weights growth memory cuda end-to-end
 
 bench: $(addprefix bench-,$(BENCHMARKS))
 

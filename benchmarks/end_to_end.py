@@ -3,29 +3,33 @@
     python -m benchmarks.end_to_end [--env ENV] [--goals 2000 4000] [--seeds 1 2 3] [--every 5000]
 
 A goal is reached at the second of two consecutive evaluations above it, each of 5 deterministic episodes, every 5 000
-environment steps; the clock starts with the process. Ours is ``rmc train`` as it comes; SAC has its defaults. Each has
-all cores for itself. One run after another: what
-results/end-to-end.jsonl has already is not run again, so that an interrupted benchmark goes on where it was.
+environment steps; the clock starts with the process. Ours is ``rmc train`` as it comes; SAC has its defaults, and what
+rl-baselines3-zoo found best for this environment: 10 000 random steps before the first update, and the defaults. Each
+has all cores for itself. One run after another: what results/end-to-end.jsonl has already is not run again, so that an
+interrupted benchmark goes on where it was.
 """
 
 import json
+import math
 import signal
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from itertools import pairwise
+from functools import partial
+from itertools import pairwise, product
 from pathlib import Path
 
+from benchmarks import PEER_ENVIRONMENT
 from benchmarks.harness import HERE, Row, command, parser, peer_python, save
 
 CURVES = HERE / "results" / "end-to-end.jsonl"
 EPISODES = 5
 LIMIT_SECONDS = 3600.0
-SAC = "stable-baselines3 SAC, defaults"
+LEARNING_STARTS = {"stable-baselines3 SAC, defaults": 100, "stable-baselines3 SAC, rl-zoo": 10_000}
 Point = tuple[float, float]  # seconds since the command, return
 
 
@@ -44,10 +48,10 @@ def ours(env: str, seed: int, every: int) -> Iterator[Point]:
             _end(process)
 
 
-def sac(python: Path, env: str, seed: int, every: int) -> Iterator[Point]:
+def sac(python: Path, learning_starts: int, env: str, seed: int, every: int) -> Iterator[Point]:
     """The same of the peer, which prints a line for each."""
     began, script = time.time(), str(HERE / "peers" / "sb3_end_to_end.py")
-    process = _started([str(python), script, env, str(seed), str(every), str(EPISODES)])
+    process = _started([str(python), script, env, *map(str, (seed, every, EPISODES, learning_starts))])
     assert process.stdout is not None
     try:
         for line in process.stdout:
@@ -58,7 +62,7 @@ def sac(python: Path, env: str, seed: int, every: int) -> Iterator[Point]:
 
 
 def _started(words: list[str]) -> subprocess.Popen[str]:
-    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=PEER_ENVIRONMENT)
 
 
 def _end(process: subprocess.Popen[str]) -> None:
@@ -111,16 +115,18 @@ def _known(key: dict[str, object]) -> list[Point] | None:
     return None
 
 
-def _row(env: str, goal: float, times: dict[str, list[float | None]], seeds: int) -> Row:
-    """Medians over the seeds; a seed that did not get there counts as one that never does."""
-    found = {who: [float("inf") if one is None else one for one in all_] for who, all_ in times.items()}
-    middle = {who: statistics.median(all_) for who, all_ in found.items()}
-    theirs = middle.get(SAC)
-    spread = {
-        name: (min(found[who]), max(found[who])) for name, who in (("ours", "ours"), ("peer", SAC)) if who in found
-    }
-    ratio = None if theirs is None else theirs / middle["ours"]
-    return Row(f"time to {goal:g}, {env}", "s", middle["ours"], SAC, theirs, ratio, None, "", spread, seeds, command())
+def _rows(env: str, goal: float, times: dict[str, list[float]], seeds: int) -> list[Row]:
+    """Medians over the seeds, a row a peer; a seed that did not get there counts as one that never does."""
+    middle = {who: statistics.median(all_) for who, all_ in times.items()}
+    range_ = {who: (min(all_), max(all_)) for who, all_ in times.items()}
+    rows = []
+    for peer in LEARNING_STARTS:
+        theirs = middle.get(peer)
+        ratio = None if theirs is None else theirs / middle["ours"]
+        spread = {"ours": range_["ours"]} | ({"peer": range_[peer]} if peer in range_ else {})
+        name = f"time to {goal:g}, {env}"
+        rows.append(Row(name, "s", middle["ours"], peer, theirs, ratio, None, "", spread, seeds, command()))
+    return rows
 
 
 def main() -> None:
@@ -131,23 +137,22 @@ def main() -> None:
     made.add_argument("--every", type=int, default=5000, help="environment steps between evaluations")
     options = made.parse_args()
     python = peer_python("peers")
-    curves: dict[str, list[list[Point]]] = {}
-    for seed in options.seeds:
-        for who in ("ours", *([SAC] if python else [])):
-            key = {"who": who, "env": options.env, "seed": seed, "every": options.every}
-            points = _known(key)
-            if points is None:
-                print(f"{who}, seed {seed}", flush=True)
-                source = ours if who == "ours" else (lambda *words: sac(python, *words))  # type: ignore[arg-type]
-                points = run(source(options.env, seed, options.every), options.goals)
-                with CURVES.open("a") as file:
-                    file.write(json.dumps({**key, "time": time.strftime("%Y-%m-%d %H:%M"), "points": points}) + "\n")
-            curves.setdefault(who, []).append(points)
-    rows = []
+    runners: dict[str, Callable[[str, int, int], Iterator[Point]]] = {"ours": ours}
+    if python:
+        runners |= {peer: partial(sac, python, starts) for peer, starts in LEARNING_STARTS.items()}
+    curves: dict[str, list[list[Point]]] = {who: [] for who in runners}
+    for seed, who in product(options.seeds, runners):
+        key = {"who": who, "env": options.env, "seed": seed, "every": options.every}
+        points = _known(key)
+        if points is None:
+            print(f"{who}, seed {seed}", flush=True)
+            points = run(runners[who](options.env, seed, options.every), options.goals)
+            with CURVES.open("a") as file:
+                file.write(json.dumps({**key, "time": time.strftime("%Y-%m-%d %H:%M"), "points": points}) + "\n")
+        curves[who].append(points)
     for goal in options.goals:
-        times = {who: [reached(points, goal) for points in all_] for who, all_ in curves.items()}
-        rows.append(_row(options.env, goal, times, len(options.seeds)))
-    save(rows)
+        times = {who: [reached(points, goal) or math.inf for points in all_] for who, all_ in curves.items()}
+        save(_rows(options.env, goal, times, len(options.seeds)))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from types import TracebackType
 
 import numpy as np
 
+from benchmarks import PEER_ENVIRONMENT
 from common.redis_bus import RedisBus
 from common.window import Rows, WindowSpec
 from deploy.redis_server import RedisServer
@@ -146,7 +147,9 @@ class Peer:
     def __init__(self, python: Path, script: str, *words: str) -> None:
         command = [str(python), str(HERE / "peers" / f"{script}.py"), *words]
         pipe = subprocess.PIPE
-        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
+        self._process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, text=True, start_new_session=True, env=PEER_ENVIRONMENT
+        )
         self._answer()
 
     def measure(self, seconds: float) -> float:

@@ -20,11 +20,11 @@ Every Redis key, R = ``rmc:{run}``:
 | R:dead                  | stream | replay   | refused entries: actor, id, reason, first 1 KiB; 1 000   |
 """
 
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+from common.checksum import crc32
 from common.errors import BusUnavailable, FencedError, MessageError
 
 METRICS_KEPT = 20_000  # records, at least
@@ -315,6 +315,6 @@ def join_pieces(pieces: Sequence[bytes | None], crc: int) -> bytes:
     if any(piece is None for piece in pieces):
         raise MessageError("weights", "a piece is gone: a newer version has replaced this one")
     blob = b"".join(piece for piece in pieces if piece is not None)
-    if zlib.crc32(blob) != crc:
+    if crc32(blob) != crc:
         raise MessageError("crc", "weights")
     return blob

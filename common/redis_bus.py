@@ -1,7 +1,6 @@
 """The bus over Redis: unix socket, TCP or TLS; the keys stand in ``common/bus.py``."""
 
 import re
-import zlib
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -11,6 +10,7 @@ from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
 from common.bus import METRICS_KEPT, Ack, Entry, EntryId, Holder, ReplayAddress, Version, join_pieces, split_pieces
+from common.checksum import crc32
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
 from common.pending_read import PendingRead
 
@@ -225,7 +225,7 @@ class RedisBus:
 
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
         pieces = split_pieces(blob)
-        head = f"{version.epoch} {version.update} {len(pieces)} {zlib.crc32(blob)}"
+        head = f"{version.epoch} {version.update} {len(pieces)} {crc32(blob)}"
         for index, piece in enumerate(pieces):  # one call each: a pipeline would join them into one blob again
             key = self._key("weights", version.epoch, version.update, index)
             self._call(self._redis.set, key, piece)

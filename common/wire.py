@@ -29,6 +29,9 @@ MAX_ENTRY_BYTES = 1 << 20  # 1 MiB: a chunk never grows past it, unless one wind
 MAX_META_BYTES = 1 << 20
 WINDOWS, HELLO = 1, 2
 _FINGERPRINT_LENGTH = 16
+_BEFORE_BODY = (int, int, str, int, int)  # version, kind, fingerprint, count, crc32
+_BEFORE_BODY_BYTES = 64  # more than they ever take
+_BIN_LENGTHS = {0xC4: ">B", 0xC5: ">H", 0xC6: ">I"}  # of msgpack's bin 8, 16 and 32, by their first byte
 
 
 class Kind(IntEnum):
@@ -87,7 +90,7 @@ def decode_rows(payload: bytes, spec: WindowSpec) -> Rows:
     """
     if len(payload) > max_entry_bytes(spec):
         raise MessageError("too-large", f"{len(payload)} bytes, at most {max_entry_bytes(spec)}")
-    version, kind, fingerprint, count, crc, body = _unpack_entry(payload, spec)
+    version, kind, fingerprint, count, crc, body = _unpack_entry(payload)
     if version != VERSION:
         raise MessageError("version", f"{version}, this side speaks {VERSION}")
     if fingerprint != spec.fingerprint:
@@ -101,27 +104,40 @@ def decode_rows(payload: bytes, spec: WindowSpec) -> Rows:
     return np.frombuffer(body, dtype=spec.dtype)
 
 
-def _unpack_entry(payload: bytes, spec: WindowSpec) -> tuple[int, int, str, int, int, bytes]:
+def _unpack_entry(payload: bytes) -> tuple[int, int, str, int, int, memoryview]:
+    """The six fields; the body, all but a few bytes of it, stays where it is."""
+    unpacker = msgpack.Unpacker(
+        raw=False,
+        strict_map_key=True,
+        max_array_len=6,
+        max_map_len=0,
+        max_str_len=_FINGERPRINT_LENGTH,
+        max_bin_len=0,
+        max_ext_len=0,
+    )
     try:
-        fields = msgpack.unpackb(
-            payload,
-            raw=False,
-            strict_map_key=True,
-            max_array_len=6,
-            max_map_len=0,
-            max_str_len=_FINGERPRINT_LENGTH,
-            max_bin_len=max_entry_bytes(spec),
-            max_ext_len=0,
-        )
+        unpacker.feed(payload[:_BEFORE_BODY_BYTES])
+        count = unpacker.read_array_header()
+        fields = [unpacker.unpack() for _ in range(min(count, len(_BEFORE_BODY)))]
     except Exception as error:  # msgpack raises several unrelated classes on hostile bytes
         raise MessageError("msgpack", type(error).__name__) from None
-    types = (int, int, str, int, int, bytes)
-    if not isinstance(fields, list) or len(fields) != len(types):
+    if count != len(_BEFORE_BODY) + 1:
         raise MessageError("structure", "not a list of six")
-    if any(type(field) is not kind for field, kind in zip(fields, types, strict=True)):
+    if any(type(field) is not kind for field, kind in zip(fields, _BEFORE_BODY, strict=True)):
         raise MessageError("structure", "a field has the wrong type")
-    version, kind, fingerprint, count, crc, body = fields
-    return version, kind, fingerprint, count, crc, body
+    version, kind, fingerprint, rows, crc = fields
+    return version, kind, fingerprint, rows, crc, _binary(memoryview(payload)[unpacker.tell() :])
+
+
+def _binary(packed: memoryview) -> memoryview:
+    """What a msgpack ``bin`` holds that ends where these bytes do."""
+    length = struct.Struct(_BIN_LENGTHS.get(packed[0], "")) if len(packed) else struct.Struct("")
+    if not length.size:
+        raise MessageError("structure", "the body is not binary")
+    body = packed[1 + length.size :]
+    if len(packed) < 1 + length.size or length.unpack(packed[1 : 1 + length.size])[0] != len(body):
+        raise MessageError("length", f"{len(body)} bytes of body, not what its length says")
+    return body
 
 
 class FrameHeader(NamedTuple):

@@ -5,11 +5,12 @@ Shapes: B rows, H units of a GRU, N rows and K units of a head's layer.
 """
 
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import TypeVar
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from common.compiled import compiled
 
 Bits = NDArray[np.uint16]  # bfloat16
 Floats = NDArray[np.float32]
@@ -22,11 +23,7 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}  # all of fastmath but the promise
 
 
 def _compiled(function: FunctionT) -> FunctionT:
-    """With its machine code kept beside this file, or compiled at every start where that cannot be written."""
-    try:
-        return cast(FunctionT, numba.njit(cache=True, fastmath=FAST, error_model="numpy", nogil=True)(function))
-    except RuntimeError:
-        return cast(FunctionT, numba.njit(fastmath=FAST, error_model="numpy", nogil=True)(function))
+    return compiled(function, FAST)
 
 
 @_compiled

@@ -5,12 +5,15 @@ import json
 import logging
 import pickle
 import time
+from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 import safetensors.torch
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from common.agent import Agent, AgentConfig
@@ -20,8 +23,10 @@ from common.errors import CheckpointError, FencedError, RmcError
 from common.metrics import Means, Rate
 from common.replay import Draw, Replay, Sample
 from common.window import Rows, WindowSpec
-from learner.batch import Batch, clear_padding, importance_weights, view_batch
+from learner.batch import clear_padding, importance_weights
+from learner.cuda_graph import HostCopy
 from learner.staleness import SLICE, measurable, staleness
+from learner.static_update import StaticUpdate
 from learner.update import UpdateConfig, Updated, make_update
 
 log = logging.getLogger(__name__)
@@ -92,7 +97,8 @@ class Learner:
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent).to(self.device)
         bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_is_native(self.device))
         self.update = make_update(self.agent, spec.burn_in, update, seed, bf16)
-        self.beta = torch.zeros((), device=self.device)
+        self._updated = StaticUpdate(self.update, spec, config.batch_size)
+        self._returning: deque[tuple[NDArray[np.int64], HostCopy]] = deque()  # priorities, and of which windows
         checkpoints.lock()
         floor = self._resume()
         self.epoch = bus.take_epoch(self.name, floor)
@@ -106,6 +112,8 @@ class Learner:
             self._broadcast(evaluate=True)
         sample = self.replay.sample(self.config.batch_size)
         self.env_steps = max(self.env_steps, sample.env_steps)
+        if sample.draw is not Draw.BATCH:
+            self._return_priorities(leave=0)
         if sample.draw is Draw.WAIT:
             self._waiting = "experience"
             self._publish_if_forgotten()
@@ -124,23 +132,24 @@ class Learner:
         return True
 
     def _learn(self, sample: Sample) -> None:
-        assert sample.rows is not None
-        self.beta.fill_(self.update.config.beta(self.env_steps))
-        updated = self.update(self._to_device(sample), self.beta)
-        self.updates += 1
-        self.replay.update_priorities(sample.rows["serial"].copy(), updated.priorities.cpu().numpy())
-        self._measure(updated)
-        self._measure_age(sample.rows)
-
-    def _to_device(self, sample: Sample) -> Batch:
         rows, values = sample.rows, sample.values
         assert rows is not None
         assert values is not None
         clear_padding(rows, self.spec)
         weights = importance_weights(values, sample.mass, sample.windows, self.config.importance_exponent)
-        raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1)).to(self.device, non_blocking=True)
-        importance = torch.from_numpy(weights).to(self.device, non_blocking=True)
-        return view_batch(raw, importance, self.spec)
+        raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
+        updated = self._updated(raw, torch.from_numpy(weights), self.update.config.beta(self.env_steps))
+        self.updates += 1
+        self._returning.append((rows["serial"].copy(), HostCopy(updated.priorities)))
+        self._return_priorities(leave=self._updated.in_flight)
+        self._measure(updated)
+        self._measure_age(rows)
+
+    def _return_priorities(self, leave: int) -> None:
+        """To the replay server, but for the newest so many, which a GPU still works on."""
+        while len(self._returning) > leave:
+            serials, priorities = self._returning.popleft()
+            self.replay.update_priorities(serials, priorities.wait().numpy())
 
     def _measure(self, updated: Updated) -> None:
         if self.updates % METRICS_UPDATES == 0:

@@ -5,6 +5,7 @@ Nothing here waits for the host: no ``.item()``, no branch on a tensor, static s
 """
 
 import copy
+import zlib
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -242,9 +243,19 @@ class JointUpdate:
         self.target_critic.load_state_dict(state["target_critic"])
         self.target_memory.load_state_dict(state["target_memory"])
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
+            capturable = optimizer.defaults["capturable"]
             optimizer.load_state_dict(saved)
+            for group in optimizer.param_groups:
+                group["capturable"] = capturable  # of this device, whatever wrote the checkpoint
         self.curiosity_variance.copy_(state["curiosity_variance"])
-        self.generator.set_state(state["generator"].cpu())
+        self._resume_noise(state["generator"].cpu())
+
+    def _resume_noise(self, state: Tensor) -> None:
+        """Bit for bit on the kind of device that saved it, with other numbers on another."""
+        if state.shape == self.generator.get_state().shape:
+            self.generator.set_state(state)
+        else:
+            self.generator.manual_seed(zlib.crc32(state.numpy().tobytes()))
 
 
 class AlternateUpdate(JointUpdate):
@@ -312,7 +323,8 @@ def _adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
         {"params": networks, "lr": config.learning_rate},
         {"params": [agent.log_alpha] if "log_alpha" in parts else [], "lr": config.alpha_learning_rate},
     ]
-    return torch.optim.Adam([group for group in groups if group["params"]], fused=True)
+    on_gpu = agent.log_alpha.device.type == "cuda"
+    return torch.optim.Adam([group for group in groups if group["params"]], fused=True, capturable=on_gpu)
 
 
 def _unexplained(predicted: Tensor, change: Tensor, m: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ from common.replay import EPISODE_BYTES, WHOLE, Draw, ObservationStatistics, Sam
 from common.window import Rows, WindowSpec
 from replay_server.episode import find_episode
 from replay_server.intake import Intake, Round
+from replay_server.observation_sums import observation_sums
 from replay_server.rate_limiter import RateLimiter
 from replay_server.record import decode_published
 from replay_server.recovery import open_store, valid_leaves
@@ -52,14 +53,6 @@ class ReplayConfig:
             raise ConfigError("--warmup-steps", self.warmup_steps, "take 0 or more")
         if not 0.0 <= self.priority_exponent <= 4.0:
             raise ConfigError("--priority-exponent", self.priority_exponent, "take 0 (uniform) to 4")
-
-
-def observation_sums(rows: Rows, spec: WindowSpec) -> ObservationStatistics:
-    """Sums over the observations that no earlier window carried and that are not blank; padding is never read."""
-    t, last = np.arange(spec.observations), rows["last"][:, None]
-    new = (t > last - rows["new_observations"][:, None]) & (t <= last) & (rows["blank"] == 0)
-    seen = rows["observation"][new].astype(np.float64)
-    return ObservationStatistics(len(seen), seen.sum(0), np.einsum("no,no->o", seen, seen))
 
 
 class ReplayServer:

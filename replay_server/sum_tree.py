@@ -5,18 +5,17 @@ Parents are recomputed from their children, never incremented, so no rounding er
 tree rebuilt from the same leaves has the same bits.
 """
 
-from collections.abc import Callable
-from functools import cache
-from typing import cast
-
 import numpy as np
 from numpy.typing import NDArray
+
+from common.compiled import compiled
 
 Values = NDArray[np.float64]
 Slots = NDArray[np.int64]
 
 
-def _set_loop(nodes: Values, size: int, slots: Slots, values: Values) -> None:
+@compiled
+def _set(nodes: Values, size: int, slots: Slots, values: Values) -> None:
     for i in range(slots.shape[0]):
         nodes[size + slots[i]] = values[i]
     for i in range(slots.shape[0]):
@@ -26,7 +25,8 @@ def _set_loop(nodes: Values, size: int, slots: Slots, values: Values) -> None:
             node //= 2
 
 
-def _find_loop(nodes: Values, size: int, positions: Values, slots: Slots) -> None:
+@compiled
+def _find(nodes: Values, size: int, positions: Values, slots: Slots) -> None:
     for i in range(positions.shape[0]):
         node, position = 1, positions[i]
         while node < size:
@@ -38,55 +38,14 @@ def _find_loop(nodes: Values, size: int, positions: Values, slots: Slots) -> Non
         slots[i] = node - size
 
 
-def _set_vectorised(nodes: Values, size: int, slots: Slots, values: Values) -> None:
-    node = size + slots
-    nodes[node] = values
-    while size > 1:
-        node, size = node // 2, size // 2
-        nodes[node] = nodes[2 * node] + nodes[2 * node + 1]
-
-
-def _find_vectorised(nodes: Values, size: int, positions: Values, slots: Slots) -> None:
-    node = np.ones(len(positions), np.int64)
-    for _ in range(size.bit_length() - 1):
-        node = 2 * node
-        left = nodes[node]
-        right = (positions >= left) & (nodes[node + 1] > 0.0)
-        positions = np.where(right, positions - left, positions)
-        node = node + right
-    slots[:] = node - size
-
-
-_SetKernel = Callable[[Values, int, Slots, Values], None]
-_FindKernel = Callable[[Values, int, Values, Slots], None]
-
-
-@cache
-def compiled_kernels() -> tuple[_SetKernel, _FindKernel] | None:
-    """Both loops by numba, or None where numba is not installed."""
-    try:
-        import numba
-    except ImportError:
-        return None
-    try:
-        compiler = numba.njit(cache=True)
-        return cast(_SetKernel, compiler(_set_loop)), cast(_FindKernel, compiler(_find_loop))
-    except RuntimeError:  # nowhere to keep the compiled code: compile at every start
-        compiler = numba.njit()
-        return cast(_SetKernel, compiler(_set_loop)), cast(_FindKernel, compiler(_find_loop))
-
-
 class SumTree:
     """Non-negative values of ``capacity`` slots; all 0 at first. Not thread-safe."""
 
-    def __init__(self, capacity: int, compiled: bool = True) -> None:
-        """``compiled=False`` takes the numpy kernels, which give the same bits 15 times slower."""
+    def __init__(self, capacity: int) -> None:
         self.size = 1 << max(capacity - 1, 1).bit_length()
         self._nodes: Values = np.zeros(2 * self.size)
-        kernels = compiled_kernels() if compiled else None
-        self._set, self._find = kernels or (_set_vectorised, _find_vectorised)
         self.set(np.zeros(1, np.int64), np.zeros(1))  # compiles both now, not amid a run
-        self._find(self._nodes, self.size, np.zeros(1), np.zeros(1, np.int64))
+        _find(self._nodes, self.size, np.zeros(1), np.zeros(1, np.int64))
 
     @property
     def total(self) -> float:
@@ -95,7 +54,7 @@ class SumTree:
 
     def set(self, slots: Slots, values: Values) -> None:
         """Give (B,) slots new values; of a slot named twice, the last counts."""
-        self._set(self._nodes, self.size, slots, values)
+        _set(self._nodes, self.size, slots, values)
 
     def values(self, slots: Slots) -> Values:
         """Values of (B,) slots."""
@@ -114,7 +73,7 @@ class SumTree:
     def find(self, positions: Values) -> Slots:
         """The slot at which the running sum of values passes each of (B,) positions in [0, total)."""
         slots = np.empty(len(positions), np.int64)
-        self._find(self._nodes, self.size, positions, slots)
+        _find(self._nodes, self.size, positions, slots)
         return slots
 
     def sample(self, batch_size: int, random: np.random.Generator) -> Slots:

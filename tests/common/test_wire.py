@@ -24,6 +24,12 @@ def test_windows_round_trip():
     assert (decode(wire.encode_windows(rows, SPEC)) == rows).all()
 
 
+@pytest.mark.parametrize("windows", [1, 2, 300])  # bodies of another kind of msgpack's binaries
+def test_bodies_of_any_size_come_back(windows):
+    rows = random_rows(windows)
+    assert np.array_equal(decode(wire.encode_windows(rows, SPEC)), rows)
+
+
 def test_hello_carries_no_rows():
     assert len(decode(wire.encode_hello(SPEC))) == 0
 
@@ -51,6 +57,13 @@ def repacked(index: int, value: object) -> bytes:
         (repacked(3, -1), "length"),
         (repacked(4, 1), "crc"),
         (msgpack.packb([1, 1, msgpack.ExtType(4, b"x"), 0, 0, b""]), "msgpack"),
+        (msgpack.packb([1, 1, [[[]]], 0, 0, b""]), "structure"),
+        (msgpack.packb([1, 1, "x" * 100, 0, 0, b""]), "msgpack"),
+        (repacked(5, "text" * 9), "structure"),
+        (wire.encode_windows(random_rows(2), SPEC) + b"more", "length"),
+        (wire.encode_windows(random_rows(2), SPEC)[:-1], "length"),
+        (wire.encode_hello(SPEC)[:-1], "length"),
+        (wire.encode_hello(SPEC)[:-2], "structure"),
     ],
 )
 def test_refusals_name_their_reason(payload, reason):

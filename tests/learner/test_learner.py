@@ -179,3 +179,17 @@ def test_latent_rank_sees_a_collapse():
     assert one == pytest.approx(1.0, abs=0.01)
     assert deviation > 0.5
     assert latent_rank(torch.ones(4, 5, 16))[1] == 0.0
+
+
+def test_priorities_of_what_a_gpu_still_works_on_come_later_but_come(setting, monkeypatch):
+    setting.feed(60)
+    setting.learner._updated.in_flight = 1  # as on a GPU
+    returned = []
+    monkeypatch.setattr(setting.server, "update_priorities", lambda serials, _: returned.append(serials))
+    assert setting.learner.step()
+    assert returned == []
+    assert setting.learner.step()
+    assert len(returned) == 1
+    while setting.learner.step():
+        pass
+    assert len(returned) == setting.learner.updates

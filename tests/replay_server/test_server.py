@@ -11,7 +11,8 @@ from common.errors import BusUnavailable, ConfigError, FencedError
 from common.redis_bus import RedisBus
 from common.replay import Draw
 from common.wire import encode_windows
-from replay_server.server import ReplayConfig, ReplayServer, observation_sums
+from replay_server.observation_sums import observation_sums
+from replay_server.server import ReplayConfig, ReplayServer
 from tests.learner.rows import observation_valid
 from tests.replay_server.support import SPEC, Sender, make_rows
 

@@ -1,0 +1,73 @@
+"""Updates a second on a GPU: one CUDA graph with batches copied ahead, beside kernels launched one by one.
+
+    python -m benchmarks.cuda [--env ENV] [--batches 64 256] [--rounds N] [--seconds S]
+
+Batches lie ready in pinned memory; both take priorities back to the host. Ends at once where there is no GPU.
+"""
+
+import torch
+
+from benchmarks.harness import Row, compare, parser, random_rows, save, speed
+from common.agent import Agent
+from common.envs import EnvConfig
+from deploy.presets import RunConfig, robust
+from learner.batch import view_batch
+from learner.cuda_graph import HostCopy
+from learner.learner import bf16_is_native
+from learner.static_update import StaticUpdate
+from learner.update import JointUpdate, make_update
+
+CHUNK = 10  # updates between looks at the clock
+
+
+def _update(run: RunConfig) -> JointUpdate:
+    spec, device = run.window_spec(), torch.device("cuda")
+    agent = Agent(spec.obs_dim, spec.action_dim, run.agent).to(device)
+    return make_update(agent, spec.burn_in, run.update, 0, bf16_is_native(device))
+
+
+def measure(run: RunConfig, batch_size: int, seconds: float, rounds: int) -> list[Row]:
+    """One batch size."""
+    spec = run.window_spec()
+    raw = torch.from_numpy(random_rows(spec, batch_size).view("u1").reshape(batch_size, -1)).pin_memory()
+    importance = torch.ones(batch_size).pin_memory()
+    plain, graphed = _update(run), StaticUpdate(_update(run), spec, batch_size)
+    beta = torch.zeros((), device="cuda")
+
+    def one_by_one() -> int:
+        for _ in range(CHUNK):
+            batch = view_batch(raw.to("cuda", non_blocking=True), importance.to("cuda", non_blocking=True), spec)
+            plain(batch, beta).priorities.cpu()
+        return CHUNK
+
+    def as_graph() -> int:
+        before = None
+        for _ in range(CHUNK):
+            updated = graphed(raw, importance, 0.0)
+            if before is not None:
+                before.wait()
+            before = HostCopy(updated.priorities)
+        torch.cuda.synchronize()
+        return CHUNK
+
+    name = f"update on a GPU, {run.env.id}, batch {batch_size}"
+    peers = {"launched kernel by kernel": lambda: speed(one_by_one, seconds)}
+    for work in (one_by_one, as_graph):
+        speed(work, 1.0)
+    return compare(name, "updates/s", lambda: speed(as_graph, seconds), peers, rounds=rounds)
+
+
+def main() -> None:
+    made = parser(__doc__)
+    made.add_argument("--env", default="HalfCheetah-v5")
+    made.add_argument("--batches", type=int, nargs="+", default=[64, 256])
+    options = made.parse_args()
+    if not torch.cuda.is_available():
+        print("PyTorch sees no CUDA device: nothing was measured")
+        return
+    run = robust(EnvConfig(options.env))
+    save([row for size in options.batches for row in measure(run, size, options.seconds, options.rounds)])
+
+
+if __name__ == "__main__":
+    main()

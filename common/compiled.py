@@ -1,0 +1,17 @@
+"""Functions compiled by numba, their machine code kept beside the source where that can be written."""
+
+from collections.abc import Callable, Set
+from typing import TypeVar, cast
+
+import numba
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
+
+
+def compiled(function: FunctionT, fastmath: Set[str] = frozenset()) -> FunctionT:
+    """The same function in machine code. ``fastmath``: liberties that LLVM may take with floating point."""
+    options = {"fastmath": set(fastmath) or False, "error_model": "numpy", "nogil": True}
+    try:
+        return cast(FunctionT, numba.njit(cache=True, **options)(function))
+    except RuntimeError:  # nowhere to keep it: compile at every start
+        return cast(FunctionT, numba.njit(**options)(function))

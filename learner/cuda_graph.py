@@ -1,0 +1,90 @@
+"""What a GPU needs so that it never waits for the host: work as one CUDA graph, copies that go beside it.
+
+An update launches more than a thousand kernels of some microseconds each; a graph launches them by one call.
+"""
+
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+T = TypeVar("T")
+WARM_UP = 3  # calls as they are, in which libraries choose their kernels and Adam makes its moments
+
+
+class CudaGraph(Generic[T]):
+    """A function of tensors that stay where they are: recorded once, after some calls as it is, and replayed."""
+
+    def __init__(self, work: Callable[[], T], generator: torch.Generator) -> None:
+        """``generator`` gives ``work`` its random numbers; a replay takes those after the last one's."""
+        self._work, self._generator, self._warm_up = work, generator, WARM_UP
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._recorded: T | None = None
+        self._stream = torch.cuda.Stream(generator.device)  # type: ignore[no-untyped-call]  # the default one cannot be recorded
+
+    def __call__(self) -> T:
+        """What ``work`` returns; the next call overwrites it."""
+        if self._warm_up:
+            self._warm_up -= 1
+            return self._as_it_is()
+        if self._graph is None:
+            self._record()
+        assert self._graph is not None
+        assert self._recorded is not None
+        self._graph.replay()
+        return self._recorded
+
+    def _as_it_is(self) -> T:
+        current = torch.cuda.current_stream(self._generator.device)
+        self._stream.wait_stream(current)
+        with torch.cuda.stream(self._stream):
+            result = self._work()
+        current.wait_stream(self._stream)
+        return result
+
+    def _record(self) -> None:
+        """Nothing is computed yet: the first replay does that."""
+        self._graph = torch.cuda.CUDAGraph()
+        self._graph.register_generator_state(self._generator)
+        with torch.cuda.graph(self._graph, stream=self._stream):
+            self._recorded = self._work()
+
+
+class CopiesAhead:
+    """Tensors from pinned memory to their places on the device, on the way while the device still works on the last."""
+
+    def __init__(self, places: list[Tensor]) -> None:
+        self._places, self._device = places, places[0].device
+        self._landed = [torch.empty_like(place) for place in places]
+        self._stream = torch.cuda.Stream(self._device)  # type: ignore[no-untyped-call]
+        self._taken = torch.cuda.Event()  # type: ignore[no-untyped-call]
+
+    def __call__(self, tensors: list[Tensor]) -> None:
+        """What is launched after this finds them there; what was launched before still finds the last."""
+        current = torch.cuda.current_stream(self._device)
+        self._stream.wait_event(self._taken)
+        with torch.cuda.stream(self._stream):
+            for landed, tensor in zip(self._landed, tensors, strict=True):
+                landed.copy_(tensor, non_blocking=True)
+        current.wait_stream(self._stream)
+        for place, landed in zip(self._places, self._landed, strict=True):
+            place.copy_(landed)
+        self._taken.record(current)
+
+
+class HostCopy:
+    """A tensor on its way to the host."""
+
+    def __init__(self, tensor: Tensor) -> None:
+        self._host, self._there = tensor, None
+        if tensor.is_cuda:
+            self._host = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
+            self._host.copy_(tensor, non_blocking=True)
+            self._there = torch.cuda.current_stream(tensor.device).record_event()
+
+    def wait(self) -> Tensor:
+        """It, once it is there."""
+        if self._there is not None:
+            self._there.synchronize()
+        return self._host

@@ -1,0 +1,168 @@
+"""The update that reads the same memory every time; what a CUDA graph asks of it, as far as a CPU can say.
+
+A CUDA stream, event and graph can't be had here: they are mocks with the signatures of the real ones.
+"""
+
+from contextlib import nullcontext
+from unittest.mock import MagicMock, call, create_autospec
+
+import numpy as np
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from common.agent import Agent, AgentConfig
+from learner.batch import clear_padding, view_batch
+from learner.cuda_graph import WARM_UP, CopiesAhead, CudaGraph, HostCopy
+from learner.static_update import StaticUpdate
+from learner.update import JointUpdate, UpdateConfig, make_update
+from tests.learner.rows import SPEC, random_rows
+
+EVERYTHING = AgentConfig(
+    hidden=SPEC.hidden, embedding=7, heads=(10, 9), layer_norm=True, shortcut=True, normalize_observations=True
+)
+BATCH = 8
+
+
+def make(order: str = "joint", device: str = "cpu", bf16: bool = False) -> JointUpdate:
+    torch.manual_seed(0)
+    config = UpdateConfig(
+        update_order=order, latent_target="ema", target_memory="ema", curiosity=0.1, curiosity_scale="std", n_step=2
+    )  # type: ignore[arg-type]
+    agent = Agent(SPEC.obs_dim, SPEC.action_dim, EVERYTHING).to(device)
+    return make_update(agent, SPEC.burn_in, config, 3, bf16)
+
+
+def host_batch(seed: int, pinned: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+    rows = random_rows(BATCH, seed)
+    clear_padding(rows, SPEC)
+    raw = torch.from_numpy(rows.view("u1").reshape(BATCH, -1))
+    importance = torch.from_numpy(np.random.default_rng(seed).uniform(0.5, 1.0, BATCH).astype(np.float32))
+    return (raw.pin_memory(), importance.pin_memory()) if pinned else (raw, importance)
+
+
+@pytest.mark.parametrize("order", ["joint", "alternate"])
+def test_it_is_the_same_update(order):
+    plain, update = make(order), make(order)
+    static = StaticUpdate(update, SPEC, BATCH)
+    for step in range(20):
+        raw, importance = host_batch(step)
+        expected = plain(view_batch(raw, importance, SPEC), torch.tensor(0.1 * step))
+        found = static(raw, importance, 0.1 * step)
+        assert torch.equal(found.priorities, expected.priorities)
+        assert all(torch.equal(found.metrics[name], value) for name, value in expected.metrics.items())
+    assert all(map(torch.equal, update.agent.state_dict().values(), plain.agent.state_dict().values()))
+
+
+class OnDevice(TorchDispatchMode):
+    """Fails where an operation reads or makes a tensor on the host."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        for x in tree_leaves((args, kwargs, result)):
+            assert not isinstance(x, torch.Tensor) or x.device.type == "meta", func
+        return result
+
+
+@pytest.mark.parametrize("order", ["joint", "alternate"])
+def test_nothing_in_an_update_waits_for_the_host(order, monkeypatch):
+    """On the device "meta", which has no values: whatever asks for one fails."""
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # meta has none
+    update = make(order)
+    for module in (update.agent, update.target_critic, update.target_memory):
+        module.to("meta")
+    update.curiosity_variance = update.curiosity_variance.to("meta")
+    raw = torch.empty(BATCH, SPEC.dtype.itemsize, dtype=torch.uint8, device="meta")
+    importance, beta = torch.empty(BATCH, device="meta"), torch.empty((), device="meta")
+    view_batch(raw, importance, SPEC)  # makes its constants
+    with OnDevice():
+        update(view_batch(raw, importance, SPEC), beta)
+
+
+def test_the_check_sees_what_waits():
+    with OnDevice(), pytest.raises(AssertionError):
+        torch.zeros(2)
+    with OnDevice(), pytest.raises(RuntimeError):
+        torch.empty(2, device="meta").sum().item()
+
+
+@pytest.fixture
+def cuda(monkeypatch):
+    """Streams, events and graphs that only remember what they were asked."""
+    calls = MagicMock()
+    for name in ("Stream", "Event", "CUDAGraph"):
+        made = create_autospec(getattr(torch.cuda, name), instance=True, spec_set=name != "CUDAGraph")
+        calls.attach_mock(made, name)
+        monkeypatch.setattr(torch.cuda, name, lambda *_, made=made: made)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda _: calls.current)
+    monkeypatch.setattr(torch.cuda, "stream", lambda _: nullcontext())
+    monkeypatch.setattr(torch.cuda, "graph", lambda graph, stream: nullcontext(calls.recording(graph, stream)))
+    return calls
+
+
+def test_a_graph_is_recorded_once_after_the_warm_up_and_replayed(cuda):
+    cuda.CUDAGraph.register_generator_state = MagicMock()
+    work, generator = MagicMock(return_value="result"), torch.Generator()
+    graph = CudaGraph(work, generator)
+    for _ in range(WARM_UP):
+        assert graph() == "result"
+    cuda.recording.assert_not_called()
+    for _ in range(3):
+        assert graph() == "result"
+    assert work.call_count == WARM_UP + 1
+    cuda.recording.assert_called_once_with(cuda.CUDAGraph, cuda.Stream)
+    cuda.CUDAGraph.register_generator_state.assert_called_once_with(generator)
+    assert cuda.CUDAGraph.replay.call_count == 3
+
+
+def test_a_copy_waits_until_the_last_was_taken_and_is_waited_for(cuda):
+    place = torch.zeros(3)
+    copies = CopiesAhead([place])
+    for value in (1.0, 2.0):
+        cuda.reset_mock()
+        copies([torch.full((3,), value)])
+        assert place.tolist() == [value] * 3
+        assert cuda.mock_calls == [
+            call.Stream.wait_event(cuda.Event),
+            call.current.wait_stream(cuda.Stream),
+            call.Event.record(cuda.current),
+        ]
+
+
+def test_a_state_of_another_device_resumes():
+    """A CPU's generator has another state than a GPU's; Adam's step is captured only on a GPU."""
+    saved = make()
+    saved(view_batch(*host_batch(0), SPEC), torch.tensor(0.0))
+    state = saved.state_dict()
+    state["generator"] = torch.arange(16, dtype=torch.uint8)
+    for optimizer in state["optimizers"]:
+        for group in optimizer["param_groups"]:
+            group["capturable"] = True
+    update = make()
+    update.load_state_dict(state)
+    assert not any(group["capturable"] for optimizer in update.optimizers for group in optimizer.param_groups)
+    first = torch.randn(3, generator=update.generator)
+    update.load_state_dict(state)
+    assert torch.equal(torch.randn(3, generator=update.generator), first)
+    update(view_batch(*host_batch(1), SPEC), torch.tensor(0.0))
+
+
+def test_a_tensor_on_the_host_is_there_at_once():
+    assert HostCopy(torch.arange(3)).wait().tolist() == [0, 1, 2]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("bf16", [False, True], ids=["fp32", "bf16"])
+@pytest.mark.parametrize("order", ["joint", "alternate"])
+def test_a_graph_trains_as_the_updates_one_by_one(order, bf16):
+    """100 updates; equal losses to 1e-3."""
+    plain, update = make(order, "cuda", bf16), make(order, "cuda", bf16)
+    static = StaticUpdate(update, SPEC, BATCH)
+    for step in range(100):
+        raw, importance = host_batch(step, pinned=True)
+        expected = plain(view_batch(raw.cuda(), importance.cuda(), SPEC), torch.tensor(0.1, device="cuda"))
+        found = static(raw, importance, 0.1)
+        torch.testing.assert_close(found.metrics, expected.metrics, rtol=1e-3, atol=1e-3)
+        priorities = HostCopy(found.priorities).wait()
+        torch.testing.assert_close(priorities, expected.priorities.cpu(), rtol=1e-3, atol=1e-3)
