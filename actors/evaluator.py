@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,13 +36,31 @@ class EvaluatorConfig:
     """Episodes per evaluation, played side by side with the policy's mean."""
 
 
+class Player(Protocol):
+    """What plays: a ``PolicyRunner``, or another agent that acts like one."""
+
+    def start(self) -> tuple[Floats, Floats]:
+        """Previous action (N, A) and hidden state (N, H) at the start of episodes."""
+
+    def act(
+        self,
+        observation: Floats,
+        prev_action: Floats,
+        blank: NDArray[np.bool_],
+        hidden: Floats,
+        noise: Floats | None,
+        /,
+    ) -> tuple[Floats, Floats]:
+        """(N, O), (N, A), (N,), (N, H), and noise or None for the mean -> (N, A) in [-1, 1], (N, H)."""
+
+
 class Match:
     """The first episode of each of N environments, played to its end; those that ended stand still.
 
     Without a time limit, an episode's first 10 000 steps are what counts.
     """
 
-    def __init__(self, runner: PolicyRunner, envs: Sequence[Env], seed: int) -> None:
+    def __init__(self, runner: Player, envs: Sequence[Env], seed: int) -> None:
         """``runner`` is for N environments. The i-th one is reset with seed + i."""
         self._runner, self._envs = runner, envs
         shape = envs[0].observation_space.shape
@@ -94,7 +112,7 @@ class Match:
         return self._returns[~self.broken]
 
 
-def play_episodes(runner: PolicyRunner, make_env: Callable[[], Env], episodes: int, seed: int) -> list[float]:
+def play_episodes(runner: Player, make_env: Callable[[], Env], episodes: int, seed: int) -> list[float]:
     """Returns of so many deterministic episodes, played as one batch; ``runner`` is for as many environments.
 
     Those in which the environment broke are left out. Raises RmcError where none is left.

@@ -10,8 +10,8 @@ FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 
 def compiled(function: FunctionT, fastmath: Set[str] = frozenset()) -> FunctionT:
     """The same function in machine code. ``fastmath``: liberties that LLVM may take with floating point."""
-    options = {"fastmath": set(fastmath) or False, "error_model": "numpy", "nogil": True}
+    liberties = set(fastmath) or False
     try:
-        return cast(FunctionT, numba.njit(cache=True, **options)(function))
+        return cast(FunctionT, numba.njit(function, cache=True, fastmath=liberties, error_model="numpy", nogil=True))
     except RuntimeError:  # nowhere to keep it: compile at every start
-        return cast(FunctionT, numba.njit(**options)(function))
+        return cast(FunctionT, numba.njit(function, fastmath=liberties, error_model="numpy", nogil=True))

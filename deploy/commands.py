@@ -1,6 +1,7 @@
 """What each command of the command line does."""
 
 import dataclasses
+import importlib.util
 import json
 import logging
 import os
@@ -15,7 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from common.errors import ConfigError
-from deploy import attachment, env_check, export, inspection, options, roles, training, video
+from deploy import attachment, curves, env_check, export, history, inspection, options, roles, training, video
 from deploy.evaluation import evaluate_checkpoint
 from deploy.policy import load_policy
 from deploy.run_folder import RunFolder
@@ -109,6 +110,30 @@ def check_env(command: options.CheckEnv) -> int:
     return env_check.check(command.env.config(), command.steps, Console())
 
 
+def baseline(command: options.Baseline) -> int:
+    """Train an agent of stable-baselines3."""
+    for package in ("stable_baselines3", "sb3_contrib"):
+        if importlib.util.find_spec(package) is None:
+            raise ConfigError("baseline", command.algorithm, f"{package} is missing; pip install 'rmc[baselines]'")
+    from deploy import baselines  # an extra, and slow to import
+
+    with training.signals_caught() as stop:
+        return baselines.train(command.config(), command.run_dir, Console(), stop)
+
+
+def plot(command: options.Plot) -> int:
+    """Draw curves and print their table."""
+    if not command.runs:
+        raise ConfigError("RUNS", "", "give folders of runs, or files of JSON lines")
+    groups = curves.grouped([found for path in command.runs for found in history.read(path)])
+    shown = curves.tables(groups, command.reference)
+    curves.draw(groups, command.by, command.out)
+    console = Console(width=max(Console().width, curves.WIDTH))
+    console.print(*shown, sep="\n")
+    console.print(f"{command.out}", soft_wrap=True, highlight=False)
+    return 0
+
+
 def stats(command: options.Stats) -> int:
     """Print the newest metrics of a run, and its result if it has one."""
     folder = RunFolder(command.run)
@@ -181,6 +206,8 @@ ACTIONS: dict[type, Callable[[Any], int]] = {  # any other is a role
     options.Export: export_policy,
     options.Inspect: inspect,
     options.CheckEnv: check_env,
+    options.Baseline: baseline,
+    options.Plot: plot,
     options.Stats: stats,
     options.Attach: attach,
     options.Stop: stop,

@@ -14,6 +14,8 @@ from actors.evaluator import EvaluatorConfig
 from common.agent import AgentConfig
 from common.envs import EnvConfig
 from deploy import presets
+from deploy.baseline_settings import Algorithm, BaselineConfig, Settings
+from deploy.curves import Axis
 from deploy.presets import Preset, RunConfig, WindowConfig
 from deploy.run_folder import IfExists
 from deploy.training import Launcher, Placement
@@ -145,6 +147,48 @@ class CheckEnv:
 
 
 @dataclass(frozen=True)
+class Baseline:
+    """Train an agent of stable-baselines3 in the same environment, to compare with; or go on with such a run."""
+
+    algorithm: Positional[Algorithm]
+    """Which one."""
+    env: EnvOptions
+    settings: Settings = "paper"
+    """Networks of 400 and 300 units, what rl-baselines3-zoo tuned, or stable-baselines3's own defaults."""
+    seed: int = 0
+    """Seed of networks, environment and sampling."""
+    total_steps: int = 1_000_000
+    """Environment steps of the run."""
+    checkpoint_steps: int = 10_000
+    """Environment steps between evaluations."""
+    episodes: int = 5
+    """Episodes of an evaluation."""
+    threads: int = 1
+    """CPU threads of the run."""
+    run_dir: Path | None = None
+    """The run's folder; by default runs/<env>__<algorithm>-<settings>__<seed>__<time>. The same one goes on."""
+
+    def config(self) -> BaselineConfig:
+        """The run's config."""
+        own = {item.name: getattr(self, item.name) for item in dataclasses.fields(BaselineConfig) if item.name != "env"}
+        return BaselineConfig(env=self.env.config(), **own)
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Draw the returns of runs as curves, and print them as a table, by environment and agent."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Folders of runs, or files of JSON lines as a study writes them."""
+    out: Path = Path("curves.png")
+    """The picture to write."""
+    by: Axis = "env_steps"
+    """What returns are drawn over."""
+    reference: str | None = None
+    """The agent, by its name in the table, that the others are scaled by and compared with."""
+
+
+@dataclass(frozen=True)
 class Stats:
     """Show the newest metrics of a run."""
 
@@ -246,7 +290,7 @@ class EvaluatorRole(_Role):
 
 
 Command = (
-    Train | Evaluate | Export | Inspect | CheckEnv | Stats | Attach | Stop | Cluster
+    Train | Evaluate | Export | Inspect | CheckEnv | Baseline | Plot | Stats | Attach | Stop | Cluster
     | LauncherRole | ActorRole | ReplayRole | LearnerRole | EvaluatorRole
 )  # fmt: skip
 
@@ -261,6 +305,8 @@ def parse(words: list[str]) -> Command:
         | Annotated[Export, tyro.conf.subcommand("export")]
         | Annotated[Inspect, tyro.conf.subcommand("inspect")]
         | Annotated[CheckEnv, tyro.conf.subcommand("check-env")]
+        | Annotated[Baseline, tyro.conf.subcommand("baseline")]
+        | Annotated[Plot, tyro.conf.subcommand("plot")]
         | Annotated[Stats, tyro.conf.subcommand("stats")]
         | Annotated[Attach, tyro.conf.subcommand("attach")]
         | Annotated[Stop, tyro.conf.subcommand("stop")]

@@ -67,7 +67,7 @@ def conduct(config: RunConfig, folder: RunFolder, placement: Placement, console:
             console.print(f"start the roles with --run {folder.name}", soft_wrap=True, highlight=False)
         monitor = Monitor(folder, config, console)
         try:
-            with _signals_caught() as stop:  # before and after, nothing runs that Ctrl-C could not end at once
+            with signals_caught() as stop:  # before and after, nothing runs that Ctrl-C could not end at once
                 finished = _launch(config, folder, placement, monitor, stop)
         finally:
             monitor.close()
@@ -112,7 +112,7 @@ def _watched_on_ray(config: RunConfig, placement: Placement, console: Console) -
     folder.unlock()
     ray_launcher.launch(config, folder, placement.device, placement.all_cpus, placement.tls)
     console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
-    with _signals_caught(hangup=False) as stop:
+    with signals_caught(hangup=False) as stop:
         attachment.watch(folder, console, _passes_on(stop, folder))
     return say_end(folder, console)
 
@@ -149,7 +149,8 @@ def say_end(folder: RunFolder, console: Console) -> int:
 
 
 @contextmanager
-def _signals_caught(hangup: bool = True) -> Iterator[StopSignal]:
+def signals_caught(hangup: bool = True) -> Iterator[StopSignal]:
+    """SIGTERM, SIGINT and a closed terminal only set the signal, for as long as this lasts."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
     stop = StopSignal()
     stop.install()

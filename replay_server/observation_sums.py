@@ -38,7 +38,8 @@ def _add_up(
 def observation_sums(rows: Rows, spec: WindowSpec) -> ObservationStatistics:
     """Over the observations that no earlier window carried and that are not blank; padding is never read."""
     total, total_square = np.zeros(spec.obs_dim), np.zeros(spec.obs_dim)
-    offset = (spec.dtype.fields or {})["observation"][1] // 4
+    assert spec.dtype.fields is not None
+    offset = spec.dtype.fields["observation"][1] // 4
     floats = rows.view(np.float32).reshape(len(rows), spec.dtype.itemsize // 4)
     new, last = np.minimum(rows["new_observations"], rows["last"] + 1), rows["last"]
     count = _add_up(floats, offset, rows["blank"], new, last, total, total_square)

@@ -1,0 +1,247 @@
+"""``rmc baseline``: stable-baselines3's agents, trained on our environments and judged by our evaluator.
+
+The run's folder looks like that of ``rmc train``, so that ``rmc plot`` reads both. Imported only where the extra
+``baselines`` is installed. Shapes: N environments, O observation, A action.
+"""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+
+from actors.evaluator import play_episodes
+from common.envs import first_env, make_env
+from common.errors import ConfigError
+from common.role import StopSignal
+from common.wrappers import Floats
+from deploy.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, transitions_per_update
+from deploy.run_folder import RunFolder
+
+CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
+FINAL_EPISODES, STOPPED = 10, 130
+SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
+RECORD_SECONDS = 5.0
+MODEL, BUFFER, SCALES, PROGRESS = "model.zip", "replay_buffer.pkl", "scales.pkl", "progress.json"
+
+
+def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: StopSignal) -> int:
+    """Train to the end, or to a stop signal; the exit status. Raises ConfigError before anything is written."""
+    first_env(config.env).close()
+    folder = _open_folder(config, run_dir)
+    torch.set_num_threads(config.threads)
+    torch.set_flush_denormal(True)  # as our learner does
+    console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
+    run = _Run(config, folder, console)
+    run.train(stop)
+    if stop.requested:
+        console.print(f"stopped at environment step {run.steps:,}; the same command goes on", highlight=False)
+        return STOPPED
+    result = run.result()
+    folder.write_result(result)
+    mean, deviation = result["eval_return_mean"], result["eval_return_std"]
+    console.print(f"after training: return {mean:,.1f} ± {deviation:,.1f}; {folder.result_file}", highlight=False)
+    return 0
+
+
+def _open_folder(config: BaselineConfig, run_dir: Path | None) -> RunFolder:
+    env = config.env.id.replace(":", "_").replace("/", "_")
+    name = f"{env}__{config.algorithm}-{config.settings}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+    folder = RunFolder(run_dir or Path("runs") / name)
+    about, now = folder.path / "config.json", json.loads(json.dumps(asdict(config)))
+    if about.exists():
+        was = json.loads(about.read_bytes())
+        for key in now:
+            if key not in ("total_steps", "threads") and was.get(key) != now[key]:
+                fix = f"the run in {folder.path} has {was.get(key)!r}; use that, or another --run-dir"
+                raise ConfigError(f"--{key.replace('_', '-')}", now[key], fix)
+    elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
+        raise ConfigError("--run-dir", str(folder.path), "is there and is no baseline's; give another one")
+    folder.checkpoints.mkdir(parents=True, exist_ok=True)
+    per_update = transitions_per_update(config)
+    about.write_text(json.dumps(now | {"name": config.name, "transitions_per_update": per_update}, indent=2) + "\n")
+    return folder
+
+
+class Opponent:
+    """A model as our evaluator plays an agent; its memory, if it has one, is kept in here."""
+
+    def __init__(self, model: Any, scaled: Callable[[Floats], Floats], envs: int) -> None:
+        self._model, self._scaled, self._envs = model, scaled, envs
+        self._state: Any = None
+        self._begins = np.ones(envs, np.bool_)
+
+    def start(self) -> tuple[Floats, Floats]:
+        """Previous actions (N, A), and in place of a hidden state (N, 0), at the start of episodes."""
+        self._state, self._begins = None, np.ones(self._envs, np.bool_)
+        sizes = (*self._model.action_space.shape, 0)
+        actions, nothing = (np.zeros((self._envs, size), np.float32) for size in sizes)
+        return actions, nothing
+
+    def act(
+        self, observation: Floats, _prev_action: Floats, _blank: NDArray[np.bool_], hidden: Floats, _: Floats | None
+    ) -> tuple[Floats, Floats]:
+        """(N, O) -> (N, A), as ``PolicyRunner.act``; of the rest nothing is used."""
+        seen = self._scaled(observation)
+        action, self._state = self._model.predict(seen, self._state, self._begins, deterministic=True)
+        self._begins = np.zeros(self._envs, np.bool_)
+        return action.astype(np.float32), hidden
+
+
+class _Run(BaseCallback):
+    """A model between its environment and its folder: evaluates, records, saves, stops."""
+
+    def __init__(self, config: BaselineConfig, folder: RunFolder, console: Console) -> None:
+        super().__init__()
+        self.config, self.folder, self._console = config, folder, console
+        choice = choose(config.algorithm, config.settings, config.env.id)
+        self._vec, self._model = self._load(choice)
+        self._began, self._wall_before = time.monotonic(), folder.wall_seconds()
+        self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, 0.0
+        self._next_evaluation = self._after(self.steps)
+        self._metrics = folder.metrics.open("a", buffering=1)
+        self._initial = self._first_evaluation()
+
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return int(self._model.num_timesteps)
+
+    @property
+    def updates(self) -> int:
+        """Gradient steps so far."""
+        return int(self._model._n_updates)
+
+    # -- the model --------------------------------------------------------------------------------------
+
+    def _load(self, choice: Choice) -> tuple[VecEnv, Any]:
+        """As it was saved last, or new."""
+        config, at, kind = self.config, self.folder.checkpoints, CLASSES[self.config.algorithm]
+        vec: VecEnv = DummyVecEnv([lambda: Monitor(make_env(config.env))])
+        if choice.normalize:
+            gamma = float(choice.arguments.get("gamma", 0.99))
+            vec = VecNormalize.load(str(at / SCALES), vec) if (at / SCALES).exists() else VecNormalize(vec, gamma=gamma)
+        if (at / PROGRESS).exists():
+            model = kind.load(at / MODEL, env=vec, device="cpu")
+            if config.algorithm in OFF_POLICY:
+                model.load_replay_buffer(at / BUFFER)
+            vec.seed(config.seed + model.num_timesteps)  # not the episodes that it has had
+            return vec, model
+        return vec, kind(_policy(config), vec, **self._arguments(choice), seed=config.seed, device="cpu")
+
+    def _arguments(self, choice: Choice) -> dict[str, Any]:
+        network = dict(choice.network) | ({"activation_fn": torch.nn.ReLU} if choice.relu else {})
+        found = dict(choice.arguments) | ({"policy_kwargs": network} if network else {})
+        if self.config.algorithm in OFF_POLICY:
+            found["buffer_size"] = min(1_000_000, self.config.total_steps)  # as large as it can ever be of use
+        if choice.noise:
+            size = first_env(self.config.env).action_space.shape or (1,)
+            found["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, choice.noise))
+        return found
+
+    def _save(self) -> None:
+        """The progress last: with it, all of it is whole."""
+        at, progress = self.folder.checkpoints, self.folder.checkpoints / PROGRESS
+        progress.unlink(missing_ok=True)
+        self._model.save(at / MODEL)
+        if self.config.algorithm in OFF_POLICY:
+            self._model.save_replay_buffer(at / BUFFER)
+        if isinstance(self._vec, VecNormalize):
+            self._vec.save(str(at / SCALES))
+        progress.write_text(json.dumps({"env_steps": self.steps, "updates": self.updates}) + "\n")
+        self._save_at = time.monotonic() + SAVE_SECONDS
+
+    # -- training ---------------------------------------------------------------------------------------
+
+    def train(self, stop: StopSignal) -> None:
+        """To the end or the signal; what is not saved then is saved."""
+        self._stop = stop
+        missing = self.config.total_steps - self.steps
+        if missing > 0:
+            self._model.learn(missing, self, reset_num_timesteps=False, log_interval=None)
+        self._save()
+        self._write_progress()
+
+    def _on_step(self) -> bool:
+        now = time.monotonic()
+        if now >= self._record_at:
+            self._record_at = now + RECORD_SECONDS
+            self._write_progress()
+        if self.num_timesteps >= self._next_evaluation:
+            self._next_evaluation = self._after(self.num_timesteps)
+            self._evaluate()
+            if now >= self._save_at:
+                self._save()
+        return not self._stop.requested
+
+    def _after(self, steps: int) -> int:
+        return (steps // self.config.checkpoint_steps + 1) * self.config.checkpoint_steps
+
+    # -- evaluation and records -------------------------------------------------------------------------
+
+    def _play(self, episodes: int) -> dict[str, Any]:
+        opponent = Opponent(self._model, self._scaled, episodes)
+        returns = play_episodes(opponent, lambda: make_env(self.config.env), episodes, self.config.seed)
+        mean, std = float(np.mean(returns)), float(np.std(returns))
+        return {"eval_return_mean": mean, "eval_return_std": std, "eval_episodes": len(returns)}
+
+    def _scaled(self, observation: Floats) -> Floats:
+        if not isinstance(self._vec, VecNormalize):
+            return observation
+        scaled: Floats = np.asarray(self._vec.normalize_obs(observation), np.float32)
+        return scaled
+
+    def _first_evaluation(self) -> float:
+        """Of what it was before any training, once for the folder."""
+        initial = self.folder.path / "initial.json"
+        if not initial.exists():
+            initial.write_text(json.dumps(self._play(FINAL_EPISODES)) + "\n")
+        return float(json.loads(initial.read_bytes())["eval_return_mean"])
+
+    def _evaluate(self) -> None:
+        found = self._play(self.config.episodes)
+        self._write_progress()
+        self._write("evaluator", {**found, "eval_update": self.updates})
+        mean, deviation = found["eval_return_mean"], found["eval_return_std"]
+        said = f"environment step {self.steps:,}: return {mean:,.1f} ± {deviation:,.1f}, {self._wall():,.0f} s"
+        self._console.print(said, highlight=False)
+
+    def _write_progress(self) -> None:
+        self._write("launcher", {"wall_s": self._wall()})
+        self._write("learner", {"env_steps": self.steps, "updates": self.updates})
+
+    def _write(self, role: str, record: dict[str, Any]) -> None:
+        self._metrics.write(json.dumps({"role": role, "time": time.time(), **record}) + "\n")
+
+    def _wall(self) -> float:
+        return self._wall_before + time.monotonic() - self._began
+
+    def result(self) -> dict[str, Any]:
+        """As that of ``rmc train``."""
+        return {
+            "env": self.config.env.id,
+            "preset": self.config.name,
+            "seed": self.config.seed,
+            "env_steps": self.steps,
+            "updates": self.updates,
+            **self._play(FINAL_EPISODES),
+            "eval_flicker": self.config.env.flicker,
+            "initial_return_mean": self._initial,
+            "wall_s": self._wall(),
+        }
+
+
+def _policy(config: BaselineConfig) -> str:
+    return "MlpLstmPolicy" if config.algorithm == "recurrent-ppo" else "MlpPolicy"

@@ -1,0 +1,181 @@
+"""What runs went through: their evaluations over environment steps, updates and wall time, read from their folders.
+
+A file of JSON lines holds many, one a line, so that results can be kept without their runs.
+"""
+
+import dataclasses
+import json
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common.envs import EnvConfig
+from common.errors import ConfigError
+from deploy.presets import RunConfig, option, preset
+from deploy.run_folder import MAY_CHANGE, RunFolder, flat
+
+UNTOLD = MAY_CHANGE | {"seed", "preset", "evaluator.episodes", "env.id"}  # makes no other agent
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Deterministic episodes of one checkpoint."""
+
+    env_steps: int
+    updates: int
+    wall_s: float
+    return_mean: float
+    return_std: float
+
+
+@dataclass(frozen=True)
+class History:
+    """One run. ``agent`` and ``env`` say all that tells it from others but its seed."""
+
+    agent: str
+    env: str
+    seed: int
+    env_steps: int
+    updates: int
+    transitions: int  # trained, a step of a window each
+    wall_s: float
+    initial_return: float | None
+    evaluations: list[Evaluation] = field(default_factory=list)
+    finished: bool = False  # then the last evaluation is the result's
+    commit: str = ""
+
+    def to_line(self) -> str:
+        """As one line of JSON."""
+        return json.dumps(dataclasses.asdict(self))
+
+
+def read(path: Path) -> list[History]:
+    """The histories in a run's folder, or in a file of lines. Raises ConfigError."""
+    if path.is_dir():
+        return [of_run(RunFolder(path))]
+    try:
+        return [_of_line(line) for line in path.read_text().splitlines() if line.strip()]
+    except OSError as error:
+        raise ConfigError("RUNS", str(path), f"{error.strerror}; give runs' folders or files of JSON lines") from None
+    except (ValueError, TypeError, KeyError) as error:
+        raise ConfigError("RUNS", str(path), f"not a file of histories ({error}); give runs' folders") from None
+
+
+def _of_line(line: str) -> History:
+    raw = json.loads(line)
+    return History(**{**raw, "evaluations": [Evaluation(**one) for one in raw["evaluations"]]})
+
+
+def of_run(folder: RunFolder) -> History:
+    """A run's, finished or not. Raises ConfigError where it is none, or was not evaluated yet."""
+    about = describe(folder.path)
+    records = _records(folder.metrics)
+    evaluations = _evaluations(records)
+    result = folder.result() or {}
+    if result:
+        evaluations = [one for one in evaluations if one.updates < result["updates"]]
+        mean, std = result["eval_return_mean"], result["eval_return_std"]
+        evaluations.append(Evaluation(result["env_steps"], result["updates"], result["wall_s"], mean, std))
+    if not evaluations:
+        raise ConfigError("RUNS", str(folder.path), "it has no evaluation yet; train it for longer")
+    last = evaluations[-1]
+    return History(
+        about.agent,
+        about.env,
+        about.seed,
+        last.env_steps,
+        last.updates,
+        last.updates * about.transitions_per_update,
+        last.wall_s,
+        result.get("initial_return_mean"),
+        evaluations,
+        bool(result),
+    )
+
+
+@dataclass(frozen=True)
+class About:
+    """What a run is, from its ``config.json``."""
+
+    agent: str
+    env: str
+    seed: int
+    transitions_per_update: int
+
+
+def describe(path: Path) -> About:
+    """Of a run of RMC, or of a baseline. Raises ConfigError."""
+    folder = RunFolder(path)
+    config_file = folder.path / "config.json"
+    with suppress(OSError, ValueError):
+        raw = json.loads(config_file.read_bytes())
+        if isinstance(raw, dict) and "algorithm" in raw:
+            env = EnvConfig(**raw["env"])
+            return About(_with(raw["name"], _stack(env)), _seen(env), raw["seed"], raw["transitions_per_update"])
+    config = folder.config()
+    name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
+    transitions = config.learner.batch_size * config.window.trained_steps
+    return About(_with(name, [*_changes(config), *_stack(config.env)]), _seen(config.env), config.seed, transitions)
+
+
+def _with(name: str, words: list[str]) -> str:
+    return " ".join([name, *words])
+
+
+def _changes(config: RunConfig) -> list[str]:
+    """Options that differ from the preset's, as they are typed."""
+    was, now = flat(preset(config.preset, config.env)), flat(config)
+    return [_typed(path, now[path]) for path in now if path not in UNTOLD and now[path] != was[path]]
+
+
+def _typed(path: str, value: Any) -> str:
+    if isinstance(value, bool):
+        return option(path) if value else option(path).replace("--", "--no-", 1)
+    return f"{option(path)} {' '.join(map(str, value)) if isinstance(value, tuple) else value}"
+
+
+def _stack(env: EnvConfig) -> list[str]:
+    """A stack of frames belongs to the agent: what there is to see is the same."""
+    return [f"--frame-stack {env.frame_stack}"] if env.frame_stack > 1 else []
+
+
+def _seen(env: EnvConfig) -> str:
+    plain = EnvConfig(env.id)
+    names = [item.name for item in dataclasses.fields(env) if item.name not in ("frame_stack", "env_timeout")]
+    odd = [name for name in names if getattr(env, name) != getattr(plain, name)]
+    return ", ".join([env.id, *(f"{name.replace('_', ' ')} {getattr(env, name)}" for name in odd)])
+
+
+def _records(path: Path) -> list[dict[str, Any]]:
+    found = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        with suppress(ValueError):  # torn by a crash
+            found.append(json.loads(line))
+    return found
+
+
+def _evaluations(records: list[dict[str, Any]]) -> list[Evaluation]:
+    """In order of updates; of a checkpoint played twice, what came last."""
+    steps = {r["updates"]: r["env_steps"] for r in records if r.get("role") == "learner" and "updates" in r}
+    walls = {r["time"]: r["wall_s"] for r in records if r.get("role") == "launcher" and "wall_s" in r}
+    found = {}
+    for record in records:
+        if "eval_return_mean" in record:
+            updates = record["eval_update"]
+            found[updates] = Evaluation(
+                int(_between(updates, steps)),
+                updates,
+                _between(record["time"], walls),
+                record["eval_return_mean"],
+                record["eval_return_std"],
+            )
+    return [found[updates] for updates in sorted(found)]
+
+
+def _between(at: float, known: dict[Any, Any]) -> float:
+    """What lies at ``at`` on the line through the points that are known."""
+    places = sorted(known)
+    return float(np.interp(at, places, [known[place] for place in places])) if places else 0.0

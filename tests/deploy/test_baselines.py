@@ -1,0 +1,98 @@
+"""Agents of stable-baselines3 in runs of our own format: trained, stopped, gone on with, judged by our evaluator."""
+
+import json
+from typing import get_args
+
+import pytest
+from rich.console import Console
+
+from common.envs import EnvConfig
+from common.errors import ConfigError
+from common.role import StopSignal
+from deploy.baseline_settings import Algorithm, BaselineConfig, Settings, choose
+from deploy.baselines import train
+from deploy.history import of_run
+from deploy.run_folder import RunFolder
+
+ENV = EnvConfig("InvertedPendulum-v5")
+ALGORITHMS = get_args(Algorithm)
+
+
+def config(algorithm: Algorithm = "sac", settings: Settings = "paper", **other) -> BaselineConfig:
+    return BaselineConfig(
+        algorithm, **{"env": ENV, "total_steps": 300, "checkpoint_steps": 100, **other}, settings=settings
+    )
+
+
+def run(made: BaselineConfig, folder, stop: StopSignal | None = None) -> int:
+    return train(made, folder, Console(quiet=True), stop or StopSignal())
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_one_trains_stops_and_goes_on(algorithm, tmp_path):
+    folder = tmp_path / "run"
+    assert run(config(algorithm), folder) == 0
+    first = of_run(RunFolder(folder))
+    assert first.finished
+    assert first.env_steps >= 300
+    assert [one.env_steps // 100 for one in first.evaluations][:2] == [1, 2]
+    assert run(config(algorithm, total_steps=500), folder) == 0
+    second = of_run(RunFolder(folder))
+    assert second.env_steps >= 500
+    assert second.evaluations[: len(first.evaluations) - 1] == first.evaluations[:-1]
+    assert second.initial_return == first.initial_return
+    assert second.wall_s > first.wall_s
+    assert second.updates >= first.updates
+
+
+def test_a_stop_signal_is_heard_and_nothing_is_lost(tmp_path):
+    stop, folder = StopSignal(), tmp_path / "run"
+    stop.requested = True
+    assert run(config(), folder, stop) == 130
+    assert RunFolder(folder).result() is None
+    progress = json.loads((folder / "checkpoints" / "progress.json").read_text())
+    assert progress["env_steps"] == 1
+    assert run(config(), folder) == 0
+    assert of_run(RunFolder(folder)).env_steps == 300
+
+
+def test_another_agent_is_not_gone_on_with(tmp_path):
+    folder = tmp_path / "run"
+    stop = StopSignal()
+    stop.requested = True
+    run(config(), folder, stop)
+    with pytest.raises(ConfigError, match="--seed"):
+        run(config(seed=1), folder)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "file").write_text("mine")
+    with pytest.raises(ConfigError, match="no baseline's"):
+        run(config(), tmp_path / "other")
+
+
+def test_a_stack_of_frames_belongs_to_the_agent(tmp_path):
+    made = config(env=EnvConfig("InvertedPendulum-v5", flicker=0.5, frame_stack=4), total_steps=100)
+    assert run(made, tmp_path / "run") == 0
+    found = of_run(RunFolder(tmp_path / "run"))
+    assert found.agent == "SAC 400-300 --frame-stack 4"
+    assert found.env == "InvertedPendulum-v5, flicker 0.5"
+    assert found.transitions == found.updates * 256
+
+
+@pytest.mark.parametrize("body", ["HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Humanoid-v5", "Ant-v5", "mine:Own-v0"])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_zoos_numbers_are_of_the_right_kind(algorithm, body):
+    choice = choose(algorithm, "zoo", body)
+    assert all(type(choice.arguments[name]) is int for name in ("batch_size", "n_steps") if name in choice.arguments)
+    assert choice.normalize == (algorithm in ("ppo", "recurrent-ppo"))
+
+
+def test_the_zoos_ppo_trains_and_keeps_its_scales(tmp_path):
+    """With running statistics of observations, which a run that goes on has again."""
+    made = config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=600, checkpoint_steps=300)
+    assert run(made, tmp_path / "run") == 0
+    before = (tmp_path / "run" / "checkpoints" / "scales.pkl").stat().st_mtime_ns
+    assert (
+        run(config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=1200, checkpoint_steps=300), tmp_path / "run")
+        == 0
+    )
+    assert (tmp_path / "run" / "checkpoints" / "scales.pkl").stat().st_mtime_ns > before

@@ -1,0 +1,133 @@
+"""Histories of runs, and what rmc plot makes of them."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from common.envs import EnvConfig
+from common.errors import ConfigError
+from deploy import curves, history
+from deploy.cli import run
+from deploy.history import Evaluation, History
+from deploy.presets import robust, to_json
+
+
+def made(agent="RMC", env="HalfCheetah-v5", seed=0, last=100.0, initial: float | None = 0.0) -> History:
+    evaluations = [Evaluation(1000 * i, 10 * i, 5.0 * i, last * i / 3, 1.0) for i in (1, 2, 3)]
+    return History(agent, env, seed, 3000, 30, 14400, 15.0, initial, evaluations, True, "abc")
+
+
+def shown(tables) -> str:
+    console = Console(width=curves.WIDTH)
+    with console.capture() as text:
+        console.print(*tables)
+    return text.get()
+
+
+def test_a_line_holds_a_history():
+    assert history._of_line(made().to_line()) == made()
+
+
+def test_a_run_is_read_from_its_folder(tmp_path):
+    """Steps and wall time of an evaluation lie between what learner and launcher said around it, resumed or not."""
+    config = dataclasses.replace(robust(EnvConfig("Hopper-v5", flicker=0.5)), seed=3)
+    config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, shortcut=True, heads=(5, 6)))
+    (tmp_path / "config.json").write_text(to_json(config))
+    records = [
+        {"role": "launcher", "time": 100.0, "wall_s": 0.0},
+        {"role": "learner", "time": 100.0, "updates": 0, "env_steps": 0},
+        {"role": "learner", "time": 110.0, "updates": 100, "env_steps": 1000},
+        {"role": "launcher", "time": 110.0, "wall_s": 10.0},
+        {"role": "evaluator", "time": 105.0, "eval_update": 50, "eval_return_mean": 7.0, "eval_return_std": 1.0},
+        {"role": "evaluator", "time": 107.0, "eval_broken_episodes": 5},
+        {"role": "launcher", "time": 900.0, "wall_s": 10.0},
+        {"role": "evaluator", "time": 905.0, "eval_update": 90, "eval_return_mean": 9.0, "eval_return_std": 1.0},
+        {"role": "launcher", "time": 910.0, "wall_s": 20.0},
+    ]
+    (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, records)) + '\n{"role": "evalu')
+    (found,) = history.read(tmp_path)
+    assert found.agent == "RMC --heads 5 6 --shortcut"
+    assert found.env == "Hopper-v5, flicker 0.5"
+    assert (found.seed, found.finished, found.initial_return) == (3, False, None)
+    assert found.evaluations == [Evaluation(500, 50, 5.0, 7.0, 1.0), Evaluation(900, 90, 15.0, 9.0, 1.0)]
+    assert found.transitions == 90 * 32 * 15
+    result = {"updates": 100, "env_steps": 1000, "wall_s": 21.0, "eval_return_mean": 11.0, "eval_return_std": 2.0}
+    (tmp_path / "result.json").write_text(json.dumps({**result, "initial_return_mean": -1.0}))
+    (found,) = history.read(tmp_path)
+    assert found.evaluations[-1] == Evaluation(1000, 100, 21.0, 11.0, 2.0)
+    assert (found.finished, found.initial_return) == (True, -1.0)
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "{}", "not json"])
+def test_what_is_no_history_is_refused(text, tmp_path):
+    (tmp_path / "file.jsonl").write_text(text)
+    with pytest.raises(ConfigError, match="RUNS"):
+        history.read(tmp_path / "file.jsonl")
+
+
+def test_a_run_without_an_evaluation_is_refused(tmp_path):
+    (tmp_path / "config.json").write_text(to_json(robust(EnvConfig("Hopper-v5"))))
+    with pytest.raises(ConfigError, match="no evaluation yet"):
+        history.read(tmp_path)
+
+
+def test_few_seeds_are_lines_and_many_a_band(tmp_path):
+    runs = [made(seed=seed, last=100.0 + seed) for seed in range(5)] + [made("SAC", seed=seed) for seed in (2, 1)]
+    groups = curves.grouped([*runs, made("SAC", "Hopper-v5")])
+    assert [one.seed for one in groups["HalfCheetah-v5"]["SAC"]] == [1, 2]
+    from matplotlib.figure import Figure
+
+    panel = Figure().subplots()
+    curves._draw_agent(panel, groups["HalfCheetah-v5"]["SAC"], "env_steps", "C0")
+    assert (len(panel.lines), len(panel.collections)) == (2, 0)
+    assert panel.lines[0].get_xdata().tolist() == [0.0, 1000.0, 2000.0, 3000.0]
+    panel = Figure().subplots()
+    line = curves._draw_agent(panel, groups["HalfCheetah-v5"]["RMC"], "wall_s", "C0")
+    assert (len(panel.lines), len(panel.collections)) == (1, 1)
+    assert line.get_ydata()[-1] == pytest.approx(np.mean([101, 102, 103]))
+    curves.draw(groups, "updates", tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 10_000
+
+
+def test_the_table_compares_with_a_reference():
+    runs = [made(seed=s, last=200.0) for s in range(5)] + [made("SAC", seed=s, last=100.0) for s in range(2)]
+    text = shown(curves.tables(curves.grouped(runs), "SAC"))
+    assert "200 [200, 200]" in text
+    assert "100 (100, 100)" in text
+    ours = next(line for line in text.splitlines() if "RMC" in line)
+    assert ours.split()[-2:] == ["2.00", "1.00"]
+    with pytest.raises(ConfigError, match="--reference"):
+        curves.tables(curves.grouped(runs), "PPO")
+
+
+def test_the_command_draws_and_prints(tmp_path, capsys):
+    lines = tmp_path / "study.jsonl"
+    lines.write_text("\n".join(made(seed=seed).to_line() for seed in range(2)) + "\n")
+    assert run(["plot", str(lines), "--out", str(tmp_path / "out.svg"), "--by", "wall_s"]) == 0
+    said = capsys.readouterr().out
+    assert "HalfCheetah-v5" in said
+    assert "100 (100, 100)" in said
+    assert (tmp_path / "out.svg").read_text().startswith("<?xml")
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (["plot"], "RUNS"),
+        (["plot", "nowhere"], "RUNS"),
+        (["plot", "LINES", "--out", "nowhere/out.png"], "--out"),
+        (["plot", "LINES", "--out", "out.gif"], "--out"),
+        (["plot", "LINES", "--reference", "PPO"], "--reference"),
+        (["baseline", "sac", "Nowhere-v0"], "no such environment"),
+        (["baseline", "dreamer", "Hopper-v5"], "dreamer"),
+    ],
+)
+def test_bad_input_is_one_line_that_names_the_fault(words, fault, tmp_path, capsys):
+    (tmp_path / "lines").write_text(made().to_line())
+    assert run([word.replace("LINES", str(tmp_path / "lines")) for word in words]) == 2
+    said = capsys.readouterr().err
+    assert fault in said
+    assert said.count("\n") == 1
