@@ -7,6 +7,7 @@ The run's folder looks like that of ``rmc train``, so that ``rmc plot`` reads bo
 import json
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -44,12 +45,12 @@ def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: 
     torch.set_num_threads(config.threads)
     torch.set_flush_denormal(True)  # as our learner does
     console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
-    run = _Run(config, folder, console)
-    run.train(stop)
-    if stop.requested:
-        console.print(f"stopped at environment step {run.steps:,}; the same command goes on", highlight=False)
-        return STOPPED
-    result = run.result()
+    with closing(_Run(config, folder, console)) as run:
+        run.train(stop)
+        if stop.requested:
+            console.print(f"stopped at environment step {run.steps:,}; the same command goes on", highlight=False)
+            return STOPPED
+        result = run.result()
     folder.write_result(result)
     mean, deviation = result["eval_return_mean"], result["eval_return_std"]
     console.print(f"after training: return {mean:,.1f} ± {deviation:,.1f}; {folder.result_file}", highlight=False)
@@ -174,6 +175,11 @@ class _Run(BaseCallback):
         self._save()
         self._write_progress()
 
+    def close(self) -> None:
+        """Close files and environments."""
+        self._metrics.close()
+        self._vec.close()
+
     def _on_step(self) -> bool:
         now = time.monotonic()
         if now >= self._record_at:
@@ -213,7 +219,7 @@ class _Run(BaseCallback):
     def _evaluate(self) -> None:
         found = self._play(self.config.episodes)
         self._write_progress()
-        self._write("evaluator", {**found, "eval_update": self.updates})
+        self._write("evaluator", {**found, "eval_update": self.updates, "eval_env_steps": self.steps})
         mean, deviation = found["eval_return_mean"], found["eval_return_std"]
         said = f"environment step {self.steps:,}: return {mean:,.1f} ± {deviation:,.1f}, {self._wall():,.0f} s"
         self._console.print(said, highlight=False)

@@ -76,7 +76,7 @@ def of_run(folder: RunFolder) -> History:
     evaluations = _evaluations(records)
     result = folder.result() or {}
     if result:
-        evaluations = [one for one in evaluations if one.updates < result["updates"]]
+        evaluations = [one for one in evaluations if one.env_steps < result["env_steps"]]
         mean, std = result["eval_return_mean"], result["eval_return_std"]
         evaluations.append(Evaluation(result["env_steps"], result["updates"], result["wall_s"], mean, std))
     if not evaluations:
@@ -158,21 +158,17 @@ def _records(path: Path) -> list[dict[str, Any]]:
 
 
 def _evaluations(records: list[dict[str, Any]]) -> list[Evaluation]:
-    """In order of updates; of a checkpoint played twice, what came last."""
+    """In order of environment steps; of a checkpoint played twice, what came last."""
     steps = {r["updates"]: r["env_steps"] for r in records if r.get("role") == "learner" and "updates" in r}
     walls = {r["time"]: r["wall_s"] for r in records if r.get("role") == "launcher" and "wall_s" in r}
     found = {}
     for record in records:
         if "eval_return_mean" in record:
             updates = record["eval_update"]
-            found[updates] = Evaluation(
-                int(_between(updates, steps)),
-                updates,
-                _between(record["time"], walls),
-                record["eval_return_mean"],
-                record["eval_return_std"],
-            )
-    return [found[updates] for updates in sorted(found)]
+            at = int(record.get("eval_env_steps", _between(updates, steps)))  # of ours only the update is known
+            wall, mean, std = _between(record["time"], walls), record["eval_return_mean"], record["eval_return_std"]
+            found[at] = Evaluation(at, updates, wall, mean, std)
+    return [found[at] for at in sorted(found)]
 
 
 def _between(at: float, known: dict[Any, Any]) -> float:
