@@ -1,0 +1,23 @@
+"""Figure (f) of the paper: half of the frames blank, RMC beside SAC with a stack of frames and a recurrent PPO.
+
+What each makes of full observation is the ceiling.
+"""
+
+from studies.study import Scale, Study
+
+ENVS = ("Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Walker2d-v5", "HumanoidStandup-v5")
+STUDY = Study(
+    "flicker",
+    {
+        "RMC": "train ENV --flicker 0.5",
+        "SAC, 4 frames": "baseline sac ENV --flicker 0.5 --frame-stack 4",
+        "RecurrentPPO": "baseline recurrent-ppo ENV --flicker 0.5",
+        "RecurrentPPO zoo": "baseline recurrent-ppo ENV --flicker 0.5 --settings zoo",
+        "RMC, all seen": "train ENV",
+        "SAC, all seen": "baseline sac ENV",
+    },
+    full=Scale(1_000_000, (1, 2, 3, 4, 5), ENVS),
+)
+
+if __name__ == "__main__":
+    STUDY.main()

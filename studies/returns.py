@@ -1,0 +1,17 @@
+"""Figures (a) to (e) of the paper: returns where everything is seen, beside DDPG, PPO, TD3 and SAC."""
+
+from studies.study import Scale, Study
+
+ENVS = ("Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Walker2d-v5", "HumanoidStandup-v5")
+OURS = {"RMC": "train ENV", "RMC paper": "train ENV --preset paper"}
+THEIRS = {name: f"baseline {name.lower()} ENV" for name in ("SAC", "TD3", "DDPG", "PPO")}
+TUNED = {f"{name} zoo": f"{words} --settings zoo" for name, words in THEIRS.items()}
+STUDY = Study(
+    "returns",
+    OURS | THEIRS | TUNED,
+    small=Scale(100_000, (1, 2)),
+    full=Scale(1_000_000, (1, 2, 3, 4, 5), ENVS),
+)
+
+if __name__ == "__main__":
+    STUDY.main()

@@ -1,0 +1,154 @@
+"""Runs a study: several agents, several seeds each, a line of results a run; the same command goes on with it.
+
+    python -m studies.NAME [--scale smoke|small|full] [--env ENV ...] [--only AGENT ...] [--seeds 1 2 3] [--jobs 2]
+
+smoke takes minutes, small two cores and hours, full is for a cluster or a GPU. A run that has its line in
+studies/results/NAME-SCALE.jsonl is not run again, one that was interrupted goes on in runs/studies/. Several jobs share
+the cores, each on its own part of them. ``rmc plot studies/results/NAME-SCALE.jsonl`` shows what came.
+"""
+
+import argparse
+import dataclasses
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Lock
+
+from common.errors import ConfigError
+from deploy import history
+
+RESULTS, RUNS = Path(__file__).parent / "results", Path("runs") / "studies"
+TINY = "--checkpoint-steps 300 --episodes 1"  # at the scale smoke
+TINY_OURS = f"{TINY} --hidden 16 --embedding 16 --heads 16 16 --warmup-steps 200 --batch-size 8 --replay-ratio 4"
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """How much of it."""
+
+    steps: int
+    seeds: Sequence[int]
+    envs: Sequence[str] = ("HalfCheetah-v5",)
+
+
+SMOKE, SMALL, FULL = Scale(600, (1,)), Scale(100_000, (1, 2)), Scale(1_000_000, (1, 2, 3, 4, 5))
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One run: ``rmc`` with these words."""
+
+    agent: str
+    env: str
+    seed: int
+    words: list[str]
+    folder: Path
+
+
+class Study:
+    """Agents by their names in the results, each as words of ``rmc`` with ENV for the environment."""
+
+    def __init__(self, name: str, agents: Mapping[str, str], small: Scale = SMALL, full: Scale = FULL) -> None:
+        self.name, self.agents = name, {agent: shlex.split(words) for agent, words in agents.items()}
+        self.scales = {"smoke": dataclasses.replace(SMOKE, envs=small.envs), "small": small, "full": full}
+
+    def jobs(
+        self,
+        scale: str,
+        seeds: Sequence[int] | None = None,
+        envs: Sequence[str] | None = None,
+        only: Sequence[str] | None = None,
+    ) -> list[Job]:
+        """All runs of a scale, seed by seed. Raises ConfigError where ``only`` names no agent of the study."""
+        if unknown := set(only or ()) - set(self.agents):
+            raise ConfigError("--only", sorted(unknown), f"use some of {', '.join(map(repr, self.agents))}")
+        size = self.scales[scale]
+        wanted = [agent for agent in self.agents if only is None or agent in only]
+        return [self._job(scale, *one) for one in product(seeds or size.seeds, envs or size.envs, wanted)]
+
+    def _job(self, scale: str, seed: int, env: str, agent: str) -> Job:
+        words = [env if word == "ENV" else word for word in self.agents[agent]]
+        tiny = {"train": TINY_OURS, "baseline": TINY}[words[0]].split() if scale == "smoke" else []
+        plain = "".join(letter if letter.isalnum() else "-" for letter in f"{env} {agent} {seed}")
+        folder = RUNS / f"{self.name}-{scale}" / plain
+        size = ["--total-steps", str(self.scales[scale].steps), "--seed", str(seed), "--run-dir", str(folder)]
+        return Job(agent, env, seed, [*words, *tiny, *size], folder)
+
+    def results(self, scale: str) -> Path:
+        """The file of a scale's lines; a smoke test's are no results."""
+        return (RUNS if scale == "smoke" else RESULTS) / f"{self.name}-{scale}.jsonl"
+
+    def main(self) -> None:
+        """The command line."""
+        parser = argparse.ArgumentParser(description=f"The study {self.name}: {', '.join(self.agents)}.")
+        parser.add_argument("--scale", choices=list(self.scales), default="small")
+        parser.add_argument("--seeds", type=int, nargs="+")
+        parser.add_argument("--env", nargs="+")
+        parser.add_argument("--only", nargs="+", help="agents")
+        parser.add_argument("--jobs", type=int, default=1, help="runs at once")
+        options = parser.parse_args()
+        try:
+            self.run(options.scale, self.jobs(options.scale, options.seeds, options.env, options.only), options.jobs)
+        except ConfigError as error:
+            sys.exit(f"studies.{self.name}: {error}")
+
+    def run(self, scale: str, jobs: Sequence[Job], at_once: int = 1) -> None:
+        """Those that have no line yet, so many at once. Raises ConfigError for the first that fails, after the rest."""
+        target, lock = self.results(scale), Lock()
+        target.parent.mkdir(parents=True, exist_ok=True)
+        found = history.read(target) if target.exists() else []
+        done = {(one.agent, one.env.partition(",")[0], one.seed) for one in found}
+        parts: SimpleQueue[set[int]] = SimpleQueue()
+        for part in _parts(at_once):
+            parts.put(part)
+
+        def conduct(job: Job) -> None:
+            cores = parts.get()
+            try:
+                found = _trained(job, cores)
+            finally:
+                parts.put(cores)
+            with lock, target.open("a") as file:
+                file.write(found.to_line() + "\n")
+
+        missing = [job for job in jobs if (job.agent, job.env, job.seed) not in done]
+        with ThreadPoolExecutor(at_once) as pool:
+            for future in [pool.submit(conduct, job) for job in missing]:
+                future.result()
+
+
+def _parts(count: int) -> list[set[int]]:
+    """The cores in as many parts; more parts than cores share them."""
+    cores = sorted(os.sched_getaffinity(0))
+    return [set(cores[index::count]) or {cores[index % len(cores)]} for index in range(count)]
+
+
+def _trained(job: Job, cores: set[int]) -> history.History:
+    """Train it on these cores, and read what came. Raises ConfigError with the end of what it said where it failed."""
+    print(f"{job.folder}: rmc {shlex.join(job.words)}", flush=True)
+    job.folder.parent.mkdir(parents=True, exist_ok=True)
+    log = job.folder.with_suffix(".log")
+    with log.open("a") as said:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "deploy.cli", *job.words], stdin=subprocess.DEVNULL, stdout=said, stderr=said
+        )
+        os.sched_setaffinity(process.pid, cores)
+        status = process.wait()
+    if status:
+        last = log.read_text().strip().splitlines()[-1:]
+        raise ConfigError(job.agent, shlex.join(job.words), f"ended with {status}: {' '.join(last)}; see {log}")
+    (found,) = history.read(job.folder)
+    return dataclasses.replace(found, agent=job.agent, commit=_commit())
+
+
+def _commit() -> str:
+    """Of the code that runs; with a + where it has changed since."""
+    git = ["git", "-C", str(RESULTS.parent), "describe", "--always", "--abbrev=7", "--dirty=+", "--exclude=*"]
+    found = subprocess.run(git, capture_output=True, text=True, check=False)
+    return found.stdout.strip()

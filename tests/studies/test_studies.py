@@ -1,0 +1,68 @@
+"""Studies: every run of every scale is one that rmc would take, and one study is run as a user would."""
+
+import dataclasses
+import importlib
+import json
+from pathlib import Path
+
+import pytest
+
+import studies
+from common.errors import ConfigError
+from deploy import history, options
+from deploy.presets import validate
+from studies import study
+from studies.study import Scale, Study
+
+NAMES = sorted({path.stem for path in Path(studies.__file__).parent.glob("*.py")} - {"__init__", "study"})
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("scale", ["smoke", "small", "full"])
+def test_every_run_is_one_that_rmc_takes(name, scale):
+    found: Study = importlib.import_module(f"studies.{name}").STUDY
+    assert found.name == name
+    jobs = found.jobs(scale)
+    assert len({job.folder for job in jobs}) == len(jobs)
+    seen = set()
+    for job in jobs:
+        command = options.parse(job.words)
+        assert isinstance(command, options.Train | options.Baseline)
+        assert (command.seed, command.run_dir, command.env.id) == (job.seed, job.folder, job.env)
+        config = command.config()
+        if isinstance(command, options.Train):
+            validate(config)
+        seen.add(dataclasses.replace(config, seed=0))
+    assert len(seen) == len(jobs) / len({job.seed for job in jobs})  # no two agents are the same
+
+
+def test_a_study_runs_once_and_its_lines_can_be_plotted(tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "RUNS", tmp_path)
+    agents = {"ours": "train ENV --flicker 0.1", "theirs": "baseline sac ENV --flicker 0.1"}
+    tiny = Study("tiny", agents, small=Scale(1000, (1, 2), ("InvertedPendulum-v5",)))
+    jobs = tiny.jobs("smoke")
+    assert [job.agent for job in jobs] == ["ours", "theirs"]
+    tiny.run("smoke", jobs, at_once=2)
+    lines = tmp_path / "tiny-smoke.jsonl"
+    found = history.read(lines)
+    assert {one.agent for one in found} == {"ours", "theirs"}
+    assert {one.env for one in found} == {"InvertedPendulum-v5, flicker 0.1"}
+    assert all(one.finished and one.env_steps >= 600 and one.commit for one in found)
+    before = lines.read_bytes()
+    tiny.run("smoke", jobs)
+    assert lines.read_bytes() == before
+
+
+def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "RUNS", tmp_path)
+    agents = {"broken": "train ENV --gamma 7", "sound": "baseline sac ENV"}
+    tiny = Study("tiny", agents, small=Scale(1000, (1,), ("InvertedPendulum-v5",)))
+    with pytest.raises(ConfigError, match="gamma"):
+        tiny.run("smoke", tiny.jobs("smoke"))
+    (found,) = (json.loads(line) for line in (tmp_path / "tiny-smoke.jsonl").read_text().splitlines())
+    assert found["agent"] == "sound"
+
+
+def test_a_wrong_agent_is_refused():
+    with pytest.raises(ConfigError, match="--only"):
+        Study("tiny", {"ours": "train ENV"}).jobs("small", only=["hours"])
