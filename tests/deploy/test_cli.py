@@ -36,6 +36,11 @@ OTHER_FLAGS = {
     "export": ["--out", "--checkpoint"],
     "inspect": ["--out", "--checkpoint"],
     "check-env": [*ENV_FLAGS, "--steps"],
+    "baseline": [
+        *ENV_FLAGS,
+        *"--settings --seed --total-steps --checkpoint-steps --episodes --threads --run-dir".split(),  # noqa: SIM905
+    ],
+    "plot": ["--out", "--by", "--reference"],
     "stats": [],
     "attach": [],
     "stop": [],
