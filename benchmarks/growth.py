@@ -103,18 +103,18 @@ def _in_steps(row: Row, steps: int) -> Row:
     return Row(**facts)
 
 
-def slopes(table: Table) -> list[str]:
-    """Lines for people: each size with the slope from the one before, and where it bends most."""
-    lines = []
+def slopes(of: str, table: Table) -> list[Row]:
+    """Over all sizes, for each unit, and at which size the slope from one to the next bends most."""
+    found = []
     for series in zip(*(rows for _, rows in table), strict=True):
         points = [(math.log(size), math.log(row.ours)) for (size, _), row in zip(table, series, strict=True)]
-        found = [(v - y) / (u - x) for (x, y), (u, v) in pairwise(points)]
-        for (size, _), row, slope in zip(table, series, [math.nan, *found], strict=True):
-            lines.append(f"{size:>9,} {row.ours:14,.1f} {row.unit:10s} slope {slope:6.2f}")
-        bends = [abs(after - before) for before, after in pairwise(found)]
+        steps = [(v - y) / (u - x) for (x, y), (u, v) in pairwise(points)]
+        bends = [abs(after - before) for before, after in pairwise(steps)]
         whole = (points[-1][1] - points[0][1]) / (points[-1][0] - points[0][0])
-        lines.append(f"slope over all {whole:.2f}; bends most at {table[1 + int(np.argmax(bends))][0]:,}")
-    return lines
+        name, bend = f"growth, slope of {series[0].unit} over {of}", float(table[1 + int(np.argmax(bends))][0])
+        spread, rounds = {"ours": (min(steps), max(steps))}, series[0].rounds
+        found.append(Row(name, "", whole, "", None, None, bend, "bends most at", spread, rounds, harness.command()))
+    return found
 
 
 def main() -> None:
@@ -125,8 +125,7 @@ def main() -> None:
     torch.set_num_threads(1)
     for name in options.what:
         table = tables[name](options.rounds, options.seconds)
-        harness.save([row for _, rows in table for row in rows])
-        print(*slopes(table), sep="\n", flush=True)
+        harness.save([*(row for _, rows in table for row in rows), *slopes(name, table)])
 
 
 if __name__ == "__main__":
