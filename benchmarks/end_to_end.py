@@ -118,7 +118,7 @@ def _known(key: dict[str, object]) -> list[Point] | None:
 def _rows(env: str, goal: float, times: dict[str, list[float]], seeds: int) -> list[Row]:
     """Medians over the seeds, a row a peer; a seed that did not get there counts as one that never does."""
     middle = {who: statistics.median(all_) for who, all_ in times.items()}
-    range_ = {who: (min(all_), max(all_)) for who, all_ in times.items()}
+    range_ = {who: (min(all_), max(all_) if math.isfinite(max(all_)) else None) for who, all_ in times.items()}
     rows = []
     for peer in LEARNING_STARTS:
         theirs = middle.get(peer)

@@ -98,7 +98,7 @@ def _learning(name: str, run: RunConfig, size: int, rounds: int, seconds: float)
 
 def _in_steps(row: Row, steps: int) -> Row:
     """The same measurement in trained steps."""
-    spread = {key: (least * steps, largest * steps) for key, (least, largest) in row.spread.items()}
+    spread = {key: (least * steps, (largest or 0.0) * steps) for key, (least, largest) in row.spread.items()}
     facts = vars(row) | {"name": f"{row.name}, trained", "unit": "steps/s", "ours": row.ours * steps, "spread": spread}
     return Row(**facts)
 

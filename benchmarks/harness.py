@@ -47,14 +47,15 @@ class Row:
     ratio: float | None  # how many times better ours is: median of the rounds' own ratios
     limit: float | None  # the ceiling
     limit_is: str
-    spread: dict[str, tuple[float, float]]  # least and largest of ours, peer and limit
+    spread: dict[str, tuple[float, float | None]]  # least and largest of ours, peer and limit; None: never
     rounds: int
     command: str
 
     def show(self) -> str:
         """One line for people."""
         least, largest = self.spread["ours"]
-        text = f"{self.name:44s} {self.ours:12,.1f} {self.unit} ({least:,.1f} to {largest:,.1f})"
+        most = "never" if largest is None else f"{largest:,.1f}"
+        text = f"{self.name:44s} {self.ours:12,.1f} {self.unit} ({least:,.1f} to {most})"
         if self.peer:
             text += f"; {self.peer}: " + ("not installed, see make peers" if self.peer_value is None else "")
         if self.peer_value is not None:

@@ -29,7 +29,9 @@ def number(value: float) -> str:
 
 def _range(row: dict[str, Any], of: str, value: float) -> str:
     least, largest = row["spread"].get(of, (value, value))
-    return number(value) if least == largest else f"{number(value)} ({number(least)} to {number(largest)})"
+    if least == largest:
+        return number(value)
+    return f"{number(value)} ({number(least)} to {'never' if largest is None else number(largest)})"
 
 
 def line(row: dict[str, Any]) -> str:

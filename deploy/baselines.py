@@ -4,7 +4,9 @@ The run's folder looks like that of ``rmc train``, so that ``rmc plot`` reads bo
 ``baselines`` is installed. Shapes: N environments, O observation, A action.
 """
 
+import dataclasses
 import json
+import shutil
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -24,7 +26,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from actors.evaluator import play_episodes
-from common.envs import first_env, make_env
+from common.envs import EnvConfig, first_env, make_env
 from common.errors import ConfigError
 from common.role import StopSignal
 from common.wrappers import Floats
@@ -74,6 +76,11 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None) -> RunFolder:
     per_update = transitions_per_update(config)
     about.write_text(json.dumps(now | {"name": config.name, "transitions_per_update": per_update}, indent=2) + "\n")
     return folder
+
+
+def _states(folder: RunFolder) -> list[Path]:
+    """What can be gone on with, whole, oldest first."""
+    return [path.parent for path in sorted(folder.checkpoints.glob(f"*/{PROGRESS}"))]
 
 
 class Opponent:
@@ -129,39 +136,43 @@ class _Run(BaseCallback):
 
     def _load(self, choice: Choice) -> tuple[VecEnv, Any]:
         """As it was saved last, or new."""
-        config, at, kind = self.config, self.folder.checkpoints, CLASSES[self.config.algorithm]
+        config, at, kind = self.config, _states(self.folder)[-1:], CLASSES[self.config.algorithm]
         vec: VecEnv = DummyVecEnv([lambda: Monitor(make_env(config.env))])
         if choice.normalize:
             gamma = float(choice.arguments.get("gamma", 0.99))
-            vec = VecNormalize.load(str(at / SCALES), vec) if (at / SCALES).exists() else VecNormalize(vec, gamma=gamma)
-        if (at / PROGRESS).exists():
-            model = kind.load(at / MODEL, env=vec, device="cpu")
+            vec = VecNormalize.load(str(at[0] / SCALES), vec) if at else VecNormalize(vec, gamma=gamma)
+        if at:
+            model = kind.load(at[0] / MODEL, env=vec, device="cpu")
             if config.algorithm in OFF_POLICY:
-                model.load_replay_buffer(at / BUFFER)
+                model.load_replay_buffer(at[0] / BUFFER)
             vec.seed(config.seed + model.num_timesteps)  # not the episodes that it has had
             return vec, model
-        return vec, kind(_policy(config), vec, **self._arguments(choice), seed=config.seed, device="cpu")
+        return vec, kind(_policy(config), vec, **self._arguments(choice, vec), seed=config.seed, device="cpu")
 
-    def _arguments(self, choice: Choice) -> dict[str, Any]:
+    def _arguments(self, choice: Choice, vec: VecEnv) -> dict[str, Any]:
         network = dict(choice.network) | ({"activation_fn": torch.nn.ReLU} if choice.relu else {})
         found = dict(choice.arguments) | ({"policy_kwargs": network} if network else {})
         if self.config.algorithm in OFF_POLICY:
             found["buffer_size"] = min(1_000_000, self.config.total_steps)  # as large as it can ever be of use
         if choice.noise:
-            size = first_env(self.config.env).action_space.shape or (1,)
+            size = vec.action_space.shape or (1,)
             found["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, choice.noise))
         return found
 
     def _save(self) -> None:
-        """The progress last: with it, all of it is whole."""
-        at, progress = self.folder.checkpoints, self.folder.checkpoints / PROGRESS
-        progress.unlink(missing_ok=True)
+        """Beside the last one, which goes once this is whole; its progress, written last, says that."""
+        at, before = self.folder.checkpoints / f"{self.steps:012d}", _states(self.folder)
+        if before[-1:] == [at]:
+            return
+        at.mkdir(exist_ok=True)
         self._model.save(at / MODEL)
         if self.config.algorithm in OFF_POLICY:
             self._model.save_replay_buffer(at / BUFFER)
         if isinstance(self._vec, VecNormalize):
             self._vec.save(str(at / SCALES))
-        progress.write_text(json.dumps({"env_steps": self.steps, "updates": self.updates}) + "\n")
+        (at / PROGRESS).write_text(json.dumps({"env_steps": self.steps, "updates": self.updates}) + "\n")
+        for old in before:
+            shutil.rmtree(old)
         self._save_at = time.monotonic() + SAVE_SECONDS
 
     # -- training ---------------------------------------------------------------------------------------
@@ -198,16 +209,8 @@ class _Run(BaseCallback):
     # -- evaluation and records -------------------------------------------------------------------------
 
     def _play(self, episodes: int) -> dict[str, Any]:
-        opponent = Opponent(self._model, self._scaled, episodes)
-        returns = play_episodes(opponent, lambda: make_env(self.config.env), episodes, self.config.seed)
-        mean, std = float(np.mean(returns)), float(np.std(returns))
-        return {"eval_return_mean": mean, "eval_return_std": std, "eval_episodes": len(returns)}
-
-    def _scaled(self, observation: Floats) -> Floats:
-        if not isinstance(self._vec, VecNormalize):
-            return observation
-        scaled: Floats = np.asarray(self._vec.normalize_obs(observation), np.float32)
-        return scaled
+        opponent = Opponent(self._model, _scaled_by(self._vec), episodes)
+        return _returns(play_episodes(opponent, lambda: make_env(self.config.env), episodes, self.config.seed))
 
     def _first_evaluation(self) -> float:
         """Of what it was before any training, once for the folder."""
@@ -247,6 +250,37 @@ class _Run(BaseCallback):
             "initial_return_mean": self._initial,
             "wall_s": self._wall(),
         }
+
+
+def evaluate(folder: RunFolder, episodes: int, flicker: float | None = None) -> dict[str, Any]:
+    """Deterministic episodes of what a baseline's run saved last, as ``evaluate_checkpoint``. Raises ConfigError."""
+    raw = json.loads((folder.path / "config.json").read_bytes())
+    states = _states(folder)
+    if not states:
+        raise ConfigError("RUN", str(folder.path), "it has no checkpoint yet; train it for longer")
+    env = EnvConfig(**raw["env"])
+    env = env if flicker is None else dataclasses.replace(env, flicker=flicker)
+    model = CLASSES[raw["algorithm"]].load(states[-1] / MODEL, device="cpu")
+    scales = states[-1] / SCALES
+    scaled = _scaled_by(
+        VecNormalize.load(str(scales), DummyVecEnv([lambda: make_env(env)])) if scales.exists() else None
+    )
+    returns = play_episodes(Opponent(model, scaled, episodes), lambda: make_env(env), episodes, raw["seed"])
+    progress = json.loads((states[-1] / PROGRESS).read_bytes())
+    about = {"env": env.id, "preset": raw["name"], "seed": raw["seed"], **progress}
+    return about | _returns(returns) | {"eval_flicker": env.flicker}
+
+
+def _returns(returns: list[float]) -> dict[str, Any]:
+    mean, std = float(np.mean(returns)), float(np.std(returns))
+    return {"eval_return_mean": mean, "eval_return_std": std, "eval_episodes": len(returns)}
+
+
+def _scaled_by(vec: VecEnv | None) -> Callable[[Floats], Floats]:
+    """Observations as a model sees them that was trained in this environment."""
+    if isinstance(vec, VecNormalize):
+        return lambda observation: np.asarray(vec.normalize_obs(observation), np.float32)
+    return lambda observation: observation
 
 
 def _policy(config: BaselineConfig) -> str:

@@ -60,18 +60,34 @@ def evaluate(command: options.Evaluate) -> int:
         if not 0.0 <= flicker <= 1.0:
             raise ConfigError("--flicker", flicker, "take probabilities from 0 to 1")
     folder, console = RunFolder(command.run), Console()
-    config = folder.config()
     for probability in command.flicker or (None,):
-        played = evaluate_checkpoint(folder, config, command.checkpoint, command.episodes, probability)
+        played = _played(folder, command, probability)
         text = json.dumps(played) if command.json else _said(played)
         console.print(text, soft_wrap=True, highlight=False, markup=False)
     if command.video is not None:
-        policy = load_policy(command.run, command.checkpoint)
+        policy, config = load_policy(command.run, command.checkpoint), folder.config()
         env = dataclasses.replace(config.env, flicker=command.flicker[0]) if command.flicker else config.env
         total = video.record(policy, env, config.seed, command.video)
         if not command.json:
             console.print(f"{command.video}: an episode with return {total:,.1f}", soft_wrap=True, highlight=False)
     return 0
+
+
+def _played(folder: RunFolder, command: options.Evaluate, flicker: float | None) -> dict[str, Any]:
+    if not history.is_baseline(folder):
+        return evaluate_checkpoint(folder, folder.config(), command.checkpoint, command.episodes, flicker)
+    if command.checkpoint != "latest":
+        raise ConfigError("--checkpoint", command.checkpoint, "a baseline keeps its last state only; use latest")
+    _check_baselines(str(folder.path))
+    from deploy import baselines
+
+    return baselines.evaluate(folder, command.episodes, flicker)
+
+
+def _check_baselines(what: str) -> None:
+    for package in ("stable_baselines3", "sb3_contrib"):
+        if importlib.util.find_spec(package) is None:
+            raise ConfigError("baseline", what, f"{package} is missing; pip install 'rmc[baselines]'")
 
 
 def _said(played: dict[str, Any]) -> str:
@@ -112,9 +128,7 @@ def check_env(command: options.CheckEnv) -> int:
 
 def baseline(command: options.Baseline) -> int:
     """Train an agent of stable-baselines3."""
-    for package in ("stable_baselines3", "sb3_contrib"):
-        if importlib.util.find_spec(package) is None:
-            raise ConfigError("baseline", command.algorithm, f"{package} is missing; pip install 'rmc[baselines]'")
+    _check_baselines(command.algorithm)
     from deploy import baselines  # an extra, and slow to import
 
     with training.signals_caught() as stop:

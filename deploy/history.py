@@ -106,15 +106,20 @@ class About:
     transitions_per_update: int
 
 
+def is_baseline(folder: RunFolder) -> bool:
+    """Whether ``rmc baseline`` made it."""
+    with suppress(OSError, ValueError):
+        return "algorithm" in json.loads((folder.path / "config.json").read_bytes())
+    return False
+
+
 def describe(path: Path) -> About:
     """Of a run of RMC, or of a baseline. Raises ConfigError."""
     folder = RunFolder(path)
-    config_file = folder.path / "config.json"
-    with suppress(OSError, ValueError):
-        raw = json.loads(config_file.read_bytes())
-        if isinstance(raw, dict) and "algorithm" in raw:
-            env = EnvConfig(**raw["env"])
-            return About(_with(raw["name"], _stack(env)), _seen(env), raw["seed"], raw["transitions_per_update"])
+    if is_baseline(folder):
+        raw = json.loads((folder.path / "config.json").read_bytes())
+        env = EnvConfig(**raw["env"])
+        return About(_with(raw["name"], _stack(env)), _seen(env), raw["seed"], raw["transitions_per_update"])
     config = folder.config()
     name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
     transitions = config.learner.batch_size * config.window.trained_steps

@@ -1,0 +1,82 @@
+"""Generalisation (a) of the paper: trained where everything is seen, played with more and more frames blank.
+
+After the runs, ``python -m studies.generalisation --scale SCALE --play`` plays each with p = 0 … 1 and prints the areas.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from deploy.aggregate import ENOUGH_SEEDS, interquartile_mean, interval
+from deploy.baselines import evaluate
+from deploy.evaluation import evaluate_checkpoint
+from deploy.history import is_baseline
+from deploy.run_folder import RunFolder
+from studies.study import Job, Scale, Study
+
+ENVS = ("HalfCheetah-v5", "Walker2d-v5", "Ant-v5")
+PROBABILITIES = tuple(round(0.1 * tenths, 1) for tenths in range(11))
+AREA = slice(1, 10)  # p = 0.1 … 0.9
+EPISODES = 10
+STUDY = Study(
+    "generalisation",
+    {"RMC": "train ENV", "SAC": "baseline sac ENV"},
+    full=Scale(1_000_000, (1, 2, 3, 4, 5), ENVS),
+)
+
+
+def play(job: Job, episodes: int = EPISODES) -> dict[str, object]:
+    """A line: returns of a run's last checkpoint under each probability."""
+    folder, returns = RunFolder(job.folder), []
+    for probability in PROBABILITIES:
+        if is_baseline(folder):
+            played = evaluate(folder, episodes, probability)
+        else:
+            played = evaluate_checkpoint(folder, folder.config(), "latest", episodes, probability)
+        returns.append(played["eval_return_mean"])
+    return {"agent": job.agent, "env": job.env, "seed": job.seed, "flicker": PROBABILITIES, "returns": returns}
+
+
+def area(returns: list[float]) -> float:
+    """Mean return over p = 0.1 … 0.9."""
+    return float(np.mean(returns[AREA]))
+
+
+def tell(path: Path) -> None:
+    """The areas by environment and agent, with an interval where there are seeds enough."""
+    found: dict[tuple[str, str], list[float]] = {}
+    for line in map(json.loads, path.read_text().splitlines()):
+        found.setdefault((line["env"], line["agent"]), []).append(area(line["returns"]))
+    for (env, agent), areas in found.items():
+        scores = np.array(areas)[:, None]
+        text = f"{env}, {agent}: {scores.mean():,.0f} ({', '.join(f'{one:,.0f}' for one in areas)})"
+        if len(areas) >= ENOUGH_SEEDS:
+            low, high = interval(interquartile_mean, scores)
+            text += f"; interquartile mean {interquartile_mean(scores):,.0f} [{low:,.0f}, {high:,.0f}]"
+        print(text)
+
+
+def main() -> None:
+    """Train, or play what was trained."""
+    if "--play" not in sys.argv:
+        STUDY.main()
+        return
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--play", action="store_true")
+    parser.add_argument("--scale", default="small")
+    scale = parser.parse_args().scale
+    target = STUDY.results(scale).with_suffix(".flicker.jsonl")
+    lines = [json.loads(line) for line in target.read_text().splitlines()] if target.exists() else []
+    done = {(line["agent"], line["env"], line["seed"]) for line in lines}
+    for job in STUDY.jobs(scale):
+        if job.folder.exists() and (job.agent, job.env, job.seed) not in done:
+            with target.open("a") as file:
+                file.write(json.dumps(play(job)) + "\n")
+    tell(target)
+
+
+if __name__ == "__main__":
+    main()
