@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bus import Ack, Bus, Holder
+from common.bus import Ack, Bus, Holder, Version
 from common.errors import ConfigError
 from common.metrics import Means, Rate
 from common.replay import EPISODE_BYTES, WHOLE, Draw, ObservationStatistics, Sample, Shard
@@ -26,6 +26,7 @@ from replay_server.recovery import open_store, valid_leaves
 
 log = logging.getLogger(__name__)
 PRIORITY_FLOOR = 1e-6  # so that every window keeps a chance
+LOOK_SECONDS = 0.1  # between looks at which weights are the newest: each waits for Redis
 REPUBLISH_PERIOD = 5.0  # seconds between repeats of all acks, in case Redis lost its data
 
 
@@ -102,6 +103,8 @@ class ReplayServer:
         self._buffers = [np.empty(0, spec.dtype)] * 2
         self._waiting_for, self._waiting_since = "", 0.0  # the learner, at the limiter
         self._refused_priorities = 0
+        self._newest: Version | None = None  # of the weights, when last looked at
+        self._look_at = 0.0
         self._means, self._rates = Means(), {name: Rate() for name in ("env_steps", "windows", "draws")}
 
     def _go_on_from(self, published: bytes | None) -> None:
@@ -154,9 +157,11 @@ class ReplayServer:
 
     def _measure_lag(self, rows: Rows) -> None:
         """Policy lag at insertion: weights versions between those that acted and the newest."""
-        version = self.bus.latest_version() if len(rows) else None
-        if version is not None:
-            lag = version.update - rows["weights_update"]
+        if len(rows) and time.monotonic() >= self._look_at:
+            self._look_at = time.monotonic() + LOOK_SECONDS
+            self._newest = self.bus.latest_version()
+        if len(rows) and self._newest is not None:
+            lag = self._newest.update - rows["weights_update"]
             self._means.add("policy_lag_mean", float(lag.mean()))
             self._means.add("policy_lag_max", float(lag.max()))
 
