@@ -262,10 +262,10 @@ def evaluate(folder: RunFolder, episodes: int, flicker: float | None = None) -> 
     env = env if flicker is None else dataclasses.replace(env, flicker=flicker)
     model = CLASSES[raw["algorithm"]].load(states[-1] / MODEL, device="cpu")
     scales = states[-1] / SCALES
-    scaled = _scaled_by(
-        VecNormalize.load(str(scales), DummyVecEnv([lambda: make_env(env)])) if scales.exists() else None
-    )
+    bare = DummyVecEnv([lambda: make_env(env)])
+    scaled = _scaled_by(VecNormalize.load(str(scales), bare) if scales.exists() else bare)
     returns = play_episodes(Opponent(model, scaled, episodes), lambda: make_env(env), episodes, raw["seed"])
+    bare.close()
     progress = json.loads((states[-1] / PROGRESS).read_bytes())
     about = {"env": env.id, "preset": raw["name"], "seed": raw["seed"], **progress}
     return about | _returns(returns) | {"eval_flicker": env.flicker}
@@ -276,7 +276,7 @@ def _returns(returns: list[float]) -> dict[str, Any]:
     return {"eval_return_mean": mean, "eval_return_std": std, "eval_episodes": len(returns)}
 
 
-def _scaled_by(vec: VecEnv | None) -> Callable[[Floats], Floats]:
+def _scaled_by(vec: VecEnv) -> Callable[[Floats], Floats]:
     """Observations as a model sees them that was trained in this environment."""
     if isinstance(vec, VecNormalize):
         return lambda observation: np.asarray(vec.normalize_obs(observation), np.float32)

@@ -1,6 +1,6 @@
 """Generalisation (a) of the paper: trained where everything is seen, played with more and more frames blank.
 
-After the runs, ``python -m studies.generalisation --scale SCALE --play`` plays each with p = 0 … 1 and prints the areas.
+After the runs, ``python -m studies.generalisation --scale SCALE --play`` plays each with p = 0 … 1 and tells the areas.
 """
 
 import argparse

@@ -1,6 +1,8 @@
 """Agents of stable-baselines3 in runs of our own format: trained, stopped, gone on with, judged by our evaluator."""
 
+import dataclasses
 import json
+import pickle
 from typing import get_args
 
 import pytest
@@ -11,6 +13,7 @@ from common.errors import ConfigError
 from common.role import StopSignal
 from deploy.baseline_settings import Algorithm, BaselineConfig, Settings, choose
 from deploy.baselines import train
+from deploy.cli import run as rmc
 from deploy.history import of_run
 from deploy.run_folder import RunFolder
 
@@ -44,6 +47,16 @@ def test_every_one_trains_stops_and_goes_on(algorithm, tmp_path):
     assert second.initial_return == first.initial_return
     assert second.wall_s > first.wall_s
     assert second.updates >= first.updates
+
+
+def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):
+    run(config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=600), tmp_path / "run")
+    assert rmc(["evaluate", str(tmp_path / "run"), "--episodes", "10", "--flicker", "0", "1", "--json"]) == 0
+    seen, blind = (json.loads(line) for line in capsys.readouterr().out.splitlines())
+    result = RunFolder(tmp_path / "run").result()
+    assert seen["eval_return_mean"] == pytest.approx(result["eval_return_mean"])
+    assert (blind["eval_flicker"], blind["env_steps"]) == (1.0, result["env_steps"])
+    assert rmc(["evaluate", str(tmp_path / "run"), "--checkpoint", "best"]) == 2
 
 
 def test_a_stop_signal_is_heard_and_nothing_is_lost(tmp_path):
@@ -91,10 +104,9 @@ def test_the_zoos_numbers_are_of_the_right_kind(algorithm, body):
 def test_the_zoos_ppo_trains_and_keeps_its_scales(tmp_path):
     """With running statistics of observations, which a run that goes on has again."""
     made = config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=600, checkpoint_steps=300)
-    assert run(made, tmp_path / "run") == 0
-    before = (tmp_path / "run" / "checkpoints" / "scales.pkl").stat().st_mtime_ns
-    assert (
-        run(config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=1200, checkpoint_steps=300), tmp_path / "run")
-        == 0
-    )
-    assert (tmp_path / "run" / "checkpoints" / "scales.pkl").stat().st_mtime_ns > before
+    for total in (600, 1200):
+        assert run(dataclasses.replace(made, total_steps=total), tmp_path / "run") == 0
+        (scales,) = (tmp_path / "run" / "checkpoints").glob("*/scales.pkl")
+        with scales.open("rb") as file:
+            count = pickle.load(file).obs_rms.count
+        assert count == pytest.approx(of_run(RunFolder(tmp_path / "run")).env_steps, rel=0.02)
