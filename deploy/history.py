@@ -5,6 +5,7 @@ A file of JSON lines holds many, one a line, so that results can be kept without
 
 import dataclasses
 import json
+import math
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -76,7 +77,9 @@ def of_run(folder: RunFolder) -> History:
     evaluations = _evaluations(records)
     result = folder.result() or {}
     if result:
-        evaluations = [one for one in evaluations if one.env_steps < result["env_steps"]]
+        ours = not is_baseline(folder)  # of its last checkpoint's own evaluation only the update is known
+        below = result["env_steps"], result["updates"] if ours else math.inf
+        evaluations = [one for one in evaluations if one.env_steps < below[0] and one.updates < below[1]]
         mean, std = result["eval_return_mean"], result["eval_return_std"]
         evaluations.append(Evaluation(result["env_steps"], result["updates"], result["wall_s"], mean, std))
     if not evaluations:
