@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from common.envs import EnvConfig
+from common.errors import ConfigError
 
 Algorithm = Literal["sac", "td3", "ddpg", "ppo", "recurrent-ppo"]
 Settings = Literal["paper", "zoo", "default"]
@@ -38,19 +39,37 @@ class BaselineConfig:
     """A baseline's run."""
 
     algorithm: Algorithm
+    """Which one."""
     env: EnvConfig
+    """The environment."""
     settings: Settings = "paper"
+    """Networks of 400 and 300 units, what rl-baselines3-zoo tuned, or stable-baselines3's own defaults."""
     seed: int = 0
+    """Seed of networks, environment and sampling."""
     total_steps: int = 1_000_000
+    """Environment steps of the run."""
     checkpoint_steps: int = 10_000
+    """Environment steps between evaluations."""
     episodes: int = 5
+    """Episodes of an evaluation."""
     threads: int = 1
+    """CPU threads of the run."""
 
     @property
     def name(self) -> str:
         """What plots call it."""
         kind = "RecurrentPPO" if self.algorithm == "recurrent-ppo" else self.algorithm.upper()
         return {"paper": f"{kind} 400-300", "zoo": f"{kind} zoo", "default": kind}[self.settings]
+
+
+def validate(config: BaselineConfig) -> None:
+    """Raises ConfigError for the first number that makes no sense."""
+    ranges = {"seed": (0, 2**32 - 1), "total_steps": (1, 2**53), "checkpoint_steps": (1, 2**53)}
+    for name, (low, high) in (ranges | {"episodes": (1, 10_000), "threads": (1, 1024)}).items():
+        value = getattr(config, name)
+        if not low <= value <= high:
+            fix = f"take a number from {low:,} to {high:,}".replace(",", "_")
+            raise ConfigError(f"--{name.replace('_', '-')}", value, fix)
 
 
 @dataclass(frozen=True)

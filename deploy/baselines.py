@@ -30,7 +30,7 @@ from common.envs import EnvConfig, first_env, make_env
 from common.errors import ConfigError
 from common.role import StopSignal
 from common.wrappers import Floats
-from deploy.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, transitions_per_update
+from deploy.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, transitions_per_update, validate
 from deploy.run_folder import RunFolder
 
 CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
@@ -42,15 +42,25 @@ MODEL, BUFFER, SCALES, PROGRESS = "model.zip", "replay_buffer.pkl", "scales.pkl"
 
 def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: StopSignal) -> int:
     """Train to the end, or to a stop signal; the exit status. Raises ConfigError before anything is written."""
+    validate(config)
     first_env(config.env).close()
     folder = _open_folder(config, run_dir)
     torch.set_num_threads(config.threads)
     torch.set_flush_denormal(True)  # as our learner does
     console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
+    folder.lock()
+    try:
+        return _conduct(config, folder, console, stop)
+    finally:
+        folder.unlock()
+
+
+def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: StopSignal) -> int:
     with closing(_Run(config, folder, console)) as run:
         run.train(stop)
         if stop.requested:
-            console.print(f"stopped at environment step {run.steps:,}; the same command goes on", highlight=False)
+            words = f"the same command with --run-dir {folder.path} goes on"
+            console.print(f"stopped at environment step {run.steps:,}; {words}", soft_wrap=True, highlight=False)
             return STOPPED
         result = run.result()
     folder.write_result(result)

@@ -61,7 +61,7 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
     columns = min(COLUMNS, len(groups))
     rows = -(-len(groups) // columns)
     figure = Figure(figsize=(1.0 + 5.0 * columns, 0.6 + 3.6 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).flat
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
     agents = list(dict.fromkeys(agent for found in groups.values() for agent in found))
     handles: dict[str, Any] = {}
     for panel, (env, found) in zip(panels, groups.items(), strict=False):
@@ -71,7 +71,7 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
         panel.set_xlabel(LABELS[by])
         panel.set_ylabel("return")
         panel.grid(alpha=0.3)
-    for panel in list(panels)[len(groups) :]:
+    for panel in panels[len(groups) :]:
         panel.set_axis_off()
     figure.legend(handles.values(), [_named(agent, groups) for agent in handles], loc="outside lower center", ncols=2)
     figure.savefig(out, dpi=110)

@@ -14,7 +14,7 @@ from actors.evaluator import EvaluatorConfig
 from common.agent import AgentConfig
 from common.envs import EnvConfig
 from deploy import presets
-from deploy.baseline_settings import Algorithm, BaselineConfig, Settings
+from deploy.baseline_settings import Algorithm, BaselineConfig
 from deploy.curves import Axis
 from deploy.presets import Preset, RunConfig, WindowConfig
 from deploy.run_folder import IfExists
@@ -147,31 +147,19 @@ class CheckEnv:
 
 
 @dataclass(frozen=True)
-class Baseline:
+class Baseline(BaselineConfig):
     """Train an agent of stable-baselines3 in the same environment, to compare with; or go on with such a run."""
 
     algorithm: Positional[Algorithm]
     """Which one."""
     env: EnvOptions
-    settings: Settings = "paper"
-    """Networks of 400 and 300 units, what rl-baselines3-zoo tuned, or stable-baselines3's own defaults."""
-    seed: int = 0
-    """Seed of networks, environment and sampling."""
-    total_steps: int = 1_000_000
-    """Environment steps of the run."""
-    checkpoint_steps: int = 10_000
-    """Environment steps between evaluations."""
-    episodes: int = 5
-    """Episodes of an evaluation."""
-    threads: int = 1
-    """CPU threads of the run."""
     run_dir: Path | None = None
     """The run's folder; by default runs/<env>__<algorithm>-<settings>__<seed>__<time>. The same one goes on."""
 
     def config(self) -> BaselineConfig:
         """The run's config."""
-        own = {item.name: getattr(self, item.name) for item in dataclasses.fields(BaselineConfig) if item.name != "env"}
-        return BaselineConfig(env=self.env.config(), **own)
+        own = {item.name: getattr(self, item.name) for item in dataclasses.fields(BaselineConfig)}
+        return BaselineConfig(**own | {"env": self.env.config()})
 
 
 @dataclass(frozen=True)

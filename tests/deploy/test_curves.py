@@ -92,6 +92,15 @@ def test_few_seeds_are_lines_and_many_a_band(tmp_path):
     assert (tmp_path / "curves.png").stat().st_size > 10_000
 
 
+def test_panels_without_an_environment_are_empty(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
+    curves.draw(curves.grouped([made(env=f"Env{i}-v0") for i in range(4)]), "env_steps", tmp_path / "out.png")
+    assert [panel.axison for panel in figures[0].axes] == [True] * 4 + [False] * 2
+
+
 def test_the_table_compares_with_a_reference():
     runs = [made(seed=s, last=200.0) for s in range(5)] + [made("SAC", seed=s, last=100.0) for s in range(2)]
     text = shown(curves.tables(curves.grouped(runs), "SAC"))
@@ -122,6 +131,9 @@ def test_the_command_draws_and_prints(tmp_path, capsys):
         (["plot", "LINES", "--out", "out.gif"], "--out"),
         (["plot", "LINES", "--reference", "PPO"], "--reference"),
         (["baseline", "sac", "Nowhere-v0"], "no such environment"),
+        (["baseline", "sac", "Hopper-v5", "--total-steps", "-5"], "--total-steps"),
+        (["baseline", "sac", "Hopper-v5", "--checkpoint-steps", "0"], "--checkpoint-steps"),
+        (["baseline", "sac", "Hopper-v5", "--threads", "0"], "--threads"),
         (["baseline", "dreamer", "Hopper-v5"], "dreamer"),
     ],
 )

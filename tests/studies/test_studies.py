@@ -11,7 +11,7 @@ import studies
 from common.errors import ConfigError
 from deploy import history, options
 from deploy.presets import validate
-from studies import study
+from studies import generalisation, study
 from studies.study import Scale, Study
 
 NAMES = sorted({path.stem for path in Path(studies.__file__).parent.glob("*.py")} - {"__init__", "study"})
@@ -66,3 +66,13 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, monkeypatch):
 def test_a_wrong_agent_is_refused():
     with pytest.raises(ConfigError, match="--only"):
         Study("tiny", {"ours": "train ENV"}).jobs("small", only=["hours"])
+
+
+def test_an_area_is_over_partial_views_only(tmp_path, capsys):
+    """Neither everything seen nor nothing counts."""
+    returns = [1e6, *[10.0] * 8, 100.0, -1e6]
+    lines = [{"agent": "RMC", "env": "Hopper-v5", "seed": seed, "returns": returns} for seed in (1, 2)]
+    (tmp_path / "lines").write_text("\n".join(map(json.dumps, lines)))
+    assert generalisation.area(returns) == 20.0
+    generalisation.tell(tmp_path / "lines")
+    assert capsys.readouterr().out == "Hopper-v5, RMC: 20 (20, 20)\n"
