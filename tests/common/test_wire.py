@@ -63,6 +63,7 @@ def repacked(index: int, value: object) -> bytes:
         (wire.encode_windows(random_rows(2), SPEC) + b"more", "length"),
         (wire.encode_windows(random_rows(2), SPEC)[:-1], "length"),
         (wire.encode_hello(SPEC)[:-1], "length"),
+        (wire.encode_hello(SPEC)[:-1] + b"\x01", "length"),
         (wire.encode_hello(SPEC)[:-2], "structure"),
     ],
 )

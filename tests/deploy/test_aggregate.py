@@ -43,9 +43,12 @@ def test_an_interval_holds_the_truth_about_as_often_as_it_says():
 
 
 def test_environments_are_resampled_each_for_itself():
-    """A run of one environment never stands in for one of another: constant columns leave no spread."""
+    """A run of one never stands in for one of another, and two are not drawn alike."""
     scores = np.tile([1.0, 1000.0], (6, 1))
     assert interval(lambda x: float(x[:, 0].mean() - x[:, 1].mean()), scores, resamples=50) == (-999.0, -999.0)
+    alike = np.tile(np.arange(6.0)[:, None], 2)
+    low, high = interval(lambda x: float(x[:, 0].mean() - x[:, 1].mean()), alike, resamples=200)
+    assert low < -0.5 < 0.5 < high
 
 
 def test_scores_are_scaled_by_environment():

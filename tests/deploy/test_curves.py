@@ -59,6 +59,9 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     (found,) = history.read(tmp_path)
     assert found.evaluations[-1] == Evaluation(1000, 100, 21.0, 11.0, 2.0)
     assert (found.finished, found.initial_return) == (True, -1.0)
+    (tmp_path / "result.json").write_text(json.dumps({**result, "updates": 90, "initial_return_mean": -1.0}))
+    (found,) = history.read(tmp_path)  # the evaluator has played that checkpoint before
+    assert [one.env_steps for one in found.evaluations] == [500, 1000]
 
 
 @pytest.mark.parametrize("text", ["[1, 2]", "{}", "not json"])
