@@ -58,7 +58,7 @@ trial_prioritized := --priority-exponent 0.6 --importance-exponent 0.4
 trial_ema_latent := --latent-target ema
 trial_ema_memory := --target-memory ema
 trial_curiosity := --curiosity 0.1 --curiosity-scale std
-trial_shortcut := --shortcut
+trial_shortcut := --head-input hidden+embedding
 trial_raw_observations := --no-normalize-observations
 TRIALS := base layer_norm prioritized ema_latent ema_memory curiosity shortcut raw_observations
 

@@ -70,7 +70,8 @@ class PolicyRunner:
         self._obs_dim, self._action_dim = obs_dim, action_dim
         inputs = obs_dim + action_dim + config.blank_flag
         embedding = config.embedding or inputs
-        features = config.hidden + (embedding if config.shortcut else 0)
+        self._beside = {"hidden": 0, "hidden+embedding": embedding}.get(config.head_input, obs_dim)
+        features = self._beside + (config.hidden if config.head_input != "observation" else 0)
         self._input = np.zeros((envs, inputs), np.float32)
         self._embed = _Linear(inputs, embedding, envs, relu=not config.layer_norm) if config.embedding else None
         self._from_embedding = _Linear(embedding, 3 * config.hidden, envs)
@@ -121,9 +122,15 @@ class PolicyRunner:
         a = tanh(mean + std * noise); without noise, tanh(mean). The hidden state returned is a buffer that
         the next call overwrites; none of the arguments is changed.
         """
-        embedding = self._embedded(self._seen(observation, prev_action, blank))
-        new_hidden = self._gru(embedding, torch.from_numpy(hidden))
-        x = torch.cat([new_hidden, embedding], 1) if self._config.shortcut else new_hidden
+        seen = self._seen(observation, prev_action, blank)
+        if self._config.head_input == "observation":
+            x, new_hidden = seen[:, : self._obs_dim], self._gru.out.zero_()
+        else:
+            embedding = self._embedded(seen)
+            x = new_hidden = self._gru(embedding, torch.from_numpy(hidden))
+            if self._beside:
+                beside = embedding if self._config.head_input == "hidden+embedding" else seen
+                x = torch.cat([x, beside[:, : self._beside]], 1)
         for layer in self._head:
             x = layer(x)
         return self._action(x.numpy(), noise), new_hidden.numpy()

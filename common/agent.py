@@ -15,6 +15,7 @@ from torch.nn import functional as F
 LOG_STD_RANGE = (-20.0, 2.0)  # of the policy's Gaussian before the tanh
 NORMALIZED_CLIP = 10.0  # standard deviations
 STD_FLOOR = 1e-2  # a constant dimension is not blown up
+HeadInput = Literal["hidden", "hidden+embedding", "hidden+observation", "observation"]
 POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what it takes to act
 CRITIC_PARTS = ("critic.", "log_alpha")  # what else it takes to rate a window
 
@@ -31,8 +32,11 @@ class AgentConfig:
     """Hidden layers of every head."""
     layer_norm: bool = False
     """LayerNorm between the embedding's Linear and its ReLU."""
-    shortcut: bool = False
-    """Heads read the current embedding beside the hidden state."""
+    head_input: HeadInput = "hidden"
+    """What the heads read: the hidden state; beside it the current embedding, or observation; or the observation alone,
+    an agent without a memory."""
+    critic_norm: bool = False
+    """LayerNorm before the ReLUs of the critics."""
     normalize_observations: bool = False
     """Observations are normalised by the replay server's running statistics."""
     grounding: bool = True
@@ -76,8 +80,8 @@ class Normalizer(nn.Module):
 class Remembered(NamedTuple):
     """What the memory makes of a sequence."""
 
-    hidden: Tensor  # (B, T, H), h_t after (o_t, a_{t-1})
-    embedding: Tensor  # (B, T, E)
+    hidden: Tensor  # (B, T, H), h_t after (o_t, a_{t-1}); zeros without a memory
+    beside: Tensor  # (B, T, S), what the heads read beside it: e_t, o_t, or nothing
 
 
 class Memory(nn.Module):
@@ -89,22 +93,33 @@ class Memory(nn.Module):
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
         width = obs_dim + action_dim + config.blank_flag
-        self.blank_flag = config.blank_flag
+        self.blank_flag, self.head_input = config.blank_flag, config.head_input
         layers: list[nn.Module] = []
         if config.embedding:
             layers = [nn.Linear(width, config.embedding), nn.ReLU()]
             if config.layer_norm:
                 layers.insert(1, nn.LayerNorm(config.embedding))
         self.embed = nn.Sequential(*layers)
-        self.embedding_dim = config.embedding or width
-        self.gru = nn.GRU(self.embedding_dim, config.hidden, batch_first=True)
+        embedding = config.embedding or width
+        self.beside_dim = {"hidden": 0, "hidden+embedding": embedding}.get(config.head_input, obs_dim)
+        self.gru = nn.GRU(embedding, config.hidden, batch_first=True)
 
     def forward(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Remembered:
         """(B, T, O) normalised, (B, T) bool, (B, T, A), (B, H) the state before the first step."""
-        embedding = self.embedded(observation, blank, prev_action)
-        return Remembered(self._unroll(embedding, hidden.unsqueeze(0).contiguous()), embedding)
+        if self.head_input == "observation":
+            return Remembered(observation.new_zeros(*observation.shape[:2], self.gru.hidden_size), observation)
+        embedding = self._embedded(observation, blank, prev_action)
+        hidden = self._unroll(embedding, hidden.unsqueeze(0).contiguous())
+        return Remembered(hidden, self._beside(observation, embedding))
 
-    def embedded(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
+    def beside(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
+        """What the heads read beside h: (..., O) normalised, (...) bool, (..., A) -> (..., S)."""
+        return self._beside(observation, self._embedded(observation, blank, prev_action))
+
+    def _beside(self, observation: Tensor, embedding: Tensor) -> Tensor:
+        return (embedding if self.head_input == "hidden+embedding" else observation)[..., : self.beside_dim]
+
+    def _embedded(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
         """(..., O) normalised, (...) bool, (..., A) -> (..., E)."""
         flag = [blank.unsqueeze(-1).to(observation.dtype)] if self.blank_flag else []
         embedding: Tensor = self.embed(torch.cat([observation, prev_action, *flag], dim=-1))
@@ -170,11 +185,12 @@ class StackedLinear(nn.Module):
 
 
 class TwinQ(nn.Module):
-    """Eq. 9: Q_1(h, a) and Q_2(h, a), stacked."""
+    """Eq. 9: Q_1(h, a) and Q_2(h, a), stacked. Where asked, a LayerNorm without weights before each ReLU."""
 
     def __init__(self, inputs: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
         first, second = config.heads
+        self.norm = config.critic_norm
         self.layers = nn.ModuleList(
             [StackedLinear(inputs + action_dim, first), StackedLinear(first, second), StackedLinear(second, 1)]
         )
@@ -185,7 +201,8 @@ class TwinQ(nn.Module):
         shape = x.shape[:-1]
         x = x.reshape(1, -1, x.shape[-1]).expand(2, -1, -1)
         for layer in self.layers[:-1]:
-            x = F.relu(layer(x))
+            x = layer(x)
+            x = F.relu(F.layer_norm(x, x.shape[-1:]) if self.norm else x)
         with torch.autocast(x.device.type, enabled=False):  # bfloat16 would give a Q of 300 in steps of 2
             q: Tensor = self.layers[-1](x.float())
         return q.reshape(2, *shape)
@@ -224,17 +241,20 @@ class Agent(nn.Module):
         self.config, self.obs_dim, self.action_dim = config, obs_dim, action_dim
         self.normalizer = Normalizer(obs_dim, config.normalize_observations)
         self.memory = Memory(obs_dim, action_dim, config)
-        features = config.hidden + (self.memory.embedding_dim if config.shortcut else 0)
+        features = self.memory.beside_dim + (config.hidden if config.head_input != "observation" else 0)
         self.world_model = WorldModel(features, obs_dim, action_dim, config)
         self.critic = TwinQ(features, action_dim, config)
         self.policy = Policy(features, action_dim, config)
         self.log_alpha = nn.Parameter(torch.zeros(()))
 
     def features(self, remembered: Remembered) -> Tensor:
-        """What the heads read: h_t, with the current embedding beside it where configured."""
-        if self.config.shortcut:
-            return torch.cat([remembered.hidden, remembered.embedding], dim=-1)
-        return remembered.hidden
+        """What the heads read: h_t, what is beside it, or both."""
+        match self.config.head_input:
+            case "hidden":
+                return remembered.hidden
+            case "observation":
+                return remembered.beside
+        return torch.cat(remembered, dim=-1)
 
     def policy_weights(self) -> dict[str, Tensor]:
         """What it takes to act, detached, on the CPU."""

@@ -120,18 +120,18 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
 def _open_loop(agent: Agent, memory: Remembered, episode: Episode) -> dict[int, Tensor]:
     """Horizon K -> (T - K + 1, O): from every step on, the model's own states and observations in place of the real."""
     steps = episode.action.shape[1]
-    hidden, embedding = memory.hidden[0, :-1], memory.embedding[0, :-1]
+    hidden, beside = memory.hidden[0, :-1], memory.beside[0, :-1]
     observation = episode.observation[0, :-1]
     found = {}
     for ahead in range(1, min(max(HORIZONS), steps) + 1):
         count = steps - ahead + 1  # starts from which so many steps were played
-        hidden, embedding, observation = hidden[:count], embedding[:count], observation[:count]
+        hidden, beside, observation = hidden[:count], beside[:count], observation[:count]
         action = episode.action[0, ahead - 1 :]
-        features = agent.features(Remembered(hidden.unsqueeze(1), embedding.unsqueeze(1)))
+        features = agent.features(Remembered(hidden.unsqueeze(1), beside.unsqueeze(1)))
         step = agent.world_model(features, action.unsqueeze(1))
         hidden = hidden + step.hidden_change.squeeze(1)
         observation = observation + step.observation_change.squeeze(1)
-        embedding = agent.memory.embedded(observation, torch.zeros(count, dtype=torch.bool), action)
+        beside = agent.memory.beside(observation, torch.zeros(count, dtype=torch.bool), action)
         if ahead in HORIZONS:
             found[ahead] = observation
     return found

@@ -210,6 +210,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "replay.priority_exponent": (0, 4),
     "replay.replay_shards": (1, 1024),
     "update.learning_rate": (1e-12, 1),
+    "update.memory_learning_scale": (0, 1_000),
     "update.alpha_learning_rate": (0, 1),
     "update.gamma": (0, 1),
     "update.polyak": (0, 1),
@@ -241,6 +242,8 @@ def validate(config: RunConfig) -> None:
         raise ConfigError("--heads", config.agent.heads, "take at least 1 unit a layer")
     if config.agent.layer_norm and not config.agent.embedding:
         raise ConfigError("--layer-norm", True, "it normalises the embedding, so it needs --embedding above 0")
+    if config.agent.head_input == "observation" and config.update.curiosity:
+        raise ConfigError("--curiosity", config.update.curiosity, "it is the error in a memory's change; take 0")
     if config.agent.initial_priority == "actor" and config.replay.priority_exponent == 0.0:
         raise ConfigError(
             "--initial-priority", "actor", "uniform replay has no priorities; try --priority-exponent 0.6"

@@ -37,6 +37,8 @@ class UpdateConfig:
 
     learning_rate: float = 3e-4
     """Adam's step size for every network."""
+    memory_learning_scale: float = 1.0
+    """The memory's step size, as a multiple of the others'."""
     alpha_learning_rate: float = 3e-4
     """Adam's step size for the temperature."""
     gamma: float = 0.99
@@ -317,10 +319,14 @@ def _target_copy(module: ModuleT) -> ModuleT:
 
 
 def _adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
-    """Adam for the parts of the agent that are named; the temperature has a step size of its own."""
-    networks = [value for part in parts if part != "log_alpha" for value in getattr(agent, part).parameters()]
+    """Adam for the parts of the agent that are named; memory and temperature have step sizes of their own."""
+    heads = [part for part in parts if part not in ("memory", "log_alpha")]
     groups = [
-        {"params": networks, "lr": config.learning_rate},
+        {"params": list(agent.memory.parameters()), "lr": config.learning_rate * config.memory_learning_scale},
+        {
+            "params": [value for part in heads for value in getattr(agent, part).parameters()],
+            "lr": config.learning_rate,
+        },
         {"params": [agent.log_alpha] if "log_alpha" in parts else [], "lr": config.alpha_learning_rate},
     ]
     on_gpu = agent.log_alpha.device.type == "cuda"

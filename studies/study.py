@@ -14,7 +14,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import product
 from pathlib import Path
 from queue import SimpleQueue
@@ -25,7 +25,7 @@ from deploy import history
 
 RESULTS, RUNS = Path(__file__).parent / "results", Path("runs") / "studies"
 TINY = "--checkpoint-steps 300 --episodes 1"  # at the scale smoke
-TINY_OURS = f"{TINY} --hidden 16 --embedding 16 --heads 16 16 --warmup-steps 200 --batch-size 8 --replay-ratio 4"
+TINY_OURS = f"{TINY} --hidden 16 --embedding 16 --heads 16 16 --warmup-steps 200 --batch-size 6 --replay-ratio 4"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Study:
         plain = "".join(letter if letter.isalnum() else "-" for letter in f"{env} {agent} {seed}")
         folder = RUNS / f"{self.name}-{scale}" / plain
         size = ["--total-steps", str(self.scales[scale].steps), "--seed", str(seed), "--run-dir", str(folder)]
-        return Job(agent, env, seed, [*words, *tiny, *size], folder)
+        return Job(agent, env, seed, [*words[:2], *tiny, *words[2:], *size], folder)  # what the study says of it wins
 
     def results(self, scale: str) -> Path:
         """The file of a scale's lines; a smoke test's are no results."""
@@ -97,6 +97,8 @@ class Study:
             self.run(options.scale, self.jobs(options.scale, options.seeds, options.env, options.only), options.jobs)
         except ConfigError as error:
             sys.exit(f"studies.{self.name}: {error}")
+        except KeyboardInterrupt:
+            sys.exit(f"studies.{self.name}: interrupted; the same command goes on with it")
 
     def run(self, scale: str, jobs: Sequence[Job], at_once: int = 1) -> None:
         """Those that have no line yet, so many at once. Raises ConfigError for the first that fails, after the rest."""
@@ -119,8 +121,14 @@ class Study:
 
         missing = [job for job in jobs if (job.agent, job.env, job.seed) not in done]
         with ThreadPoolExecutor(at_once) as pool:
-            for future in [pool.submit(conduct, job) for job in missing]:
-                future.result()
+            runs = [pool.submit(conduct, job) for job in missing]
+            try:
+                wait(runs)
+            except KeyboardInterrupt:  # those at work have heard it, too; no other one starts
+                pool.shutdown(cancel_futures=True)
+                raise
+            for run in runs:
+                run.result()
 
 
 def _parts(count: int) -> list[set[int]]:

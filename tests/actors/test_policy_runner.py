@@ -1,6 +1,7 @@
 """The fast policy against the agent's own modules."""
 
 from itertools import product
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from safetensors.torch import save
 
 from actors.policy_runner import PolicyRunner
-from common.agent import Agent, AgentConfig, squashed_sample
+from common.agent import Agent, AgentConfig, HeadInput, squashed_sample
 from common.errors import MessageError
 
 OBS_DIM, ACTION_DIM, ENVS = 5, 3, 4
@@ -46,14 +47,14 @@ def reference(
 
 
 @pytest.mark.parametrize(
-    ("embedding", "layer_norm", "shortcut", "normalize", "blank_flag"),
-    list(product((0, 16), (False, True), (False, True), (False, True), (False, True))),
+    ("embedding", "layer_norm", "head_input", "normalize", "blank_flag"),
+    list(product((0, 16), (False, True), get_args(HeadInput), (False, True), (False, True))),
 )
 def test_agrees_with_the_agent(
-    embedding: int, layer_norm: bool, shortcut: bool, normalize: bool, blank_flag: bool
+    embedding: int, layer_norm: bool, head_input: HeadInput, normalize: bool, blank_flag: bool
 ) -> None:
     config = AgentConfig(
-        hidden=12, embedding=embedding, heads=(9, 7), layer_norm=layer_norm, shortcut=shortcut,
+        hidden=12, embedding=embedding, heads=(9, 7), layer_norm=layer_norm, head_input=head_input,
         normalize_observations=normalize, blank_flag=blank_flag,
     )  # fmt: skip
     agent = make_agent(config)
@@ -81,7 +82,7 @@ def test_agrees_with_the_agent(
 @pytest.mark.parametrize("envs", [1, 32])
 def test_both_ways_to_multiply_agree_with_the_agent(envs: int) -> None:
     """Default sizes: plain products for few environments, packed ones for many."""
-    agent = make_agent(AgentConfig(shortcut=True))
+    agent = make_agent(AgentConfig(head_input="hidden+embedding"))
     with torch.no_grad():
         for value in agent.parameters():
             value *= 0.1

@@ -21,7 +21,7 @@ AGENTS = {
             embedding=embedding,
             heads=(8, 8),
             layer_norm=bool(embedding),
-            shortcut=True,
+            head_input="hidden+embedding",
             normalize_observations=True,
             blank_flag=bool(embedding),
         )

@@ -20,11 +20,12 @@ TRAIN_FLAGS = """
     --env-timeout --run-dir --if-exists --launcher --device --redis-url
     --ray-address --all-cpus --tls
     --burn-in --trained-steps
-    --hidden --embedding --heads --layer-norm --shortcut --normalize-observations --grounding
+    --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
     --blank-flag --initial-priority
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
     --capacity --replay-shards --replay-ratio --warmup-steps --priority-exponent --importance-exponent
-    --learning-rate --alpha-learning-rate --gamma --polyak --clip-norm --latent-target --target-memory --policy-q
+    --learning-rate --memory-learning-scale
+    --alpha-learning-rate --gamma --polyak --clip-norm --latent-target --target-memory --policy-q
     --scheme --policy-through-q --update-order --model-norm --n-step --state-strategy
     --curiosity --curiosity-scale --curiosity-steps --eta
     --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads
@@ -207,11 +208,11 @@ def test_a_run_may_be_made_longer(tmp_path: Path) -> None:
 
 def test_options_become_the_config() -> None:
     words = ["train", PENDULUM, "--preset", "paper", "--seed", "4", "--envs-per-actor", "3", "--heads", "64", "32"]
-    command = options.parse([*words, "--replay-ratio", "64", "--flicker", "0.5", "--shortcut"])
+    command = options.parse([*words, "--replay-ratio", "64", "--flicker", "0.5", "--head-input", "hidden+embedding"])
     assert isinstance(command, options.Train)
     config = command.config()
     expected = presets.paper(EnvConfig(PENDULUM, 0.5))
     assert (config.seed, config.actor.envs_per_actor, config.agent.heads) == (4, 3, (64, 32))
-    assert (config.replay.replay_ratio, config.agent.shortcut, config.env.flicker) == (64.0, True, 0.5)
+    assert (config.replay.replay_ratio, config.agent.head_input, config.env.flicker) == (64.0, "hidden+embedding", 0.5)
     assert config.update == expected.update
     assert to_json(config) != to_json(expected)

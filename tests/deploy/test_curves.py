@@ -34,7 +34,9 @@ def test_a_line_holds_a_history():
 def test_a_run_is_read_from_its_folder(tmp_path):
     """Steps and wall time of an evaluation lie between what learner and launcher said around it, resumed or not."""
     config = dataclasses.replace(robust(EnvConfig("Hopper-v5", flicker=0.5)), seed=3)
-    config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, shortcut=True, heads=(5, 6)))
+    config = dataclasses.replace(
+        config, agent=dataclasses.replace(config.agent, head_input="hidden+embedding", heads=(5, 6))
+    )
     (tmp_path / "config.json").write_text(to_json(config))
     records = [
         {"role": "launcher", "time": 100.0, "wall_s": 0.0},
@@ -49,7 +51,7 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     ]
     (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, records)) + '\n{"role": "evalu')
     (found,) = history.read(tmp_path)
-    assert found.agent == "RMC --heads 5 6 --shortcut"
+    assert found.agent == "RMC --heads 5 6 --head-input hidden+embedding"
     assert found.env == "Hopper-v5, flicker 0.5"
     assert (found.seed, found.finished, found.initial_return) == (3, False, None)
     assert found.evaluations == [Evaluation(500, 50, 5.0, 7.0, 1.0), Evaluation(900, 90, 15.0, 9.0, 1.0)]

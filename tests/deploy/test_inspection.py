@@ -54,7 +54,10 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
         step = agent.world_model(agent.features(seen), action)
         observation = observation + step.observation_change
         embedding = agent.memory.embed(torch.cat([observation, action], -1))
-        seen = seen._replace(hidden=seen.hidden + step.hidden_change, embedding=embedding)
+        beside = {"hidden": observation[..., :0], "hidden+embedding": embedding}.get(
+            agent.config.head_input, observation
+        )
+        seen = seen._replace(hidden=seen.hidden + step.hidden_change, beside=beside)
     return observation[0, 0]
 
 

@@ -20,8 +20,12 @@ from deploy.presets import debug
 from deploy.run_folder import RunFolder, open_run
 
 AGENTS = {
-    "robust": AgentConfig(hidden=16, embedding=12, heads=(10, 9), shortcut=True, normalize_observations=True),
+    "robust": AgentConfig(
+        hidden=16, embedding=12, heads=(10, 9), head_input="hidden+embedding", normalize_observations=True
+    ),
     "layer norm": AgentConfig(hidden=16, embedding=12, heads=(10, 9), layer_norm=True),
+    "observation beside": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="hidden+observation"),
+    "without a memory": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="observation"),
     "paper": AgentConfig(hidden=16, embedding=0, heads=(10, 9), grounding=False),
 }
 

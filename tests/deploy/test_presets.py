@@ -3,12 +3,13 @@
 import dataclasses
 import json
 import math
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from common.agent import HeadInput
 from common.envs import EnvConfig
 from common.errors import ConfigError
 from deploy import presets
@@ -36,13 +37,18 @@ def test_the_paper_preset_is_the_papers() -> None:
     assert config.replay.warmup_steps == 10_000
 
 
-@given(st.floats(1e-6, 0.1), st.integers(1, 10**9), st.booleans(), st.sampled_from(["online", "ema"]))
-def test_json_keeps_every_value(rate: float, steps: int, shortcut: bool, memory: Any) -> None:
+@given(
+    st.floats(1e-6, 0.1),
+    st.integers(1, 10**9),
+    st.sampled_from(get_args(HeadInput)),
+    st.sampled_from(["online", "ema"]),
+)
+def test_json_keeps_every_value(rate: float, steps: int, head_input: Any, memory: Any) -> None:
     config = presets.robust(ENV)
     config = dataclasses.replace(
         config,
         total_steps=steps,
-        agent=dataclasses.replace(config.agent, shortcut=shortcut, heads=(7, 5)),
+        agent=dataclasses.replace(config.agent, head_input=head_input, heads=(7, 5)),
         update=dataclasses.replace(config.update, learning_rate=rate, target_memory=memory),
     )
     assert from_json(to_json(config)) == config

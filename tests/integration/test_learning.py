@@ -11,7 +11,18 @@ from tests.integration.running import Training
 from tests.memory_env import SOLVED_RETURN
 
 SECONDS = 600.0
-SMALL = ["--hidden", "64", "--embedding", "64", "--heads", "128", "128", "--shortcut", "--normalize-observations"]
+SMALL = [
+    "--hidden",
+    "64",
+    "--embedding",
+    "64",
+    "--heads",
+    "128",
+    "128",
+    "--head-input",
+    "hidden+embedding",
+    "--normalize-observations",
+]
 FAST = ["--learning-rate", "5e-4", "--polyak", "0.99", "--target-memory", "ema", "--batch-size", "16"]
 DATA = ["--capacity", "5000", "--warmup-steps", "1000", "--priority-exponent", "0", "--episodes", "10"]
 pytestmark = pytest.mark.timeout(SECONDS + 30)

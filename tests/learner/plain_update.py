@@ -24,6 +24,7 @@ class Known(NamedTuple):
 
     h: Tensor
     e: Tensor
+    o: Tensor
 
 
 class PlainUpdate:
@@ -39,12 +40,15 @@ class PlainUpdate:
         self.optimizers = [self._optimizer(parts) for parts in groups]
 
     def _optimizer(self, parts: Sequence[str | None]) -> torch.optim.Adam:
-        networks = list(self.agent.memory.parameters())
-        networks += [p for part in parts if part is not None for p in getattr(self.agent, part).parameters()]
-        groups = [{"params": networks, "lr": self.c.learning_rate}]
+        rate = self.c.learning_rate
+        heads = [p for part in parts if part is not None for p in getattr(self.agent, part).parameters()]
+        groups = [
+            {"params": list(self.agent.memory.parameters()), "lr": self.c.memory_learning_scale * rate},
+            {"params": heads, "lr": rate},
+        ]
         if None in parts:
             groups.append({"params": [self.agent.log_alpha], "lr": self.c.alpha_learning_rate})
-        return torch.optim.Adam(groups, fused=False)
+        return torch.optim.Adam([group for group in groups if group["params"]], fused=False)
 
     def __call__(self, rows: np.ndarray, importance: np.ndarray, beta: float) -> tuple[dict[str, float], list[float]]:
         """One update; the losses as they were before it, and the windows' priorities."""
@@ -76,11 +80,12 @@ class PlainUpdate:
             if t == self.burn_in:
                 h = h.detach()
             previous = row["prev_action"] if t == row["first"] else row["action"][t - 1]
-            inputs = [self.seen(row, t), torch.tensor(previous)]
+            o = self.seen(row, t)
+            inputs = [o, torch.tensor(previous)]
             inputs += [torch.tensor([float(row["blank"][t])])] if self.agent.config.blank_flag else []
             e = memory.embed(torch.cat(inputs))
-            h = gru(memory, e, h)
-            known[t] = Known(h, e)
+            h = torch.zeros_like(h) if self.agent.config.head_input == "observation" else gru(memory, e, h)
+            known[t] = Known(h, e, o)
         return {t: known[t] for t in range(self.burn_in, int(row["last"]) + 1)}
 
     def seen(self, row: np.void, t: int) -> Tensor:
@@ -92,7 +97,8 @@ class PlainUpdate:
         return ((o - normalizer.mean) / normalizer.std).clamp(-10, 10) if normalizer.enabled else o
 
     def z(self, known: Known) -> Tensor:
-        return torch.cat([known.h, known.e]) if self.agent.config.shortcut else known.h
+        parts = {"hidden": known.h, "embedding": known.e, "observation": known.o}
+        return torch.cat([parts[name] for name in self.agent.config.head_input.split("+")])
 
     def sample(self, z: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         mean, log_std = self.agent.policy(z)
@@ -204,6 +210,8 @@ def twin_q(critic: torch.nn.Module, z: Tensor, a: Tensor, frozen: bool = False) 
             weight, bias = layer.weight[j], layer.bias[j, 0]
             weight, bias = (weight.detach(), bias.detach()) if frozen else (weight, bias)
             x = x @ weight + bias
+            if depth < 2 and critic.norm:
+                x = (x - x.mean()) / (x.var(correction=0) + 1e-5).sqrt()
             x = F.relu(x) if depth < 2 else x
         values.append(x[0])
     return torch.stack(values)

@@ -14,7 +14,7 @@ from learner.update import UpdateConfig, make_update
 from tests.learner.rows import SPEC, random_rows, to_batch
 
 B, T = 6, 5
-CONFIG = AgentConfig(hidden=24, embedding=20, heads=(40, 28), shortcut=True)
+CONFIG = AgentConfig(hidden=24, embedding=20, heads=(40, 28), head_input="hidden+embedding")
 
 
 def floats(bits):

@@ -5,17 +5,17 @@ import pytest
 import safetensors.torch
 import torch
 
-from common.agent import Agent, AgentConfig
+from common.agent import Agent, AgentConfig, HeadInput
 from learner.initial_priority import InitialPriority
 from learner.update import UpdateConfig, make_update
 from tests.learner.rows import SPEC, random_rows, to_batch
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
-@pytest.mark.parametrize("shortcut", [False, True])
-def test_it_is_the_learners_own_priority(n_step: int, shortcut: bool) -> None:
+@pytest.mark.parametrize("head_input", ["hidden", "hidden+observation"])
+def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput) -> None:
     config = AgentConfig(
-        hidden=SPEC.hidden, embedding=7, heads=(10, 9), shortcut=shortcut, normalize_observations=True,
+        hidden=SPEC.hidden, embedding=7, heads=(10, 9), head_input=head_input, normalize_observations=True,
         initial_priority="actor",
     )  # fmt: skip
     torch.manual_seed(0)

@@ -10,7 +10,7 @@ from learner.staleness import measurable, staleness
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=4, train=5)
 UNBURNED = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=0, train=5)
-AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), shortcut=True, normalize_observations=True)
+AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), head_input="hidden+embedding", normalize_observations=True)
 STEPS = 32  # of the episode
 
 

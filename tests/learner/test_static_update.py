@@ -20,7 +20,12 @@ from learner.update import JointUpdate, UpdateConfig, make_update
 from tests.learner.rows import SPEC, random_rows
 
 EVERYTHING = AgentConfig(
-    hidden=SPEC.hidden, embedding=7, heads=(10, 9), layer_norm=True, shortcut=True, normalize_observations=True
+    hidden=SPEC.hidden,
+    embedding=7,
+    heads=(10, 9),
+    layer_norm=True,
+    head_input="hidden+embedding",
+    normalize_observations=True,
 )
 BATCH = 8
 

@@ -14,7 +14,12 @@ from learner.update import TRAINS_MEMORY, JointUpdate, UpdateConfig, make_update
 from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
 
 ROBUST = AgentConfig(
-    hidden=SPEC.hidden, embedding=7, heads=(10, 9), layer_norm=True, shortcut=True, normalize_observations=True
+    hidden=SPEC.hidden,
+    embedding=7,
+    heads=(10, 9),
+    layer_norm=True,
+    head_input="hidden+embedding",
+    normalize_observations=True,
 )
 PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding=False)
 BETA = torch.tensor(0.5)
@@ -238,7 +243,7 @@ def test_beta_decays_to_zero():
 
 def test_values_and_policy_are_not_rounded_to_bf16():
     agent, action = make(ROBUST).agent, torch.rand(4, 5, SPEC.action_dim)
-    features = torch.randn(4, 5, ROBUST.hidden + (ROBUST.embedding if ROBUST.shortcut else 0))
+    features = torch.randn(4, 5, ROBUST.hidden + ROBUST.embedding)
     with torch.autocast("cpu", torch.bfloat16):
         outputs = [agent.critic(features, action), *agent.policy(features)]
     for output in outputs:

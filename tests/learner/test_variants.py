@@ -14,7 +14,12 @@ from tests.learner.rows import SPEC, random_rows, to_batch
 
 PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding=False)
 ROBUST = AgentConfig(
-    hidden=SPEC.hidden, embedding=7, heads=(10, 9), shortcut=True, normalize_observations=True, blank_flag=True
+    hidden=SPEC.hidden,
+    embedding=7,
+    heads=(10, 9),
+    head_input="hidden+embedding",
+    normalize_observations=True,
+    blank_flag=True,
 )
 NAMES = {
     "M": "model_loss", "G": "grounding_loss", "V": "q_loss", "P": "policy_loss", "T": "temperature_loss",
@@ -36,11 +41,21 @@ VARIANTS = [
     {"n_step": 9},
     {"clip_norm": 0.3},
     {"clip_norm": 0.0},
+    {"memory_learning_scale": 0.1},
     {"gamma": 0.5, "polyak": 0.9, "eta": 0.3, "target_memory": "ema"},
 ]
 
 
-@pytest.mark.parametrize("agent", [PAPER, ROBUST, dataclasses.replace(ROBUST, layer_norm=True, shortcut=False)])
+AGENTS = [
+    PAPER,
+    ROBUST,
+    dataclasses.replace(ROBUST, layer_norm=True, head_input="hidden"),
+    dataclasses.replace(ROBUST, critic_norm=True, head_input="hidden+observation"),
+    dataclasses.replace(ROBUST, head_input="observation"),
+]
+
+
+@pytest.mark.parametrize("agent", AGENTS)
 @pytest.mark.parametrize("options", VARIANTS, ids=lambda options: "-".join(f"{k}={v}" for k, v in options.items()))
 def test_three_updates_are_those_of_the_equations(agent: AgentConfig, options: dict[str, object]) -> None:
     torch.manual_seed(0)
