@@ -15,6 +15,7 @@ from torch.nn import functional as F
 LOG_STD_RANGE = (-20.0, 2.0)  # of the policy's Gaussian before the tanh
 NORMALIZED_CLIP = 10.0  # standard deviations
 STD_FLOOR = 1e-2  # a constant dimension is not blown up
+Grounding = Literal["off", "change", "observation"]
 HeadInput = Literal["hidden", "hidden+embedding", "hidden+observation", "observation"]
 POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what it takes to act
 CRITIC_PARTS = ("critic.", "log_alpha")  # what else it takes to rate a window
@@ -39,8 +40,9 @@ class AgentConfig:
     """LayerNorm before the ReLUs of the critics."""
     normalize_observations: bool = False
     """Observations are normalised by the replay server's running statistics."""
-    grounding: bool = True
-    """The world model also predicts the next observation's change and the reward."""
+    grounding: Grounding = "change"
+    """What the world model also predicts, beside the reward: the next observation's change, or that observation; or
+    neither."""
     blank_flag: bool = False
     """The memory is told which observations are blank (flickered out), not left to tell them from zeros."""
     initial_priority: Literal["max", "actor"] = "max"
@@ -152,7 +154,7 @@ class Prediction(NamedTuple):
     """One step ahead, from (z_t, a_t)."""
 
     hidden_change: Tensor  # (B, T, H), of h_{t+1} - h_t
-    observation_change: Tensor  # (B, T, O), of the normalised o_{t+1} - o_t; O = 0 without grounding
+    observation: Tensor  # (B, T, O), the normalised o_{t+1} - o_t, or o_{t+1}, as grounded; O = 0 without
     reward: Tensor  # (B, T), or zeros without grounding
 
 
@@ -161,14 +163,21 @@ class WorldModel(nn.Module):
 
     def __init__(self, inputs: int, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
-        self.sizes = [config.hidden, obs_dim if config.grounding else 0, 1 if config.grounding else 0]
+        self.grounding = config.grounding
+        self.sizes = [config.hidden, *((0, 0) if config.grounding == "off" else (obs_dim, 1))]
         self.net = _mlp(inputs + action_dim, config.heads, nn.Linear(config.heads[1], sum(self.sizes)))
 
     def forward(self, features: Tensor, action: Tensor) -> Prediction:
         """(B, T, Z), (B, T, A)."""
         out = self.net(torch.cat([features, action.to(features.dtype)], dim=-1))
-        hidden_change, observation_change, reward = out.split(self.sizes, dim=-1)
-        return Prediction(hidden_change, observation_change, reward.sum(-1))
+        hidden_change, observation, reward = out.split(self.sizes, dim=-1)
+        return Prediction(hidden_change, observation, reward.sum(-1))
+
+    def next_observation(self, observation: Tensor, prediction: Prediction) -> Tensor:
+        """Normalised o_t and what is predicted from there -> o_{t+1}, (..., O) each."""
+        if self.grounding == "change":
+            return observation + prediction.observation
+        return prediction.observation
 
 
 class StackedLinear(nn.Module):

@@ -130,7 +130,7 @@ def _open_loop(agent: Agent, memory: Remembered, episode: Episode) -> dict[int, 
         features = agent.features(Remembered(hidden.unsqueeze(1), beside.unsqueeze(1)))
         step = agent.world_model(features, action.unsqueeze(1))
         hidden = hidden + step.hidden_change.squeeze(1)
-        observation = observation + step.observation_change.squeeze(1)
+        observation = agent.world_model.next_observation(observation.unsqueeze(1), step).squeeze(1)
         beside = agent.memory.beside(observation, torch.zeros(count, dtype=torch.bool), action)
         if ahead in HORIZONS:
             found[ahead] = observation
@@ -156,8 +156,8 @@ def inspect(run: Path, checkpoint: str, out: Path) -> Insight:
     check_writable("--out", out, PICTURES)
     folder = RunFolder(run)
     config = folder.config()
-    if not config.agent.grounding:
-        raise ConfigError("RUN", str(run), "its world model predicts no observations; train with --grounding")
+    if config.agent.grounding == "off":
+        raise ConfigError("RUN", str(run), "its world model predicts no observations; train with --grounding change")
     agent = load_agent(folder, config, checkpoint)
     insight = look(agent, play(folder, agent, config, checkpoint), config.update.model_norm)
     draw(insight, f"{config.env.id}, {config.preset}, seed {config.seed}", out)

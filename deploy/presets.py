@@ -109,7 +109,7 @@ def paper(env: EnvConfig) -> RunConfig:
     return RunConfig(
         env=env,
         preset="paper",
-        agent=AgentConfig(embedding=0, grounding=False),
+        agent=AgentConfig(embedding=0, grounding="off"),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(warmup_steps=10_000),
         update=UpdateConfig(

@@ -78,11 +78,11 @@ def temperature_loss(log_alpha: Tensor, log_pi: Tensor, target_entropy: float, m
 
 
 def grounding_loss(
-    predicted_change: Tensor, observation_change: Tensor, predicted_reward: Tensor, r: Tensor, seen: Tensor, m: Tensor
+    predicted: Tensor, observation: Tensor, predicted_reward: Tensor, r: Tensor, seen: Tensor, m: Tensor
 ) -> Tensor:
-    """L1 of the next observation's change (mean over O, where ``seen``: neither frame is blank) and of the reward."""
-    observation = masked_mean((predicted_change - observation_change).abs().mean(-1), m * seen)
-    return observation + masked_mean((predicted_reward - r).abs(), m)
+    """L1 of o_{t+1} (mean over O), where ``seen``: no frame that it takes is blank; and of the reward."""
+    error = masked_mean((predicted - observation).abs().mean(-1), m * seen)
+    return error + masked_mean((predicted_reward - r).abs(), m)
 
 
 def priority(td_error: Tensor, eta: float, m: Tensor) -> Tensor:

@@ -162,13 +162,13 @@ class JointUpdate:
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
         unexplained = o.new_zeros(0)
-        if agent.config.grounding:
-            seen, observation_change = _seen(batch)[:, steps], o[:, steps].diff(dim=1)
-            predicted = prediction.observation_change.float()
-            parts["grounding_loss"] = losses.grounding_loss(
-                predicted, observation_change, prediction.reward.float(), r, seen, m
-            )
-            unexplained = _unexplained(predicted.detach(), observation_change, m * seen)
+        if agent.config.grounding != "off":
+            now, after = o[:, steps][:, :-1], o[:, steps][:, 1:]
+            seen_now, seen_after = _seen(batch)[:, steps][:, :-1], _seen(batch)[:, steps][:, 1:]
+            predicted = agent.world_model.next_observation(now, prediction).float()
+            seen = seen_after * seen_now if agent.config.grounding == "change" else seen_after
+            parts["grounding_loss"] = losses.grounding_loss(predicted, after, prediction.reward.float(), r, seen, m)
+            unexplained = _unexplained(predicted.detach() - now, after - now, m * seen_after * seen_now)
 
         td_error = (q.detach() - y).abs().mean(0)
         no_change = losses.model_loss(losses.model_error(torch.zeros_like(change), change, c.model_norm), d, m)
@@ -345,6 +345,5 @@ def share_unexplained(error: Tensor, size: Tensor) -> Tensor:
 
 
 def _seen(batch: Batch) -> Tensor:
-    """(B, T) float: neither the step's observation nor the next one is blank."""
-    visible = batch.observation_valid & ~batch.blank
-    return (visible[:, 1:] & visible[:, :-1]).float()
+    """(B, T + 1) float: the observation is real, and not blank."""
+    return (batch.observation_valid & ~batch.blank).float()

@@ -52,7 +52,8 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
     for t in range(start, start + horizon):
         action = episode.action[:, t : t + 1]
         step = agent.world_model(agent.features(seen), action)
-        observation = observation + step.observation_change
+        change = agent.config.grounding == "change"
+        observation = observation * change + step.observation
         embedding = agent.memory.embed(torch.cat([observation, action], -1))
         beside = {"hidden": observation[..., :0], "hidden+embedding": embedding}.get(
             agent.config.head_input, observation

@@ -25,8 +25,10 @@ AGENTS = {
     ),
     "layer norm": AgentConfig(hidden=16, embedding=12, heads=(10, 9), layer_norm=True),
     "observation beside": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="hidden+observation"),
-    "without a memory": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="observation"),
-    "paper": AgentConfig(hidden=16, embedding=0, heads=(10, 9), grounding=False),
+    "without a memory": AgentConfig(
+        hidden=16, embedding=12, heads=(10, 9), head_input="observation", grounding="observation"
+    ),
+    "paper": AgentConfig(hidden=16, embedding=0, heads=(10, 9), grounding="off"),
 }
 
 

@@ -30,7 +30,7 @@ def test_presets_are_valid_and_come_back_from_json(name: presets.Preset) -> None
 
 def test_the_paper_preset_is_the_papers() -> None:
     config = presets.paper(ENV)
-    assert (config.agent.embedding, config.agent.heads, config.agent.grounding) == (0, (400, 300), False)
+    assert (config.agent.embedding, config.agent.heads, config.agent.grounding) == (0, (400, 300), "off")
     assert (config.update.learning_rate, config.update.alpha_learning_rate) == (1e-4, 1e-5)
     assert (config.update.curiosity, config.update.curiosity_scale) == (0.5, "raw")
     assert (config.update.gamma, config.update.polyak, config.update.policy_q) == (0.99, 0.995, "first")

@@ -55,7 +55,7 @@ VARIANTS: list[dict[str, Any]] = [
     {"state_strategy": "zero"},
     {"state_strategy": "stored"},
     {"state_strategy": "episode", "env": "Reacher-v5"},
-    {"embedding": 0, "grounding": False},
+    {"embedding": 0, "grounding": "off"},
     {"layer_norm": True, "head_input": "hidden+embedding", "normalize_observations": True},
     {"flicker": 0.5},
     {"flicker": 0.5, "blank_flag": True, "normalize_observations": True},

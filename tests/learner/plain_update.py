@@ -130,10 +130,12 @@ class PlainUpdate:
                 if not self.ends(row, t):
                     sums["M"].append(error)
                 window[t] = 0.0 if self.ends(row, t) else error.item()
-                if agent.config.grounding:
-                    change = self.seen(row, t + 1) - self.seen(row, t)
-                    if not row["blank"][t] and not row["blank"][t + 1]:
-                        sums["observation"].append((predicted.observation_change - change).abs().mean())
+                if agent.config.grounding != "off":
+                    wanted = self.seen(row, t + 1)
+                    if agent.config.grounding == "change":
+                        wanted = wanted - self.seen(row, t)
+                    if not row["blank"][t + 1] and not (agent.config.grounding == "change" and row["blank"][t]):
+                        sums["observation"].append((predicted.observation - wanted).abs().mean())
                     sums["reward"].append((predicted.reward - float(row["reward"][t])).abs())
                 pi, log_pi = self.sample(self.reaching("P", z), noise[b, t - self.burn_in])
                 climbed = self.reaching("P", z) if c.policy_through_q else z.detach()

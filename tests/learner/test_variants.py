@@ -12,7 +12,7 @@ from learner.update import UpdateConfig, make_update
 from tests.learner.plain_update import PlainUpdate
 from tests.learner.rows import SPEC, random_rows, to_batch
 
-PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding=False)
+PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding="off")
 ROBUST = AgentConfig(
     hidden=SPEC.hidden,
     embedding=7,
@@ -51,7 +51,7 @@ AGENTS = [
     ROBUST,
     dataclasses.replace(ROBUST, layer_norm=True, head_input="hidden"),
     dataclasses.replace(ROBUST, critic_norm=True, head_input="hidden+observation"),
-    dataclasses.replace(ROBUST, head_input="observation"),
+    dataclasses.replace(ROBUST, head_input="observation", grounding="observation"),
 ]
 
 
