@@ -223,9 +223,9 @@ def replay_process(spec: WindowSpec, config: ReplayConfig, actors: int = 1) -> I
         assert redis.process is not None
         os.sched_setaffinity(redis.process.pid, {cores[-1]})
         with on_cores({cores[0]}):
-            bus = RedisBus(redis.url, RUN)
+            bus = RedisBus(redis.url(), RUN)
             server = multiprocessing.get_context("spawn").Process(
-                target=_serve, args=(redis.url, folder, spec, config, actors, cores[-1])
+                target=_serve, args=(redis.url(), folder, spec, config, actors, cores[-1])
             )
             server.start()
             while bus.replay_address("replay") is None:

@@ -88,13 +88,13 @@ def _system(spec: WindowSpec, shards: int, actors: int, rate: float) -> Iterator
     """Redis, replay servers and simulated actors as processes; their numbers by kind."""
     spawn = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as folder, RedisServer(Path(folder)) as redis:
-        bus = RedisBus(redis.url, RUN)
+        bus = RedisBus(redis.url(), RUN)
         servers = [
-            spawn.Process(target=_serve, args=(redis.url, f"{folder}/{k}", spec, actors, Shard(k, shards)))
+            spawn.Process(target=_serve, args=(redis.url(), f"{folder}/{k}", spec, actors, Shard(k, shards)))
             for k in range(shards)
         ]
         senders = [
-            spawn.Process(target=_simulate, args=(redis.url, k, spec, rate / actors), daemon=True)
+            spawn.Process(target=_simulate, args=(redis.url(), k, spec, rate / actors), daemon=True)
             for k in range(actors)
         ]
         for process in (*servers, *senders):

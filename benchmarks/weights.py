@@ -87,8 +87,8 @@ def broadcasting(actors: int) -> Iterator[Broadcast]:
     """Redis, and actors that have had a first broadcast."""
     spawn = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as folder, RedisServer(Path(folder)) as redis:
-        bus, loaded = RedisBus(redis.url, RUN), spawn.Queue()
-        receivers = [spawn.Process(target=_receive, args=(redis.url, loaded)) for _ in range(actors)]
+        bus, loaded = RedisBus(redis.url(), RUN), spawn.Queue()
+        receivers = [spawn.Process(target=_receive, args=(redis.url(), loaded)) for _ in range(actors)]
         for process in receivers:
             process.start()
         broadcast = Broadcast(bus, loaded, actors)

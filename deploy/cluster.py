@@ -6,8 +6,6 @@ Learner, evaluator and a single replay server share a node; actors take a CPU ea
 """
 
 import dataclasses
-import hashlib
-import hmac
 import logging
 import os
 import shutil
@@ -51,6 +49,7 @@ from deploy.ray_places import (
     whole_shares,
 )
 from deploy.redis_server import Port, RedisServer
+from deploy.redis_users import RedisUsers
 from deploy.rings import Rings
 from deploy.roles import PATIENCE_VARIABLE, URL_VARIABLE, connect
 from deploy.run_folder import RunFolder
@@ -82,10 +81,10 @@ class ClusterRun:
             if encrypted:
                 tls.make_certificate(folder.path, ip)
             number, self._moved = _port(folder, ip)
-            port = Port(ip, number, redis_password(folder), folder.path if encrypted else None)
-            self._server = RedisServer(sockets, port=port)
+            port = Port(ip, number, folder.path if encrypted else None)
+            self._server = RedisServer(sockets, port=port, users=self._users())
             self._leave.enter_context(self._server)
-            self.bus = connect(self._server.url, folder.name)
+            self.bus = connect(self._server.url(), folder.name)
             register(self.bus, config)
             self._counters.restore(self.bus)
         except BaseException:
@@ -97,6 +96,9 @@ class ClusterRun:
         self._lost: dict[str, list[float]] = {}  # when hosts died for good, by role
         self._look_at = 0.0
         self._homeless_since: float | None = None
+
+    def _users(self) -> RedisUsers:
+        return RedisUsers(self._folder.name, self._folder.secret(), self.config.roles())
 
     # -- placing --------------------------------------------------------------------------------------
 
@@ -143,7 +145,7 @@ class ClusterRun:
             name=host_name(self._folder.name, name), namespace=NAMESPACE, lifetime="detached", get_if_exists=True,
             max_restarts=-1, num_cpus=place.cpus, num_gpus=place.gpus, scheduling_strategy=strategy,
         )  # fmt: skip
-        url = self._server.network_url(f"{{scratch}}/{tls.CERTIFICATE}")
+        url = self._server.network_url(name, f"{{scratch}}/{tls.CERTIFICATE}")
         secrets = {"redis-url": url.encode()}
         if name == "learner" or name.startswith("replay"):
             secrets["secret"] = self._folder.secret()
@@ -249,6 +251,7 @@ class ClusterRun:
         except (BusUnavailable, BusFull):  # the next look tries again
             return
         self.config = grown
+        self._server.admit(self._users())
         self._folder.write_config(grown)
         for name, hosted in self._hosts.items():
             if name.startswith("replay"):
@@ -336,11 +339,6 @@ def train(
         return over
     finally:
         run.close(over)
-
-
-def redis_password(folder: RunFolder) -> str:
-    """Redis's password: follows from the run's secret, and does not give it away."""
-    return hmac.new(folder.secret(), b"redis", hashlib.sha256).hexdigest()
 
 
 def _port(folder: RunFolder, ip: str) -> tuple[int, bool]:

@@ -18,6 +18,7 @@ from deploy.counters import Counters
 from deploy.monitor import Monitor
 from deploy.presets import RunConfig, to_json
 from deploy.redis_server import RedisServer
+from deploy.redis_users import LAUNCHER, RedisUsers
 from deploy.roles import URL_VARIABLE, connect
 from deploy.run_folder import RunFolder
 from deploy.supervisor import STOP_SECONDS, RoleCommand, Supervisor
@@ -48,6 +49,10 @@ def _replay_command(shard: Shard, folder: RunFolder, sockets: Path, place: tuple
     return RoleCommand(shard.role, ("replay", *place, *words))
 
 
+def _redis(config: RunConfig, folder: RunFolder, sockets: Path) -> RedisServer:
+    return RedisServer(sockets, users=RedisUsers(folder.name, folder.secret(), config.roles()))
+
+
 class LocalRun:
     """A run's processes between ``start`` and ``close``."""
 
@@ -58,15 +63,22 @@ class LocalRun:
         self.sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))  # private, and short: see redis_server
         self._leave.callback(shutil.rmtree, self.sockets)
         try:
-            self._server = None if redis_url else self._leave.enter_context(RedisServer(self.sockets))
-            url = redis_url or f"unix://{self.sockets / 'redis.sock'}"
-            self.bus = connect(url, folder.name)
+            self._server = None if redis_url else self._leave.enter_context(_redis(config, folder, self.sockets))
+            self.bus = connect(redis_url or self._url(LAUNCHER), folder.name)
             register(self.bus, config)
             self._counters.restore(self.bus)
         except BaseException:
             self._leave.close()
             raise
-        self.supervisor = Supervisor(commands(config, folder, self.sockets, device), {URL_VARIABLE: url}, folder.logs)
+        self.supervisor = Supervisor(
+            commands(config, folder, self.sockets, device),
+            lambda role: {URL_VARIABLE: redis_url or self._url(role)},
+            folder.logs,
+        )
+
+    def _url(self, user: str) -> str:
+        assert self._server is not None
+        return self._server.url(user)
 
     def tend(self) -> None:
         """Start again what died: roles, and the embedded Redis. Raises RoleDied."""

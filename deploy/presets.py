@@ -79,6 +79,11 @@ class RunConfig:
         count = self.replay.replay_shards
         return [Shard(index, count) for index in range(count)]
 
+    def roles(self) -> tuple[str, ...]:
+        """The names of all roles."""
+        actors = [f"actor-{index}" for index in range(self.actors)]
+        return ("learner", "evaluator", *(shard.role for shard in self.shards()), *actors)
+
     def slack_steps(self) -> int:
         """How far actors may run ahead of the replay ratio: two windows of every environment.
 

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +17,7 @@ import redis
 
 from common.errors import ConfigError
 from deploy import lifeline, tls
+from deploy.redis_users import LAUNCHER, RedisUsers
 
 START_SECONDS = 10.0
 STOP_SECONDS = 2.0
@@ -41,37 +43,39 @@ def server_binary() -> str:
 
 @dataclass(frozen=True)
 class Port:
-    """Where a server listens for other machines, and what they must know."""
+    """Where a server listens for other machines."""
 
     host: str
     number: int
-    password: str
     tls: Path | None = None  # folder of the certificate and its key, if clients must encrypt
 
 
 class RedisServer:
     """A server in ``folder``, which must be private (mode 0700). Use as a context manager, from the main thread.
 
-    Raises ConfigError where it cannot start. It dies with this process.
+    With ``users``, whoever connects must be one of them; without, only the socket's folder keeps others away, so there
+    is no port. Raises ConfigError where it cannot start. It dies with this process.
     """
 
-    def __init__(self, folder: Path, maxmemory: int = MAXMEMORY, port: Port | None = None) -> None:
-        self.folder, self.maxmemory, self.port = folder, maxmemory, port
+    def __init__(
+        self, folder: Path, maxmemory: int = MAXMEMORY, port: Port | None = None, users: RedisUsers | None = None
+    ) -> None:
+        assert port is None or users is not None
+        self.folder, self.maxmemory, self.port, self.users = folder, maxmemory, port, users
         self.socket = folder / "redis.sock"
         self.process: subprocess.Popen[bytes] | None = None
         if len(os.fsencode(self.socket)) > SOCKET_PATH_LIMIT:
             raise ConfigError("--run-dir", str(folder), f"a socket path may have {SOCKET_PATH_LIMIT} bytes at most")
 
-    @property
-    def url(self) -> str:
-        """What clients of this machine connect to."""
-        secret = f":{self.port.password}@" if self.port else ""
-        return f"unix://{secret}{self.socket}"
+    def url(self, user: str = LAUNCHER) -> str:
+        """What a user on this machine connects to."""
+        return f"unix://{self.users.login(user) if self.users else ''}{self.socket}"
 
-    def network_url(self, certificate: str = "") -> str:
-        """What clients of other machines connect to; where they have the certificate, if they need it."""
+    def network_url(self, user: str, certificate: str = "") -> str:
+        """What a user on another machine connects to; where it has the certificate, if it needs it."""
         assert self.port is not None
-        place = f":{self.port.password}@{self.port.host}:{self.port.number}"
+        assert self.users is not None
+        place = f"{self.users.login(user)}{self.port.host}:{self.port.number}"
         if self.port.tls is None:
             return f"redis://{place}"
         return f"rediss://{place}?ssl_ca_certs={certificate}"
@@ -89,23 +93,38 @@ class RedisServer:
 
     def _write_config(self) -> Path:
         """A file, which only the owner may read: what is on a command line is seen by everyone."""
-        path = self.folder / "redis.conf"
+        if self.users is not None:
+            self._write("users.acl", self.users.acl())
+        return self._write("redis.conf", "".join(f'{name} "{value}"\n' for name, value in self._options().items()))
+
+    def _write(self, name: str, text: str) -> Path:
+        path = self.folder / name
         path.unlink(missing_ok=True)
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.writelines(f'{name} "{value}"\n' for name, value in self._options().items())
+            file.write(text)
         return path
+
+    def admit(self, users: RedisUsers) -> None:
+        """Take other users than before, of the same secret. A server that is away reads of them when it comes back."""
+        self.users = users
+        self._write("users.acl", users.acl())
+        client = redis.Redis.from_url(self.url())
+        with closing(client), suppress(redis.exceptions.ConnectionError):
+            client.acl_load()
 
     def _options(self) -> dict[str, str]:
         listening = {"port": "0"}
         if self.port is not None:
             name = "port" if self.port.tls is None else "tls-port"
-            listening |= {"bind": self.port.host, name: str(self.port.number), "requirepass": self.port.password}
+            listening |= {"bind": self.port.host, name: str(self.port.number)}
             if self.port.tls is not None:
                 certificate, key = str(self.port.tls / tls.CERTIFICATE), str(self.port.tls / tls.KEY)
                 listening |= {"tls-cert-file": certificate, "tls-key-file": key, "tls-ca-cert-file": certificate}
                 listening["tls-auth-clients"] = "no"  # they know the password
+        users = {} if self.users is None else {"aclfile": str(self.folder / "users.acl")}
         return {
             **listening,
+            **users,
             "unixsocket": str(self.socket),
             "unixsocketperm": "700",
             "save": "",
@@ -118,7 +137,7 @@ class RedisServer:
 
     def _wait(self) -> None:
         assert self.process is not None
-        client = redis.Redis(unix_socket_path=str(self.socket), password=self.port.password if self.port else None)
+        client = redis.Redis.from_url(self.url())
         deadline = time.monotonic() + START_SECONDS
         try:
             while self.process.poll() is None and time.monotonic() < deadline:

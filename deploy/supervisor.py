@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -119,8 +120,9 @@ class RoleProcess:
 class Supervisor:
     """All roles of a run. ``tend`` them often; ``stop`` them at the end, whatever the end was."""
 
-    def __init__(self, commands: list[RoleCommand], environment: dict[str, str], logs: Path) -> None:
-        self.roles = {command.name: RoleProcess(command, environment, logs) for command in commands}
+    def __init__(self, commands: list[RoleCommand], environment: Callable[[str], dict[str, str]], logs: Path) -> None:
+        """``environment`` is of each role by its name, beside this process's own."""
+        self.roles = {command.name: RoleProcess(command, environment(command.name), logs) for command in commands}
 
     def start(self) -> None:
         """Start every role."""

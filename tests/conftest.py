@@ -22,7 +22,7 @@ def redis_url() -> Iterator[str]:
     folder = Path(tempfile.mkdtemp(prefix="rmc-test-"))  # short: a socket path may have 107 bytes
     try:
         with RedisServer(folder) as server:
-            yield server.url
+            yield server.url()
     finally:
         shutil.rmtree(folder)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from common.bus import EntryId
 from common.errors import FencedError
 from common.redis_bus import RedisBus
-from deploy.cluster import redis_password
+from deploy.redis_users import LAUNCHER, RedisUsers
 from deploy.run_folder import RunFolder
 
 
@@ -28,12 +28,20 @@ def main(path: str, host: str) -> None:
     """Print them for the run in that folder, whose Redis is on that host."""
     folder = RunFolder(Path(path))
     port = (folder.path / "redis-port").read_text().strip()
-    bus = RedisBus(f"redis://:{redis_password(folder)}@{host}:{port}", folder.name)
-    found = {}
+    users = RedisUsers(folder.name, folder.secret(), folder.config().roles())
+
+    def bus_of(user: str) -> RedisBus:
+        return RedisBus(f"redis://{users.login(user)}{host}:{port}", folder.name)
+
+    bus, found = bus_of(LAUNCHER), {}
     for actor in bus.actors():
         epoch, ack = bus.current_epoch(f"actor-{actor}"), bus.ack(actor)
         acked = ack.id.epoch if ack else 0
-        found[actor] = {"epoch": epoch, "acked": acked, "refused": acked > 1 and is_refused(bus, actor, acked - 1)}
+        found[actor] = {
+            "epoch": epoch,
+            "acked": acked,
+            "refused": acked > 1 and is_refused(bus_of(f"actor-{actor}"), actor, acked - 1),
+        }
     print(json.dumps(found))
 
 

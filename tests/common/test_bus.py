@@ -84,7 +84,7 @@ def test_expecting_without_a_redis_says_so_and_goes_on_with_the_next(tmp_path):
     folder = tmp_path / "redis"
     folder.mkdir(mode=0o700)
     with RedisServer(folder) as server:
-        bus = RedisBus(server.url, "run")
+        bus = RedisBus(server.url(), "run")
         bus.append(0, EntryId(1, 0), b"x")
         bus.expect({0: EntryId(1, 0)}, 10)
         server.close()
@@ -186,7 +186,7 @@ def test_a_full_redis_is_emptied_by_commits():
     folder = Path(tempfile.mkdtemp(prefix="rmc-full-"))  # short: a socket path may have 107 bytes
     try:
         with RedisServer(folder, maxmemory=8 << 20) as server:
-            bus = RedisBus(server.url, "full")
+            bus = RedisBus(server.url(), "full")
             holder, seq = Holder("replay", bus.take_epoch("replay")), fill(bus)
             assert seq > 10
             bus.commit(holder, {0: Ack(EntryId(1, seq - 1), 5)})
@@ -199,7 +199,7 @@ def test_a_full_redis_is_emptied_by_commits():
                 bus.commit(holder, {0: Ack(EntryId(1, seq), 5)})  # replaced, and nothing is trimmed
             assert len(bus.read({0: EntryId(0, 0)}, 1000)) > 10
             with pytest.raises(BusUnavailable, match="out of range"):
-                RedisBus(f"{server.url}?db=99", "full").ping()
+                RedisBus(f"{server.url()}?db=99", "full").ping()
     finally:
         shutil.rmtree(folder)
 

@@ -27,7 +27,7 @@ time.sleep(60)
 
 def test_listens_on_its_socket_only(tmp_path: Path) -> None:
     with RedisServer(tmp_path) as server:
-        client = redis.Redis.from_url(server.url)
+        client = redis.Redis.from_url(server.url())
         assert client.config_get("port")["port"] == "0"
         assert client.config_get("maxmemory-policy")["maxmemory-policy"] == "noeviction"
         assert stat.S_IMODE(server.socket.stat().st_mode) == 0o700

@@ -19,12 +19,14 @@ from common.redis_bus import RedisBus
 from common.replay import Draw
 from deploy import redis_server, tls
 from deploy.redis_server import Port, RedisServer, server_binary
+from deploy.redis_users import LAUNCHER, RedisUsers
 from learner.replay_client import ReplayClient
 from replay_server.server import ReplayConfig, ReplayServer
 from replay_server.socket_server import SocketServer
 from tests.replay_server.support import SPEC, Sender
 
 SECRET = b"encrypted"
+USERS = RedisUsers("encrypted", SECRET, ("learner", "actor-0"))
 
 
 def free_port() -> int:
@@ -125,29 +127,18 @@ def lacks_tls() -> bool:
 @pytest.mark.skipif(lacks_tls(), reason="the Redis server found here was built without TLS")
 def test_redis_takes_encrypted_clients_that_know_the_password(folder: Path) -> None:
     place = Path(tempfile.mkdtemp(prefix="rmc-tls-"))
-    with RedisServer(place, port=Port("127.0.0.1", free_port(), "password", folder)) as server:
-        url = server.network_url(str(folder / tls.CERTIFICATE))
-        bus = RedisBus(url, "encrypted")
+    with RedisServer(place, port=Port("127.0.0.1", free_port(), folder), users=USERS) as server:
+        url = server.network_url(LAUNCHER, str(folder / tls.CERTIFICATE))
+        bus = RedisBus(url, USERS.run)
         bus.set_config(b"{}")
         assert bus.config() == b"{}"
-        for wrong in (url.replace("rediss", "redis").partition("?")[0], url.replace("password", "guess")):
+        for wrong in (url.replace("rediss", "redis").partition("?")[0], url.replace(USERS.password(LAUNCHER), "guess")):
             with pytest.raises(BusUnavailable):
-                RedisBus(wrong, "encrypted").ping()
+                RedisBus(wrong, USERS.run).ping()
 
 
 def test_a_redis_without_tls_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(redis_server, "server_binary", lambda: str(get_binary_path()))
     place = Path(tempfile.mkdtemp(prefix="rmc-tls-"))
     with pytest.raises(ConfigError, match=r"--tls=None: .*needs a redis-server"):
-        RedisServer(place, port=Port("127.0.0.1", free_port(), "password", folder)).start()
-
-
-def test_redis_with_a_password_alone() -> None:
-    place = Path(tempfile.mkdtemp(prefix="rmc-password-"))
-    with RedisServer(place, port=Port("127.0.0.1", free_port(), "password")) as server:
-        for url in (server.url, server.network_url()):
-            RedisBus(url, "run").set_config(b"x")
-        with pytest.raises(BusUnavailable):
-            RedisBus(server.network_url().replace("password", "guess"), "run").ping()
-        assert server.process is not None
-        assert "password" not in Path(f"/proc/{server.process.pid}/cmdline").read_text()
+        RedisServer(place, port=Port("127.0.0.1", free_port(), folder), users=USERS).start()

@@ -84,8 +84,8 @@ def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_
     folder.mkdir(mode=0o700)
     redis_server = RedisServer(folder)
     redis_server.start()
-    bus = RedisBus(redis_server.url, "run")
-    running = Running(tmp_path, RedisBus(redis_server.url, "run"))
+    bus = RedisBus(redis_server.url(), "run")
+    running = Running(tmp_path, RedisBus(redis_server.url(), "run"))
     try:
         until(lambda: bus.replay_address("replay") is not None)
         sender, client = Sender(bus), client_of(bus)

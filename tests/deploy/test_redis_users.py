@@ -1,0 +1,158 @@
+"""Every role may do in Redis what its work takes, and nothing else; against a real server."""
+
+import socket
+import stat
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import redis
+
+from common.bus import Ack, EntryId, Holder, Version
+from common.errors import BusUnavailable, ConfigError
+from common.redis_bus import RedisBus
+from deploy.redis_server import Port, RedisServer
+from deploy.redis_users import LAUNCHER, RedisUsers
+from deploy.roles import connect
+
+SECRET = b"of the run"
+USERS = RedisUsers("odd name*[1]é", SECRET, ("learner", "evaluator", "replay", "actor-0", "actor-1"))
+ROLES = [*USERS.roles, LAUNCHER]
+EVERYWHERE = """
+    FUNCTION LIST|SCRIPT LOAD x|CONFIG GET *|KEYS *|FLUSHALL|FLUSHDB|SHUTDOWN|CONFIG SET dir /|ACL LIST
+    ACL SETUSER default on|CLIENT LIST
+    MONITOR|SAVE|REPLICAOF 127.0.0.1 1|MODULE LIST|SUBSCRIBE x|MIGRATE 127.0.0.1 1 x 0 1|SORT x
+    GET other|SET other 1|EVAL redis.call('SET',KEYS[1],1) 1 R:weights
+"""
+FORBIDDEN = {  # R for the prefix
+    "actor-0": """
+        XADD R:windows:1 * p x|XRANGE R:windows:0 - +|DEL R:windows:0|XTRIM R:windows:0 MAXLEN 0
+        XREAD STREAMS R:metrics 0|SET R:config x|SET R:weights x|SET R:weights:1:1:0 x|SET R:stop x
+        GET R:evaluate|HSET R:acks 0 x|SCAN 0
+        HSET R:replay replay x|INCR R:epoch:actor-1|INCR R:epoch:learner|HGETALL R:stats|XADD R:dead * reason x
+    """,
+    "actor-1": "XADD R:windows:0 * p x|XADD R:windows:10 * p x|INCR R:epoch:actor-0|XINFO STREAM R:windows:0",
+    "evaluator": "XADD R:windows:0 * p x|SET R:evaluate x|HGET R:acks 0|SCAN 0|INCR R:epoch:learner",
+    "learner": """
+        XADD R:windows:0 * p x|SET R:config x|INCR R:epoch:replay|HSET R:replay a b|XREAD STREAMS R:windows:0 0
+        SET R:stop x|SCAN 0|DEL R:weights
+    """,
+    "replay": """
+        XADD R:windows:0 * p x|SET R:weights x|SET R:config x|SET R:epoch:learner 9|SADD R:actors 7|SCAN 0
+        HGETALL R:stats|EXPIRE R:weights:1:1:0 1
+    """,
+    LAUNCHER: "",
+}
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[RedisServer]:
+    with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=USERS) as server:
+        yield server
+
+
+def bus_of(server: RedisServer, user: str) -> RedisBus:
+    return RedisBus(server.url(user), USERS.run)
+
+
+def test_every_role_can_do_its_work(server: RedisServer) -> None:
+    """The bus's whole interface, each call by who makes it."""
+    launcher, learner, evaluator, replay, actor = (
+        bus_of(server, user) for user in (LAUNCHER, "learner", "evaluator", "replay", "actor-0")
+    )
+    launcher.expire(None)
+    launcher.set_config(b"{}")
+    launcher.clear_stop()
+    launcher.set_progress("replay", b"counted")
+    for role, bus in (("learner", learner), ("evaluator", evaluator), ("replay", replay), ("actor-0", actor)):
+        bus.ping()
+        assert bus.config() == b"{}"
+        assert bus.stop_requested() is None
+        assert bus.take_epoch(role, floor=4) == 5
+        assert bus.current_epoch(role) == 5
+        bus.emit(role, {"updates": 1})
+    actor.append(0, EntryId(5, 0), b"hello")
+    for _ in range(2):  # the second is refused by its id, and looked up
+        actor.append(0, EntryId(5, 1), b"windows")
+    holder = Holder("replay", 5)
+    assert replay.progress("replay") == b"counted"
+    assert replay.actors() == [0]
+    replay.expect({0: EntryId(0, 0)}, 10)
+    assert len(replay.read({0: EntryId(0, 0)}, 10)) <= 2
+    (_, entry) = replay.read({0: EntryId(4, 0)}, 10)
+    replay.dead_letter(entry, "a test")
+    replay.announce_replay(holder, "unix:/nowhere")
+    replay.commit(holder, {0: Ack(EntryId(5, 1), 100)}, b"more")
+    replay._trim(holder, {0: Ack(EntryId(5, 1), 100)})
+    assert learner.replay_address("replay") is not None
+    for update in (1, 2, 3):
+        learner.publish_weights(Version(5, update), b"w" * 600_000, evaluate=True)
+    assert replay.latest_version() == Version(5, 3)
+    assert actor.ack(0) == Ack(EntryId(5, 1), 100)
+    for bus, evaluate in ((actor, False), (evaluator, True)):
+        assert bus.latest_version(evaluate) == Version(5, 3)
+        assert bus.weights(evaluate) == (Version(5, 3), b"w" * 600_000)
+    replay.drop_stream(holder, 0)
+    assert launcher.progress("replay") == b"more"
+    assert len(launcher.records("0")[0]) == 4
+    assert set(launcher.stats()) == {"learner", "evaluator", "replay", "actor-0"}
+    launcher.request_stop("done")
+    launcher.expire(60)
+
+
+def commands(user: str) -> list[list[str]]:
+    """The words of every command that a user may not use."""
+    lines = "\n".join([EVERYWHERE, FORBIDDEN[user]]).replace("\n", "|").split("|")
+    prefix = f"rmc:{USERS.run}:"
+    return [[word.replace("R:", prefix, 1) for word in line.split()] for line in lines if line.strip()]
+
+
+def answer(client: redis.Redis, words: list[str]) -> str:
+    try:
+        return f"it ran, and gave {client.execute_command(*words)!r}"
+    except redis.exceptions.ResponseError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("user", ROLES)
+def test_every_other_command_is_refused(server: RedisServer, user: str) -> None:
+    with redis.Redis.from_url(server.url(user)) as client:
+        for words in commands(user):
+            assert "permission" in answer(client, words), words
+
+
+@pytest.mark.parametrize("login", ["", "default:guess@", "actor-0:guess@", f"actor-0:{USERS.password('actor-1')}@"])
+def test_a_stranger_is_told_so_in_one_line_that_holds_no_password(server: RedisServer, login: str) -> None:
+    with pytest.raises(ConfigError, match=r"--redis-url=.*no Redis answers there") as error:
+        connect(f"unix://{login}{server.socket}", USERS.run)
+    assert "\n" not in str(error.value)
+    assert "guess" not in str(error.value)
+    assert USERS.password("actor-1") not in str(error.value)
+
+
+def test_users_that_come_later_get_in(tmp_path: Path) -> None:
+    with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=USERS) as server:
+        held = bus_of(server, "actor-1")
+        held.ping()
+        more = RedisUsers(USERS.run, SECRET, (*USERS.roles, "actor-2"))
+        with pytest.raises(BusUnavailable):
+            RedisBus(f"unix://{more.login('actor-2')}{server.socket}", USERS.run).ping()
+        server.admit(more)
+        bus_of(server, "actor-2").append(2, EntryId(1, 0), b"hello")
+        held.append(1, EntryId(1, 0), b"hello")
+
+
+def test_passwords_are_nowhere_to_be_read(tmp_path: Path) -> None:
+    """Neither on a command line nor in the server's files or a value's repr; files are the owner's alone."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        number = int(probe.getsockname()[1])
+    port = Port("127.0.0.1", number)
+    with tempfile.TemporaryDirectory() as name, RedisServer(folder := Path(name), port=port, users=USERS) as server:
+        RedisBus(server.network_url("actor-0"), USERS.run).ping()
+        assert server.process is not None
+        said = Path(f"/proc/{server.process.pid}/cmdline").read_text() + repr(USERS)
+        said += "".join(file.read_text() for file in folder.iterdir() if not file.is_socket())
+        assert [stat.S_IMODE((folder / file).stat().st_mode) for file in ("redis.conf", "users.acl")] == [0o600] * 2
+        assert not [user for user in ROLES if USERS.password(user) in said]
+        assert SECRET.decode() not in said
