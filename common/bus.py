@@ -14,12 +14,12 @@ Every Redis key, R = ``rmc:{run}``:
 | R:weights               | string | learner  | ``epoch update pieces crc32`` of the newest weights      |
 | R:weights:EPOCH:UPDATE:I| string | learner  | piece I (256 KiB) of a policy, safetensors               |
 | R:evaluate              | string | learner  | ``epoch update pieces crc32`` the evaluator should play  |
-| R:metrics               | stream | all      | records, msgpack, about the last 20 000                  |
-| R:stats                 | hash   | all      | ROLE -> its newest record, msgpack                       |
+| R:metrics:ROLE          | stream | ROLE     | records, msgpack, about the last 2 000                   |
 | R:stop                  | string | launcher | why the run should end                                   |
 | R:dead                  | stream | replay   | refused entries: actor, id, reason, first 1 KiB; 1 000   |
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -27,7 +27,7 @@ from typing import Any, NamedTuple, Protocol
 from common.checksum import crc32
 from common.errors import BusUnavailable, FencedError, MessageError
 
-METRICS_KEPT = 20_000  # records, at least
+METRICS_KEPT = 2_000  # records of a role, at least
 
 
 class EntryId(NamedTuple):
@@ -153,13 +153,13 @@ class Bus(Protocol):
         """The newest policy, or the newest to evaluate. None if there is none or it was just replaced."""
 
     def emit(self, role: str, record: Mapping[str, Any]) -> None:
-        """Append a metrics record (flat: str -> int | float | str | list of numbers)."""
+        """Append a metrics record, see ``common/record.py``."""
 
-    def records(self, after: str) -> tuple[list[dict[str, Any]], str]:
-        """Metrics records past a cursor ("0" = all that is kept), and the next cursor."""
+    def records(self, after: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, str]]:
+        """Records of each role past its cursor ("0" = all that is kept), with a ``role``, and the next cursors.
 
-    def stats(self) -> dict[str, dict[str, Any]]:
-        """The newest record of each role."""
+        What is no record is left out.
+        """
 
     def request_stop(self, reason: str) -> None:
         """Ask every role to end."""
@@ -183,9 +183,8 @@ class MemoryBus:
         self._replay: dict[str, ReplayAddress] = {}
         self._progress: dict[str, bytes] = {}
         self._weights: dict[bool, tuple[Version, bytes]] = {}
-        self._records: list[dict[str, Any]] = []
-        self._forgotten = 0  # records that made room
-        self._stats: dict[str, dict[str, Any]] = {}
+        self._records: dict[str, list[dict[str, Any]]] = {}
+        self._forgotten: Counter[str] = Counter()  # records that made room
         self._stop: str | None = None
         self.dead_letters: list[tuple[Entry, str]] = []
 
@@ -279,18 +278,20 @@ class MemoryBus:
         return self._weights.get(evaluate)
 
     def emit(self, role: str, record: Mapping[str, Any]) -> None:
-        entry = {"role": role, **record}
-        self._records.append(entry)
-        self._stats[role] = entry
-        if len(self._records) >= 2 * METRICS_KEPT:
-            del self._records[:METRICS_KEPT]
-            self._forgotten += METRICS_KEPT
+        said = self._records.setdefault(role, [])
+        said.append({**record, "role": role})
+        if len(said) >= 2 * METRICS_KEPT:
+            del said[:METRICS_KEPT]
+            self._forgotten[role] += METRICS_KEPT
 
-    def records(self, after: str) -> tuple[list[dict[str, Any]], str]:
-        return self._records[max(0, int(after) - self._forgotten) :], str(self._forgotten + len(self._records))
-
-    def stats(self) -> dict[str, dict[str, Any]]:
-        return dict(self._stats)
+    def records(self, after: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, str]]:
+        found: list[dict[str, Any]] = []
+        cursors = {}
+        for role, cursor in after.items():
+            said, forgotten = self._records.get(role, []), self._forgotten[role]
+            found += said[max(0, int(cursor) - forgotten) :]
+            cursors[role] = str(forgotten + len(said))
+        return found, cursors
 
     def request_stop(self, reason: str) -> None:
         self._stop = reason

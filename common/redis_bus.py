@@ -1,10 +1,10 @@
 """The bus over Redis: unix socket, TCP or TLS; the keys stand in ``common/bus.py``."""
 
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-import msgpack
 import redis
 from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
@@ -13,9 +13,12 @@ from common.bus import METRICS_KEPT, Ack, Entry, EntryId, Holder, ReplayAddress,
 from common.checksum import crc32
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
 from common.pending_read import PendingRead
+from common.record import decode_record, encode_record
 
 DEAD_LETTERS_KEPT = 1_000
+RECORDS_READ = 1_000  # of a role at a time
 DEAD_LETTER_BYTES = 1_024
+ACTOR_DIGITS = 4  # an actor's id is below 4096; what else stands among them is no actor
 TRIM_SCRIPT = """
 if tonumber(redis.call('GET', KEYS[1]) or '0') > tonumber(ARGV[1]) then return -1 end
 for i = 2, #KEYS do redis.call('XTRIM', KEYS[i], 'MINID', ARGV[i]) end
@@ -40,6 +43,7 @@ class RedisBus:
         except ValueError as error:
             raise ConfigError("--redis-url", url.split("@")[-1], f"not a Redis URL ({error})") from None
         self.url, self._prefix = url, f"rmc:{run}"
+        self.refused: Counter[str] = Counter()  # records by reason
         self._pending = PendingRead(self._redis.connection_pool)
 
     def _key(self, *parts: object) -> str:
@@ -111,7 +115,8 @@ class RedisBus:
             raise FencedError(f"actor {actor}: epoch {last.epoch} has replaced epoch {entry_id.epoch}")
 
     def actors(self) -> list[int]:
-        return sorted(int(actor) for actor in self._call(lambda: self._redis.smembers(self._key("actors"))))
+        said = self._call(lambda: self._redis.smembers(self._key("actors")))
+        return sorted(int(actor) for actor in said if actor.isdigit() and len(actor) <= ACTOR_DIGITS)
 
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
         if not after:
@@ -287,25 +292,30 @@ class RedisBus:
             return None
 
     def emit(self, role: str, record: Mapping[str, Any]) -> None:
-        packed = msgpack.packb({"role": role, **record}, use_bin_type=True)
+        key, fields = self._key("metrics", role), {"r": encode_record(record)}
+        self._call(lambda: self._redis.xadd(key, fields, maxlen=METRICS_KEPT))
 
-        def send() -> None:
-            pipe = self._redis.pipeline(transaction=False)
-            pipe.xadd(self._key("metrics"), {"r": packed}, maxlen=METRICS_KEPT)
-            pipe.hset(self._key("stats"), role, packed)
-            pipe.execute()
+    def records(self, after: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, str]]:
+        cursors: dict[str, str] = dict(after)
+        found: list[dict[str, Any]] = []
+        if not after:
+            return found, cursors
+        asked = {self._key("metrics", role): cursor for role, cursor in after.items()}
+        reply = self._call(lambda: self._redis.xread(asked, count=RECORDS_READ))
+        for name, entries in _stream_items(reply):
+            role = name.decode().removeprefix(f"{self._key('metrics')}:")
+            cursors[role] = entries[-1][0].decode()
+            found += [{**record, "role": role} for record in map(self._record, entries) if record is not None]
+            if len(entries) == RECORDS_READ:  # more than roles say: whoever does that shall not fill Redis
+                self._call(self._redis.xtrim, name, METRICS_KEPT)
+        return found, cursors
 
-        self._call(send)
-
-    def records(self, after: str) -> tuple[list[dict[str, Any]], str]:
-        reply = self._call(lambda: self._redis.xread({self._key("metrics"): after}, count=1000))
-        found = [(raw_id.decode(), fields[b"r"]) for _, entries in _stream_items(reply) for raw_id, fields in entries]
-        records = [msgpack.unpackb(packed, raw=False) for _, packed in found]
-        return records, found[-1][0] if found else after
-
-    def stats(self) -> dict[str, dict[str, Any]]:
-        reply = self._call(lambda: self._redis.hgetall(self._key("stats")))
-        return {role.decode(): msgpack.unpackb(packed, raw=False) for role, packed in reply.items()}
+    def _record(self, entry: tuple[bytes, dict[bytes, bytes]]) -> dict[str, Any] | None:
+        try:
+            return decode_record(entry[1].get(b"r", b""))
+        except MessageError as error:
+            self.refused[error.reason] += 1
+            return None
 
     def request_stop(self, reason: str) -> None:
         self._call(lambda: self._redis.set(self._key("stop"), reason))

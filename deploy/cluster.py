@@ -325,6 +325,7 @@ def train(
     """Train until the total is reached or ``stop`` is set; whether it was reached. Raises RoleDied, ConfigError."""
     run = ClusterRun(config, folder, device, all_cpus, encrypted)
     monitor.restarts, monitor.unplaced = run.restarts, run.waiting
+    monitor.roles = lambda: run.config.roles()
     over = False
     try:
         monitor.skip_old(run.bus)

@@ -17,7 +17,6 @@ from deploy.run_folder import RunFolder
 from deploy.view import Board, View
 
 RECORD_SECONDS = 5.0  # between the launcher's own records
-PAGE = 1000  # records that the bus gives at a time
 
 
 class Monitor:
@@ -28,7 +27,9 @@ class Monitor:
         self.restarts: Callable[[], dict[str, int]] = dict  # how often each role was started again
         self.unplaced: Callable[[], list[str]] = list  # roles that run nowhere now
         self._checkpoints = CheckpointFolder(folder.checkpoints, config.learner.keep_checkpoints)
-        self._cursor, self._started, self._wall_before = "0", time.monotonic(), folder.wall_seconds()
+        self.roles: Callable[[], tuple[str, ...]] = config.roles  # who may have something to say
+        self._cursors: dict[str, str] = {}
+        self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
         self._next_record = 0.0
         self._lines = folder.metrics.open("a", buffering=1)
         self._events = EventFileWriter(str(folder.events))
@@ -45,9 +46,8 @@ class Monitor:
 
     def skip_old(self, bus: Bus) -> None:
         """Pass over what an earlier start left in a shared Redis."""
-        records, self._cursor = bus.records(self._cursor)
-        while len(records) >= PAGE:
-            records, self._cursor = bus.records(self._cursor)
+        while self._read(bus):
+            pass
 
     def watch(self, bus: Bus) -> None:
         """Take in what is new, and refresh the view when it is due."""
@@ -59,20 +59,22 @@ class Monitor:
         self.view.refresh()
 
     def _take_in(self, bus: Bus) -> None:
-        while True:
-            records, self._cursor = bus.records(self._cursor)
+        while records := self._read(bus):
             for record in records:
                 self.record(record)
-            if len(records) < PAGE:
-                return
+
+    def _read(self, bus: Bus) -> list[dict[str, Any]]:
+        records, self._cursors = bus.records({role: self._cursors.get(role, "0") for role in self.roles()})
+        return records
 
     def record(self, record: dict[str, Any]) -> None:
         """Write one record (with its ``role``) and take it into the view."""
         self._lines.write(json.dumps(record) + "\n")
         self.board.take(record)
         self._write_events(record)
-        if "eval_update" in record:
-            self._checkpoints.mark_best(int(record["eval_update"]), float(record["eval_return_mean"]))
+        update = record.get("eval_update")
+        if record["role"] == "evaluator" and isinstance(update, int):
+            self._checkpoints.mark_best(update, float(record["eval_return_mean"]))
 
     def _record_launcher(self) -> None:
         restarts = {f"restarts_{role}": count for role, count in self.restarts().items()}

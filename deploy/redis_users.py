@@ -17,8 +17,7 @@ CONNECTS = "+ping +hello"
 EVERYONE = (
     "(+get %R~R:config %R~R:stop)",
     "(+get +incr +incrby ~R:epoch:ROLE)",
-    "(+xadd %W~R:metrics)",
-    "(+hset %W~R:stats)",
+    "(+xadd %W~R:metrics:ROLE)",
 )
 READS_WEIGHTS = "(+get %R~R:weights %R~R:weights:*)"
 ACTOR = (

@@ -12,6 +12,8 @@ from rich.table import Table
 NONE_YET = "-"
 REFRESH_SECONDS = 0.5  # of a live view
 LINE_SECONDS = 10.0  # between plain lines
+MOST_NAMES = 1000
+LARGEST_STEP = 2**53
 SILENT_SECONDS = 5.0  # after which a role's silence is shown
 
 
@@ -24,8 +26,10 @@ class Board:
         self.roles: dict[str, dict[str, Any]] = {}
 
     def take(self, record: dict[str, Any]) -> None:
-        """Take in a record; what it does not name stays as it was."""
-        self.roles.setdefault(record["role"], {}).update(record)
+        """Take in a record; what it does not name stays as it was, and of a role there are ``MOST_NAMES`` at most."""
+        known = self.roles.setdefault(record["role"], {})
+        room = MOST_NAMES - len(known)
+        known.update(record if len(record) <= room else {name: record[name] for name in record if name in known})
 
     def get(self, role: str, name: str) -> Any:
         """The newest value, or None."""
@@ -34,7 +38,8 @@ class Board:
     @property
     def env_steps(self) -> int:
         """Environment steps committed to the ring."""
-        return int(self.replay("env_steps", sum) or self.get("learner", "env_steps") or 0)
+        steps = self.replay("env_steps", sum) or self.get("learner", "env_steps") or 0
+        return int(steps) if 0 <= steps < LARGEST_STEP else 0  # and so not NaN
 
     def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:
         """The sum or mean ``over`` all replay servers, or None."""
@@ -143,7 +148,7 @@ def line(board: Board) -> str:
     parts = [
         f"steps {board.env_steps}/{board.total_steps}",
         f"{number(board.replay('env_steps_per_s', sum), '.0f')} steps/s",
-        f"updates {number(learner.get('updates'), 'd')}",
+        f"updates {number(learner.get('updates'), '.0f')}",
         f"{number(learner.get('updates_per_s'), '.1f')}/s",
         f"ring {number(board.replay('ring_fill', mean), '.0%')}",
         f"ratio {number(board.replay('replay_ratio', mean), '.1f')}/{board.replay_ratio:g}",

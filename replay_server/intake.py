@@ -19,6 +19,7 @@ ROUND_BYTES = 4 << 20  # read at most about this much in a round, so that the le
 MAX_ENTRIES = 256  # of one actor in a round
 DISCOVERY_ROUNDS = 100  # rounds between looks for actors beyond those the run was started with
 BEFORE_ALL = EntryId(0, -1)
+LARGEST_ID = 2**53  # of an epoch or an entry's number; past it no honest entry could follow, so the stream is dropped
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,10 @@ class Intake:
         broken: list[int] = []
         for entry in entries:
             if entry.actor in broken:
+                continue
+            if max(entry.id) > LARGEST_ID:
+                self._refuse(entry, MessageError("id", f"{entry.id.epoch}-{entry.id.seq}, at most {LARGEST_ID}"))
+                broken.append(entry.actor)
                 continue
             if self._lacks_entries(last.get(entry.actor, BEFORE_ALL), entry):
                 broken.append(entry.actor)

@@ -98,7 +98,7 @@ def test_close_hands_out_what_is_left() -> None:
     publish(bus, 5, evaluate=True)
     step_until_idle(evaluator)
     evaluator.close()
-    (record,), _ = bus.records("0")
+    (record,), _ = bus.records({"evaluator": "0"})
     assert (record["role"], record["eval_update"]) == ("evaluator", 5)
 
 

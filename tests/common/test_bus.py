@@ -160,26 +160,52 @@ def test_a_replaced_learner_cannot_publish(bus):
     assert bus.latest_version() == Version(new, 1)
 
 
-def test_metrics_and_stats(bus):
+def test_metrics_by_role(bus):
     bus.emit("learner", {"updates": 1})
     bus.emit("learner", {"updates": 2})
-    records, cursor = bus.records("0")
-    assert [record["updates"] for record in records] == [1, 2]
-    assert records[0]["role"] == "learner"
-    assert bus.records(cursor)[0] == []
-    assert bus.stats()["learner"]["updates"] == 2
+    bus.emit("actor-0", {"role": 7, "updates": 3})
+    records, cursors = bus.records({"learner": "0", "evaluator": "0"})
+    assert records == [{"role": "learner", "updates": 1}, {"role": "learner", "updates": 2}]
+    assert bus.records(cursors)[0] == []
+    bus.emit("evaluator", {"eval_update": 4})
+    assert bus.records(cursors)[0] == [{"role": "evaluator", "eval_update": 4}]
+    assert bus.records({})[0] == []
+    assert bus.records({"actor-0": "0"})[0] == [{"role": "actor-0", "updates": 3}]  # it cannot say that it is another
+
+
+def test_what_is_no_record_is_left_out_and_a_flood_is_trimmed(redis_url):
+    bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
+    client, key = bus._redis, bus._key("metrics", "actor-0")
+    client.xadd(key, {"x": b"no record"})
+    for packed in (b"", b"\xff", b"\x81\xa1a\xa1b"):
+        client.xadd(key, {"r": packed})
+    bus.emit("actor-0", {"updates": 1})
+    assert bus.records({"actor-0": "0"})[0] == [{"role": "actor-0", "updates": 1}]
+    assert bus.refused == {"msgpack": 2, "structure": 2}
+    with client.pipeline(transaction=False) as pipe:
+        for _ in range(3 * METRICS_KEPT):
+            pipe.xadd(key, {"r": b"\x80"})
+        pipe.execute()
+    bus.records({"actor-0": "0"})
+    assert client.xlen(key) <= 1.1 * METRICS_KEPT
+
+
+def test_only_numbers_are_actors(redis_url):
+    bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
+    bus._redis.sadd(bus._key("actors"), "3", "-1", "10000", "no", "", "²", "1e3")
+    assert bus.actors() == [3]
 
 
 def test_the_memory_bus_forgets_old_records():
-    bus, cursor, seen = MemoryBus(), "0", []
+    bus, cursors, seen = MemoryBus(), {"actor-0": "0"}, []
     for i in range(5 * METRICS_KEPT // 2):
         bus.emit("actor-0", {"i": i})
-        if i % 7_000 == 0:
-            records, cursor = bus.records(cursor)
+        if i % 700 == 0:
+            records, cursors = bus.records(cursors)
             seen += [record["i"] for record in records]
-    seen += [record["i"] for record in bus.records(cursor)[0]]
+    seen += [record["i"] for record in bus.records(cursors)[0]]
     assert seen == list(range(5 * METRICS_KEPT // 2))
-    assert METRICS_KEPT <= len(bus.records("0")[0]) < 2 * METRICS_KEPT
+    assert METRICS_KEPT <= len(bus.records({"actor-0": "0"})[0]) < 2 * METRICS_KEPT
 
 
 def test_a_full_redis_is_emptied_by_commits():

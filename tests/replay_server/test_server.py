@@ -380,6 +380,27 @@ def test_what_a_stream_lacks_is_sent_again(make: Make, kind: str, redis_url: str
     assert sender.granted() > 0
 
 
+@pytest.mark.parametrize("bad", [EntryId(2**64 - 1, 2**64 - 1), EntryId(1, 2**63), EntryId(2**60, 0)])
+@pytest.mark.parametrize("kind", ["memory", "redis"])
+def test_an_id_past_all_others_closes_a_stream_to_nobody(
+    make: Make, kind: str, bad: EntryId, redis_url: str, run_name: str
+) -> None:
+    bus: Bus = MemoryBus() if kind == "memory" else RedisBus(redis_url, run_name)
+    server, sender = make(on=bus), Sender(bus)
+    sender.send(2)
+    drain(server)
+    bus.append(0, bad, b"anything")
+    drain(server)
+    assert server.stats()["dead_letters_id"] == 1
+    with pytest.raises(BusUnavailable, match="gone"):
+        sender.send(1)
+    sender.greet()
+    sender.seq = 1
+    sender.send(1)
+    drain(server)
+    assert stored(server)["reward"][:, 0].tolist() == [0, 1, 2]
+
+
 def test_what_its_actor_lacks_too_is_given_up(make: Make, bus: MemoryBus) -> None:
     server, sender = make(), Sender(bus)
     sender.send(2)

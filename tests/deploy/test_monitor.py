@@ -1,0 +1,75 @@
+"""The launcher takes in whatever roles say, and goes on."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from common.bus import MemoryBus
+from common.envs import EnvConfig
+from deploy.monitor import Monitor
+from deploy.presets import RunConfig, debug
+from deploy.run_folder import open_run
+from deploy.view import MOST_NAMES, line, table
+
+CONFIG = debug(EnvConfig("Pendulum-v1"))
+
+
+@pytest.fixture
+def config() -> RunConfig:
+    return CONFIG
+
+
+@pytest.fixture
+def monitor(config: RunConfig, tmp_path: Path) -> Monitor:
+    folder = open_run(config, tmp_path / "run", "fail")
+    folder.unlock()
+    return Monitor(folder, config, Console(quiet=True, force_terminal=False))
+
+
+NUMBERS = [0, -1, 2**63 - 1, math.nan, math.inf, -math.inf, 1e300, 1.5]
+
+
+@pytest.mark.parametrize("value", NUMBERS)
+def test_any_number_is_shown(monitor: Monitor, value: float) -> None:
+    """All names that the view formats, each as a number that makes no sense."""
+    bus = MemoryBus()
+    counts = ["env_steps", "updates", "eval_update", "broken_episodes", "time", "sample_age_mean", "latent_rank"]
+    rates = ["env_steps_per_s", "updates_per_s", "ring_fill", "replay_ratio", "busy_share", "waiting_share"]
+    losses = ["q_loss", "model_loss", "alpha", "beta", "curiosity_share", "model_unexplained", "policy_lag_mean"]
+    returns = [
+        "episode_return_mean",
+        "eval_return_mean",
+        "eval_return_std",
+        "stale_state_stored",
+        "stale_q_first_stored",
+    ]
+    names = counts + rates + losses + returns
+    for role in ("learner", "replay", "evaluator", "actor-0"):
+        bus.emit(role, {"waiting_for": "credit", **dict.fromkeys(names, value)})
+    monitor.watch(bus)
+    assert "credit" in line(monitor.board) or not value > 0.5
+    Console(quiet=True).print(table(monitor.board))
+    assert monitor.board.env_steps == (value if value == 0 else 0) or value == 1.5
+    monitor.close()
+
+
+def test_each_role_speaks_for_itself_only(monitor: Monitor, tmp_path: Path) -> None:
+    bus = MemoryBus()
+    bus.emit("actor-0", {"role": 5, "updates": 7, "eval_update": 0, "eval_return_mean": 1e9})
+    bus.emit("actor-9", {"updates": 8})  # the run has no such role
+    monitor.watch(bus)
+    monitor.close()
+    lines = [json.loads(text) for text in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert {record["role"] for record in lines} == {"actor-0", "launcher"}
+    assert monitor.board.get("learner", "updates") is None
+
+
+def test_new_names_without_end_are_left_out(monitor: Monitor) -> None:
+    for start in range(0, 3 * MOST_NAMES, 100):
+        monitor.board.take({"role": "actor-0", "env_steps": start, **{f"n{start + i}": 0 for i in range(100)}})
+    assert len(monitor.board.roles["actor-0"]) <= MOST_NAMES
+    assert monitor.board.get("actor-0", "env_steps") == 3 * MOST_NAMES - 100
+    monitor.close()
