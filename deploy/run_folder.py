@@ -185,8 +185,11 @@ def _unused(folder: RunFolder) -> RunFolder:
 
 def _make(folder: RunFolder) -> None:
     try:
-        for path in (folder.path, folder.checkpoints, folder.logs):
-            path.mkdir(parents=True, exist_ok=True)
+        folder.path.mkdir(parents=True, exist_ok=True)
+        if not (folder.path / "config.json").exists():
+            folder.path.chmod(0o700)  # what a later owner opens to others stays open
+        for path in (folder.checkpoints, folder.logs):
+            path.mkdir(exist_ok=True)
     except OSError as error:
         raise ConfigError("--run-dir", str(folder.path), f"cannot be made ({error.strerror}); give another") from None
 

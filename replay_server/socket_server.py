@@ -83,7 +83,7 @@ class SocketServer:
             accepted, _ = self._listener.accept()
         except OSError:  # it went away again, or we are out of file handles
             return
-        if len(self._connections) >= MAX_CONNECTIONS:
+        if len(self._connections) >= MAX_CONNECTIONS and not self._end_oldest_stranger():
             self.refused["too-many"] += 1
             accepted.close()
             return
@@ -100,6 +100,14 @@ class SocketServer:
                 connection.send(Kind.CHALLENGE, {"nonce": connection.challenge})
             except OSError:
                 self._end(connection)
+
+    def _end_oldest_stranger(self) -> bool:
+        """Make room, so that a crowd of strangers keeps no client out; whether there was one to end."""
+        strangers = [connection for connection in self._connections if not connection.authenticated]
+        if strangers:
+            self.refused["too-many"] += 1
+            self._end(min(strangers, key=lambda stranger: stranger.opened))
+        return bool(strangers)
 
     def _prepared(self, accepted: socket.socket) -> socket.socket:
         with contextlib.suppress(OSError):  # macOS refuses more than its limit, Linux takes what it allows

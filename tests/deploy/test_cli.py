@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import stat
 from pathlib import Path
 
 import pytest
@@ -203,7 +204,15 @@ def test_a_run_may_be_made_longer(tmp_path: Path) -> None:
     run = open_run(longer, tmp_path / "run", "resume")
     run.unlock()
     assert run.config() == longer
-    assert oct((run.path / "secret").stat().st_mode & 0o777) == "0o600"
+
+
+def test_a_runs_folder_is_its_owners_alone_until_they_open_it(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir(mode=0o755)
+    run = made_run(tmp_path / "run")
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (run.path, run.secret_file)] == [0o700, 0o600]
+    run.path.chmod(0o750)
+    open_run(run.config(), run.path, "resume").unlock()
+    assert stat.S_IMODE(run.path.stat().st_mode) == 0o750
 
 
 def test_options_become_the_config() -> None:

@@ -331,11 +331,37 @@ def test_strangers_are_sent_away_and_cannot_fill_the_server(serve: Serve, monkey
     strangers = []
     for _ in range(socket_server.MAX_CONNECTIONS):
         strangers.append(served.stranger())
-    one_more = served.stranger()
-    served.refused("too-many")
+    works(served)  # the oldest stranger makes room for it
+    assert served.sockets.refused["too-many"] == 1
+    assert strangers[0].recv(1) == b""
     served.refused("silent")
+    for raw in strangers:
+        raw.close()
+
+
+def test_a_thousand_strangers_stop_no_batch(serve: Serve) -> None:
+    served, crowd = serve(), []
+    learner = served.connect()
+
+    def throng() -> None:
+        for number in range(1000):
+            raw = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            raw.connect(served.address.removeprefix("unix:"))
+            raw.send(b"\xff" * (number % 40))  # nothing, half a header, or one of a huge length
+            crowd.append(raw)
+
+    thread = threading.Thread(target=throng)
+    thread.start()
+    slowest, drawn = 0.0, 0
+    while thread.is_alive() or drawn < 100:
+        started = time.monotonic()
+        assert draw(learner)[0] is Kind.BATCH
+        slowest, drawn = max(slowest, time.monotonic() - started), drawn + 1
     works(served)
-    for raw in [*strangers, one_more]:
+    assert slowest < 1.0
+    assert served.sockets.refused.total() > 900
+    thread.join()
+    for raw in [*crowd, learner]:
         raw.close()
 
 
