@@ -16,6 +16,8 @@ from common.pending_read import PendingRead
 from common.record import decode_record, encode_record
 
 DEAD_LETTERS_KEPT = 1_000
+INTEGER = re.compile(rb"-?[0-9]{1,18}")
+PIECES = 4096  # of a policy, at most: 1 GiB
 RECORDS_READ = 1_000  # of a role at a time
 DEAD_LETTER_BYTES = 1_024
 ACTOR_DIGITS = 4  # an actor's id is below 4096; what else stands among them is no actor
@@ -43,7 +45,7 @@ class RedisBus:
         except ValueError as error:
             raise ConfigError("--redis-url", url.split("@")[-1], f"not a Redis URL ({error})") from None
         self.url, self._prefix = url, f"rmc:{run}"
-        self.refused: Counter[str] = Counter()  # records by reason
+        self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
         self._pending = PendingRead(self._redis.connection_pool)
 
     def _key(self, *parts: object) -> str:
@@ -204,10 +206,8 @@ class RedisBus:
 
     def ack(self, actor: int) -> Ack | None:
         raw = self._call(lambda: self._redis.hget(self._key("acks"), str(actor)))
-        if raw is None:
-            return None
-        epoch, seq, granted, final = map(int, raw.split())
-        return Ack(EntryId(epoch, seq), granted, bool(final))
+        found = self._integers(raw, 4)
+        return Ack(EntryId(found[0], found[1]), found[2], bool(found[3])) if found else None
 
     def dead_letter(self, entry: Entry, reason: str) -> None:
         fields = {
@@ -223,10 +223,9 @@ class RedisBus:
 
     def replay_address(self, role: str) -> ReplayAddress | None:
         raw = self._call(lambda: self._redis.hget(self._key("replay"), role))
-        if raw is None:
-            return None
-        epoch, address = raw.decode().split(" ", 1)
-        return ReplayAddress(int(epoch), address)
+        epoch, _, address = (raw or b"").partition(b" ")
+        found = self._integers(epoch, 1)
+        return ReplayAddress(found[0], address.decode(errors="replace")) if found else None
 
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
         pieces = split_pieces(blob)
@@ -248,6 +247,14 @@ class RedisBus:
         self._call(lambda: self._redis.transaction(transaction, self._key("epoch", "learner")))
         self._drop_pieces(before - self._heads())
 
+    def _integers(self, raw: bytes | None, count: int) -> list[int] | None:
+        """So many numbers, as they stand in a value; None where there is no value, or another one, which is counted."""
+        words = (raw or b"").split()
+        if len(words) == count and all(INTEGER.fullmatch(word) for word in words):
+            return [int(word) for word in words]
+        self.refused["control"] += bool(raw)
+        return None
+
     def _heads(self) -> set[tuple[Version, int]]:
         """Versions that a head names, with their number of pieces."""
         found = [self._head(False), self._head(True)]
@@ -255,10 +262,10 @@ class RedisBus:
 
     def _head(self, evaluate: bool) -> tuple[Version, int, int] | None:
         raw = self._call(lambda: self._redis.get(self._key("evaluate" if evaluate else "weights")))
-        if raw is None:
+        found = self._integers(raw, 4)
+        if found is None or found[2] > PIECES:
             return None
-        epoch, update, pieces, crc = map(int, raw.split())
-        return Version(epoch, update), pieces, crc
+        return Version(found[0], found[1]), found[2], found[3]
 
     def _piece_keys(self, version: Version, pieces: int) -> list[str]:
         return [self._key("weights", version.epoch, version.update, index) for index in range(pieces)]

@@ -190,6 +190,22 @@ def test_what_is_no_record_is_left_out_and_a_flood_is_trimmed(redis_url):
     assert client.xlen(key) <= 1.1 * METRICS_KEPT
 
 
+@pytest.mark.parametrize("value", [b"a b c d", b"1 2 3", b"1 2 3 4 5", b"1 2 3 \xff", b"9" * 40, b"1 2 3 4.0", b"\x00"])
+def test_what_is_no_control_message_is_none_and_counted(redis_url, value):
+    bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
+    bus._redis.set(bus._key("weights"), value)
+    bus._redis.hset(bus._key("acks"), "0", value)
+    bus._redis.hset(bus._key("replay"), "replay", b"x" + value)
+    assert (bus.latest_version(), bus.weights(), bus.ack(0), bus.replay_address("replay")) == (None, None, None, None)
+    assert bus.refused["control"] == 4
+
+
+def test_weights_of_too_many_pieces_are_not_asked_for(redis_url):
+    bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
+    bus._redis.set(bus._key("weights"), b"1 2 1000000000 4")
+    assert bus.weights() is None
+
+
 def test_only_numbers_are_actors(redis_url):
     bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
     bus._redis.sadd(bus._key("actors"), "3", "-1", "10000", "no", "", "²", "1e3")
