@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo test test-cluster test-dm-control lint results trial comparisons docs bench peers clean
+.PHONY: env demo test test-faults test-cluster test-dm-control lint results trial comparisons docs bench peers clean
 
 env: $(STAMP)
 
@@ -22,6 +22,10 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
+
+# The scripts of tests/faults at length; each puts a row into tests/faults/results.json.
+test-faults: $(STAMP)
+	$(BIN)/python -m tests.faults.fuzz
 
 # Real ray up on three machines that are namespaces of this one: Linux, root, openssh-server, rsync, iproute2.
 ROUNDS ?= 5

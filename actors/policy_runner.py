@@ -4,6 +4,9 @@ Shapes: N environments, O observation, A action, E embedding, H hidden. Float32 
 ``common.agent`` (its modules are the reference) to 1e-5.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,6 +22,14 @@ from common.window import BoolArray
 Floats = NDArray[np.float32]
 
 
+def _of_shape(weights: dict[str, Tensor], name: str, like: Tensor) -> Tensor:
+    """Out of ``weights``. Raises KeyError, ValueError."""
+    found = weights.pop(name)
+    if found.shape != like.shape:
+        raise ValueError(f"{name} has shape {tuple(found.shape)}, expected {tuple(like.shape)}")
+    return found
+
+
 class _Linear:
     """y = x W + b, then ReLU if asked, into ``out``.
 
@@ -30,13 +41,16 @@ class _Linear:
         self._weight, self._bias, self._relu = torch.zeros(inputs, outputs), torch.zeros(outputs), relu
         self.out = torch.zeros(rows, outputs)
 
-    def take(self, weights: dict[str, Tensor], name: str) -> None:
-        """Copy what is called ``name``, out of ``weights``. Raises KeyError, ValueError."""
-        weight, bias = weights.pop(name.format("weight")), weights.pop(name.format("bias"))
-        if weight.shape != self._weight.shape[::-1]:
-            raise ValueError(f"{name} has shape {tuple(weight.shape)}, expected {tuple(self._weight.shape[::-1])}")
-        self._weight.copy_(weight.T)
-        self._bias.copy_(bias)
+    def take(self, weights: dict[str, Tensor], name: str) -> Callable[[], object]:
+        """What is called ``name``, out of ``weights``; calling the result copies it. Raises KeyError, ValueError."""
+        weight = _of_shape(weights, name.format("weight"), self._weight.T)
+        bias = _of_shape(weights, name.format("bias"), self._bias)
+
+        def copy() -> None:
+            self._weight.copy_(weight.T)
+            self._bias.copy_(bias)
+
+        return copy
 
     def __call__(self, x: Tensor) -> Tensor:
         torch.addmm(self._bias, x, self._weight, out=self.out)
@@ -76,6 +90,9 @@ class PolicyRunner:
         self._embed = _Linear(inputs, embedding, envs, relu=not config.layer_norm) if config.embedding else None
         self._from_embedding = _Linear(embedding, 3 * config.hidden, envs)
         self._from_hidden = _Linear(config.hidden, 3 * config.hidden, envs)
+        self._mean, self._std = torch.zeros(obs_dim), torch.ones(obs_dim)
+        normed = config.layer_norm and config.embedding > 0
+        self._norm = (torch.ones(embedding), torch.zeros(embedding)) if normed else ()
         self._gru = _GRU(self._from_embedding, self._from_hidden, envs, config.hidden)
         first, second = config.heads
         self._head = (
@@ -94,25 +111,25 @@ class PolicyRunner:
         """Take over the safetensors of ``Agent.policy_weights()``, or of what is broadcast. Raises MessageError."""
         try:
             weights = load(blob)
-            self._take(weights)
+            copies = self._copies(weights)
         except (SafetensorError, KeyError, ValueError) as error:
             raise MessageError("weights", f"not a policy of this run ({error})") from None
         rates = self._config.initial_priority == "actor"
         if left := [name for name in weights if not (rates and name.startswith(CRITIC_PARTS))]:
             raise MessageError("weights", f"not a policy of this run (it also has {', '.join(left)})")
+        for copy in copies:  # only now, so that what is refused changes nothing
+            copy()
 
-    def _take(self, weights: dict[str, Tensor]) -> None:
-        """Fill the layers; takes what it uses out of ``weights``."""
-        self._mean, self._std = weights.pop("normalizer.mean").numpy(), weights.pop("normalizer.std").numpy()
-        self._norm = None
+    def _copies(self, weights: dict[str, Tensor]) -> list[Callable[[], object]]:
+        """What fills every part, once called; takes what it uses out of ``weights``."""
+        layers = {"memory.gru.{}_ih_l0": self._from_embedding, "memory.gru.{}_hh_l0": self._from_hidden}
+        layers |= {f"policy.net.{place}.{{}}": layer for place, layer in zip((0, 2, 4), self._head, strict=True)}
         if self._embed is not None:
-            self._embed.take(weights, "memory.embed.0.{}")
-            if self._config.layer_norm:
-                self._norm = weights.pop("memory.embed.1.weight"), weights.pop("memory.embed.1.bias")
-        self._from_embedding.take(weights, "memory.gru.{}_ih_l0")
-        self._from_hidden.take(weights, "memory.gru.{}_hh_l0")
-        for place, layer in zip((0, 2, 4), self._head, strict=True):
-            layer.take(weights, f"policy.net.{place}.{{}}")
+            layers["memory.embed.0.{}"] = self._embed
+        copies = [layer.take(weights, name) for name, layer in layers.items()]
+        plain = {"normalizer.mean": self._mean, "normalizer.std": self._std}
+        plain |= dict(zip(("memory.embed.1.weight", "memory.embed.1.bias"), self._norm, strict=False))
+        return copies + [partial(mine.copy_, _of_shape(weights, name, mine)) for name, mine in plain.items()]
 
     def act(
         self, observation: Floats, prev_action: Floats, blank: BoolArray, hidden: Floats, noise: Floats | None
@@ -139,8 +156,8 @@ class PolicyRunner:
         x = self._input
         normalized = x[:, : self._obs_dim]
         if self._config.normalize_observations:
-            np.subtract(observation, self._mean, out=normalized)
-            np.divide(normalized, self._std, out=normalized)
+            np.subtract(observation, self._mean.numpy(), out=normalized)
+            np.divide(normalized, self._std.numpy(), out=normalized)
             np.minimum(normalized, NORMALIZED_CLIP, out=normalized)  # the two take a third of one clip
             np.maximum(normalized, -NORMALIZED_CLIP, out=normalized)
         else:
@@ -155,7 +172,7 @@ class PolicyRunner:
         if self._embed is None:
             return x
         embedding = self._embed(x)
-        if self._norm is None:
+        if not self._norm:
             return embedding
         return F.layer_norm(embedding, embedding.shape[1:], *self._norm).relu_()
 

@@ -130,3 +130,15 @@ def test_another_runs_weights_are_refused() -> None:
         make_runner(agent).load(blob[:-4])
     with pytest.raises(MessageError):
         make_runner(agent).load(save({"policy.net.0.weight": torch.zeros(1)}))
+
+
+@pytest.mark.parametrize("spoilt", ["policy.net.4.bias", "normalizer.std", "memory.embed.1.weight", "surprise"])
+def test_refused_weights_change_nothing(spoilt: str) -> None:
+    config = AgentConfig(hidden=8, embedding=8, heads=(8, 8), layer_norm=True, normalize_observations=True)
+    agent, others = make_agent(config), make_agent(config, seed=1).policy_weights()
+    runner = make_runner(agent)
+    given = (np.ones((ENVS, OBS_DIM), np.float32), runner.start()[0], np.zeros(ENVS, np.bool_), runner.start()[1], None)
+    before = runner.act(*given)[0]
+    with pytest.raises(MessageError):
+        runner.load(save(others | {spoilt: torch.zeros(3, 7)}))
+    np.testing.assert_array_equal(runner.act(*given)[0], before)

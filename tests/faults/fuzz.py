@@ -1,0 +1,150 @@
+"""Messages that were changed at random: ``python -m tests.faults.fuzz [--cases 1000000]``.
+
+Of each kind a lawful one is mutated, read by what reads it in a run, and either taken or refused by name: nothing else
+may come of it, in no more than 10 ms, nor may memory grow. Mutations that keep a checksum right get past it.
+"""
+
+import argparse
+import random
+import resource
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+from safetensors.torch import save
+
+from actors.policy_runner import PolicyRunner
+from common.agent import Agent, AgentConfig
+from common.bus import join_pieces
+from common.checksum import crc32
+from common.envs import EnvConfig
+from common.errors import ConfigError, MessageError
+from common.record import decode_record, encode_record
+from common.wire import HEADER, Kind, check_rows, decode_header, decode_meta, decode_rows, encode_frame, encode_windows
+from deploy.presets import from_json, robust, to_json
+from replay_server.record import Progress, decode_published
+from tests.faults.row import Row
+from tests.replay_server.support import SPEC, make_rows
+
+SLOWEST_S, MOST_MB = 0.010, 64
+AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), normalize_observations=True)
+Reader = Callable[[bytes], object]
+
+
+def mutate(raw: bytes, rng: random.Random) -> bytes:
+    """One to four changes: bytes, runs, cuts, copies of itself, lengths that lie."""
+    changed = bytearray(raw)
+    for _ in range(rng.randint(1, 4)):
+        place = rng.randrange(len(changed) + 1)
+        match rng.randrange(7):
+            case 0 if changed:
+                changed[place % len(changed)] = rng.randrange(256)
+            case 1 if changed:
+                changed[place % len(changed)] ^= 1 << rng.randrange(8)
+            case 2:
+                del changed[place : place + rng.choice((1, 4, 64, 10**6))]
+            case 3:
+                changed[place:place] = rng.randbytes(rng.choice((1, 2, 8, 64)))
+            case 4:
+                start = rng.randrange(len(changed) + 1)
+                changed[place:place] = changed[start : start + rng.choice((1, 8, 256))]
+            case 5:
+                changed[place : place + 4] = rng.choice(
+                    (b"\xff" * 4, bytes(4), b"\x7f\xff\xff\xff", b"\xdd\xff\xff\xff")
+                )
+            case 6:
+                changed[place : place + 8] = np.array(rng.choice((np.nan, np.inf, -1e308, 2.0**63))).tobytes()
+    return bytes(changed)
+
+
+def window(payload: bytes) -> None:
+    """As the replay server's intake reads an entry."""
+    check_rows(decode_rows(payload, SPEC), SPEC)
+
+
+def honest_window(body: bytes) -> None:
+    """The same where header, length and checksum are right: what is within must be judged."""
+    size = SPEC.dtype.itemsize
+    rows = np.frombuffer(body[: len(body) // size * size].ljust(size, b"\0"), SPEC.dtype)
+    window(encode_windows(rows, SPEC))
+
+
+def frame(raw: bytes) -> None:
+    """As both ends of the replay server's socket read one: batches, priorities, statistics."""
+    header = decode_header(raw[: HEADER.size].ljust(HEADER.size, b"\0"), 1 << 20)
+    meta, body = raw[HEADER.size :][: header.meta_length], raw[HEADER.size + header.meta_length :]
+    decode_meta(meta, body, header)
+
+
+def weights(blob: bytes) -> None:
+    """As an actor takes in a policy whose pieces are whole."""
+    RUNNER.load(join_pieces([blob], crc32(blob)))
+
+
+def config(raw: bytes) -> None:
+    from_json(raw)
+
+
+def published(raw: bytes) -> None:
+    """Counters that a replay server begins with."""
+    decode_published(raw, SPEC.obs_dim)
+
+
+torch.manual_seed(0)
+RUNNER = PolicyRunner(SPEC.obs_dim, SPEC.action_dim, AGENT, envs=1)
+POLICY = save(Agent(SPEC.obs_dim, SPEC.action_dim, AGENT).policy_weights())
+BODY = make_rows(4).tobytes()
+PRIORITIES = (np.arange(8).tobytes(), np.ones(8, np.float32).tobytes())
+KINDS: dict[str, tuple[bytes, Reader]] = {
+    "window": (encode_windows(make_rows(4), SPEC), window),
+    "window, checksum right": (BODY, honest_window),
+    "batch": (encode_frame(Kind.BATCH, {"mass": 1.0, "windows": 4, "env_steps": 9}, (BODY,)) + BODY, frame),
+    "priorities": (encode_frame(Kind.PRIORITIES, {"count": 8}, PRIORITIES) + b"".join(PRIORITIES), frame),
+    "weights": (POLICY, weights),
+    "record": (encode_record({"time": 1.5, "updates": 7, "waiting_for": "credit"}), decode_record),
+    "config": (to_json(robust(EnvConfig("HalfCheetah-v5"))).encode(), config),
+    "counters": (Progress(SPEC.obs_dim).encode(), published),
+}
+
+
+def cases(count: int, seed: int) -> Iterator[tuple[str, bytes, Reader]]:
+    """So many, all kinds in turn."""
+    rng, kinds = random.Random(seed), list(KINDS.items())
+    for number in range(count):
+        name, (lawful, reader) = kinds[number % len(kinds)]
+        yield name, mutate(lawful, rng), reader
+
+
+def peak_mb() -> float:
+    """This process's largest memory so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def fuzz(count: int, seed: int = 0) -> Row:
+    """Read so many. Raises whatever a reader raises that is no refusal."""
+    for lawful, reader in KINDS.values():
+        reader(lawful)
+    before, refused, slow, slowest = peak_mb(), Counter[str](), 0, 0.0
+    for name, raw, reader in cases(count, seed):
+        started = time.process_time()
+        try:
+            reader(raw)
+        except MessageError as error:
+            refused[f"{name}: {error.reason}"] += 1
+        except ConfigError:
+            refused[f"{name}: option"] += 1
+        taken = time.process_time() - started
+        slowest, slow = max(slowest, taken), slow + (taken > SLOWEST_S)
+    grown = peak_mb() - before
+    found = {"slowest_ms": round(1e3 * slowest, 2), "over_10_ms": slow, "grown_mb": round(grown, 1), **refused}
+    return Row("messages changed at random", count, slow == 0 and grown < MOST_MB, found=found)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    fuzz(options.cases, options.seed).keep()
