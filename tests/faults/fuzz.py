@@ -29,6 +29,7 @@ from tests.faults.row import Row
 from tests.replay_server.support import SPEC, make_rows
 
 SLOWEST_S, MOST_MB = 0.010, 64
+TAKEN = "taken"
 AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), normalize_observations=True)
 Reader = Callable[[bytes], object]
 
@@ -122,20 +123,28 @@ def peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
+def read(reader: Reader, raw: bytes) -> tuple[float, str]:
+    """How long that took, in seconds of this process, and why it was refused."""
+    started, reason = time.process_time(), TAKEN
+    try:
+        reader(raw)
+    except MessageError as error:
+        reason = error.reason
+    except ConfigError:
+        reason = "option"
+    return time.process_time() - started, reason
+
+
 def fuzz(count: int, seed: int = 0) -> Row:
     """Read so many. Raises whatever a reader raises that is no refusal."""
     for lawful, reader in KINDS.values():
         reader(lawful)
     before, refused, slow, slowest = peak_mb(), Counter[str](), 0, 0.0
     for name, raw, reader in cases(count, seed):
-        started = time.process_time()
-        try:
-            reader(raw)
-        except MessageError as error:
-            refused[f"{name}: {error.reason}"] += 1
-        except ConfigError:
-            refused[f"{name}: option"] += 1
-        taken = time.process_time() - started
+        taken, reason = read(reader, raw)
+        refused[f"{name}: {reason}"] += 1
+        if taken > SLOWEST_S:  # the message's fault, or the garbage collector's?
+            taken = min(taken, *(read(reader, raw)[0] for _ in range(3)))
         slowest, slow = max(slowest, taken), slow + (taken > SLOWEST_S)
     grown = peak_mb() - before
     found = {"slowest_ms": round(1e3 * slowest, 2), "over_10_ms": slow, "grown_mb": round(grown, 1), **refused}
