@@ -19,7 +19,7 @@ ROUND_BYTES = 4 << 20  # read at most about this much in a round, so that the le
 MAX_ENTRIES = 256  # of one actor in a round
 DISCOVERY_ROUNDS = 100  # rounds between looks for actors beyond those the run was started with
 BEFORE_ALL = EntryId(0, -1)
-LARGEST_ID = 2**53  # of an epoch or an entry's number; past it no honest entry could follow, so the stream is dropped
+LARGEST = EntryId(2**31 - 1, 2**53)  # of each number; past one of them a row cannot say it, and the stream is dropped
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ class Intake:
         for entry in entries:
             if entry.actor in broken:
                 continue
-            if max(entry.id) > LARGEST_ID:
-                self._refuse(entry, MessageError("id", f"{entry.id.epoch}-{entry.id.seq}, at most {LARGEST_ID}"))
+            if entry.id.epoch > LARGEST.epoch or entry.id.seq > LARGEST.seq:
+                self._refuse(entry, MessageError("id", f"{entry.id.epoch}-{entry.id.seq}, past all others"))
                 broken.append(entry.actor)
                 continue
             if self._lacks_entries(last.get(entry.actor, BEFORE_ALL), entry):

@@ -380,7 +380,7 @@ def test_what_a_stream_lacks_is_sent_again(make: Make, kind: str, redis_url: str
     assert sender.granted() > 0
 
 
-@pytest.mark.parametrize("bad", [EntryId(2**64 - 1, 2**64 - 1), EntryId(1, 2**63), EntryId(2**60, 0)])
+@pytest.mark.parametrize("bad", [EntryId(2**64 - 1, 2**64 - 1), EntryId(1, 2**63), EntryId(2**31, 0)])
 @pytest.mark.parametrize("kind", ["memory", "redis"])
 def test_an_id_past_all_others_closes_a_stream_to_nobody(
     make: Make, kind: str, bad: EntryId, redis_url: str, run_name: str
