@@ -10,7 +10,7 @@ import ray
 
 from common.errors import RoleDied
 from deploy.ray_host import Report
-from deploy.supervisor import EXIT_CONFIG, QUICK_DEATHS, QUICK_SECONDS
+from deploy.supervisor import EXIT_CONFIG, QUICK_DEATHS, QUICK_SECONDS, from_outside
 
 POLL_SECONDS = 0.5  # between questions to each host
 log = logging.getLogger(__name__)
@@ -85,7 +85,8 @@ class Hosted:
             self._note_death(report)
 
     def _note_death(self, report: Report) -> None:
-        quick = time.monotonic() - self._began_at < QUICK_SECONDS
+        assert report.status is not None
+        quick = time.monotonic() - self._began_at < QUICK_SECONDS and not from_outside(report.status)
         self._quick_deaths = self._quick_deaths + 1 if quick else 0
         if report.status == EXIT_CONFIG or self._quick_deaths >= QUICK_DEATHS:
             often = f"{self._quick_deaths} times in a row soon after its start" if self._quick_deaths > 1 else "at once"

@@ -12,12 +12,20 @@ from pathlib import Path
 from common.errors import RoleDied
 from deploy.lifeline import PARENT_VARIABLE
 
-QUICK_DEATHS, QUICK_SECONDS = 3, 60.0  # so many deaths in a row, each within so long of its start, end the run
+QUICK_DEATHS, QUICK_SECONDS = (
+    3,
+    60.0,
+)  # so many deaths of its own in a row, each within so long of its start, end the run
 FIRST_BACKOFF, LONGEST_BACKOFF = 0.25, 10.0  # seconds before a role is started again, doubled at each quick death
 STOP_SECONDS = 3.5  # for the roles to end in order; then they are killed
 EXIT_CONFIG = 2  # the exit status of an error that starting again cannot mend
 TRACEBACK_BYTES = 8192
 SINGLE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+def from_outside(status: int) -> bool:
+    """Whether somebody else ended it, for whom it can do nothing: it is started again, however often."""
+    return status in (-signal.SIGKILL, -signal.SIGTERM)
 
 
 @dataclass(frozen=True)
@@ -84,7 +92,7 @@ class RoleProcess:
 
     def _note_death(self, status: int) -> None:
         now = time.monotonic()
-        quick = now - self._started_at < QUICK_SECONDS
+        quick = now - self._started_at < QUICK_SECONDS and not from_outside(status)
         self._quick_deaths = self._quick_deaths + 1 if quick else 0
         if self._quick_deaths >= QUICK_DEATHS or status == EXIT_CONFIG:
             how = f"killed by signal {-status}" if status < 0 else f"exit status {status}"

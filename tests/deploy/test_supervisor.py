@@ -41,3 +41,25 @@ def test_any_other_role_that_ends_unasked_is_started_again(quick: Path) -> None:
     with pytest.raises(RoleDied, match=r"3 times in a row soon after its start, exit status 0"):
         tend_until(role)
     assert role.restarts == 2
+
+
+@pytest.mark.parametrize("number", [9, 15])
+def test_a_role_that_others_kill_is_started_again_however_often(quick: Path, number: int) -> None:
+    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\nkill -{number} $$\n")
+    role = RoleProcess(RoleCommand("actor-0", ("actor",)), {}, quick)
+    role.start()
+    deadline = time.monotonic() + 20.0
+    while role.restarts < 10:
+        assert time.monotonic() < deadline
+        role.tend()
+        time.sleep(0.001)
+    role.signal(9)
+    role.reap(5.0)
+
+
+def test_a_role_that_crashes_ends_the_run(quick: Path) -> None:
+    Path(supervisor.sys.executable).write_text("#!/bin/sh\nkill -11 $$\n")
+    role = RoleProcess(RoleCommand("actor-0", ("actor",)), {}, quick)
+    role.start()
+    with pytest.raises(RoleDied, match=r"3 times in a row soon after its start, killed by signal 11"):
+        tend_until(role)

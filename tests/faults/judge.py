@@ -1,0 +1,83 @@
+"""What a ring holds against what was acknowledged: nothing lost but by age, nothing there twice.
+
+An actor numbers the entries of its life, an entry its windows, and the windows of an environment follow step on step:
+so a gap shows what was lost, and an origin (actor, epoch, seq, k) that stands twice what was doubled.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from common.bus import EntryId
+from common.window import Rows
+from deploy.run_folder import RunFolder
+from replay_server.recovery import open_store, valid_leaves
+from replay_server.sum_tree import SumTree
+
+
+@dataclasses.dataclass(frozen=True)
+class Judgement:
+    """Windows of a ring that no process has open."""
+
+    acknowledged: int
+    lost: int
+    duplicated: int
+    tree_differs: bool
+    """The sum tree from the one that is rebuilt from priorities."""
+
+
+def judge(folder: Path, acks: dict[tuple[int, int], int]) -> Judgement:
+    """``acks``: the largest number of an entry that was acknowledged, by actor and epoch. Raises ConfigError."""
+    run = RunFolder(folder)
+    config = run.config()
+    store = open_store(run.replay, config.window_spec(), config.replay.capacity, config.replay.priority_exponent)
+    try:
+        progress, capacity = store.ring.progress, store.ring.capacity
+        serials = np.arange(progress.valid_from, progress.next_serial)
+        rows = store.ring.rows[serials % capacity].copy()
+        rebuilt = SumTree(capacity)
+        rebuilt.rebuild(valid_leaves(store))
+        differs = not np.array_equal(rebuilt._nodes, store.tree._nodes)
+    finally:
+        store.close()
+    full = progress.valid_from > 0
+    lost = sum(_lost(_of(rows, *life), acks.get(life, 0), full) for life in _lives(rows) | set(acks))
+    origins = {tuple(row) for row in rows[["actor", "epoch", "seq", "k"]].tolist()}
+    return Judgement(progress.next_serial, lost, len(rows) - len(origins), differs)
+
+
+def _lives(rows: Rows) -> set[tuple[int, int]]:
+    return {(actor, epoch) for actor, epoch in rows[["actor", "epoch"]].tolist()}
+
+
+def _of(rows: Rows, actor: int, epoch: int) -> Rows:
+    """A life's windows, as they were sent."""
+    own = rows[(rows["actor"] == actor) & (rows["epoch"] == epoch)]
+    found: Rows = own[np.lexsort((own["k"], own["seq"]))]
+    return found
+
+
+def _lost(own: Rows, acked: int, full: bool) -> int:
+    """Entries, windows and steps that are missing between others or before ``acked``; age takes from the front."""
+    if not len(own):
+        return 0 if full else acked
+    seqs = np.unique(own["seq"])
+    first = int(seqs[0]) if full else 1
+    missing = max(int(seqs[-1]), acked) - first + 1 - len(seqs)
+    for seq in seqs[1:] if full else seqs:
+        missing += int((np.diff(own["k"][own["seq"] == seq], prepend=-1) != 1).sum())
+    return missing + sum(_gaps(own[own["env"] == env]) for env in np.unique(own["env"]))
+
+
+def _gaps(windows: Rows) -> int:
+    """Where an environment's windows do not follow each other, nor begin an episode."""
+    reached = windows["episode_step"][:-1] + windows["new_steps"][:-1]
+    follows = windows["episode_step"][1:] == reached
+    return int((~follows & (windows["episode_step"][1:] != 0)).sum())
+
+
+def newest(acks: dict[tuple[int, int], int], actor: int, entry: EntryId) -> None:
+    """Take an ack into ``acks``."""
+    life = actor, entry.epoch
+    acks[life] = max(acks.get(life, 0), entry.seq)
