@@ -19,7 +19,7 @@ from actors.window_builder import WindowBuilder
 from common.agent import AgentConfig
 from common.bus import Ack, Bus, Version
 from common.envs import rebuilt, sound_reset
-from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
+from common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
 from common.metrics import Means, Rate
 from common.window import Rows, WindowSpec
 from common.wrappers import Env, Floats
@@ -107,6 +107,7 @@ class Actor:
         self._reward = np.zeros(n, np.float32)
         self._blank, self._terminated, self._truncated = (np.zeros(n, np.bool_) for _ in range(3))
         self._means, self._rate, self._episodes, self._resends = Means(), Rate(), 0, 0
+        self._refused_weights = 0
         self._total_steps = 0
         self._start_epoch()
 
@@ -160,6 +161,7 @@ class Actor:
             "unacked_entries": len(self._outbox),
             "resends": self._resends + self._outbox.resends,
             "broken_episodes": self._broken,
+            "refused_weights": self._refused_weights,
         }
         return record | self._means.take()
 
@@ -208,12 +210,21 @@ class Actor:
         if self._version is not None and newest.epoch == self._version.epoch:
             self._means.add("policy_lag", newest.update - self._version.update)
         if self._version is None or newest > self._version:
-            found = self._bus.weights()
-            if found is not None:
-                self._version, blob = found
-                self._runner.load(blob)
-                if self._rater is not None:
-                    self._rater.load(blob)
+            self._take_weights(self._bus.weights())
+
+    def _take_weights(self, found: tuple[Version, bytes] | None) -> None:
+        """A policy that cannot be read is refused, and the one before goes on."""
+        if found is None:
+            return
+        try:
+            self._runner.load(found[1])
+            if self._rater is not None:
+                self._rater.load(found[1])
+        except MessageError as error:
+            self._refused_weights += 1
+            log.warning("%s: refused %s: %s", self.name, found[0], error)
+        else:
+            self._version = found[0]
 
     def _poll_ack(self) -> None:
         ack, now = self._bus.ack(self._index), self._clock()

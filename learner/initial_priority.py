@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from common.agent import Agent, AgentConfig, squashed_sample
+from common.errors import MessageError
 from common.window import Rows, WindowSpec
 from learner import losses
 from learner.batch import view_batch
@@ -26,8 +27,11 @@ class InitialPriority:
         self._generator = torch.Generator().manual_seed(seed)
 
     def load(self, blob: bytes) -> None:
-        """Take over what was broadcast, the safetensors of ``Agent.broadcast_weights()``."""
-        self._agent.load_state_dict(safetensors.torch.load(blob), strict=False)
+        """Take over what was broadcast, the safetensors of ``Agent.broadcast_weights()``. Raises MessageError."""
+        try:
+            self._agent.load_state_dict(safetensors.torch.load(blob), strict=False)
+        except (safetensors.SafetensorError, RuntimeError) as error:
+            raise MessageError("weights", f"not of this run ({error})") from None
 
     @torch.no_grad()
     def __call__(self, rows: Rows) -> NDArray[np.float32]:

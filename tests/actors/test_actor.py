@@ -200,6 +200,22 @@ def test_random_phase_and_newer_weights(bus: Bus) -> None:
     actor.close()
 
 
+def test_a_policy_that_cannot_be_read_is_refused_and_the_one_before_goes_on(bus: Bus) -> None:
+    bus.publish_weights(Version(1, 2), b"no policy")
+    actor, reader = make_actor(bus), Reader(bus)
+    reader.read(400)
+    step_until_blocked(actor)
+    assert actor.waiting_for() == "weights"
+    publish(bus, 3)
+    play(bus, actor, reader, 400, final=False)
+    bus.publish_weights(Version(1, 8), b"no policy")
+    play(bus, actor, reader, 800)
+    record = actor.metrics()
+    assert record["weights_update"] == 3
+    assert record["refused_weights"] >= 2
+    actor.close()
+
+
 def test_metrics() -> None:
     bus = MemoryBus()
     publish(bus, 3)
