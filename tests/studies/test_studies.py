@@ -3,6 +3,9 @@
 import dataclasses
 import importlib
 import json
+import os
+import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -61,6 +64,23 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, monkeypatch):
         tiny.run("smoke", tiny.jobs("smoke"))
     (found,) = (json.loads(line) for line in (tmp_path / "tiny-smoke.jsonl").read_text().splitlines())
     assert found["agent"] == "sound"
+
+
+def test_ctrl_c_starts_no_other_run(tmp_path, monkeypatch):
+    begun = []
+
+    def interrupted(job, cores):
+        begun.append(job.agent)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.3)
+        raise ConfigError(job.agent, "", "ended with 130")
+
+    monkeypatch.setattr(study, "RUNS", tmp_path)
+    monkeypatch.setattr(study, "_trained", interrupted)
+    tiny = Study("tiny", {name: f"train ENV --seed {name}" for name in "123"})
+    with pytest.raises(KeyboardInterrupt):
+        tiny.run("smoke", tiny.jobs("smoke"))
+    assert begun == ["1"]
 
 
 def test_a_wrong_agent_is_refused():
