@@ -146,13 +146,13 @@ class ClusterRun:
             max_restarts=-1, num_cpus=place.cpus, num_gpus=place.gpus, scheduling_strategy=strategy,
         )  # fmt: skip
         url = self._server.network_url(name, f"{{scratch}}/{tls.CERTIFICATE}")
-        secrets = {"redis-url": url.encode()}
+        secrets = {f"redis-url-{name}": url.encode()}  # roles on one node share its scratch folder
         if name == "learner" or name.startswith("replay"):
             secrets["secret"] = self._folder.secret()
         if self._encrypted:
             files = (tls.CERTIFICATE, tls.KEY) if name.startswith("replay") else (tls.CERTIFICATE,)
             secrets |= {file: (self._folder.path / file).read_bytes() for file in files}
-        environment = {URL_VARIABLE: "file:{scratch}/redis-url", PATIENCE_VARIABLE: str(PATIENCE_SECONDS)}
+        environment = {URL_VARIABLE: f"file:{{scratch}}/redis-url-{name}", PATIENCE_VARIABLE: str(PATIENCE_SECONDS)}
         return options.remote(Task(self._folder.name, place.command, environment, secrets, os.getcwd()))
 
     # -- tending --------------------------------------------------------------------------------------
