@@ -78,8 +78,12 @@ def test_ctrl_c_starts_no_other_run(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "RUNS", tmp_path)
     monkeypatch.setattr(study, "_trained", interrupted)
     tiny = Study("tiny", {name: f"train ENV --seed {name}" for name in "123"})
-    with pytest.raises(KeyboardInterrupt):
-        tiny.run("smoke", tiny.jobs("smoke"))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            tiny.run("smoke", tiny.jobs("smoke"))
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert begun == ["1"]
 
 
