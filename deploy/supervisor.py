@@ -12,10 +12,8 @@ from pathlib import Path
 from common.errors import RoleDied
 from deploy.lifeline import PARENT_VARIABLE
 
-QUICK_DEATHS, QUICK_SECONDS = (
-    3,
-    60.0,
-)  # so many deaths of its own in a row, each within so long of its start, end the run
+# So many deaths of a role's own in a row, each within so long of its start, end the run.
+QUICK_DEATHS, QUICK_SECONDS = 3, 60.0
 FIRST_BACKOFF, LONGEST_BACKOFF = 0.25, 10.0  # seconds before a role is started again, doubled at each quick death
 STOP_SECONDS = 3.5  # for the roles to end in order; then they are killed
 EXIT_CONFIG = 2  # the exit status of an error that starting again cannot mend

@@ -55,7 +55,7 @@ WHEN = {
     "heads": "rarely",
     "layer_norm": "rarely: it cost return in the [trial](results.md)",
     "head_input": "rarely: the embedding beside it cost return in the [trial](results.md)",
-    "critic_norm": "to try where values run away",
+    "critic_norm": "rarely: it cost return in the [trial](results.md)",
     "normalize_observations": "off where observations are scaled already and their statistics keep moving",
     "grounding": "`off` for the paper's model; without it the latent can collapse in other schemes than 1",
     "blank_flag": "with flicker, to see what the flag is worth; the paper has none",

@@ -28,7 +28,9 @@ def kill(tries: int, folder: Path, seed: int = 0) -> Row:
             victim.kill()
             slowest = max(slowest, run.until(lambda name=name, epoch=epoch: run.bus.current_epoch(name) > epoch))
         acked = dict(run.acks)
-        run.until(lambda: all(run.acks != acked for _ in range(ACTORS)))  # it goes on
+        for actor in range(ACTORS):  # each goes on
+            before = _of_actor(acked, actor)
+            run.until(lambda actor=actor, before=before: _of_actor(run.acks, actor) != before)
         found = run.end()
     repeated = _repeated_starts(folder)
     passed = not (found.lost or found.duplicated or repeated) and slowest < RECOVERY_S
@@ -36,6 +38,10 @@ def kill(tries: int, folder: Path, seed: int = 0) -> Row:
         "kill -9 of an actor", tries, passed, found.acknowledged, found.lost, found.duplicated, round(slowest, 2),
         {"repeated_episodes": repeated},
     )  # fmt: skip
+
+
+def _of_actor(acks: dict[tuple[int, int], int], actor: int) -> dict[tuple[int, int], int]:
+    return {life: seq for life, seq in acks.copy().items() if life[0] == actor}
 
 
 def _repeated_starts(folder: Path) -> int:

@@ -18,13 +18,14 @@ from tests.integration.running import Training
 
 ACTORS = 2
 ENDLESS = ("--total-steps", "100000000", "--replay-ratio", "4", "--actors", str(ACTORS), "--checkpoint-steps", "20000")
+ROOMY = ("--capacity", "100000")  # windows: none is evicted before all are judged
 
 
 class Loaded(Training):
     """Ready, with a learner that updates, once ``begin`` returns."""
 
     def __init__(self, folder: Path, *options: str) -> None:
-        super().__init__(folder, *ENDLESS, *options)
+        super().__init__(folder, *ENDLESS, *(options or ROOMY))
         self.acks: dict[tuple[int, int], int] = {}
         self._over = threading.Event()
         self._watch = threading.Thread(target=self._note_acks, daemon=True)
