@@ -23,9 +23,15 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest
 
-# The scripts of tests/faults at length; each puts a row into tests/faults/results.json.
-test-faults: $(STAMP)
-	$(BIN)/python -m tests.faults.fuzz
+# The scripts of tests/faults at length, an hour and a half in all; each puts its rows into tests/faults/results.json.
+# Linux; disk_full wants root, clock a C compiler.
+FAULTS := fuzz broken_checkpoints kill_actor kill_replay kill_learner kill_redis kill_all nan_loss frozen disk_full clock \
+	slow_learner soak
+
+test-faults: $(addprefix test-faults-,$(FAULTS)) docs
+
+test-faults-%: $(STAMP)
+	$(BIN)/python -m tests.faults.$*
 
 # Real ray up on three machines that are namespaces of this one: Linux, root, openssh-server, rsync, iproute2.
 ROUNDS ?= 5
@@ -70,7 +76,7 @@ trial: $(STAMP)
 	$(foreach name,$(TRIALS),$(foreach seed,1 2,$(BIN)/rmc train HalfCheetah-v5 --seed $(seed) --total-steps 100000 --run-dir runs/trial-$(name)-$(seed) $(trial_$(name)) && )) true
 
 # With flicker, what the flag of blank frames is worth; and windows that begin with a stored state or with none.
-MEMORY40 := --hidden 64 --embedding 64 --heads 128 128 --shortcut --normalize-observations --learning-rate 5e-4 \
+MEMORY40 := --hidden 64 --embedding 64 --heads 128 128 --head-input hidden+embedding --normalize-observations --learning-rate 5e-4 \
 	--polyak 0.99 --target-memory ema --batch-size 16 --capacity 5000 --warmup-steps 1000 --priority-exponent 0 \
 	--episodes 10 --replay-ratio 96 --alpha-learning-rate 5e-3 --trained-steps 42 --stride 14
 
@@ -80,6 +86,7 @@ comparisons: $(STAMP)
 
 docs: $(STAMP)
 	$(BIN)/python -m docs.generate
+	$(BIN)/python -m docs.fault_table
 
 # Each beside what a user would pick instead, where make peers has installed that. Results: docs/performance.md.
 BENCHMARKS := replay ingest learner actor weights growth memory cuda end-to-end

@@ -14,7 +14,7 @@ Every Redis key, R = ``rmc:{run}``:
 | R:weights               | string | learner  | ``epoch update pieces crc32`` of the newest weights      |
 | R:weights:EPOCH:UPDATE:I| string | learner  | piece I (256 KiB) of a policy, safetensors               |
 | R:evaluate              | string | learner  | ``epoch update pieces crc32`` the evaluator should play  |
-| R:metrics:ROLE          | stream | ROLE     | records, msgpack, about the last 2 000                   |
+| R:metrics:ROLE          | stream | ROLE     | records, msgpack, about the last 300                     |
 | R:stop                  | string | launcher | why the run should end                                   |
 | R:dead                  | stream | replay   | refused entries: actor, id, reason, first 1 KiB; 1 000   |
 """
@@ -27,7 +27,7 @@ from typing import Any, NamedTuple, Protocol
 from common.checksum import crc32
 from common.errors import BusUnavailable, FencedError, MessageError
 
-METRICS_KEPT = 2_000  # records of a role, at least
+METRICS_KEPT = 300  # records of a role, at least: five minutes
 
 
 class EntryId(NamedTuple):
@@ -85,6 +85,9 @@ class Bus(Protocol):
     Every method may raise BusUnavailable (retry) and, where it writes, BusFull (wait).
     """
 
+    refused: Counter[str]
+    """What roles wrote and could not be read, by reason."""
+
     def set_config(self, config: bytes) -> None:
         """Register the run's config."""
 
@@ -93,6 +96,9 @@ class Bus(Protocol):
 
     def take_epoch(self, role: str, floor: int = 0) -> int:
         """A new epoch of this role, larger than ``floor`` and than any taken before."""
+
+    def check_room(self, role: str) -> None:
+        """Raises BusFull or BusUnavailable where what this role writes would not be taken now."""
 
     def current_epoch(self, role: str) -> int:
         """The newest epoch taken by this role; 0 before the first."""
@@ -186,6 +192,7 @@ class MemoryBus:
         self._records: dict[str, list[dict[str, Any]]] = {}
         self._forgotten: Counter[str] = Counter()  # records that made room
         self._stop: str | None = None
+        self.refused: Counter[str] = Counter()  # here, nobody writes what cannot be read
         self.dead_letters: list[tuple[Entry, str]] = []
 
     def set_config(self, config: bytes) -> None:
@@ -197,6 +204,9 @@ class MemoryBus:
     def take_epoch(self, role: str, floor: int = 0) -> int:
         self._epochs[role] = max(self._epochs.get(role, 0), floor) + 1
         return self._epochs[role]
+
+    def check_room(self, role: str) -> None:
+        """There always is some."""
 
     def current_epoch(self, role: str) -> int:
         return self._epochs.get(role, 0)

@@ -1,7 +1,7 @@
 """A folder of checkpoints that are whole or absent: temp folder, fsync, rename, SHA-256 manifest.
 
 ``checkpoints/000001200/{FILES…, manifest.json}``, one folder an update count; ``checkpoints/best.json`` names
-the best one evaluated, which is kept beside the newest few.
+the best one evaluated, which is kept beside the newest few, and ``checkpoints/epoch`` the writer's epoch.
 """
 
 import fcntl
@@ -11,6 +11,7 @@ import logging
 import os
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from common.errors import CheckpointError, ConfigError
@@ -18,6 +19,7 @@ from common.errors import CheckpointError, ConfigError
 log = logging.getLogger(__name__)
 MANIFEST = "manifest.json"
 BEST = "best.json"
+EPOCH = "epoch"
 
 
 class CheckpointFolder:
@@ -55,40 +57,61 @@ class CheckpointFolder:
         return self.folder / f"{number:09d}"
 
     def save(self, number: int, files: Mapping[str, bytes]) -> Path:
-        """Write a checkpoint so that it is there whole or not at all, then drop the oldest ones."""
+        """Write a checkpoint so that it is there whole or not at all, then drop the oldest ones.
+
+        Raises CheckpointError where it cannot be written; those before it stay, and nothing of it.
+        """
         temporary, final = self.folder / f".tmp-{number:09d}", self.path(number)
         shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
-        digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
-        manifest = json.dumps({"update": number, "sha256": digests}, indent=1).encode()
-        for name, content in {**files, MANIFEST: manifest}.items():
-            _write(temporary / name, content)
-        _sync_folder(temporary)
-        if final.exists():  # a resumed run repeats this number: the new one replaces the old
-            shutil.rmtree(final)
-        temporary.rename(final)
-        _sync_folder(self.folder)
+        try:
+            temporary.mkdir(parents=True)
+            for name, content in {**files, MANIFEST: _manifest(number, files)}.items():
+                _write(temporary / name, content)
+            _sync_folder(temporary)
+            if final.exists():  # a resumed run repeats this number: the new one replaces the old
+                shutil.rmtree(final)
+            temporary.rename(final)
+            _sync_folder(self.folder)
+        except OSError as error:
+            shutil.rmtree(temporary, ignore_errors=True)
+            reason = error.strerror or "?"
+            raise CheckpointError(f"checkpoint {final} cannot be written ({reason})", reason) from None
         self._prune()
         return final
+
+    def note_epoch(self, epoch: int) -> None:
+        """The writer's, so that the next one's is larger though Redis forgets; where there is no room, unnoted."""
+        with suppress(OSError):
+            _write(self.folder / f".{EPOCH}", str(epoch).encode())
+            (self.folder / f".{EPOCH}").rename(self.folder / EPOCH)
+
+    def last_epoch(self) -> int:
+        """What was noted last; 0 where nothing was."""
+        try:
+            return int((self.folder / EPOCH).read_bytes())
+        except (OSError, ValueError):
+            return 0
 
     def _prune(self) -> None:
         best = self.best()
         for number in self.numbers()[: -self.keep]:
             if number != best:
-                shutil.rmtree(self.path(number))
+                shutil.rmtree(self.path(number), ignore_errors=True)  # the next one tries again
 
     def load(self, number: int) -> dict[str, bytes]:
         """A checkpoint's files, verified. Raises CheckpointError naming the file at fault."""
         path = self.path(number)
         try:
-            manifest = json.loads((path / MANIFEST).read_bytes())
-            digests = dict(manifest["sha256"])
+            manifest = (path / MANIFEST).read_bytes()
+            digests = dict(json.loads(manifest)["sha256"])
             files = {name: (path / Path(name).name).read_bytes() for name in digests}
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise CheckpointError(f"checkpoint {path}: unreadable ({error})") from None
         for name, content in files.items():
             if hashlib.sha256(content).hexdigest() != digests[name]:
                 raise CheckpointError(f"checkpoint {path}: {name} does not match its manifest")
+        if manifest != _manifest(number, files):
+            raise CheckpointError(f"checkpoint {path}: {MANIFEST} is not as it was written")
         return files
 
     def latest(self) -> tuple[int, dict[str, bytes]] | None:
@@ -117,6 +140,11 @@ class CheckpointFolder:
             return int(record["update"]), float(record["eval_return_mean"])
         except (OSError, ValueError, KeyError, TypeError):
             return None, float("-inf")
+
+
+def _manifest(number: int, files: Mapping[str, bytes]) -> bytes:
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    return json.dumps({"update": number, "sha256": digests}, indent=1).encode()
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -5,9 +5,9 @@ RmcError
 ├── MessageError         a message that is not what its header or the run promises
 ├── FencedError          a newer process has taken this role's name: end yourself
 ├── BusUnavailable       Redis cannot be reached (worth retrying)
-├── BusFull              Redis is out of memory (worth waiting)
+├── BusFull              Redis is out of memory, or of disk for its log (worth waiting)
 ├── AuthenticationError  the other end of a socket does not know the run's secret
-├── CheckpointError      a checkpoint is missing or does not match its manifest
+├── CheckpointError      a checkpoint is missing, does not match its manifest, or cannot be written
 └── RoleDied             a supervised role ended too often
 """
 
@@ -41,7 +41,7 @@ class BusUnavailable(RmcError):
 
 
 class BusFull(RmcError):
-    """Redis refuses writes because it is out of memory."""
+    """Redis refuses writes: it is out of memory, or of disk for its append-only file."""
 
 
 class AuthenticationError(RmcError):
@@ -49,7 +49,11 @@ class AuthenticationError(RmcError):
 
 
 class CheckpointError(RmcError):
-    """No valid checkpoint, or one that does not match its manifest."""
+    """No valid checkpoint, one that does not match its manifest, or that cannot be written; ``reason``: why not."""
+
+    def __init__(self, message: str, reason: str = "") -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 class RoleDied(RmcError):

@@ -1,6 +1,7 @@
 """A metrics record as bytes: what a role says of itself now and then. Read without trust in who wrote it.
 
-Flat: names to numbers; what a role waits for (``…waiting_for``) is text, and one metric is a list of numbers.
+Flat: names to numbers; what a role waits for (``…waiting_for``) and why it cannot save (``checkpoint_error``) is text,
+and one metric is a list of numbers.
 """
 
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ import msgpack
 from common.errors import MessageError
 
 MAX_BYTES, MAX_FIELDS, MAX_TEXT, MAX_LIST = 1 << 16, 512, 200, 4096
-TEXT, LIST = "waiting_for", "observation_unexplained"  # how names of texts end, and the list's
+TEXT, LIST = ("waiting_for", "checkpoint_error"), "observation_unexplained"  # how names of texts end, and the list's
 LARGEST = 2.0**63  # of a number; metrics are far below
 
 

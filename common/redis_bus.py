@@ -56,6 +56,10 @@ class RedisBus:
             return action(*args)
         except redis.exceptions.OutOfMemoryError as error:
             raise BusFull(str(error)) from None
+        except redis.exceptions.ResponseError as error:
+            if "MISCONF" in str(error):  # it cannot write its append-only file: no room, most often
+                raise BusFull(str(error)) from None
+            raise
         except (redis.exceptions.ConnectionError, redis.exceptions.TimeoutError, OSError) as error:
             raise BusUnavailable(str(error)) from None
 
@@ -88,6 +92,9 @@ class RedisBus:
         if epoch <= floor:  # Redis lost its data: catch up with what the ring has seen
             epoch = int(self._call(lambda: self._redis.incrby(key, floor + 1 - epoch)))
         return epoch
+
+    def check_room(self, role: str) -> None:
+        self._call(lambda: self._redis.incrby(self._key("epoch", role), 0))  # a write that changes nothing
 
     def current_epoch(self, role: str) -> int:
         return int(self._call(lambda: self._redis.get(self._key("epoch", role))) or 0)
@@ -236,15 +243,19 @@ class RedisBus:
         heads = [self._key("weights")] + [self._key("evaluate")] * evaluate
         before = self._heads()
 
+        epoch_key = self._key("epoch", "learner")
+
         def transaction(pipe: Any) -> None:
-            held = int(pipe.get(self._key("epoch", "learner")) or 0)
+            held = int(pipe.get(epoch_key) or 0)
             if held > version.epoch:
                 raise FencedError(f"learner epoch {version.epoch} was replaced by {held}")
             pipe.multi()
+            if held < version.epoch:  # Redis lost its data: the next learner must not begin below
+                pipe.set(epoch_key, version.epoch)
             for key in heads:
                 pipe.set(key, head)
 
-        self._call(lambda: self._redis.transaction(transaction, self._key("epoch", "learner")))
+        self._call(lambda: self._redis.transaction(transaction, epoch_key))
         self._drop_pieces(before - self._heads())
 
     def _integers(self, raw: bytes | None, count: int) -> list[int] | None:

@@ -77,6 +77,9 @@ class ObservationStatistics:
 class Replay(Protocol):
     """A replay server as its learner sees it."""
 
+    def introduce(self, epoch: int) -> None:
+        """Say which learner asks, before it asks: those of smaller epochs are served no more, and hear FencedError."""
+
     def sample(self, batch_size: int, elsewhere: int = 0) -> Sample:
         """Draw a batch, or learn why there is none. ``elsewhere``: trained steps drawn from other shards so far."""
 

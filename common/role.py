@@ -1,6 +1,5 @@
 """A role and the loop that every role shares: stop signal, heartbeat metrics, waiting out Redis."""
 
-import logging
 import signal
 import time
 from collections.abc import Callable
@@ -10,8 +9,8 @@ from typing import Any, Protocol
 from common.bus import Bus
 from common.errors import BusFull, BusUnavailable
 from common.metrics import BusyClock
+from common.outage import Outage
 
-log = logging.getLogger(__name__)
 METRICS_PERIOD = 1.0  # seconds between a role's metrics records, which are its heartbeat too
 STOP_PERIOD = 0.5  # seconds between looks at the bus's stop key
 IDLE_SLEEP = 0.002  # seconds slept when a step had nothing to do
@@ -56,6 +55,7 @@ class _Pulse:
 
     def __init__(self, role: Role, bus: Bus, clock: BusyClock) -> None:
         self._role, self._bus, self._clock = role, bus, clock
+        self.outage = Outage(role.name)
         self._next_metrics = self._next_stop = 0.0
 
     def says_stop(self) -> bool:
@@ -69,15 +69,17 @@ class _Pulse:
             if now >= self._next_metrics:
                 self._next_metrics = now + METRICS_PERIOD
                 self._bus.emit(self._role.name, self.record())
+                self.outage.over()
         except (BusUnavailable, BusFull) as error:
-            log.warning("%s: waiting for Redis: %s", self._role.name, error)
+            self.outage.note(error)
             self._clock.wait("redis")
             self._next_stop = self._next_metrics = time.monotonic() + RECONNECT_SLEEP
         return False
 
     def record(self) -> dict[str, Any]:
         """What the role has to say now."""
-        return {"time": time.time(), **self._role.metrics(), **self._clock.shares()}
+        refused = {"refused_values": self._bus.refused.total()}
+        return {"time": time.time(), **self._role.metrics(), **refused, **self._clock.shares()}
 
 
 def run_role(
@@ -103,8 +105,8 @@ def run_role(
                     time.sleep(IDLE_SLEEP)
                     clock.wait(role.waiting_for())
             except (BusUnavailable, BusFull) as error:
-                log.warning("%s: waiting for Redis: %s", role.name, error)
                 time.sleep(RECONNECT_SLEEP)
+                pulse.outage.note(error)
                 clock.wait("redis")
         last = pulse.record()
     finally:

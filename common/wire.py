@@ -38,7 +38,7 @@ class Kind(IntEnum):
     """Kinds of socket frames."""
 
     CHALLENGE = 1  # server -> client: its nonce
-    PROOF = 2  # client -> server: its nonce and HMAC
+    PROOF = 2  # client -> server: its nonce and HMAC, and the epoch of the learner that it is
     WELCOME = 3  # server -> client: its HMAC, window fingerprint
     SAMPLE = 4  # client -> server: batch_size, elsewhere (see ``Replay.sample``)
     BATCH = 5  # server -> client: rows | values (float64), with mass, windows, env_steps, drawn_steps
@@ -47,7 +47,7 @@ class Kind(IntEnum):
     PRIORITIES = 8  # client -> server: serials (int64) | priorities (float32); no reply
     STATISTICS = 9  # client -> server, and its reply: count, then sum | sum of squares (float64)
     STATS = 10  # client -> server, and its reply: the server's counters
-    ERROR = 11  # server -> client: why the connection ends
+    ERROR = 11  # server -> client: why the connection ends; fenced: by a newer learner
     EPISODE = 12  # client -> server: serial, and its reply: count, then rows
     SHARE = 13  # client -> server: batch_size, and its reply, with a descriptor where memory can be shared
     SHARED = 14  # server -> client: BATCH without its body, which lies in shared memory: turn and crc32 with the rest

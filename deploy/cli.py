@@ -1,6 +1,7 @@
 """``rmc``: every command's entry, and how errors reach the user: one line, exit status 2."""
 
 import contextlib
+import errno
 import io
 import logging
 import os
@@ -10,6 +11,7 @@ from deploy.lifeline import PARENT_VARIABLE, die_with
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
 ROLES = SINGLE_THREADED | {"learner", "launcher"}
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 
 
@@ -49,6 +51,10 @@ def run(words: list[str]) -> int:
         if words[0] in ROLES:
             raise  # a role: the supervisor shows its traceback
         return _complain(str(error), FAILED_STATUS)
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        return _complain(f"{error.filename or 'disk'}: {error.strerror}; make room and try again", FAILED_STATUS)
 
 
 def _parse_and_run(words: list[str]) -> int:

@@ -26,7 +26,7 @@ class Counters:
         if not at_once and time.monotonic() < self._keep_at:
             return
         self._keep_at = time.monotonic() + KEEP_SECONDS
-        with suppress(BusUnavailable):
+        with suppress(BusUnavailable, OSError):  # the disk is full: those before stay
             found = {role: raw for role in self._roles if (raw := bus.progress(role)) is not None}
             if found:
                 temporary = self._path.with_suffix(".new")

@@ -73,7 +73,9 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
         panel.grid(alpha=0.3)
     for panel in panels[len(groups) :]:
         panel.set_axis_off()
-    figure.legend(handles.values(), [_named(agent, groups) for agent in handles], loc="outside lower center", ncols=2)
+    figure.legend(
+        handles.values(), [_named(agent, groups) for agent in handles], loc="outside lower center", ncols=columns
+    )
     figure.savefig(out, dpi=110)
 
 

@@ -19,11 +19,12 @@ from deploy.monitor import Monitor
 from deploy.presets import RunConfig, to_json
 from deploy.redis_server import RedisServer
 from deploy.redis_users import LAUNCHER, RedisUsers
-from deploy.roles import URL_VARIABLE, connect
+from deploy.roles import PATIENCE_VARIABLE, URL_VARIABLE, connect
 from deploy.run_folder import RunFolder
 from deploy.supervisor import STOP_SECONDS, RoleCommand, Supervisor
 
 TICK_SECONDS = 0.1
+OUTAGE_SECONDS = 86_400.0  # of a Redis that answered once, until a role that is started amid it gives up
 KEPT_SECONDS = 3600  # in a user's Redis, after the end
 PREFIX = "rmc-run-"  # of the temporary folders that hold the sockets
 log = logging.getLogger(__name__)
@@ -72,7 +73,7 @@ class LocalRun:
             raise
         self.supervisor = Supervisor(
             commands(config, folder, self.sockets, device),
-            lambda role: {URL_VARIABLE: redis_url or self._url(role)},
+            lambda role: {URL_VARIABLE: redis_url or self._url(role), PATIENCE_VARIABLE: str(OUTAGE_SECONDS)},
             folder.logs,
         )
 
@@ -123,7 +124,7 @@ def register(bus: RedisBus, config: RunConfig) -> None:
 
 def _expire(bus: RedisBus) -> None:
     """Do not leave a user's Redis full of runs that are over; what they need to go on is in their folders."""
-    with suppress(BusUnavailable):
+    with suppress(BusUnavailable, BusFull):
         bus.expire(KEPT_SECONDS)
 
 
@@ -155,7 +156,8 @@ def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monito
     while not stop.requested and not monitor.learner_finished():
         watch(monitor, bus)
         time.sleep(TICK_SECONDS)
-    bus.request_stop("stopped by its launcher" if stop.requested else "finished")
+    with suppress(BusUnavailable, BusFull):
+        bus.request_stop("stopped by its launcher" if stop.requested else "finished")
     deadline = time.monotonic() + STOP_SECONDS
     while stop.requested and time.monotonic() < deadline:  # the learner saves; what it says then is still recorded
         watch(monitor, bus)
@@ -168,8 +170,9 @@ def watch(monitor: Monitor, bus: RedisBus) -> None:
     """Let the monitor see what is new; a Redis that is away for a while costs nothing but that."""
     try:
         monitor.watch(bus)
+        monitor.outage.over()
     except (BusUnavailable, BusFull) as error:
-        log.warning("waiting for Redis: %s", error)
+        monitor.outage.note(error)
 
 
 def check_redis(url: str) -> None:

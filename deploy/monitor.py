@@ -1,17 +1,16 @@
 """What everyone looks at: metrics from the bus to metrics.jsonl, TensorBoard, and a live view or plain lines."""
 
-import json
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from rich.console import Console
-from tensorboard.compat.proto.event_pb2 import Event
-from tensorboard.compat.proto.summary_pb2 import Summary
-from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 from common.bus import Bus
 from common.checkpoint import CheckpointFolder
+from common.outage import Outage
+from deploy.journal import Journal
 from deploy.presets import RunConfig
 from deploy.run_folder import RunFolder
 from deploy.view import Board, View
@@ -29,11 +28,12 @@ class Monitor:
         self._checkpoints = CheckpointFolder(folder.checkpoints, config.learner.keep_checkpoints)
         self.roles: Callable[[], tuple[str, ...]] = config.roles  # who may have something to say
         self._cursors: dict[str, str] = {}
+        self._refused = 0  # records and values that could not be read
         self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
         self._next_record = 0.0
-        self._lines = folder.metrics.open("a", buffering=1)
-        self._events = EventFileWriter(str(folder.events))
-        self.view = View(self.board, console)
+        self._journal = Journal(folder)
+        self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
+        self.view, self.outage = View(self.board, console), Outage("launcher")
 
     @property
     def wall_seconds(self) -> float:
@@ -64,17 +64,21 @@ class Monitor:
                 self.record(record)
 
     def _read(self, bus: Bus) -> list[dict[str, Any]]:
+        self._refused = bus.refused.total()
         records, self._cursors = bus.records({role: self._cursors.get(role, "0") for role in self.roles()})
         return records
 
     def record(self, record: dict[str, Any]) -> None:
         """Write one record (with its ``role``) and take it into the view."""
-        self._lines.write(json.dumps(record) + "\n")
         self.board.take(record)
-        self._write_events(record)
+        self._journal.write(record, self.board.env_steps)
         update = record.get("eval_update")
         if record["role"] == "evaluator" and isinstance(update, int):
-            self._checkpoints.mark_best(update, float(record["eval_return_mean"]))
+            self._unmarked[update] = float(record["eval_return_mean"])
+        with suppress(OSError):  # no room; the next record tries again
+            for update in list(self._unmarked):
+                self._checkpoints.mark_best(update, self._unmarked[update])
+                del self._unmarked[update]
 
     def _record_launcher(self) -> None:
         restarts = {f"restarts_{role}": count for role, count in self.restarts().items()}
@@ -86,23 +90,13 @@ class Monitor:
                 "wall_s": self.wall_seconds,
                 "restarts": total,
                 **restarts,
+                "refused_values": self._refused,
                 "not_running": " ".join(self.unplaced()),
             }
         )
-
-    def _write_events(self, record: dict[str, Any]) -> None:
-        role = record["role"]
-        values = [
-            Summary.Value(tag=f"{role}/{name}", simple_value=value)
-            for name, value in record.items()
-            if isinstance(value, int | float) and name != "time"
-        ]
-        when, step = record.get("time", time.time()), self.board.env_steps
-        self._events.add_event(Event(wall_time=when, step=step, summary=Summary(value=values)))
 
     def close(self) -> None:
         """Show the last state and close the files."""
         self._record_launcher()
         self.view.close()
-        self._lines.close()
-        self._events.close()
+        self._journal.close()

@@ -105,7 +105,7 @@ def robust(env: EnvConfig) -> RunConfig:
         agent=AgentConfig(normalize_observations=True),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0),
-        learner=LearnerConfig(batch_size=32, importance_exponent=0.0),
+        learner=LearnerConfig(batch_size=8, importance_exponent=0.0),
     )
 
 

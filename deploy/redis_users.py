@@ -31,7 +31,7 @@ EVALUATOR = (READS_WEIGHTS, "(+get %R~R:evaluate)")
 LEARNER = (
     "+watch +unwatch +multi +exec",
     "(+get +set +expire ~R:weights ~R:weights:* ~R:evaluate)",
-    "(+watch ~R:epoch:ROLE)",
+    "(+set +watch ~R:epoch:ROLE)",
     "(+hget %R~R:replay)",
 )
 REPLAY = (

@@ -20,12 +20,12 @@ def check_ring_fits(spec: WindowSpec, capacity: int, folder: Path) -> None:
     ring = folder / "ring"
     existing = ring.stat().st_size if ring.exists() else 0
     there = next(path for path in (folder, *folder.parents) if path.exists())
-    free_disk = max(0, shutil.disk_usage(there).free - DISK_RESERVE)
-    if size - existing > free_disk:
-        fits = (free_disk + existing) // spec.dtype.itemsize
-        raise ConfigError(
-            "--capacity", capacity, f"takes {_gb(size)} of disk, {_gb(free_disk)} are free; take at most {fits}"
-        )
+    free_disk = shutil.disk_usage(there).free
+    if size - existing > max(0, free_disk - DISK_RESERVE):
+        fits = (max(0, free_disk - DISK_RESERVE) + existing) // spec.dtype.itemsize
+        rest = f"{_gb(free_disk)} are free, {_gb(DISK_RESERVE)} of which are left for checkpoints and logs"
+        fix = f"take at most {fits}" if fits else "make room"
+        raise ConfigError("--capacity", capacity, f"takes {_gb(size)} of disk, {rest}; {fix}")
     memory = psutil.virtual_memory().total
     if size > memory:
         fits = memory // spec.dtype.itemsize
@@ -33,4 +33,4 @@ def check_ring_fits(spec: WindowSpec, capacity: int, folder: Path) -> None:
 
 
 def _gb(size: int) -> str:
-    return f"{size / 1e9:.1f} GB"
+    return f"{size / 1e9:.3g} GB"

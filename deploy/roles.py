@@ -7,6 +7,7 @@ import ssl
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +15,11 @@ import torch
 
 from actors.actor import Actor
 from actors.evaluator import Evaluator
+from common.bus import Bus
 from common.checkpoint import CheckpointFolder
 from common.envs import make_env
-from common.errors import BusUnavailable, ConfigError
+from common.errors import BusFull, BusUnavailable, ConfigError
+from common.outage import Outage
 from common.redis_bus import RedisBus
 from common.replay import Shard
 from common.role import RECONNECT_SLEEP, StopSignal, run_role
@@ -34,7 +37,7 @@ from replay_server.socket_server import SocketServer
 
 SECRET_VARIABLE, URL_VARIABLE = "RMC_SECRET", "RMC_REDIS_URL"
 PATIENCE_VARIABLE = "RMC_PATIENCE"  # seconds that a role which starts while Redis is coming back waits for it
-PATIENCE_SECONDS = float(os.environ.get(PATIENCE_VARIABLE, 5.0))
+PATIENCE_SECONDS = "5"  # of one that is started by hand
 EVALUATOR_NICENESS = 10  # it must not take the learner's core
 log = logging.getLogger(__name__)
 
@@ -73,21 +76,37 @@ class Process:
         logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
         self.stop = StopSignal()
         self.stop.install()
-        self.bus = connect(place.redis_url, place.run, PATIENCE_SECONDS)
-        self.config = self._registered_config(place.run)
+        patience = float(os.environ.get(PATIENCE_VARIABLE, PATIENCE_SECONDS))
+        self.bus = connect(place.redis_url, place.run, patience)
+        self.config = self._registered_config(place.run, time.monotonic() + patience)
 
-    def _registered_config(self, run: str) -> RunConfig:
+    def _registered_config(self, run: str, deadline: float) -> RunConfig:
         """The run's config; a Redis that has just come back empty gets it again within moments."""
-        deadline = time.monotonic() + PATIENCE_SECONDS
-        while (raw := self.bus.config()) is None:
+        while True:
+            with suppress(BusUnavailable):
+                if (raw := self.bus.config()) is not None:
+                    return from_json(raw)
             if self.stop.requested or time.monotonic() >= deadline:
                 raise ConfigError("--run", run, "no run of this name is registered in that Redis; start it first")
             time.sleep(RECONNECT_SLEEP)
-        return from_json(raw)
 
     def make_env(self) -> Env:
         """A new environment of the run."""
         return make_env(self.config.env)
+
+
+def wait_for_room(bus: Bus, role: str, stop: StopSignal) -> None:
+    """Until Redis takes what this role writes, or it is stopped: one that begins amid an outage waits as others do."""
+    outage = Outage(role)
+    while not stop.requested:
+        try:
+            bus.check_room(role)
+        except (BusUnavailable, BusFull) as error:
+            outage.note(error)
+            time.sleep(RECONNECT_SLEEP)
+        else:
+            outage.over()
+            return
 
 
 def connect(url: str, run: str, patience_seconds: float = 0.0) -> RedisBus:
@@ -97,7 +116,8 @@ def connect(url: str, run: str, patience_seconds: float = 0.0) -> RedisBus:
     bus, deadline = RedisBus(url, run), time.monotonic() + patience_seconds
     while True:
         try:
-            bus.ping()
+            with suppress(BusFull):  # that is an answer
+                bus.ping()
             return bus
         except BusUnavailable as error:
             if time.monotonic() >= deadline:
@@ -124,6 +144,7 @@ def run_actor(place: Place, index: int) -> None:
     config = process.config
     if not 0 <= index < config.actors:
         raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
+    wait_for_room(process.bus, f"actor-{index}", process.stop)
     torch.set_num_threads(1)
     spec, rater = config.window_spec(), initial_priority(config, index)
     actor = Actor(index, config.seed, process.make_env, spec, config.agent, config.actor, process.bus, rater=rater)
@@ -143,6 +164,7 @@ def run_evaluator(place: Place) -> None:
     """The evaluator's process."""
     process = Process(place)
     config = process.config
+    wait_for_room(process.bus, "evaluator", process.stop)
     torch.set_num_threads(1)
     os.nice(EVALUATOR_NICENESS)
     evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, process.bus)
@@ -158,6 +180,7 @@ def run_replay(place: Place, folder: Path, listen: str, index: int) -> None:
     shard = Shard(index, config.replay.replay_shards)
     if not 0 <= index < shard.count:
         raise ConfigError("--shard", index, f"the run has replay servers 0 to {shard.count - 1}")
+    wait_for_room(process.bus, shard.role, process.stop)
     torch.set_num_threads(1)
     server = ReplayServer(
         spec, config.replay, folder, config.seed, config.total_steps, config.actors, config.slack_steps(), process.bus,
@@ -175,7 +198,7 @@ def run_learner(place: Place, folder: Path, device: str) -> None:
     config, spec, bus = process.config, process.config.window_spec(), process.bus
     torch.set_num_threads(config.learner.threads or max(1, cores() - 1))
     check_device(device)
-
+    wait_for_room(bus, Learner.name, process.stop)
     pinned, batch = device.startswith("cuda"), config.learner.batch_size
     context = tls.client_context(place.tls_folder) if place.tls_folder is not None else None
     clients = replay_clients(config, bus, secret, pinned, context)

@@ -6,11 +6,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from common.errors import RoleDied
 from deploy.lifeline import PARENT_VARIABLE
+from deploy.nursery import SINGLE_THREAD, Forked, Nursery, command_line
 
 # So many deaths of a role's own in a row, each within so long of its start, end the run.
 QUICK_DEATHS, QUICK_SECONDS = 3, 60.0
@@ -18,7 +21,6 @@ FIRST_BACKOFF, LONGEST_BACKOFF = 0.25, 10.0  # seconds before a role is started 
 STOP_SECONDS = 3.5  # for the roles to end in order; then they are killed
 EXIT_CONFIG = 2  # the exit status of an error that starting again cannot mend
 TRACEBACK_BYTES = 8192
-SINGLE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 def from_outside(status: int) -> bool:
@@ -37,14 +39,15 @@ class RoleCommand:
 
 
 class RoleProcess:
-    """One role: its process, its log, its deaths."""
+    """One role: its process, its log, its deaths. Of a single thread, it is forked where there is a nursery."""
 
-    def __init__(self, command: RoleCommand, environment: dict[str, str], logs: Path) -> None:
+    def __init__(
+        self, command: RoleCommand, environment: dict[str, str], logs: Path, nursery: Nursery | None = None
+    ) -> None:
         self.command, self.log, self.restarts = command, logs / f"{command.name}.log", 0
-        self._environment = {**os.environ, **environment, PARENT_VARIABLE: str(os.getpid())}
-        if command.single_thread:
-            self._environment |= SINGLE_THREAD
-        self._process: subprocess.Popen[bytes] | None = None
+        self._environment = {**environment, **(SINGLE_THREAD if command.single_thread else {})}
+        self._nursery = nursery if command.single_thread else None
+        self._process: subprocess.Popen[bytes] | Forked | None = None
         self.log_start = 0  # where in its log this start's words begin
         self._started_at, self._start_at = 0.0, 0.0
         self._quick_deaths, self.finished = 0, False
@@ -68,18 +71,25 @@ class RoleProcess:
         """Start its process, in a process group of its own: Ctrl-C is for the supervisor alone."""
         self.log_start = self.log.stat().st_size if self.log.exists() else 0
         self._started_at = time.monotonic()
-        words = [sys.executable, "-P", "-m", "deploy.cli", *self.command.words]
         with self.log.open("ab") as log:
-            self._process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=self._environment, process_group=0
-            )
+            if self._nursery is not None:
+                self._process = self._nursery.fork(self.command.words, self._environment, log.fileno())
+            else:
+                self._process = self._new_process(log)
+
+    def _new_process(self, log: BinaryIO) -> subprocess.Popen[bytes]:
+        environment = {**os.environ, **self._environment, PARENT_VARIABLE: str(os.getpid())}
+        words = command_line(self.command.words)
+        return subprocess.Popen(
+            words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0
+        )
 
     def tend(self) -> None:
         """Note a death, or start again when it is time. Raises RoleDied."""
         if self.finished or self.running:
             return
-        if self._process is not None:
-            status, self._process = self._process.returncode, None
+        if (status := self.status) is not None:
+            self._process = None
             if status == 0 and self.command.ends:
                 self.finished = True
             else:
@@ -110,7 +120,8 @@ class RoleProcess:
         """Send a signal to its process group, if it runs."""
         if self.running:
             assert self._process is not None
-            os.killpg(self._process.pid, number)
+            with suppress(ProcessLookupError):  # it has ended since
+                os.killpg(self._process.pid, number)
 
     def reap(self, timeout: float) -> bool:
         """Wait for its end; whether it came."""
@@ -128,11 +139,16 @@ class Supervisor:
 
     def __init__(self, commands: list[RoleCommand], environment: Callable[[str], dict[str, str]], logs: Path) -> None:
         """``environment`` is of each role by its name, beside this process's own."""
-        self.roles = {command.name: RoleProcess(command, environment(command.name), logs) for command in commands}
+        self._nursery = Nursery(logs / "nursery.log") if sys.platform == "linux" else None  # elsewhere a fork may crash
+        self.roles = {
+            command.name: RoleProcess(command, environment(command.name), logs, self._nursery) for command in commands
+        }
 
     def start(self) -> None:
-        """Start every role."""
-        for role in self.roles.values():
+        """Start every role: first those that need no nursery, which takes its time to begin."""
+        if self._nursery is not None:
+            self._nursery.start()
+        for role in sorted(self.roles.values(), key=lambda role: role.command.single_thread):
             role.start()
 
     def tend(self) -> None:
@@ -156,6 +172,8 @@ class Supervisor:
             for role in self.roles.values():
                 role.signal(signal.SIGKILL)
                 role.reap(STOP_SECONDS)
+            if self._nursery is not None:
+                self._nursery.close()
 
     @staticmethod
     def _end(roles: list[RoleProcess], deadline: float) -> None:

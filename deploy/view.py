@@ -1,5 +1,6 @@
 """The newest state of a run as a table for a terminal, or as one plain line."""
 
+import errno
 import time
 from collections.abc import Callable
 from statistics import mean
@@ -134,6 +135,8 @@ def table(board: Board) -> Group:
         facts.add_row(name, value)
     if board.get("launcher", "not_running"):
         facts.add_row("not running", board.get("launcher", "not_running"))
+    if board.get("learner", "checkpoint_error"):
+        facts.add_row("not saved", str(board.get("learner", "checkpoint_error")))
     return Group(f"[bold]{board.env}[/] · {board.preset} · seed {board.seed}", facts, _stages(board))
 
 
@@ -163,6 +166,7 @@ def line(board: Board) -> str:
     ]
     missing = board.get("launcher", "not_running")
     parts += [f"not running: {missing}"] if missing else []
+    parts += [f"not saved: {learner['checkpoint_error']}"] if learner.get("checkpoint_error") else []
     return " | ".join(parts) + (f" | waiting: {', '.join(waits)}" if waits else "")
 
 
@@ -183,6 +187,13 @@ class View:
             self._show()
 
     def _show(self) -> None:
+        try:
+            self._print()
+        except OSError as error:
+            if error.errno != errno.ENOSPC:  # written to a file whose disk is full: less is seen, nothing else
+                raise
+
+    def _print(self) -> None:
         if self._live is not None:
             self._live.update(table(self._board), refresh=True)
         else:

@@ -92,7 +92,7 @@ WHEN = {
     "curiosity_scale": "`std` makes beta mean the same in every environment, `raw` is the paper's",
     "curiosity_steps": "as long as exploration should last",
     "eta": "rarely; only with prioritized replay",
-    "batch_size": "up for steadier, slower updates; the replay ratio then makes fewer of them",
+    "batch_size": "up for steadier updates; more and smaller ones learn [sooner](results.md) at the same replay ratio",
     "publish_updates": "rarely",
     "checkpoint_steps": "down to see more evaluations",
     "keep_checkpoints": "up to go back further; the best is always kept",

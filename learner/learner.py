@@ -6,7 +6,6 @@ import logging
 import pickle
 import time
 from collections import deque
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -32,6 +31,7 @@ from learner.update import UpdateConfig, Updated, make_update
 log = logging.getLogger(__name__)
 STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
 METRICS_UPDATES = 20  # updates between looks at the update's metrics: each look waits for the device
+SAVE_AGAIN_SECONDS = 10.0  # after a checkpoint that could not be written
 LOOK_SECONDS = 5.0  # between looks, while waiting, whether Redis still has the weights
 INSIGHT_UPDATES = 500  # updates between looks at what takes longer: the latent's rank and the states' staleness
 
@@ -92,6 +92,7 @@ class Learner:
         self._means, self._rate, self._waiting = Means(), Rate(), ""
         self._unexplained: list[float] = []  # of every observation dimension, since the last look at it
         self._look_at = 0.0  # when to ask next whether Redis still has the weights
+        self._save_at, self._checkpoint_error = 0.0, ""
         torch.set_flush_denormal(True)  # into which Adam's moments of idle units decay: 13 % slower on a CPU
         torch.manual_seed(seed)  # the networks' initial weights
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent).to(self.device)
@@ -100,14 +101,23 @@ class Learner:
         self._updated = StaticUpdate(self.update, spec, config.batch_size)
         self._returning: deque[tuple[NDArray[np.int64], HostCopy]] = deque()  # priorities, and of which windows
         checkpoints.lock()
-        floor = self._resume()
+        floor = max(self._resume(), checkpoints.last_epoch())
         self.epoch = bus.take_epoch(self.name, floor)
+        checkpoints.note_epoch(self.epoch)
+        replay.introduce(self.epoch)
         self.publish()
 
     def step(self) -> bool:
-        """Draw and update once, with all that is due after it."""
+        """Draw and update once, with all that is due after it. Raises FencedError where a newer learner has come."""
         if self.finished:
             return False
+        try:
+            return self._step()
+        except FencedError:
+            self._fenced = True
+            raise
+
+    def _step(self) -> bool:
         if self._evaluation_due:
             self._broadcast(evaluate=True)
         sample = self.replay.sample(self.config.batch_size)
@@ -119,9 +129,9 @@ class Learner:
             self._publish_if_forgotten()
             return False
         if sample.draw is Draw.FINISHED:
-            self.checkpoint()
-            self.finished = True
-            return True
+            self._waiting = "disk"
+            self.finished = self.checkpoint()
+            return self.finished
         if self.updates == 0:
             self._freeze_statistics()
         self._learn(sample)
@@ -187,11 +197,7 @@ class Learner:
 
     def _broadcast(self, evaluate: bool = False) -> None:
         blob = self._sound(self.agent.broadcast_weights())
-        try:
-            self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate)
-        except FencedError:
-            self._fenced = True
-            raise
+        self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate)
         self._evaluation_due = self._evaluation_due and not evaluate
 
     def _sound(self, weights: dict[str, Tensor]) -> bytes:
@@ -209,17 +215,30 @@ class Learner:
             total, square = torch.from_numpy(statistics.total), torch.from_numpy(statistics.total_square)
             self.agent.normalizer.freeze(statistics.count, total.to(self.device), square.to(self.device))
 
-    def checkpoint(self) -> None:
-        """Save, broadcast, and ask for an evaluation of what was saved; ``step`` asks again if Redis is away."""
+    def checkpoint(self) -> bool:
+        """Save, broadcast, and ask for an evaluation of what was saved; ``step`` asks again if Redis is away.
+
+        Whether it was saved: a disk that is full, or away, is tried again later, and training goes on until then.
+        """
+        if time.monotonic() < self._save_at:
+            return False
         self._freeze_statistics()
-        self.save()
+        try:
+            self.save()
+        except CheckpointError as error:
+            log.warning("%s; trying again in %.0f s", error, SAVE_AGAIN_SECONDS)
+            self._save_at = time.monotonic() + SAVE_AGAIN_SECONDS
+            self._checkpoint_error = error.reason
+            return False
+        self._checkpoint_error = ""
         self._evaluation_due = True
         self.last_checkpoint = self.updates
         self._next_checkpoint = self._after(self.env_steps)
         self._broadcast(evaluate=True)
+        return True
 
     def save(self) -> None:
-        """Write everything that a resumed learner needs."""
+        """Write everything that a resumed learner needs. Raises CheckpointError where that cannot be."""
         state = io.BytesIO()
         torch.save(self.update.state_dict(), state)
         progress = {"updates": self.updates, "env_steps": self.env_steps, "epoch": self.epoch, "time": time.time()}
@@ -266,6 +285,7 @@ class Learner:
             "env_steps": self.env_steps,
             "beta": self.update.config.beta(self.env_steps),
             "epoch": self.epoch,
+            "checkpoint_error": self._checkpoint_error,
             **({"observation_unexplained": unexplained} if unexplained else {}),
             **self._means.take(),
         }
@@ -274,8 +294,10 @@ class Learner:
         """Save what a resumed run needs, unless that is done, a newer learner has taken over, or training diverged."""
         spoilt = self._fenced or self._diverged
         if not self.finished and not spoilt and self.updates > self.last_checkpoint:
-            with suppress(RmcError):  # diverged since the last look: the checkpoint before is the one to keep
+            try:
                 self.save()
+            except RmcError as error:  # diverged since the last look, or no room: the checkpoint before is kept
+                log.warning("%s; the checkpoint of update %d is the last", error, self.last_checkpoint)
         self.checkpoints.unlock()
 
 

@@ -15,13 +15,13 @@ import ssl
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from common.errors import AuthenticationError, MessageError, RmcError
+from common.errors import AuthenticationError, FencedError, MessageError, RmcError
 from common.replay import EPISODE_BYTES, NOTHING_YET, Draw, ObservationStatistics, Sample
 from common.shared_batches import SharedBatches
 from common.window import Rows, WindowSpec
@@ -38,29 +38,38 @@ class Connection:
     """One authenticated connection. Blocking, with a timeout."""
 
     def __init__(
-        self, address: str, secret: bytes, fingerprint: str, max_body: int, tls: ssl.SSLContext | None = None
+        self,
+        address: str,
+        secret: bytes,
+        fingerprint: str,
+        max_body: int,
+        tls: ssl.SSLContext | None = None,
+        epoch: int = 0,
     ) -> None:
-        """``address``: ``unix:PATH`` or ``tcp:HOST:PORT``. Raises OSError, MessageError, AuthenticationError."""
+        """``address``: ``unix:PATH`` or ``tcp:HOST:PORT``; ``epoch``: the learner's.
+
+        Raises OSError, MessageError, AuthenticationError, FencedError.
+        """
         self._max_body = max_body
         self._socket = _connect(address, tls)
         self._reader = self._socket.makefile("rb")  # a small frame comes by one call
         self._unsent: list[bytes | memoryview] = []
         try:
-            self._authenticate(secret, fingerprint)
+            self._authenticate(secret, fingerprint, epoch)
         except BaseException:
             self.close()
             raise
 
-    def _authenticate(self, secret: bytes, fingerprint: str) -> None:
+    def _authenticate(self, secret: bytes, fingerprint: str, epoch: int) -> None:
         header, meta = self.receive_small()
         challenge = meta.get("nonce")
         if header.kind is not Kind.CHALLENGE or not isinstance(challenge, bytes):
             raise AuthenticationError("the replay server sent no challenge")
         nonce = os.urandom(NONCE_BYTES)
-        self.send(Kind.PROOF, {"nonce": nonce, "proof": proof(secret, b"client", challenge, nonce)})
+        self.send(Kind.PROOF, {"nonce": nonce, "proof": proof(secret, b"client", challenge, nonce), "epoch": epoch})
         header, meta = self.receive_small()
         if header.kind is Kind.ERROR:
-            raise AuthenticationError(str(meta.get("error")))
+            raise (FencedError if meta.get("fenced") else AuthenticationError)(str(meta.get("error")))
         answer = meta.get("proof")
         expected = proof(secret, b"server", nonce, challenge)
         known = isinstance(answer, bytes) and hmac.compare_digest(answer, expected)
@@ -128,6 +137,12 @@ class Connection:
         self._socket.close()
 
 
+def _raise_error(meta: dict[str, Any]) -> NoReturn:
+    if meta.get("fenced"):
+        raise FencedError(str(meta.get("error")))
+    raise MessageError("replay", str(meta.get("error")))
+
+
 def _connect(address: str, tls: ssl.SSLContext | None) -> socket.socket:
     scheme, _, rest = address.partition(":")
     if scheme == "unix":
@@ -153,7 +168,8 @@ class ReplayClient:
     """The Replay protocol over the server's socket.
 
     ``address`` gives the server's present address, or None while it has none. Raises
-    AuthenticationError for a wrong secret; outages only make draws answer WAIT.
+    AuthenticationError for a wrong secret, FencedError where a newer learner has come; outages only make draws
+    answer WAIT.
     """
 
     def __init__(
@@ -178,6 +194,10 @@ class ReplayClient:
         self._batches: Connection | None = None
         self._control: Connection | None = None
         self._is_away = False  # said in the log already
+        self._epoch = 0
+
+    def introduce(self, epoch: int) -> None:
+        self._epoch = epoch
 
     def sample(self, batch_size: int, elsewhere: int = 0) -> Sample:
         """The oldest draw asked for; asks for the next. ``rows`` stay valid until the next draw but one."""
@@ -204,7 +224,7 @@ class ReplayClient:
         header, meta, body = connection.receive(self._buffers[self._turn])
         self._in_flight -= 1
         if header.kind is Kind.ERROR:
-            raise MessageError("replay", str(meta.get("error")))
+            _raise_error(meta)
         self._is_away = False
         draw, rows, values = Draw.BATCH, None, None
         if header.kind is Kind.SHARED and self._shared is not None:
@@ -227,7 +247,7 @@ class ReplayClient:
         if address is None:
             return None
         self._in_flight = 0
-        connection = Connection(address, self._secret, self._spec.fingerprint, self._buffers[0].nbytes, self._tls)
+        connection = self._connect(address, self._buffers[0].nbytes)
         if self._may_share and address.startswith("unix:"):
             try:
                 self._shared = connection.share(self._spec, self._batch_size)
@@ -291,8 +311,10 @@ class ReplayClient:
             if self._batches is not None:
                 self._batches.flush()  # so that the answer takes into account what was sent before
             connection.send(kind, question)
-            _, meta, body = connection.receive(self._answer)
-        except (OSError, MessageError):
+            header, meta, body = connection.receive(self._answer)
+            if header.kind is Kind.ERROR:
+                _raise_error(meta)
+        except (OSError, MessageError, FencedError):
             connection.close()
             self._control = None
             raise
@@ -302,4 +324,7 @@ class ReplayClient:
         address = self._address()
         if address is None:
             raise ConnectionError("the replay server is not up yet")
-        return Connection(address, self._secret, self._spec.fingerprint, self._answer.nbytes, self._tls)
+        return self._connect(address, self._answer.nbytes)
+
+    def _connect(self, address: str, max_body: int) -> Connection:
+        return Connection(address, self._secret, self._spec.fingerprint, max_body, self._tls, self._epoch)

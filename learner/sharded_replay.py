@@ -56,6 +56,10 @@ class ShardedReplay:
         self._buffers: list[Rows] = [tensor.numpy().view(spec.dtype).reshape(-1) for tensor in tensors]
         self._parts: NDArray[np.int64] | None = None  # (S,) windows of each in the batch that is being gathered
 
+    def introduce(self, epoch: int) -> None:
+        for stock in self._stocks:
+            stock.replay.introduce(epoch)
+
     def sample(self, batch_size: int, elsewhere: int = 0) -> Sample:
         """A batch once every shard has given its part. ``rows`` stay valid until the next draw but one.
 

@@ -30,7 +30,7 @@ class Connection:
         connection.setblocking(False)
         self.socket, self.challenge = connection, challenge
         self.encrypted = not isinstance(connection, ssl.SSLSocket)  # or need not be
-        self.authenticated = False
+        self.authenticated, self.epoch = False, 0  # and of which learner
         self.opened = time.monotonic()
         self._inbox = bytearray()
         self._outbox: deque[memoryview] = deque()

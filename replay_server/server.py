@@ -209,6 +209,9 @@ class ReplayServer:
 
     # -- out --------------------------------------------------------------------------------------------
 
+    def introduce(self, epoch: int) -> None:
+        """The learner of the same thread has nobody beside it; of others the socket's server knows."""
+
     def sample(self, batch_size: int, elsewhere: int = 0, out: Rows | None = None) -> Sample:
         """Draw (B,) rows in proportion to priority ** exponent, if the limiter lets it.
 

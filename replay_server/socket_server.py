@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import AuthenticationError, ConfigError, MessageError
+from common.errors import AuthenticationError, ConfigError, FencedError, MessageError
 from common.replay import Draw
 from common.shared_batches import SharedBatches, reserve_memory, shared_bytes
 from common.window import WindowSpec
@@ -65,6 +65,7 @@ class SocketServer:
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, READ)
         self._connections: dict[Connection, int] = {}  # and the events each is registered for
+        self._learner = 0  # the newest epoch that has introduced itself
         self.refused: Counter[str] = Counter()  # connections ended for a fault of theirs, by reason
 
     def poll(self, timeout: float) -> bool:
@@ -131,10 +132,10 @@ class SocketServer:
                 connection.receive()
             self._handle_frames(connection)
             self._await(connection, WRITE if connection.sending else READ)
+        except FencedError as error:
+            self._refuse(connection, "fenced", str(error), fenced=True)
         except (MessageError, AuthenticationError) as error:
-            reason = error.reason if isinstance(error, MessageError) else "authentication"
-            log.warning("replay socket: a client was refused: %s", error)
-            self._refuse(connection, reason, str(error))
+            self._refuse(connection, error.reason if isinstance(error, MessageError) else "authentication", str(error))
         except OSError:
             self._end(connection)
 
@@ -161,9 +162,20 @@ class SocketServer:
         expected = proof(self._secret, b"client", connection.challenge, nonce)
         if not isinstance(given, bytes) or not hmac.compare_digest(given, expected):
             raise AuthenticationError("the client does not know this run's secret")
+        self._fence(connection, frame.meta.get("epoch"))
         connection.authenticated = True
         answer = proof(self._secret, b"server", nonce, connection.challenge)
         connection.send(Kind.WELCOME, {"proof": answer, "fingerprint": self._spec.fingerprint})
+
+    def _fence(self, connection: Connection, epoch: Any) -> None:
+        """Only the newest learner is served, so that one which was stopped and replaced writes nothing any more."""
+        if type(epoch) is not int or not 0 <= epoch < 2**62:
+            raise AuthenticationError(f"{epoch!r} is no learner's epoch")
+        if epoch < self._learner:
+            raise FencedError(f"the learner of epoch {epoch} was replaced by {self._learner}")
+        self._learner = connection.epoch = epoch
+        for other in [other for other in self._connections if other.authenticated and other.epoch < epoch]:
+            self._refuse(other, "fenced", f"the learner of epoch {other.epoch} was replaced by {epoch}", fenced=True)
 
     def _handle(self, connection: Connection, frame: Frame) -> None:
         if frame.kind is Kind.SAMPLE:
@@ -235,10 +247,11 @@ class SocketServer:
         serials = np.frombuffer(frame.body, np.int64, count)
         self._server.update_priorities(serials, np.frombuffer(frame.body, np.float32, count, 8 * count))
 
-    def _refuse(self, connection: Connection, reason: str, detail: str) -> None:
+    def _refuse(self, connection: Connection, reason: str, detail: str, fenced: bool = False) -> None:
+        log.warning("replay socket: a client was refused: %s", detail)
         self.refused[reason] += 1
         with contextlib.suppress(OSError):  # it may have gone already
-            connection.send(Kind.ERROR, {"error": detail})
+            connection.send(Kind.ERROR, {"error": detail, "fenced": fenced})
         self._end(connection)
 
     def _end_strangers(self) -> None:

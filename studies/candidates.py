@@ -1,26 +1,29 @@
-"""What one update is worth: one change at a time from ``robust``, to find what moves the return at 60 000 steps."""
+"""What one update is worth: one change at a time from 32 windows a batch, at 60 000 steps.
+
+What names no batch has 32.
+"""
 
 from studies.study import Scale, Study
 
 CHANGES = {
-    "robust": "",
-    "ratio 96": "--replay-ratio 96",
+    "batch 32": "--batch-size 32",
+    "ratio 96": "--batch-size 32 --replay-ratio 96",
     "batch 16": "--batch-size 16",
-    "polyak 0.98": "--polyak 0.98",
-    "learning rate 1e-3": "--learning-rate 1e-3",
-    "n-step 3": "--n-step 3",
-    "heads 256 256": "--heads 256 256",
-    "memory's rate 0.1": "--memory-learning-scale 0.1",
-    "critics normalised": "--critic-norm",
-    "observation beside": "--head-input hidden+observation",
-    "stride 5": "--stride 5",
-    "prioritized": "--priority-exponent 0.6 --importance-exponent 0.4",
-    "first critic": "--policy-q first",
-    "no grounding": "--grounding off",
-    "grounded by o itself": "--grounding observation",
-    "not clipped": "--clip-norm 0",
-    "optimisers apart": "--update-order alternate",
-    "reward scale 5": "--reward-scale 5",
+    "polyak 0.98": "--batch-size 32 --polyak 0.98",
+    "learning rate 1e-3": "--batch-size 32 --learning-rate 1e-3",
+    "n-step 3": "--batch-size 32 --n-step 3",
+    "heads 256 256": "--batch-size 32 --heads 256 256",
+    "memory's rate 0.1": "--batch-size 32 --memory-learning-scale 0.1",
+    "critics normalised": "--batch-size 32 --critic-norm",
+    "observation beside": "--batch-size 32 --head-input hidden+observation",
+    "stride 5": "--batch-size 32 --stride 5",
+    "prioritized": "--batch-size 32 --priority-exponent 0.6 --importance-exponent 0.4",
+    "first critic": "--batch-size 32 --policy-q first",
+    "no grounding": "--batch-size 32 --grounding off",
+    "grounded by o itself": "--batch-size 32 --grounding observation",
+    "not clipped": "--batch-size 32 --clip-norm 0",
+    "optimisers apart": "--batch-size 32 --update-order alternate",
+    "reward scale 5": "--batch-size 32 --reward-scale 5",
     "batch 8": "--batch-size 8",
     "batch 16, ratio 96": "--batch-size 16 --replay-ratio 96",
     "batch 16, learning rate 1e-3": "--batch-size 16 --learning-rate 1e-3",

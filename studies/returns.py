@@ -9,7 +9,7 @@ TUNED = {f"{name} zoo": f"{words} --settings zoo" for name, words in THEIRS.item
 STUDY = Study(
     "returns",
     OURS | THEIRS | TUNED,
-    small=Scale(100_000, (1, 2)),
+    small=Scale(300_000, (1, 2, 3), ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")),
     full=Scale(1_000_000, (1, 2, 3, 4, 5), ENVS),
 )
 

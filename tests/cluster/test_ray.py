@@ -16,6 +16,7 @@ import ray
 from ray.cluster_utils import Cluster
 
 from deploy.run_folder import RunFolder
+from tests.cluster import machines
 from tests.deploy.test_tls import lacks_tls
 from tests.integration.running import ENVIRONMENT, Training
 
@@ -128,6 +129,7 @@ def nodes() -> Iterator[Cluster]:
         del os.environ["RAY_AUTH_MODE"]
 
 
+@pytest.mark.skipif(not machines.missing(), reason="make test-cluster does that here, on machines")
 def test_a_node_is_lost_and_another_comes(nodes: Cluster, tmp_path: Path) -> None:
     first, _ = nodes.add_node(num_cpus=1), nodes.add_node(num_cpus=1)
     folder = tmp_path / "run"

@@ -12,7 +12,7 @@ import pytest
 
 from common.bus import METRICS_KEPT, Ack, Bus, Entry, EntryId, Holder, MemoryBus, ReplayAddress, Version
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
-from common.redis_bus import RedisBus
+from common.redis_bus import RECORDS_READ, RedisBus
 from deploy.redis_server import RedisServer
 
 
@@ -105,6 +105,15 @@ def test_a_repeated_append_is_stored_once(bus):
     assert len(bus.read({0: EntryId(0, 0)}, 10)) == 2
 
 
+def test_a_redis_that_lost_its_data_hears_of_the_learners_epoch_again(redis_url):
+    bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
+    for _ in range(3):
+        epoch = bus.take_epoch("learner")
+    bus._redis.delete(bus._key("epoch", "learner"))
+    bus.publish_weights(Version(epoch, 7), b"weights")
+    assert bus.take_epoch("learner") == epoch + 1
+
+
 def test_an_older_epoch_is_fenced(bus):
     bus.append(0, EntryId(1, 0), b"")
     bus.append(0, EntryId(2, 0), b"")
@@ -183,7 +192,7 @@ def test_what_is_no_record_is_left_out_and_a_flood_is_trimmed(redis_url):
     assert bus.records({"actor-0": "0"})[0] == [{"role": "actor-0", "updates": 1}]
     assert bus.refused == {"msgpack": 2, "structure": 2}
     with client.pipeline(transaction=False) as pipe:
-        for _ in range(3 * METRICS_KEPT):
+        for _ in range(2 * RECORDS_READ):
             pipe.xadd(key, {"r": b"\x80"})
         pipe.execute()
     bus.records({"actor-0": "0"})
@@ -216,7 +225,7 @@ def test_the_memory_bus_forgets_old_records():
     bus, cursors, seen = MemoryBus(), {"actor-0": "0"}, []
     for i in range(5 * METRICS_KEPT // 2):
         bus.emit("actor-0", {"i": i})
-        if i % 700 == 0:
+        if i % (METRICS_KEPT // 3) == 0:
             records, cursors = bus.records(cursors)
             seen += [record["i"] for record in records]
     seen += [record["i"] for record in bus.records(cursors)[0]]

@@ -46,6 +46,39 @@ def test_damage_is_found_and_an_older_one_used(tmp_path, damage):
     assert found[0] == 1
 
 
+@pytest.mark.parametrize("place", range(0, 160, 3))
+def test_every_byte_of_a_manifest_counts(tmp_path, place):
+    folder = CheckpointFolder(tmp_path)
+    folder.save(1, FILES)
+    manifest = folder.path(1) / "manifest.json"
+    content = bytearray(manifest.read_bytes())
+    content[place] ^= 1 << place % 8
+    manifest.write_bytes(content)
+    with pytest.raises(CheckpointError, match="000000001"):
+        folder.load(1)
+
+
+def test_one_without_room_leaves_nothing(tmp_path):
+    folder = CheckpointFolder(tmp_path / "c")
+    folder.save(1, FILES)
+    with pytest.raises(CheckpointError, match=r"000000002 cannot be written \(No such file or directory\)") as raised:
+        folder.save(2, {**FILES, "no/such": b""})  # the third of three
+    assert raised.value.reason == "No such file or directory"
+    assert sorted(path.name for path in folder.folder.iterdir()) == ["000000001"]
+
+
+def test_the_writers_epoch_is_kept(tmp_path):
+    folder = CheckpointFolder(tmp_path)
+    assert folder.last_epoch() == 0
+    folder.note_epoch(7)
+    folder.note_epoch(8)
+    assert CheckpointFolder(tmp_path).last_epoch() == 8
+    (tmp_path / "epoch").write_bytes(b"")
+    assert folder.last_epoch() == 0
+    folder.folder = tmp_path / "away"
+    folder.note_epoch(9)  # no room there; nothing is raised
+
+
 def test_a_half_written_checkpoint_is_not_seen(tmp_path):
     folder = CheckpointFolder(tmp_path)
     (tmp_path / ".tmp-000000005").mkdir()

@@ -124,6 +124,18 @@ def test_errors_are_one_line(
     assert not list(tmp_path.iterdir())  # nothing was started or written
 
 
+def test_a_full_disk_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def full(words: list[str]) -> int:
+        with open("/dev/full", "wb", buffering=0) as file:
+            return file.write(b"x")
+
+    monkeypatch.setattr(cli, "_parse_and_run", full)
+    assert cli.run(["train"]) == 1
+    assert capsys.readouterr().err == "rmc: disk: No space left on device; make room and try again\n"
+
+
 def made_run(folder: Path) -> RunFolder:
     run = open_run(presets.debug(EnvConfig(PENDULUM)), folder, "fail")
     run.unlock()

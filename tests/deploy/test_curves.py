@@ -55,7 +55,7 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     assert found.env == "Hopper-v5, flicker 0.5"
     assert (found.seed, found.finished, found.initial_return) == (3, False, None)
     assert found.evaluations == [Evaluation(500, 50, 5.0, 7.0, 1.0), Evaluation(900, 90, 15.0, 9.0, 1.0)]
-    assert found.transitions == 90 * 32 * 15
+    assert found.transitions == 90 * 8 * 15
     result = {"updates": 100, "env_steps": 1000, "wall_s": 21.0, "eval_return_mean": 11.0, "eval_return_std": 2.0}
     (tmp_path / "result.json").write_text(json.dumps({**result, "initial_return_mean": -1.0}))
     (found,) = history.read(tmp_path)

@@ -73,3 +73,21 @@ def test_new_names_without_end_are_left_out(monitor: Monitor) -> None:
     assert len(monitor.board.roles["actor-0"]) <= MOST_NAMES
     assert monitor.board.get("actor-0", "env_steps") == 3 * MOST_NAMES - 100
     monitor.close()
+
+
+def test_evaluations_that_found_no_room_are_marked_when_there_is_some(
+    monitor: Monitor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    marked: list[tuple[int, float]] = []
+
+    def full(number: int, score: float) -> None:
+        raise OSError(28, "No space left on device")
+
+    for update, score in ((10, 1.0), (20, 3.0), (30, 2.0)):
+        monkeypatch.setattr(monitor._checkpoints, "mark_best", full)
+        monitor.record({"role": "evaluator", "eval_update": update, "eval_return_mean": score})
+    monkeypatch.setattr(monitor._checkpoints, "mark_best", lambda *found: marked.append(found))
+    for _ in range(2):
+        monitor.record({"role": "learner", "updates": 30})
+    assert marked == [(10, 1.0), (20, 3.0), (30, 2.0)]
+    monitor.close()

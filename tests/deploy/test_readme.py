@@ -1,5 +1,6 @@
 """The README stays true: its commands run, its file tree is the repository's."""
 
+import json
 import re
 import subprocess
 import sys
@@ -8,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from common import agent, wrappers
+from docs import fault_table
 from docs.generate import page
 from learner import losses, staleness, update
 
@@ -26,6 +28,13 @@ def test_its_tree_names_every_file() -> None:
             found.add(f"{folder}/{leaf[1]}")
     there = {f"{package}/{path.name}" for package in PACKAGES for path in (ROOT / package).glob("*.py")}
     assert found == {path for path in there if not path.endswith("__init__.py")}
+
+
+def test_the_faults_that_were_run_are_in_their_page() -> None:
+    assert fault_table.PAGE.read_text() == fault_table.page(), "run make docs"
+    faults = {row["fault"] for row in json.loads(fault_table.RESULTS.read_text())}
+    assert all(f"| {fault} |" in fault_table.page() for fault in faults)
+    assert len(faults) >= 10
 
 
 def test_every_equation_leads_to_its_code_and_back() -> None:

@@ -20,6 +20,7 @@ from common.replay import Draw
 from deploy import redis_server, tls
 from deploy.redis_server import Port, RedisServer, server_binary
 from deploy.redis_users import LAUNCHER, RedisUsers
+from deploy.roles import connect
 from learner.replay_client import ReplayClient
 from replay_server.server import ReplayConfig, ReplayServer
 from replay_server.socket_server import SocketServer
@@ -34,10 +35,11 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    tls.make_certificate(tmp_path)
-    return tmp_path
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("certificate")
+    tls.make_certificate(made)
+    return made
 
 
 def test_the_key_is_private(folder: Path) -> None:
@@ -135,6 +137,56 @@ def test_redis_takes_encrypted_clients_that_know_the_password(folder: Path) -> N
         for wrong in (url.replace("rediss", "redis").partition("?")[0], url.replace(USERS.password(LAUNCHER), "guess")):
             with pytest.raises(BusUnavailable):
                 RedisBus(wrong, USERS.run).ping()
+
+
+@pytest.fixture
+def strict(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
+    """A user's own Redis that takes clients with a certificate only: its URL without words, and the client's folder."""
+    if lacks_tls():
+        pytest.skip("the Redis server found here was built without TLS")
+    client, port = tmp_path_factory.mktemp("client"), free_port()
+    tls.make_certificate(client)
+    words = [
+        server_binary(), "--port", "0", "--tls-port", str(port), "--bind", "127.0.0.1", "--save", "",
+        "--tls-cert-file", folder / tls.CERTIFICATE, "--tls-key-file", folder / tls.KEY,
+        "--tls-ca-cert-file", client / tls.CERTIFICATE, "--tls-auth-clients", "yes", "--requirepass", "a-password",
+    ]  # fmt: skip
+    server = subprocess.Popen(words, stdout=subprocess.DEVNULL, cwd=client)
+    yield f"rediss://:a-password@127.0.0.1:{port}", client
+    server.kill()
+    server.wait()
+
+
+def words(folder: Path, client: Path | None) -> str:
+    own = f"&ssl_certfile={client / tls.CERTIFICATE}&ssl_keyfile={client / tls.KEY}" if client is not None else ""
+    return f"?ssl_ca_certs={folder / tls.CERTIFICATE}{own}"
+
+
+def test_a_redis_of_the_users_own_may_ask_for_a_certificate(folder: Path, strict: tuple[str, Path]) -> None:
+    url, client = strict
+    bus = connect(url + words(folder, client), "run", 10.0)
+    bus.set_config(b"{}")
+    assert bus.config() == b"{}"
+
+
+@pytest.mark.parametrize("wrong", ["no certificate of the client's", "the server's is another", "password"])
+def test_who_is_refused_there_reads_one_line_without_the_password(
+    folder: Path, strict: tuple[str, Path], wrong: str
+) -> None:
+    url, client = strict
+    connect(url + words(folder, client), "run", 10.0)  # it is up
+    asked = {
+        "no certificate of the client's": url + words(folder, None),
+        "the server's is another": url + words(client, client),
+        "password": url.replace("a-password", "another") + words(folder, client),
+    }[wrong]
+    with pytest.raises(ConfigError, match=r"^--redis-url='rediss://127.0.0.1:\d+.*no Redis answers there") as raised:
+        connect(asked, "run")
+    assert "\n" not in str(raised.value)
+    assert "password@" not in str(raised.value)
+    assert "another@" not in str(raised.value)
+    said = {"password": "invalid", "the server's is another": "certificate verify failed"}.get(wrong, "")
+    assert said in str(raised.value)
 
 
 def test_a_redis_without_tls_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,10 +1,9 @@
-"""Messages that were changed at random: ``python -m tests.faults.fuzz [--cases 1000000]``.
+"""Messages that were changed at random: ``python -m tests.faults.fuzz [--tries 1000000]``.
 
 Of each kind a lawful one is mutated, read by what reads it in a run, and either taken or refused by name: nothing else
 may come of it, in no more than 10 ms, nor may memory grow. Mutations that keep a checksum right get past it.
 """
 
-import argparse
 import random
 import resource
 import time
@@ -25,7 +24,7 @@ from common.record import decode_record, encode_record
 from common.wire import HEADER, Kind, check_rows, decode_header, decode_meta, decode_rows, encode_frame, encode_windows
 from deploy.presets import from_json, robust, to_json
 from replay_server.record import Progress, decode_published
-from tests.faults.row import Row
+from tests.faults.row import Row, at_length
 from tests.replay_server.support import SPEC, make_rows
 
 SLOWEST_S, MOST_MB = 0.010, 64
@@ -152,8 +151,4 @@ def fuzz(count: int, seed: int = 0) -> Row:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=1_000_000)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    fuzz(options.cases, options.seed).keep()
+    at_length(__doc__, 1_000_000, lambda tries, folder: iter([fuzz(tries)]))

@@ -12,8 +12,7 @@ import numpy as np
 from common.bus import EntryId
 from common.window import Rows
 from deploy.run_folder import RunFolder
-from replay_server.recovery import open_store, valid_leaves
-from replay_server.sum_tree import SumTree
+from replay_server.recovery import open_store
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,8 +22,6 @@ class Judgement:
     acknowledged: int
     lost: int
     duplicated: int
-    tree_differs: bool
-    """The sum tree from the one that is rebuilt from priorities."""
 
 
 def judge(folder: Path, acks: dict[tuple[int, int], int]) -> Judgement:
@@ -36,15 +33,12 @@ def judge(folder: Path, acks: dict[tuple[int, int], int]) -> Judgement:
         progress, capacity = store.ring.progress, store.ring.capacity
         serials = np.arange(progress.valid_from, progress.next_serial)
         rows = store.ring.rows[serials % capacity].copy()
-        rebuilt = SumTree(capacity)
-        rebuilt.rebuild(valid_leaves(store))
-        differs = not np.array_equal(rebuilt._nodes, store.tree._nodes)
     finally:
         store.close()
     full = progress.valid_from > 0
     lost = sum(_lost(_of(rows, *life), acks.get(life, 0), full) for life in _lives(rows) | set(acks))
     origins = {tuple(row) for row in rows[["actor", "epoch", "seq", "k"]].tolist()}
-    return Judgement(progress.next_serial, lost, len(rows) - len(origins), differs)
+    return Judgement(progress.next_serial, lost, len(rows) - len(origins))
 
 
 def _lives(rows: Rows) -> set[tuple[int, int]]:

@@ -1,9 +1,8 @@
 """kill -9 of an actor under load: ``python -m tests.faults.kill_actor [--tries 50]``."""
 
-import argparse
 import random
-import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,37 +10,27 @@ import numpy as np
 from deploy.run_folder import RunFolder
 from replay_server.recovery import open_store
 from tests.faults.loaded import ACTORS, Loaded
-from tests.faults.row import Row
+from tests.faults.row import Row, at_length
 
 RECOVERY_S = 3.0
 
 
-def kill(tries: int, folder: Path, seed: int = 0) -> Row:
-    """Kill one or the other so often."""
-    chance, slowest = random.Random(seed), 0.0
-    with Loaded(folder) as run:
+def kill_actors(tries: int, folder: Path) -> Iterator[Row]:
+    """One or the other so often, amid whatever it does."""
+    chance, slowest = random.Random(0), 0.0
+    with Loaded(folder / "run") as run:
         run.begin()
         for _ in range(tries):
-            name = f"actor-{chance.randrange(ACTORS)}"
-            victim, epoch = run.process_of(name), run.bus.current_epoch(name)
             time.sleep(chance.uniform(0.2, 1.5))
-            victim.kill()
-            slowest = max(slowest, run.until(lambda name=name, epoch=epoch: run.bus.current_epoch(name) > epoch))
-        acked = dict(run.acks)
-        for actor in range(ACTORS):  # each goes on
-            before = _of_actor(acked, actor)
-            run.until(lambda actor=actor, before=before: _of_actor(run.acks, actor) != before)
+            slowest = max(slowest, run.kill(f"actor-{chance.randrange(ACTORS)}"))
+        run.until_all_go_on()
         found = run.end()
-    repeated = _repeated_starts(folder)
+    repeated = _repeated_starts(folder / "run")
     passed = not (found.lost or found.duplicated or repeated) and slowest < RECOVERY_S
-    return Row(
+    yield Row(
         "kill -9 of an actor", tries, passed, found.acknowledged, found.lost, found.duplicated, round(slowest, 2),
         {"repeated_episodes": repeated},
     )  # fmt: skip
-
-
-def _of_actor(acks: dict[tuple[int, int], int], actor: int) -> dict[tuple[int, int], int]:
-    return {life: seq for life, seq in acks.copy().items() if life[0] == actor}
 
 
 def _repeated_starts(folder: Path) -> int:
@@ -58,8 +47,4 @@ def _repeated_starts(folder: Path) -> int:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tries", type=int, default=50)
-    with tempfile.TemporaryDirectory(prefix="rmc-fault-") as place:
-        row = kill(parser.parse_args().tries, Path(place) / "run")
-    row.keep()
+    at_length(__doc__, 50, kill_actors)

@@ -1,13 +1,20 @@
 """A real run under load, its acknowledgements written down as they come: two actors, Redis, replay server, learner."""
 
+import json
+import os
 import re
+import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import psutil
 
+from common.bus import EntryId, Version
 from common.errors import BusUnavailable
 from common.redis_bus import RedisBus
 from deploy.presets import from_json
@@ -19,16 +26,35 @@ from tests.integration.running import Training
 ACTORS = 2
 ENDLESS = ("--total-steps", "100000000", "--replay-ratio", "4", "--actors", str(ACTORS), "--checkpoint-steps", "20000")
 ROOMY = ("--capacity", "100000")  # windows: none is evicted before all are judged
+WRAPPING = ("--capacity", "2000")  # full within a minute
+FILL_SECONDS = 200.0
+HOOKS = Path(__file__).parent / "hooks"
+Acks = dict[tuple[int, int], int]
 
 
 class Loaded(Training):
-    """Ready, with a learner that updates, once ``begin`` returns."""
+    """Ready, with a learner that updates, once ``begin`` returns; ``arm`` lets a fault of ``hooks`` happen in it."""
 
-    def __init__(self, folder: Path, *options: str) -> None:
-        super().__init__(folder, *ENDLESS, *(options or ROOMY))
-        self.acks: dict[tuple[int, int], int] = {}
+    def __init__(
+        self,
+        folder: Path,
+        *options: str,
+        redis_url: str = "",
+        slower: float = 1.0,
+        environment: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        self.armed = folder.parent / f"{folder.name}-armed"
+        self.armed.mkdir(exist_ok=True)
+        path = os.pathsep.join([str(HOOKS), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+        hooks = {"PYTHONPATH": path, "RMC_FAULTS": str(self.armed), "RMC_SLOWER": str(slower)}
+        place = ("--redis-url", redis_url) if redis_url else ()
+        super().__init__(folder, *ENDLESS, *(options or ROOMY), *place, environment={**hooks, **environment})
+        self.acks: Acks = {}
+        self.versions: list[Version] = []  # of the weights, as they were seen
+        self.acks_went_back = 0
+        self._redis_url = redis_url
         self._over = threading.Event()
-        self._watch = threading.Thread(target=self._note_acks, daemon=True)
+        self._watch = threading.Thread(target=self._note, daemon=True)
 
     def begin(self) -> None:
         """Wait for the first updates."""
@@ -40,17 +66,33 @@ class Loaded(Training):
 
     def make_bus(self, user: str = LAUNCHER) -> RedisBus:
         """The run's bus, for one thread."""
-        (socket,) = (path for path in self.sockets() if path.name == "redis.sock")
-        return RedisBus(f"unix://{self._users.login(user)}{socket}", self._users.run)
+        return RedisBus(self.url_of(user), self._users.run)
 
-    def _note_acks(self) -> None:
-        bus = self.make_bus()
+    def url_of(self, user: str) -> str:
+        """Where a user of the run finds its Redis."""
+        if self._redis_url:
+            return self._redis_url
+        (socket,) = (path for path in self.sockets() if path.name == "redis.sock")
+        return f"unix://{self._users.login(user)}{socket}"
+
+    @property
+    def name(self) -> str:
+        """The run's, in Redis."""
+        return self._users.run
+
+    def _note(self) -> None:
+        bus, before = self.make_bus(), [EntryId(0, 0)] * ACTORS
         while not self._over.is_set():
             try:
                 for actor in range(ACTORS):
                     ack = bus.ack(actor)
                     if ack is not None:
+                        self.acks_went_back += ack.id < before[actor]
+                        before[actor] = ack.id
                         newest(self.acks, actor, ack.id)
+                version = bus.latest_version()
+                if version is not None and [version] != self.versions[-1:]:
+                    self.versions.append(version)
             except BusUnavailable:
                 pass
             time.sleep(0.005)
@@ -68,6 +110,28 @@ class Loaded(Training):
         self.wait_for(there)
         return found[0]
 
+    def kill(self, role: str) -> float:
+        """kill -9; how long it takes until it is back in a new epoch."""
+        victim, epoch = self.process_of(role), self.bus.current_epoch(role)
+        victim.kill()
+        return self.until(lambda: self.bus.current_epoch(role) > epoch)
+
+    def arm(self, fault: str) -> None:
+        """Let it happen at the next occasion."""
+        (self.armed / fault).touch()
+
+    def said(self, name: str) -> list[dict[str, Any]]:
+        """What the hooks have written down."""
+        path = self.armed / f"said-{name}"
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+    def strike(self, fault: str, role: str) -> float:
+        """Arm a fault that kills the role; how long it takes from its death until it is back in a new epoch."""
+        epoch, deaths = self.bus.current_epoch(role), len(self.said("died"))
+        self.arm(fault)
+        self.until(lambda: len(self.said("died")) > deaths)
+        return self.until(lambda: self.bus.current_epoch(role) > epoch)
+
     def until(self, condition: Callable[[], object], seconds: float = 60.0) -> float:
         """Wait for it, however Redis is; how long that took."""
         began = time.monotonic()
@@ -81,12 +145,57 @@ class Loaded(Training):
             assert time.monotonic() < began + seconds, f"waited {seconds} s in vain:\n{self.logs()}"
             time.sleep(0.01)
 
+    def until_all_go_on(self) -> float:
+        """Wait for acks of every actor, and weights, newer than now; how long that took."""
+        acks, versions = self.acks.copy(), len(self.versions)
+        return self.until(lambda: _all_moved(acks, self.acks.copy()) and len(self.versions) > versions)
+
+    def held(self) -> dict[str, tuple[float, int]]:
+        """Of each role, and of an embedded Redis: memory that is no file's, so not the ring's, in MB; open files."""
+        roles = ["replay", "learner", "evaluator", *(f"actor-{actor}" for actor in range(ACTORS))]
+        roles += [] if self._redis_url else ["redis"]
+        processes = {role: self.process_of(role) for role in roles}
+        return {role: (_anonymous_mb(process.pid), process.num_fds()) for role, process in processes.items()}
+
+    def kill_all(self) -> None:
+        """Every process at once, the launcher first."""
+        everyone = [self.launcher, *self.launcher.children(recursive=True)]
+        self._over.set()
+        for process in everyone:
+            process.send_signal(signal.SIGKILL)
+        self.process.wait()
+        psutil.wait_procs(everyone[1:], 10)
+
+    def close(self) -> None:
+        """Kill what is left, and look no more."""
+        self._over.set()
+        super().close()
+
     def end(self) -> Judgement:
         """Stop it in order, and judge what its ring holds."""
         self._over.set()
         self._watch.join()
         self.interrupt()
         return judge(self.folder, self.acks)
+
+
+def _anonymous_mb(pid: int) -> float:
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    (kilobytes,) = (line.split()[1] for line in lines if line.startswith("Anonymous:"))
+    return int(kilobytes) / 1e3
+
+
+def went_back(versions: list[Version]) -> int:
+    """How often weights were older than those seen before."""
+    return sum(later < earlier for earlier, later in pairwise(versions))
+
+
+def _all_moved(before: Acks, now: Acks) -> bool:
+    return all(_of(now, actor) != _of(before, actor) for actor in range(ACTORS))
+
+
+def _of(acks: Acks, actor: int) -> Acks:
+    return {life: seq for life, seq in acks.items() if life[0] == actor}
 
 
 def _matches(process: psutil.Process, pattern: str) -> bool:

@@ -1,10 +1,13 @@
 """A row of ``tests/faults/results.json``: what a fault's script found when it was run at length."""
 
+import argparse
 import dataclasses
 import json
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 RESULTS = Path(__file__).parent / "results.json"
@@ -25,20 +28,30 @@ class Row:
     """What else it measured."""
 
     def keep(self) -> None:
-        """Put it into the file, in the place of an earlier one of the same fault; ends the script."""
+        """Put it into the file, in the place of an earlier one of the same fault."""
         rows = json.loads(RESULTS.read_text()) if RESULTS.exists() else []
         kept = [row for row in rows if row["fault"] != self.fault]
-        words = [Path(word).stem if word.endswith(".py") else word for word in sys.argv]
-        command = f"python -m tests.faults.{' '.join(words)}"
+        words = [Path(sys.argv[0]).stem, *sys.argv[1:]]
         made = {
-            "command": command,
+            "command": f"python -m tests.faults.{' '.join(words)}",
             "date": time.strftime("%Y-%m-%d"),
             "commit": _commit(),
         }
         rows = sorted([*kept, dataclasses.asdict(self) | made], key=lambda row: str(row["fault"]))
         RESULTS.write_text(json.dumps(rows, indent=1) + "\n")
-        print(json.dumps(dataclasses.asdict(self)))
-        sys.exit(0 if self.passed else 1)
+        print(json.dumps(dataclasses.asdict(self)), flush=True)
+
+
+def at_length(said: str | None, tries: int, fault: Callable[[int, Path], Iterator[Row]]) -> None:
+    """A script: ``fault`` with so many tries, or ``--tries``, in a folder of its own; ends with 1 if a row failed."""
+    parser = argparse.ArgumentParser(description=said)
+    parser.add_argument("--tries", type=int, default=tries)
+    options, passed = parser.parse_args(), True
+    with tempfile.TemporaryDirectory(prefix="rmc-fault-") as place:
+        for row in fault(options.tries, Path(place)):
+            row.keep()
+            passed = passed and row.passed
+    sys.exit(0 if passed else 1)
 
 
 def _commit() -> str:

@@ -8,8 +8,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import psutil
@@ -21,7 +22,14 @@ ENVIRONMENT = {**os.environ, "RMC_SECRET": "", "COLUMNS": "200"}
 class Training:
     """Started at once; ``close`` kills what is left of it."""
 
-    def __init__(self, folder: Path, *options: str, env: str = "InvertedPendulum-v5", preset: str = "debug") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *options: str,
+        env: str = "InvertedPendulum-v5",
+        preset: str = "debug",
+        environment: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         self.folder = folder
         self.output = folder.parent / f"{folder.name}.out"
         words = [
@@ -38,8 +46,9 @@ class Training:
         ]
         with self.output.open("ab") as output:
             self.process = subprocess.Popen(
-                words, stdout=output, stderr=output, stdin=subprocess.DEVNULL, env=ENVIRONMENT, process_group=0
-            )
+                words, stdout=output, stderr=output, stdin=subprocess.DEVNULL, env={**ENVIRONMENT, **environment},
+                process_group=0,
+            )  # fmt: skip
         self.launcher = psutil.Process(self.process.pid)
 
     def text(self) -> str:

@@ -1,5 +1,6 @@
-"""Ctrl-C, kill -9 of each role, a frozen learner: nothing is left behind and the run goes on."""
+"""Ctrl-C, a killed Redis or evaluator, a frozen learner: nothing is left behind; the other faults: tests/faults."""
 
+import sys
 import time
 from collections.abc import Iterator
 
@@ -23,16 +24,14 @@ def leaves_nothing_behind() -> None:
     """Not after each of these tests, which share a run: the one of Ctrl-C looks."""
 
 
-@pytest.mark.parametrize("name", ["actor", "evaluator", "learner", "replay"])
-def test_a_killed_role_comes_back(endless: Training, name: str) -> None:
-    before, restarts = endless.role(name), endless.newest("launcher", "restarts")
+def test_a_killed_evaluator_comes_back(endless: Training) -> None:
+    before, restarts = endless.role("evaluator"), endless.newest("launcher", "restarts")
     assert before is not None
     before.kill()
-    endless.wait_for(lambda: (now := endless.role(name)) is not None and now.pid != before.pid)
+    endless.wait_for(lambda: (now := endless.role("evaluator")) is not None and now.pid != before.pid)
     endless.wait_for(lambda: endless.newest("launcher", "restarts") > restarts)
-    steps = endless.newest("replay", "env_steps")
-    endless.wait_for_updates(100)
-    endless.wait_for(lambda: endless.newest("replay", "env_steps") > steps + 100)
+    evaluations = len(endless.records("evaluator"))
+    endless.wait_for(lambda: len(endless.records("evaluator")) > evaluations)
 
 
 def test_a_killed_redis_comes_back(endless: Training) -> None:
@@ -68,7 +67,8 @@ def test_a_second_launcher_is_refused(endless: Training) -> None:
 
 def test_ctrl_c_saves_and_leaves_nothing(endless: Training) -> None:
     processes = endless.launcher.children(recursive=True)
-    assert len(processes) == 5  # four roles and Redis
+    nursery = sys.platform == "linux"  # that three roles come from
+    assert len(processes) == 5 + nursery  # four roles and Redis
     sockets = endless.sockets()
     assert sockets
     checkpoints = {path.name for path in (endless.folder / "checkpoints").glob("0*")}

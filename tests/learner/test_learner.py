@@ -148,9 +148,58 @@ def test_a_replaced_learner_is_fenced(setting):
     saved = setting.learner.checkpoints.numbers()
     setting.bus.take_epoch("learner")
     with pytest.raises(FencedError):
-        setting.learner.publish()
+        step_for_long(setting)
     setting.learner.close()
     assert setting.learner.checkpoints.numbers() == saved
+
+
+def test_the_next_epoch_is_above_the_one_in_the_folder(setting):
+    setting.learner.close()
+    setting.learner.checkpoints.note_epoch(9)
+    setting.learner = setting.start()
+    assert setting.learner.epoch == 10
+    assert setting.learner.checkpoints.last_epoch() == 10
+
+
+def test_a_checkpoint_without_room_is_tried_again_and_training_goes_on(setting, monkeypatch):
+    setting.feed(60)
+    setting.learner.step()
+    blocked = setting.learner.checkpoints.folder
+    blocked.rename(blocked.with_name("away"))
+    blocked.write_bytes(b"")  # no folder, so nothing can be made in it
+    assert not setting.learner.checkpoint()
+    assert setting.learner.metrics()["checkpoint_error"] == "Not a directory"
+    updates = setting.learner.updates
+    setting.feed(60)
+    assert setting.learner.step()
+    assert setting.learner.updates == updates + 1
+    assert not setting.learner.checkpoint()  # not so soon
+    blocked.unlink()
+    blocked.with_name("away").rename(blocked)
+    monkeypatch.setattr(setting.learner, "_save_at", 0.0)
+    assert setting.learner.checkpoint()
+    assert setting.learner.metrics()["checkpoint_error"] == ""
+    assert setting.learner.checkpoints.numbers()[-1] == updates + 1
+
+
+def test_the_end_waits_for_room(tmp_path, monkeypatch):
+    setting = Setting(tmp_path, total_steps=100)
+    setting.feed(60)
+    learner, save = setting.learner, setting.learner.checkpoints.save
+
+    def full(number, files):
+        raise CheckpointError("as told", "as told")
+
+    monkeypatch.setattr(learner.checkpoints, "save", full)
+    while learner.step():
+        assert not learner.finished
+    assert (learner.finished, learner.waiting_for()) == (False, "disk")
+    monkeypatch.setattr(learner.checkpoints, "save", save)
+    monkeypatch.setattr(learner, "_save_at", 0.0)
+    assert learner.step()
+    assert learner.finished
+    learner.close()
+    setting.server.close()
 
 
 def test_divergence_ends_it_and_keeps_the_last_good_checkpoint(setting):

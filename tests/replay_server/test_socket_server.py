@@ -6,15 +6,17 @@ import socket
 import struct
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from common.bus import MemoryBus
-from common.errors import AuthenticationError, ConfigError, MessageError
+from common.errors import AuthenticationError, ConfigError, FencedError, MessageError
 from common.replay import Draw
 from common.shared_batches import TURNS
 from common.wire import HEADER, MAGIC, VERSION, Kind, encode_frame, proof
@@ -55,8 +57,14 @@ class Served:
         self.sockets.close()
         self.replay.close()
 
-    def connect(self, secret: bytes = SECRET) -> Connection:
-        return Connection(self.address, secret, SPEC.fingerprint, BIG)
+    def connect(self, secret: bytes = SECRET, epoch: int = 0) -> Connection:
+        return Connection(self.address, secret, SPEC.fingerprint, BIG, epoch=epoch)
+
+    def client(self, epoch: int) -> ReplayClient:
+        """A learner's end."""
+        client = ReplayClient(lambda: self.address, SECRET, SPEC, 8)
+        client.introduce(epoch)
+        return client
 
     def stranger(self) -> socket.socket:
         """A raw connection that has got its challenge and said nothing."""
@@ -237,6 +245,37 @@ def test_a_server_with_another_secret_is_refused(tmp_path: Path) -> None:
         Connection(f"unix:{tmp_path}/r.sock", SECRET, SPEC.fingerprint, BIG)
     thread.join()
     listener.close()
+
+
+def test_a_replaced_learner_reads_and_writes_nothing_more(serve: Serve) -> None:
+    served = serve()
+    old, new = served.client(4), served.client(5)
+    sample = old.sample(8)
+    assert sample.rows is not None
+    serials = sample.rows["serial"].copy()
+    assert old.statistics().count > 0  # by its other connection
+    assert new.sample(8).rows is not None
+    served.refused("fenced")
+    old.update_priorities(serials, np.full(8, 1e6, np.float32))
+    with pytest.raises(FencedError, match="the learner of epoch 4 was replaced by 5"):
+        deque(old.sample(8) for _ in range(4))  # what was drawn ahead is still there; then at the latest
+    with pytest.raises(FencedError):
+        old.statistics()
+    with pytest.raises(FencedError):
+        served.connect(epoch=4)
+    assert new.stats()["max_priority"] == 1.0
+    again = served.connect(epoch=5)
+    assert draw(again)[0] is Kind.BATCH
+    for client in (old, new, again):
+        client.close()
+
+
+@pytest.mark.parametrize("epoch", [-1, "5", True, None, 1.0, 2**63])
+def test_what_is_no_epoch_is_refused(serve: Serve, epoch: Any) -> None:
+    served = serve()
+    with pytest.raises(AuthenticationError, match="is no learner's epoch"):
+        served.connect(epoch=epoch)
+    works(served)
 
 
 def test_a_proof_cannot_be_used_again_or_turned_round(serve: Serve) -> None:

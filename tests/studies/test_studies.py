@@ -29,6 +29,9 @@ def test_every_run_is_one_that_rmc_takes(name, scale):
     assert len({job.folder for job in jobs}) == len(jobs)
     seen = set()
     for job in jobs:
+        assert job.words[job.words.index("--seed") + 1] == str(job.seed)
+        if job.seed != jobs[0].seed:  # the same words but for that
+            continue
         command = options.parse(job.words)
         assert isinstance(command, options.Train | options.Baseline)
         assert (command.seed, command.run_dir, command.env.id) == (job.seed, job.folder, job.env)

@@ -1,0 +1,23 @@
+"""An outage is told when it begins and when it is over."""
+
+import logging
+
+import pytest
+
+from common.outage import Outage
+
+
+def test_once_each(caplog: pytest.LogCaptureFixture) -> None:
+    outage = Outage("actor-0")
+    with caplog.at_level(logging.WARNING):
+        outage.over()
+        for _ in range(3):
+            outage.note(OSError("no answer"))
+        outage.over()
+        outage.over()
+        outage.note(OSError("again"))
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 3
+    assert said[0] == "actor-0: waiting for Redis: no answer"
+    assert said[1].startswith("actor-0: Redis is back after ")
+    assert said[2] == "actor-0: waiting for Redis: again"

@@ -1,0 +1,72 @@
+"""Records are kept whole, on a disk that is full now and then."""
+
+import io
+import json
+import logging
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from common.envs import EnvConfig
+from deploy import journal
+from deploy.journal import Journal
+from deploy.presets import debug
+from deploy.run_folder import RunFolder, open_run
+from deploy.view import Board, View
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    made = open_run(debug(EnvConfig("Pendulum-v1")), tmp_path / "run", "fail")
+    made.unlock()
+    return made
+
+
+def lines(folder: RunFolder) -> list[int]:
+    return [json.loads(line)["x"] for line in folder.metrics.read_text().splitlines()]
+
+
+def test_a_full_disk_is_told_once_and_over_once(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(journal, "RETRY_SECONDS", 0.0)
+    kept = Journal(folder)
+    kept.write({"role": "learner", "x": 1}, 0)
+    there = kept._lines
+    with open("/dev/full", "ab", buffering=0) as full, caplog.at_level(logging.WARNING):
+        kept._lines = full.fileno()  # a real ENOSPC
+        kept.write({"role": "learner", "x": 2}, 0)
+        kept.write({"role": "learner", "x": 3}, 0)
+        kept._lines = there
+        kept.write({"role": "learner", "x": 4}, 0)
+    kept.close()
+    assert lines(folder) == [1, 4]
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 2
+    assert "is not written" in said[0]
+    assert "is written again" in said[1]
+    assert len(list(folder.events.glob("events.*"))) == 2  # a writer that failed is done for
+
+
+def test_no_half_of_a_line_is_left(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept, write = Journal(folder), journal.os.write
+    kept.write({"role": "learner", "x": 1}, 0)
+
+    def short(file: int, line: bytes) -> int:
+        return write(file, line[:5])
+
+    with monkeypatch.context() as patch:
+        patch.setattr(journal.os, "write", short)
+        kept.write({"role": "learner", "x": 2}, 0)
+    assert lines(folder) == [1]
+    kept.close()
+
+
+def test_a_view_that_cannot_be_written_ends_nothing() -> None:
+    board = Board("Pendulum-v1", "debug", 0, 100, 4.0)
+    with open("/dev/full", "wb", buffering=0) as raw:
+        full = io.TextIOWrapper(raw, write_through=True)
+        View(board, Console(file=full, force_terminal=False)).refresh()
+        with pytest.raises(OSError, match="No space"):
+            full.write("x")

@@ -1,0 +1,81 @@
+"""Roles forked from a nursery: as their own processes would be, and gone with it."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from common.errors import RoleDied
+from deploy import nursery
+from deploy.nursery import Forked, Nursery
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nursery]:
+    one = Nursery(tmp_path_factory.mktemp("nursery") / "nursery.log")
+    one.start()
+    yield one
+    one.close()
+
+
+@pytest.fixture(autouse=True)
+def leaves_nothing_behind() -> None:
+    """Not after each of these tests, which share a nursery."""
+
+
+def fork(shared: Nursery, log: Path, *words: str, **environment: str) -> Forked:
+    with log.open("ab") as file:
+        return shared.fork(words, environment, file.fileno())
+
+
+def test_it_is_rmc_with_its_words(shared: Nursery, tmp_path: Path) -> None:
+    role = fork(shared, tmp_path / "log", "actor", "--run", "x", "--index", "0", RMC_REDIS_URL="unix:///nowhere")
+    assert role.wait(20) == 2
+    assert "--redis-url='unix:///nowhere'" in (tmp_path / "log").read_text()
+    assert role.poll() == 2  # it is still known
+
+
+def test_it_leads_a_group_has_its_title_and_dies_of_a_signal(shared: Nursery, tmp_path: Path) -> None:
+    role = fork(
+        shared, tmp_path / "log", "actor", "--run", "x", "--index", "7", RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99"
+    )
+    assert os.getpgid(role.pid) == role.pid
+    assert role.poll() is None
+    with pytest.raises(subprocess.TimeoutExpired):
+        role.wait(0.2)
+    assert " ".join(psutil.Process(role.pid).cmdline()).endswith("-P -m deploy.cli actor --run x --index 7")
+    os.killpg(role.pid, signal.SIGKILL)
+    assert role.wait(5) == -signal.SIGKILL
+
+
+def test_with_the_nursery_go_those_it_forked_and_another_begins(shared: Nursery, tmp_path: Path) -> None:
+    words = ("actor", "--run", "x", "--index", "0")
+    role = fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99")
+    process = psutil.Process(role.pid)
+    assert shared._program is not None
+    shared._program.kill()
+    assert role.wait(5) == -signal.SIGKILL
+    process.wait(5)
+    after = fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a")
+    assert after.poll() is None
+    assert role.poll() == -signal.SIGKILL
+    after.wait(20)
+
+
+def test_one_that_does_not_start_says_where_to_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = tmp_path / "python"
+    broken.write_text("#!/bin/sh\necho no torch here\nexit 1\n")
+    broken.chmod(0o700)
+    monkeypatch.setattr(nursery.sys, "executable", str(broken))
+    one = Nursery(tmp_path / "nursery.log")
+    with pytest.raises(RoleDied, match=r"does not start; its log is .*nursery\.log"):
+        fork(one, tmp_path / "log", "actor")
+    one.close()
+    assert (tmp_path / "nursery.log").read_text() == "no torch here\n" * 2

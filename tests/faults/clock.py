@@ -1,0 +1,66 @@
+"""The clock moved by an hour, both ways: ``python -m tests.faults.clock [--tries 3]``.
+
+Through a library that is loaded before all others, ``clock.c``: it needs a C compiler. The monotonic clock stays as it
+is, as it does where a clock is moved.
+"""
+
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.faults.loaded import Loaded, went_back
+from tests.faults.row import Row, at_length
+
+SOURCE = Path(__file__).with_name("clock.c")
+HOUR, HOURS, SECONDS = 3600, (1, -1, 0), 3.0  # seconds of one, where to, and how long between moves
+
+
+def move_clock(tries: int, folder: Path) -> Iterator[Row]:
+    """An hour on, an hour back, so often, amid a run that goes on as it did."""
+    slowest, hours = 0.0, []
+    with Loaded(folder / "run", environment=other_clock(folder)) as run:
+        run.begin()
+        for _ in range(tries):
+            for hour in HOURS:
+                set_clock(folder, hour)
+                slowest = max(slowest, run.until_all_go_on())
+                time.sleep(SECONDS)
+                hours.append(hours_away(run))
+        restarts = run.newest("launcher", "restarts")
+        found = run.end()
+    facts = {
+        "moves_seen_by_the_roles": sum(hour != 0 for hour in hours),
+        "restarts": restarts,
+        "weights_went_back": went_back(run.versions),
+    }
+    passed = not (found.lost or found.duplicated or restarts or facts["weights_went_back"])
+    passed = passed and hours == [*HOURS] * tries
+    yield Row(
+        "clock moved by an hour, both ways", 2 * tries, passed, found.acknowledged, found.lost, found.duplicated,
+        round(slowest, 2), facts,
+    )  # fmt: skip
+
+
+def other_clock(folder: Path) -> dict[str, str]:
+    """The environment of processes whose clock ``set_clock`` moves."""
+    library = folder / "clock.so"
+    subprocess.run(["cc", "-shared", "-fPIC", "-O2", "-o", library, SOURCE, "-ldl"], check=True)
+    set_clock(folder, 0)
+    return {"LD_PRELOAD": str(library), "CLOCK_FILE": str(folder / "clock")}
+
+
+def set_clock(folder: Path, hours: int) -> None:
+    """At once: it is read all the time."""
+    new = folder / "clock.new"
+    new.write_text(str(hours * HOUR))
+    new.rename(folder / "clock")
+
+
+def hours_away(run: Loaded) -> int:
+    """How far the roles' clock is from this process's."""
+    return round((run.newest("replay", "time") - time.time()) / HOUR)
+
+
+if __name__ == "__main__":
+    at_length(__doc__, 3, move_clock)

@@ -1,0 +1,163 @@
+"""Faults within running roles: Python reads this file first of all where it stands on PYTHONPATH.
+
+A file in the folder RMC_FAULTS arms the fault of its name, which takes the file away and happens once, in whichever
+role comes to that point next.
+"""
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(os.environ.get("RMC_FAULTS", "/nonexistent"))
+SLOWER = float(os.environ.get("RMC_SLOWER", "1"))  # times as long for an update of the learner
+
+
+def strikes(fault: str) -> bool:
+    """Whether it was armed."""
+    try:
+        (FOLDER / fault).unlink()
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def say(name: str, **facts: object) -> None:
+    """A line for the script that watches."""
+    with (FOLDER / f"said-{name}").open("a") as file:
+        file.write(json.dumps(facts) + "\n")
+
+
+def die() -> None:
+    """At once, as by kill -9."""
+    say("died", at=time.time())
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def after(owner: Any, method: str, fault: str) -> None:
+    """Die when the method has done its work."""
+    original = getattr(owner, method)
+
+    def done(*args: Any, **words: Any) -> Any:
+        result = original(*args, **words)
+        if strikes(fault):
+            die()
+        return result
+
+    setattr(owner, method, done)
+
+
+def replay_server() -> None:
+    """Every point between a read and its ack."""
+    from common.redis_bus import RedisBus
+    from replay_server.intake import Intake
+    from replay_server.record import _HEADER, RecordPair
+    from replay_server.recovery import ReplayStore, valid_leaves
+    from replay_server.ring import Ring
+    from replay_server.server import ReplayServer
+    from replay_server.sum_tree import SumTree
+
+    write, record, step, read = Ring.write, RecordPair.write, ReplayServer.step, Intake.read
+
+    def half_the_rows(self: Any, rows: Any) -> Any:
+        serials = range(self.progress.next_serial, self.progress.next_serial + len(rows))
+        kept = [serial % self.capacity for serial in serials][-self.capacity :][len(rows) // 2 :]
+        before = self._blocks[kept].copy()
+        slots = write(self, rows)
+        if len(rows) > 1 and strikes("half-the-rows"):
+            self._blocks[kept] = before
+            die()
+        return slots
+
+    def half_a_record(self: Any, progress: Any) -> None:
+        copy = self._copies[(self._sequence + 1) % 2]
+        before = bytes(copy)
+        record(self, progress)
+        if strikes("half-a-record"):
+            half = (_HEADER.size + len(progress.encode())) // 2
+            copy[half:] = before[half:]
+            die()
+
+    def all_there(self: Any, positions: Any) -> Any:
+        found = read(self, positions)
+        if self.gaps:
+            say("gap", gaps=self.gaps)
+        return found
+
+    def compared(self: Any) -> bool:
+        if strikes("compare-tree"):
+            rebuilt = SumTree(self._store.ring.capacity)
+            rebuilt.rebuild(valid_leaves(self._store))
+            say("tree", same=bool((rebuilt._nodes == self._store.tree._nodes).all()))
+        return bool(step(self))
+
+    Ring.write, RecordPair.write, ReplayServer.step = half_the_rows, half_a_record, compared  # type: ignore[method-assign]
+    Intake.read = all_there  # type: ignore[method-assign]
+    after(Intake, "read", "read")
+    after(RecordPair, "write", "record")
+    after(Ring, "write", "rows")
+    after(ReplayStore, "set_priorities", "priorities")
+    after(Ring, "commit", "committed")
+    after(RedisBus, "commit", "acknowledged")
+    after(ReplayServer, "sample", "drawn")
+
+
+def learner() -> None:
+    """Amid saving; what it resumes from; a loss that is no number; slow updates."""
+    import torch
+
+    from common import checkpoint
+    from learner.learner import STATE, Learner
+    from learner.static_update import StaticUpdate
+
+    write, resume, update = checkpoint._write, Learner._resume, StaticUpdate.__call__
+
+    def half_a_file(path: Path, content: bytes) -> None:
+        if path.name == STATE and strikes("half-a-checkpoint"):
+            path.write_bytes(content[: len(content) // 2])
+            die()
+        write(path, content)
+
+    def compared(self: Any) -> int:
+        epoch = resume(self)
+        found = self.checkpoints.latest()
+        if found is not None:
+            said = torch.load(self.checkpoints.path(found[0]) / STATE, weights_only=True)
+            say("resumed", number=found[0], same=_same(said, self.update.state_dict()))
+        return epoch
+
+    def slower(self: Any, raw: Any, importance: Any, beta: float) -> Any:
+        began = time.monotonic()
+        if strikes("nan"):
+            importance = importance * float("nan")  # with which the loss is a mean
+            say("nan")
+        result = update(self, raw, importance, beta)
+        time.sleep((SLOWER - 1) * (time.monotonic() - began))
+        return result
+
+    checkpoint._write, Learner._resume = half_a_file, compared  # type: ignore[method-assign]
+    StaticUpdate.__call__ = slower  # type: ignore[method-assign]
+    after(checkpoint, "_sync_folder", "synchronised")
+    after(checkpoint.CheckpointFolder, "save", "saved")
+
+
+def _same(one: Any, other: Any) -> bool:
+    """To the last bit."""
+    import torch
+
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if isinstance(one, torch.Tensor):
+        return one.dtype == other.dtype and one.cpu().numpy().tobytes() == other.cpu().numpy().tobytes()
+    return bool(one == other)
+
+
+if "deploy.nursery" in sys.orig_argv:
+    replay_server()
+elif "learner" in sys.orig_argv:
+    learner()

@@ -1,0 +1,73 @@
+"""kill -9 of a whole run at once, then ``rmc train`` again: ``python -m tests.faults.kill_all [--tries 5]``."""
+
+import random
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from common.checkpoint import CheckpointFolder
+from deploy.run_folder import RunFolder
+from replay_server.recovery import open_store
+from tests.faults.judge import judge
+from tests.faults.loaded import ROOMY, Acks, Loaded, went_back
+from tests.faults.row import Row, at_length
+
+RECOVERY_S = 30.0  # from ``rmc train`` on; a run's own start
+OFTEN = (*ROOMY, "--checkpoint-steps", "500")
+COUNTED = ("env_steps", "windows", "drawn_steps", "draws")  # beta's clock is the first
+Kept = dict[str, float]
+
+
+def kill_everything(tries: int, folder: Path) -> Iterator[Row]:
+    """So often, each time going on in the same folder."""
+    chance, slowest, less = random.Random(0), 0.0, 0
+    place, acks, versions = folder / "run", Acks(), []
+    said: Kept = {}
+    left: Kept = {}
+    for _ in range(tries + 1):
+        began = time.monotonic()
+        with Loaded(place, *OFTEN) as run:
+            run.acks = acks  # of all lives
+            run.begin()
+            run.until_all_go_on()
+            slowest = max(slowest, time.monotonic() - began)
+            run.until(lambda run=run: CheckpointFolder(run.folder / "checkpoints").numbers())
+            time.sleep(chance.uniform(1.0, 3.0))
+            said = {name: run.newest("replay", name) for name in COUNTED}
+            run.kill_all()
+        versions += run.versions
+        before, left = left, on_disk(place)
+        less += sum(left[name] < said[name] for name in said) + sum(left[name] < before[name] for name in before)
+    found = judge(place, acks)
+    differs = sum(not one["same"] for one in run.said("resumed"))
+    table = {name: f"{said.get(name, '-')} said last, {left[name]} on disk" for name in left}
+    passed = not (found.lost or found.duplicated or less or differs or went_back(versions)) and slowest < RECOVERY_S
+    yield Row(
+        "kill -9 of every process at once", tries, passed, found.acknowledged, found.lost, found.duplicated,
+        round(slowest, 2), {"learner_state_differs": differs, "counters_fell": less, **table},
+    )  # fmt: skip
+
+
+def on_disk(place: Path) -> Kept:
+    """What the next start goes on with."""
+    run = RunFolder(place)
+    config = run.config()
+    store = open_store(run.replay, config.window_spec(), config.replay.capacity, config.replay.priority_exponent)
+    store.close()
+    progress, found = store.ring.progress, CheckpointFolder(run.checkpoints).latest()
+    learnt = store.priorities[: progress.next_serial] != 1.0
+    return {
+        "env_steps": progress.env_steps,
+        "windows": progress.next_serial,
+        "drawn_steps": progress.drawn_steps,
+        "draws": progress.draws,
+        "normaliser's observations": progress.observations,
+        "priorities learnt": int(np.count_nonzero(learnt)),
+        "learner's update": found[0] if found is not None else 0,
+    }
+
+
+if __name__ == "__main__":
+    at_length(__doc__, 5, kill_everything)

@@ -1,0 +1,44 @@
+"""kill -9 of the learner, at random and amid saving: ``python -m tests.faults.kill_learner [--tries 20]``."""
+
+import random
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from common.checkpoint import CheckpointFolder
+from tests.faults.loaded import ROOMY, Loaded, went_back
+from tests.faults.row import Row, at_length
+
+RECOVERY_S = 15.0
+POINTS = ("half-a-checkpoint", "synchronised", "saved")
+OFTEN = (*ROOMY, "--checkpoint-steps", "500")
+
+
+def kill_learners(tries: int, folder: Path) -> Iterator[Row]:
+    """So often, each third one amid a checkpoint."""
+    chance, slowest = random.Random(0), 0.0
+    with Loaded(folder / "run", *OFTEN) as run:
+        run.begin()
+        run.until(lambda: CheckpointFolder(run.folder / "checkpoints").numbers())
+        for number in range(tries):
+            time.sleep(chance.uniform(0.2, 1.5))
+            point = POINTS[number // 3 % len(POINTS)]
+            slowest = max(slowest, run.strike(point, "learner") if number % 3 == 0 else run.kill("learner"))
+            run.until_all_go_on()
+        resumed = run.said("resumed")
+        found = run.end()
+    facts = {
+        "resumed": len(resumed),
+        "state_differs": sum(not one["same"] for one in resumed),
+        "weights_went_back": went_back(run.versions),
+    }
+    passed = not (found.lost or found.duplicated or facts["state_differs"] or facts["weights_went_back"])
+    passed = passed and len(resumed) >= tries and slowest < RECOVERY_S
+    yield Row(
+        "kill -9 of the learner", tries, passed, found.acknowledged, found.lost, found.duplicated, round(slowest, 2),
+        facts,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    at_length(__doc__, 20, kill_learners)

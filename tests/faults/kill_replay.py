@@ -1,0 +1,82 @@
+"""kill -9 of the replay server under load: ``python -m tests.faults.kill_replay [--tries 20]``.
+
+At random, none evicted before all is judged; at every commit point, its ring full and wrapping; with 100 000 windows.
+"""
+
+import random
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.faults.loaded import FILL_SECONDS, ROOMY, WRAPPING, Loaded
+from tests.faults.row import Row, at_length
+
+RECOVERY_S = 10.0
+POINTS = (
+    "read", "record", "half-the-rows", "rows", "priorities", "half-a-record", "committed", "acknowledged", "drawn",
+)  # fmt: skip
+LARGE = ("--capacity", "100000", "--replay-ratio", "0.05")  # so that it fills within minutes
+
+
+def kill_replays(tries: int, folder: Path) -> Iterator[Row]:
+    """At random moments, then at each point; then with 100 000 windows."""
+    chance, slowest = random.Random(0), 0.0
+    with Loaded(folder / "run", *ROOMY) as run:
+        run.begin()
+        for _ in range(tries):
+            time.sleep(chance.uniform(0.2, 1.5))
+            slowest = max(slowest, run.kill("replay"))
+            run.until_all_go_on()
+        yield _row("kill -9 of the replay server at random", run, tries, slowest)
+    with Loaded(folder / "points", *WRAPPING) as run:
+        run.begin()
+        run.until(lambda: run.newest("replay", "ring_fill") == 1.0, FILL_SECONDS)
+        slowest = strike_everywhere(run)
+        yield _row("kill -9 of the replay server at every commit point", run, len(POINTS), slowest)
+
+
+def strike_everywhere(run: Loaded) -> float:
+    """At each point once, going on in between; the longest until it was back."""
+    slowest = 0.0
+    for point in POINTS:
+        slowest = max(slowest, run.strike(point, "replay"))
+        run.until_all_go_on()
+    return slowest
+
+
+def tree_is_its_rebuild(run: Loaded) -> bool:
+    """Of the replay server that runs."""
+    looks = len(run.said("tree"))
+    run.arm("compare-tree")
+    run.until(lambda: len(run.said("tree")) > looks)
+    return all(look["same"] for look in run.said("tree"))
+
+
+def kill_large(tries: int, folder: Path) -> Iterator[Row]:
+    """With 100 000 windows in the ring."""
+    slowest = 0.0
+    with Loaded(folder / "large", *LARGE) as run:
+        run.begin()
+        run.until(lambda: run.newest("replay", "ring_fill") == 1.0, 580.0)
+        for _ in range(tries):
+            slowest = max(slowest, run.kill("replay"))
+            run.until_all_go_on()
+        yield _row("kill -9 of the replay server with 100 000 windows", run, tries, slowest)
+
+
+def _row(fault: str, run: Loaded, tries: int, slowest: float) -> Row:
+    rebuilt = tree_is_its_rebuild(run)
+    found = run.end()
+    facts = {"tree_is_its_rebuild": int(rebuilt), "entries_missed": len(run.said("gap"))}
+    passed = not (found.lost or found.duplicated or facts["entries_missed"]) and rebuilt and slowest < RECOVERY_S
+    return Row(fault, tries, passed, found.acknowledged, found.lost, found.duplicated, round(slowest, 2), facts)
+
+
+def all_of_them(tries: int, folder: Path) -> Iterator[Row]:
+    """The three rows."""
+    yield from kill_replays(tries, folder)
+    yield from kill_large(3, folder)
+
+
+if __name__ == "__main__":
+    at_length(__doc__, 20, all_of_them)

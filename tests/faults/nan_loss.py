@@ -1,0 +1,73 @@
+"""A loss that is no number, forced, under load: ``python -m tests.faults.nan_loss [--tries 5]``."""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from common.checkpoint import CheckpointFolder
+from deploy.supervisor import QUICK_DEATHS
+from learner.learner import STATE
+from tests.faults.judge import judge
+from tests.faults.loaded import ROOMY, Loaded, went_back
+from tests.faults.row import Row, at_length
+
+RECOVERY_S = 15.0
+CAUSE = "training has diverged, weights are not finite"
+
+
+def force_nan(tries: int, folder: Path) -> Iterator[Row]:
+    """In so many runs twice: the learner ends with the cause, and goes on from its last checkpoint, which is sound.
+
+    Then once more, too soon: the run ends with the cause.
+    """
+    slowest, facts = 0.0, {"causes_said": 0, "checkpoints_spoilt": 0, "weights_went_back": 0}
+    acknowledged = lost = doubled = 0
+    for number in range(tries):
+        with Loaded(folder / f"run-{number}", *ROOMY, "--checkpoint-steps", "500") as run:
+            run.begin()
+            checkpoints = CheckpointFolder(run.folder / "checkpoints")
+            run.until(checkpoints.numbers)
+            slowest = max(slowest, *(_once(run) for _ in range(QUICK_DEATHS - 1)))
+            run.arm("nan")
+            status = run.process.wait(60)
+            text = run.text()
+        found = judge(run.folder, run.acks)
+        log = (run.folder / "logs" / "learner.log").read_text()
+        facts["causes_said"] += log.count(CAUSE) // QUICK_DEATHS + (status == 1 and CAUSE in text)
+        facts["checkpoints_spoilt"] += sum(not _sound(checkpoints.load(one)) for one in checkpoints.numbers())
+        facts["weights_went_back"] += went_back(run.versions)
+        acknowledged, lost, doubled = acknowledged + found.acknowledged, lost + found.lost, doubled + found.duplicated
+    passed = facts == {"causes_said": 2 * tries, "checkpoints_spoilt": 0, "weights_went_back": 0}
+    passed = passed and not (lost or doubled) and slowest < RECOVERY_S
+    yield Row(
+        "NaN in a loss", QUICK_DEATHS * tries, passed, acknowledged, lost, doubled, round(slowest, 2), {**facts},
+    )  # fmt: skip
+
+
+def _once(run: Loaded) -> float:
+    """How long until it is back."""
+    epoch = run.bus.current_epoch("learner")
+    run.arm("nan")
+    run.until(lambda: not (run.armed / "nan").exists())
+    back = run.until(lambda: run.bus.current_epoch("learner") > epoch)
+    run.until_all_go_on()
+    return back
+
+
+def _sound(files: dict[str, bytes]) -> bool:
+    return _finite(torch.load(io.BytesIO(files[STATE]), weights_only=True))
+
+
+def _finite(state: Any) -> bool:
+    if isinstance(state, dict):
+        return all(map(_finite, state.values()))
+    if isinstance(state, (list, tuple)):
+        return all(map(_finite, state))
+    return not isinstance(state, torch.Tensor) or bool(state.isfinite().all())
+
+
+if __name__ == "__main__":
+    at_length(__doc__, 5, force_nan)

@@ -1,0 +1,39 @@
+"""A learner ten times slower, and one that stands still: ``python -m tests.faults.slow_learner [--tries 1]``."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.faults.loaded import ACTORS, Loaded
+from tests.faults.row import Row, at_length
+from tests.faults.soak import MOST_GROWTH, memory_growth, watch
+
+MINUTES, SETTLED = 16.0, 6.0  # from when on Redis keeps as many metrics as it ever will
+SLOWER = 10.0
+
+
+def slow_down(tries: int, folder: Path, minutes: float = MINUTES, settled: float = SETTLED) -> Iterator[Row]:
+    """So often, both."""
+    for number in range(tries):
+        with Loaded(folder / f"slow-{number}", slower=SLOWER) as run:
+            run.begin()
+            yield _judged("learner 10 times slower", run, minutes, settled)
+        with Loaded(folder / f"stopped-{number}") as run:
+            run.begin()
+            learner = run.process_of("learner")
+            learner.suspend()
+            yield _judged("learner stopped", run, minutes, settled)
+            learner.resume()
+
+
+def _judged(fault: str, run: Loaded, minutes: float, settled: float) -> Row:
+    looks = watch(run, 60 * minutes, 60 * settled)
+    growth = memory_growth(looks)
+    waits = {run.newest(f"actor-{actor}", "waiting_for") for actor in range(ACTORS)}
+    passed = max(growth.values()) < MOST_GROWTH and waits == {"credit"}
+    facts: dict[str, float | int | str] = {f"{role}_grew": round(share, 4) for role, share in growth.items()}
+    facts |= {"actors_wait_for": " ".join(sorted(waits)), "replay_waits_for": run.newest("replay", "waiting_for")}
+    return Row(f"{fault}, {minutes:.0f} minutes", 1, passed, found=facts)
+
+
+if __name__ == "__main__":
+    at_length(__doc__, 1, slow_down)

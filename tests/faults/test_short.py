@@ -1,0 +1,161 @@
+"""The short forms: every fault once, in their order, in one run, whose ring is judged at the end."""
+
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from common.checkpoint import CheckpointFolder
+from tests.faults.broken_checkpoints import spoil_each
+from tests.faults.clock import HOURS, hours_away, other_clock, set_clock
+from tests.faults.disk_full import cannot_log, filled, goes_on_unsaved, small_disk
+from tests.faults.frozen import freeze
+from tests.faults.kill_redis import LoggedRedis, logged_redis
+from tests.faults.kill_replay import strike_everywhere, tree_is_its_rebuild
+from tests.faults.loaded import ROOMY, Loaded, went_back
+from tests.faults.soak import memory_growth, watch
+
+OPTIONS = (*ROOMY, "--checkpoint-steps", "1000")  # none is evicted before all is judged
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="hooks of a nursery, small disks, memory by /proc")
+compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="the other clock is in C")
+root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a small disk")
+
+
+@pytest.fixture(autouse=True)
+def leaves_nothing_behind() -> None:
+    """Not after each of these tests, which share a run."""
+
+
+class Place:
+    """Where it happens: a folder, a small disk for the run and one for the log of its Redis."""
+
+    def __init__(self, folder: Path, leave: ExitStack) -> None:
+        self.folder, self.disks = folder, {}
+        for name, megabytes in (("run", 400), ("log", 300)):
+            self.disks[name] = folder / f"{name}-disk"
+            if os.geteuid() == 0:
+                leave.enter_context(small_disk(self.disks[name], megabytes))
+            else:
+                self.disks[name].mkdir()
+        (self.disks["run"] / "run").mkdir()
+        (folder / "run").symlink_to(self.disks["run"] / "run")  # what it prints goes elsewhere
+        self.environment = other_clock(folder) if shutil.which("cc") else {}
+        self.redis: LoggedRedis = leave.enter_context(logged_redis(self.disks["log"] / "redis", folder / "redis.said"))
+
+    def start(self) -> Loaded:
+        """The run, or the run again."""
+        return Loaded(self.folder / "run", *OPTIONS, redis_url=self.redis.url, environment=self.environment)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+    with ExitStack() as leave:
+        yield Place(tmp_path_factory.mktemp("faults"), leave)
+
+
+@pytest.fixture(scope="module")
+def run(place: Place) -> Iterator[Loaded]:
+    with place.start() as run:
+        run.begin()
+        yield run
+
+
+def test_an_actor_is_killed(run: Loaded) -> None:
+    run.kill("actor-1")
+    run.until_all_go_on()
+
+
+def test_the_replay_server_is_killed_at_every_commit_point(run: Loaded) -> None:
+    strike_everywhere(run)
+    assert tree_is_its_rebuild(run)
+
+
+def test_the_learner_is_killed_also_amid_saving(run: Loaded) -> None:
+    run.until(CheckpointFolder(run.folder / "checkpoints").numbers)
+    run.kill("learner")
+    run.strike("half-a-checkpoint", "learner")
+    run.until_all_go_on()
+    assert [one["same"] for one in run.said("resumed")] == [True, True]
+
+
+def test_a_loss_is_no_number(run: Loaded) -> None:
+    epoch = run.bus.current_epoch("learner")
+    run.arm("nan")
+    run.until(lambda: run.bus.current_epoch("learner") > epoch)
+    run.until_all_go_on()
+    assert "training has diverged, weights are not finite" in (run.folder / "logs" / "learner.log").read_text()
+
+
+def test_redis_is_killed(place: Place, run: Loaded) -> None:
+    place.redis.kill()
+    place.redis.start()
+    run.until_all_go_on()
+
+
+@compiler
+def test_the_clock_is_moved(place: Place, run: Loaded) -> None:
+    restarts = run.newest("launcher", "restarts")
+    for hour in HOURS:
+        set_clock(place.folder, hour)
+        run.until(lambda hour=hour: hours_away(run) == hour)
+        run.until_all_go_on()
+    assert run.newest("launcher", "restarts") == restarts
+
+
+def test_an_actor_stands_still_and_is_replaced(run: Loaded) -> None:
+    row = freeze(run, "actor-0", 1, 1.0)
+    assert row.passed, row
+
+
+@root
+def test_the_log_of_redis_has_no_room(place: Place, run: Loaded) -> None:
+    with filled(place.disks["log"]):
+        cannot_log(run, place.redis)
+    run.until_all_go_on()
+
+
+@root
+def test_a_checkpoint_has_no_room(place: Place, run: Loaded) -> None:
+    checkpoints = CheckpointFolder(run.folder / "checkpoints")
+    with filled(place.disks["run"]):
+        before = checkpoints.numbers()
+        goes_on_unsaved(run)
+        assert checkpoints.numbers() == before
+    run.until(lambda: checkpoints.numbers() > before)
+    assert all(line.endswith("}") for line in (run.folder / "metrics.jsonl").read_text().splitlines())
+
+
+def test_the_learner_stands_still(run: Loaded) -> None:
+    learner = run.process_of("learner")
+    learner.suspend()
+    looks = watch(run, 7.0, 1.0)
+    assert run.newest("actor-0", "waiting_for") == "credit"
+    learner.resume()
+    run.until_all_go_on()
+    growth = memory_growth(looks)
+    assert all(share < 0.05 for share in growth.values()), growth
+
+
+def test_all_are_killed_at_once_and_nothing_was_ever_lost(place: Place, run: Loaded) -> None:
+    run.kill_all()
+    said = {name: run.newest("replay", name) for name in ("env_steps", "windows", "drawn_steps", "draws")}
+    with place.start() as again:
+        again.acks = run.acks
+        again.begin()
+        again.until_all_go_on()
+        assert all(again.newest("replay", name) >= value for name, value in said.items())
+        found = again.end()
+    assert again.process.returncode == 130
+    assert all(one["same"] for one in again.said("resumed"))
+    assert went_back(run.versions + again.versions) == run.acks_went_back == 0
+    assert (found.lost, found.duplicated) == (0, 0)
+    assert found.acknowledged > 1_000
+
+
+def test_a_bit_of_a_checkpoint_is_flipped(run: Loaded, tmp_path: Path) -> None:
+    row = spoil_each(50, CheckpointFolder(run.folder / "checkpoints"), tmp_path / "copy")
+    assert row.passed, row
