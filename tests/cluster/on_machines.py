@@ -110,6 +110,11 @@ class Run:
         found: dict[str, dict[str, Any]] = json.loads(self.site.head.run(words).stdout)
         return found
 
+    def all_have_sent(self) -> bool:
+        """Whether of every actor something is acknowledged."""
+        epochs = self.epochs()
+        return len(epochs) == self.actors() and all(at["acked"] for at in epochs.values())
+
     def check_replaced_are_fenced(self, before: dict[str, dict[str, Any]]) -> list[str]:
         """Actors replaced since: all that is acknowledged is their newest life's, and an older one is refused."""
         self.wait_for(lambda: all(at["acked"] == at["epoch"] for at in self.epochs().values()))
@@ -179,6 +184,7 @@ def endless(site: Site) -> Run:
     run = Run(site, "endless", "--preset", "debug", "--total-steps", "10000000", "--replay-ratio", "8", "--all-cpus")
     run.wait_for(lambda: not run.newest("launcher", "not_running", "x"))
     run.wait_for_updates(100)
+    run.wait_for(run.all_have_sent)  # an actor that is still on its way could not be missed by a test that kills it
     return run
 
 
