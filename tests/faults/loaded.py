@@ -40,13 +40,12 @@ class Loaded(Training):
         folder: Path,
         *options: str,
         redis_url: str = "",
-        slower: float = 1.0,
         environment: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.armed = folder.parent / f"{folder.name}-armed"
         self.armed.mkdir(exist_ok=True)
         path = os.pathsep.join([str(HOOKS), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-        hooks = {"PYTHONPATH": path, "RMC_FAULTS": str(self.armed), "RMC_SLOWER": str(slower)}
+        hooks = {"PYTHONPATH": path, "RMC_FAULTS": str(self.armed)}
         place = ("--redis-url", redis_url) if redis_url else ()
         super().__init__(folder, *ENDLESS, *(options or ROOMY), *place, environment={**hooks, **environment})
         self.acks: Acks = {}
@@ -119,6 +118,12 @@ class Loaded(Training):
     def arm(self, fault: str) -> None:
         """Let it happen at the next occasion."""
         (self.armed / fault).touch()
+
+    def slow_down(self, times: float) -> None:
+        """Let every update of the learner take so many times as long, until it is said again."""
+        new = self.armed / "slower.new"
+        new.write_text(str(times))
+        new.replace(self.armed / "slower")
 
     def said(self, name: str) -> list[dict[str, Any]]:
         """What the hooks have written down."""

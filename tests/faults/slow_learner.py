@@ -14,25 +14,26 @@ SLOWER = 10.0
 def slow_down(tries: int, folder: Path, minutes: float = MINUTES, settled: float = SETTLED) -> Iterator[Row]:
     """So often, both."""
     for number in range(tries):
-        with Loaded(folder / f"slow-{number}", slower=SLOWER) as run:
+        with Loaded(folder / f"slow-{number}") as run:
             run.begin()
-            yield _judged("learner 10 times slower", run, minutes, settled)
+            run.slow_down(SLOWER)
+            yield judged("learner 10 times slower", run, 60 * minutes, 60 * settled)
         with Loaded(folder / f"stopped-{number}") as run:
             run.begin()
             learner = run.process_of("learner")
             learner.suspend()
-            yield _judged("learner stopped", run, minutes, settled)
+            yield judged("learner stopped", run, 60 * minutes, 60 * settled)
             learner.resume()
 
 
-def _judged(fault: str, run: Loaded, minutes: float, settled: float) -> Row:
-    looks = watch(run, 60 * minutes, 60 * settled)
-    growth = memory_growth(looks)
+def judged(fault: str, run: Loaded, seconds: float, settled: float, most_growth: float = MOST_GROWTH) -> Row:
+    """Whether memory stays as it is after ``settled`` seconds, while the actors wait at their credit."""
+    growth = memory_growth(watch(run, seconds, settled))
     waits = {run.newest(f"actor-{actor}", "waiting_for") for actor in range(ACTORS)}
-    passed = max(growth.values()) < MOST_GROWTH and waits == {"credit"}
+    passed = max(growth.values()) < most_growth and waits == {"credit"}
     facts: dict[str, float | int | str] = {f"{role}_grew": round(share, 4) for role, share in growth.items()}
     facts |= {"actors_wait_for": " ".join(sorted(waits)), "replay_waits_for": run.newest("replay", "waiting_for")}
-    return Row(f"{fault}, {minutes:.0f} minutes", 1, passed, found=facts)
+    return Row(f"{fault}, {seconds / 60:.0f} minutes", 1, passed, found=facts)
 
 
 if __name__ == "__main__":

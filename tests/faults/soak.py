@@ -1,5 +1,6 @@
 """Half an hour at full speed, the ring full and wrapping: ``python -m tests.faults.soak [--tries 1]``."""
 
+import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,18 +19,22 @@ def soak(tries: int, folder: Path, minutes: float = MINUTES, settled: float = SE
     for number in range(tries):
         with Loaded(folder / f"run-{number}", *WRAPPING) as run:
             run.begin()
-            looks = watch(run, 60 * minutes, 60 * settled)
-            ratio, updates = run.newest("replay", "replay_ratio"), run.newest("learner", "updates")
-            fill = run.newest("replay", "ring_fill")
+            row = soaked(run, 60 * minutes, 60 * settled)
             found = run.end()
-        growth, files = memory_growth(looks), files_growth(looks)
-        passed = not (found.lost or found.duplicated or max(files.values())) and fill == 1.0
-        passed = passed and max(growth.values()) < MOST_GROWTH and abs(ratio / RATIO - 1) < RATIO_TOLERANCE
-        facts = {f"{role}_grew": round(share, 4) for role, share in growth.items()}
-        facts |= {"files_grew": max(files.values()), "replay_ratio": round(ratio, 3), "updates": updates}
-        yield Row(
-            f"soak, {minutes:.0f} minutes", tries, passed, found.acknowledged, found.lost, found.duplicated, None, facts
-        )
+        passed = row.passed and not (found.lost or found.duplicated)
+        counts = {"acknowledged": found.acknowledged, "lost": found.lost, "duplicated": found.duplicated}
+        yield dataclasses.replace(row, passed=passed, **counts)
+
+
+def soaked(run: Loaded, seconds: float, settled: float, most_growth: float = MOST_GROWTH) -> Row:
+    """Whether memory and open files stay as they are after ``settled`` seconds, the ring full and the ratio held."""
+    looks = watch(run, seconds, settled)
+    growth, files = memory_growth(looks), max(files_growth(looks).values())
+    ratio, full = run.newest("replay", "replay_ratio"), run.newest("replay", "ring_fill") == 1.0
+    passed = max(growth.values()) < most_growth and not files and full and abs(ratio / RATIO - 1) < RATIO_TOLERANCE
+    facts = {f"{role}_grew": round(share, 4) for role, share in growth.items()}
+    facts |= {"files_grew": files, "replay_ratio": round(ratio, 3), "updates": run.newest("learner", "updates")}
+    return Row(f"soak, {seconds / 60:.0f} minutes", 1, passed, found=facts)
 
 
 def watch(run: Loaded, seconds: float, settled: float) -> Looks:

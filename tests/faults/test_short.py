@@ -1,4 +1,7 @@
-"""The short forms: every fault once, in their order, in one run, whose ring is judged at the end."""
+"""The short forms: every fault once, in their order, in one run, whose ring is judged at the end.
+
+A second run has a ring that is full and wraps.
+"""
 
 import os
 import shutil
@@ -17,9 +20,12 @@ from tests.faults.frozen import freeze
 from tests.faults.kill_redis import LoggedRedis, logged_redis
 from tests.faults.kill_replay import strike_everywhere, tree_is_its_rebuild
 from tests.faults.loaded import ROOMY, Loaded, went_back
-from tests.faults.soak import memory_growth, watch
+from tests.faults.slow_learner import SLOWER, judged
+from tests.faults.soak import soaked
 
 OPTIONS = (*ROOMY, "--checkpoint-steps", "1000")  # none is evicted before all is judged
+FULL = ("--capacity", "300")  # windows
+MOST_GROWTH = 0.05  # of a role's memory within seconds
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="hooks of a nursery, small disks, memory by /proc")
 compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="the other clock is in C")
 root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a small disk")
@@ -50,6 +56,10 @@ class Place:
         """The run, or the run again."""
         return Loaded(self.folder / "run", *OPTIONS, redis_url=self.redis.url, environment=self.environment)
 
+    def start_full(self) -> Loaded:
+        """The second run."""
+        return Loaded(self.folder / "full", *FULL, redis_url=self.redis.url)
+
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
@@ -61,6 +71,14 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
 def run(place: Place) -> Iterator[Loaded]:
     with place.start() as run:
         run.begin()
+        yield run
+
+
+@pytest.fixture(scope="module")
+def full(place: Place) -> Iterator[Loaded]:
+    with place.start_full() as run:
+        run.begin()
+        run.until(lambda: run.newest("replay", "ring_fill") == 1.0)
         yield run
 
 
@@ -132,12 +150,15 @@ def test_a_checkpoint_has_no_room(place: Place, run: Loaded) -> None:
 def test_the_learner_stands_still(run: Loaded) -> None:
     learner = run.process_of("learner")
     learner.suspend()
-    looks = watch(run, 7.0, 1.0)
-    assert run.newest("actor-0", "waiting_for") == "credit"
+    row = judged("learner stopped", run, 7.0, 1.0, MOST_GROWTH)
     learner.resume()
     run.until_all_go_on()
-    growth = memory_growth(looks)
-    assert all(share < 0.05 for share in growth.values()), growth
+    assert row.passed, row
+
+
+def test_the_learner_stands_still_and_is_replaced(run: Loaded) -> None:
+    row = freeze(run, "learner", 1, 1.0)
+    assert row.passed, row
 
 
 def test_all_are_killed_at_once_and_nothing_was_ever_lost(place: Place, run: Loaded) -> None:
@@ -158,4 +179,21 @@ def test_all_are_killed_at_once_and_nothing_was_ever_lost(place: Place, run: Loa
 
 def test_a_bit_of_a_checkpoint_is_flipped(run: Loaded, tmp_path: Path) -> None:
     row = spoil_each(50, CheckpointFolder(run.folder / "checkpoints"), tmp_path / "copy")
+    assert row.passed, row
+
+
+def test_a_full_ring_wraps(full: Loaded) -> None:
+    row = soaked(full, 10.0, 2.0, MOST_GROWTH)
+    assert row.passed, row
+
+
+def test_a_learner_becomes_ten_times_slower(full: Loaded) -> None:
+    full.slow_down(SLOWER)
+    row = judged("learner 10 times slower", full, 7.0, 1.0, MOST_GROWTH)
+    full.slow_down(1.0)
+    assert row.passed, row
+
+
+def test_the_replay_server_stands_still_and_is_replaced(full: Loaded) -> None:
+    row = freeze(full, "replay", 1, 1.0)
     assert row.passed, row

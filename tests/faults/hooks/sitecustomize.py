@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 FOLDER = Path(os.environ.get("RMC_FAULTS", "/nonexistent"))
-SLOWER = float(os.environ.get("RMC_SLOWER", "1"))  # times as long for an update of the learner
 
 
 def strikes(fault: str) -> bool:
@@ -29,6 +28,12 @@ def say(name: str, **facts: object) -> None:
     """A line for the script that watches."""
     with (FOLDER / f"said-{name}").open("a") as file:
         file.write(json.dumps(facts) + "\n")
+
+
+def times_slower() -> float:
+    """How many times as long an update of the learner takes: what a file says that stays."""
+    path = FOLDER / "slower"
+    return float(path.read_text()) if path.exists() else 1.0
 
 
 def die() -> None:
@@ -135,7 +140,7 @@ def learner() -> None:
             importance = importance * float("nan")  # with which the loss is a mean
             say("nan")
         result = update(self, raw, importance, beta)
-        time.sleep((SLOWER - 1) * (time.monotonic() - began))
+        time.sleep((times_slower() - 1) * (time.monotonic() - began))
         return result
 
     checkpoint._write, Learner._resume = half_a_file, compared  # type: ignore[method-assign]
