@@ -215,6 +215,8 @@ class LearnerHost(RoleHost):
         if newest is not None:
             self._folder.save(*newest)
         self._archived = set(ray.get(launcher.numbers.remote()))
+        self._epoch: int = ray.get(launcher.last_epoch.remote())
+        self._folder.note_epoch(max(self._epoch, self._folder.last_epoch()))
 
     def _claim(self, place: str) -> tuple[Any, bool]:
         """The launcher, and whether the learner was here before."""
@@ -245,6 +247,9 @@ class LearnerHost(RoleHost):
             if number > newest and number not in self._archived:
                 ray.get(self._launcher().archive.remote(self._life, number, self._folder.load(number)))
                 self._archived.add(number)
+        epoch = self._folder.last_epoch()
+        if epoch > self._epoch:
+            self._epoch = ray.get(self._launcher().note_epoch.remote(self._life, epoch))
 
     def settle(self) -> None:
         deadline = time.monotonic() + SETTLE_SECONDS
@@ -303,8 +308,21 @@ class LauncherHost(RoleHost):
 
     def archive(self, life: str, number: int, files: dict[str, bytes]) -> None:
         """Keep a checkpoint, if it comes from the learner's present host."""
-        if self._claim.read_text().split()[1:] == [life]:
+        if self._holds(life):
             self._checkpoints.save(number, files)
+
+    def note_epoch(self, life: str, epoch: int) -> int:
+        """Keep the learner's epoch, likewise; returns what is kept."""
+        if self._holds(life):
+            self._checkpoints.note_epoch(epoch)
+        return self.last_epoch()
+
+    def last_epoch(self) -> int:
+        """Of the learner; 0 where there was none."""
+        return self._checkpoints.last_epoch()
+
+    def _holds(self, life: str) -> bool:
+        return self._claim.read_text().split()[1:] == [life]
 
     def newest(self, above: int) -> tuple[int, dict[str, bytes]] | None:
         """The newest whole checkpoint, if it is newer than that."""

@@ -104,6 +104,9 @@ def test_checkpoints_that_do_not_reach_the_head_are_said_and_brought_later(tmp_p
         (tmp_path / "aside").rename(folder.checkpoints)
         training.wait_for(lambda: "learner: checkpoints reach the head again" in launcher_log.read_text())
         training.interrupt()
+    (folder.checkpoints / "epoch").write_text("7")  # of a learner of which nobody remembers anything else
+    with Training(folder.path, *ENDLESS, "--launcher", "ray", "--ray-address", "local") as training:
+        training.wait_for(lambda: (folder.checkpoints / "epoch").read_text() == "8")
 
 
 def test_more_than_the_cluster_holds_is_refused(tmp_path: Path) -> None:

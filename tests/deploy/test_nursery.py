@@ -1,7 +1,9 @@
 """Roles forked from a nursery: as their own processes would be, and gone with it."""
 
+import errno
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -79,3 +81,53 @@ def test_one_that_does_not_start_says_where_to_look(tmp_path: Path, monkeypatch:
         fork(one, tmp_path / "log", "actor")
     one.close()
     assert (tmp_path / "nursery.log").read_text() == "no torch here\n" * 2
+
+
+def test_one_that_hangs_is_given_up_for_another(
+    shared: Nursery, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(nursery, "REPLY_SECONDS", 0.3)
+    words = ("actor", "--run", "x", "--index", "0")
+    role = fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99")
+    process, hung = psutil.Process(role.pid), shared._program
+    assert hung is not None
+    hung.send_signal(signal.SIGSTOP)
+    assert role.wait(5) == -signal.SIGKILL  # it cannot be asked
+    process.wait(5)
+    assert hung.returncode == -signal.SIGKILL
+    monkeypatch.undo()
+    assert fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a").wait(20) == 2
+
+
+def test_a_system_without_room_for_a_process_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_room() -> int:
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr(nursery.os, "fork", no_room)
+    ours, theirs = socket.socketpair()
+    with ours, theirs, (tmp_path / "log").open("ab") as log:
+        assert nursery._forked(theirs, {"words": [], "environment": {}}, log.fileno()) == 0
+    assert (tmp_path / "log").read_text() == "no process can be forked: Resource temporarily unavailable\n"
+    ended = Forked(Nursery(tmp_path / "nursery.log"), 0, 0, nursery.FAILED_STATUS)
+    assert ended.poll() == nursery.FAILED_STATUS
+
+
+FORKS_THAT_DRAW = """
+import os, socket, sys, types
+import numpy as np
+import deploy
+from deploy import nursery
+
+np.random.seed(0)
+deploy.cli = sys.modules["deploy.cli"] = types.ModuleType("deploy.cli")
+deploy.cli.main = lambda: print(np.random.random(), flush=True)
+for _ in range(2):
+    pid = nursery._forked(socket.socket(), {"words": [], "environment": {}}, os.dup(1))
+    os.waitpid(pid, 0)
+"""
+
+
+def test_forks_do_not_draw_the_same_numbers() -> None:
+    said = subprocess.run([sys.executable, "-c", FORKS_THAT_DRAW], capture_output=True, text=True, check=True).stdout
+    first, second = map(float, said.split())
+    assert first != second
