@@ -107,6 +107,7 @@ def test_checkpoints_that_do_not_reach_the_head_are_said_and_brought_later(tmp_p
     (folder.checkpoints / "epoch").write_text("7")  # of a learner of which nobody remembers anything else
     with Training(folder.path, *ENDLESS, "--launcher", "ray", "--ray-address", "local") as training:
         training.wait_for(lambda: (folder.checkpoints / "epoch").read_text() == "8")
+        training.interrupt()
 
 
 def test_more_than_the_cluster_holds_is_refused(tmp_path: Path) -> None:
