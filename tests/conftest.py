@@ -1,4 +1,8 @@
-"""Fixtures that every folder shares: a real Redis, and the check that a test leaves nothing behind."""
+"""What every folder shares: a real Redis, the check that a test leaves nothing behind, and who runs beside whom.
+
+``make test`` has two workers: one for the tests that compute and do not mind how long that takes, at a low priority,
+and one for all others, which watch processes by the clock and so run one at a time.
+"""
 
 import os
 import shutil
@@ -9,11 +13,20 @@ from pathlib import Path
 import psutil
 import pytest
 
+PATIENT = (  # tests that only compute
+    "actors/", "learner/", "studies/", "deploy/test_baselines", "deploy/test_policy", "deploy/test_readme",
+    "deploy/test_video", "integration/test_learning", "integration/test_lockstep", "integration/test_variants",
+)  # fmt: skip
+NICENESS = 10
+SHARED_MEMORY = Path("/dev/shm")
+WORKER = "PYTEST_XDIST_WORKER" in os.environ
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch starts its threads: small products only, few cores
 TEMPORARY = tempfile.mkdtemp(prefix="rmct-")  # so that what other runs on this machine leave is not taken for ours
 os.environ["TMPDIR"] = tempfile.tempdir = TEMPORARY
 
 from deploy.redis_server import RedisServer  # noqa: E402
+
+BEFORE = pytest.StashKey[set[str]]()
 
 
 @pytest.fixture(scope="session")
@@ -25,6 +38,33 @@ def redis_url() -> Iterator[str]:
             yield server.url()
     finally:
         shutil.rmtree(folder)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Two groups, a worker each."""
+    for item in items:
+        place = item.path.relative_to(Path(__file__).parent).as_posix()
+        item.add_marker(pytest.mark.xdist_group("patient" if place.startswith(PATIENT) else "prompt"))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """The patient worker steps back."""
+    (group,) = (mark.args[0] for mark in item.iter_markers("xdist_group"))
+    if WORKER and group == "patient":
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Look at the shared memory that is there already."""
+    session.stash[BEFORE] = _shared_memory()
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fails a session that leaves shared memory; which test it was, nobody can tell where two run at once."""
+    left = _shared_memory() - session.stash[BEFORE]
+    if left and not WORKER:
+        print(f"left behind: {sorted(left)}")
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 def pytest_unconfigure() -> None:
@@ -41,8 +81,11 @@ def run_name(request: pytest.FixtureRequest) -> str:
 def _left_over() -> set[str]:
     children = {f"process {child.pid} {' '.join(child.cmdline()[:6])}" for child in _running_children()}
     temporary = {str(path) for path in Path(tempfile.gettempdir()).glob("rmc-run-*")}
-    shared = {str(path) for path in Path("/dev/shm").glob("*")} if Path("/dev/shm").is_dir() else set()
-    return children | temporary | shared
+    return children | temporary | (set() if WORKER else _shared_memory())
+
+
+def _shared_memory() -> set[str]:
+    return {str(path) for path in SHARED_MEMORY.glob("*")}
 
 
 def _running_children() -> list[psutil.Process]:
