@@ -25,6 +25,7 @@ CHANGES = {
     "optimisers apart": "--batch-size 32 --update-order alternate",
     "reward scale 5": "--batch-size 32 --reward-scale 5",
     "batch 8": "--batch-size 8",
+    "batch 8, temperature's rate 1e-3": "--batch-size 8 --alpha-learning-rate 1e-3",
     "batch 4": "--batch-size 4",
     "batch 4, ratio 24": "--batch-size 4 --replay-ratio 24",
     "batch 4, ratio 24, heads 256 256": "--batch-size 4 --replay-ratio 24 --heads 256 256",
