@@ -21,7 +21,7 @@ demo: $(STAMP)
 	$(BIN)/rmc train HalfCheetah-v5 --total-steps $(DEMO_STEPS)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadgroup --durations=25 --durations-min=5
+	$(BIN)/python -m pytest -n 2 --dist loadscope --durations=25 --durations-min=5
 
 # The scripts of tests/faults at length, two hours in all; each puts its rows into tests/faults/results.json.
 # Linux; disk_full wants root, clock a C compiler.

@@ -9,9 +9,11 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
+from xdist.scheduler import LoadScopeScheduling
 
 PATIENT = (  # tests that only compute
     "actors/", "learner/", "studies/", "deploy/test_baselines", "deploy/test_policy", "deploy/test_readme",
@@ -40,17 +42,26 @@ def redis_url() -> Iterator[str]:
         shutil.rmtree(folder)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Two groups, a worker each."""
-    for item in items:
-        place = item.path.relative_to(Path(__file__).parent).as_posix()
-        item.add_marker(pytest.mark.xdist_group("patient" if place.startswith(PATIENT) else "prompt"))
+class TwoGroups(LoadScopeScheduling):  # type: ignore[misc]
+    """A worker for each."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return "patient" if is_patient(nodeid) else "prompt"
+
+
+def is_patient(nodeid: str) -> bool:
+    """Whether that test only computes."""
+    return nodeid.removeprefix("tests/").startswith(PATIENT)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> TwoGroups:
+    """Of ``--dist loadscope``."""
+    return TwoGroups(config, log)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """The patient worker steps back."""
-    (group,) = (mark.args[0] for mark in item.iter_markers("xdist_group"))
-    if WORKER and group == "patient":
+    if WORKER and is_patient(item.nodeid):
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import mode
 
 from tests.faults.loaded import ACTORS, Loaded
 from tests.faults.row import Row, at_length
@@ -29,11 +30,16 @@ def slow_down(tries: int, folder: Path, minutes: float = MINUTES, settled: float
 def judged(fault: str, run: Loaded, seconds: float, settled: float, most_growth: float = MOST_GROWTH) -> Row:
     """Whether memory stays as it is after ``settled`` seconds, while the actors wait at their credit."""
     growth = memory_growth(watch(run, seconds, settled))
-    waits = {run.newest(f"actor-{actor}", "waiting_for") for actor in range(ACTORS)}
+    waits = {_waits_for(run, actor) for actor in range(ACTORS)}
     passed = max(growth.values()) < most_growth and waits == {"credit"}
     facts: dict[str, float | int | str] = {f"{role}_grew": round(share, 4) for role, share in growth.items()}
     facts |= {"actors_wait_for": " ".join(sorted(waits)), "replay_waits_for": run.newest("replay", "waiting_for")}
     return Row(f"{fault}, {seconds / 60:.0f} minutes", 1, passed, found=facts)
+
+
+def _waits_for(run: Loaded, actor: int) -> str:
+    """What it waited for in most of its last seconds."""
+    return mode(record["waiting_for"] for record in run.records(f"actor-{actor}")[-5:])
 
 
 if __name__ == "__main__":
