@@ -291,7 +291,7 @@ def test_a_node_that_joins_gets_actors(endless: Run) -> None:
 def test_the_learners_node_is_lost(endless: Run) -> None:
     site, lost = endless.site, where(endless, "learner")
     steps, updates = endless.newest("replay", "env_steps"), endless.newest("learner", "updates")
-    checkpoint = int(site.head.run(f"ls {endless.folder}/checkpoints | grep -v best | tail -n 1").stdout)
+    checkpoint = int(site.head.run(f"ls {endless.folder}/checkpoints | grep -E '^[0-9]+$' | tail -n 1").stdout)
     lost.kill("raylet/raylet")
     away = endless.wait_for(lambda: not lost.processes("deploy.cli learner"))
     back = endless.wait_for(
