@@ -69,6 +69,7 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
             handles.setdefault(agent, _draw_agent(panel, runs, by, f"C{agents.index(agent) % 10}"))
         panel.set_title(env)
         panel.set_xlabel(LABELS[by])
+        panel.locator_params(axis="x", nbins=5)  # more would run into each other
         panel.set_ylabel("return")
         panel.grid(alpha=0.3)
     for panel in panels[len(groups) :]:
