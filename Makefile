@@ -23,7 +23,7 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadscope --durations=25 --durations-min=5
 
-# The scripts of tests/faults at length, two hours in all; each puts its rows into tests/faults/results.json.
+# The scripts of tests/faults at length, some two hours in all; each puts its rows into tests/faults/results.json.
 # Linux; disk_full wants root, clock a C compiler.
 FAULTS := fuzz broken_checkpoints kill_actor kill_replay kill_learner kill_redis kill_all nan_loss frozen disk_full clock \
 	slow_learner soak

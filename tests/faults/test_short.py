@@ -6,6 +6,7 @@ A second run has a ring that is full and wraps.
 import os
 import shutil
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -182,13 +183,22 @@ def test_a_bit_of_a_checkpoint_is_flipped(run: Loaded, tmp_path: Path) -> None:
     assert row.passed, row
 
 
+def updates_in(run: Loaded, seconds: float) -> int:
+    """Of the learner, as its metrics tell it."""
+    before = run.newest("learner", "updates")
+    time.sleep(seconds)
+    return int(run.newest("learner", "updates") - before)
+
+
 def test_a_full_ring_wraps(full: Loaded) -> None:
     row = soaked(full, 10.0, 2.0, MOST_GROWTH)
     assert row.passed, row
 
 
 def test_a_learner_becomes_ten_times_slower(full: Loaded) -> None:
+    usual = updates_in(full, 5.0)
     full.slow_down(SLOWER)
+    assert updates_in(full, 5.0) < usual / 2
     row = judged("learner 10 times slower", full, 7.0, 1.0, MOST_GROWTH)
     full.slow_down(1.0)
     assert row.passed, row
