@@ -84,8 +84,7 @@ class ReplayServer:
         self._intake = Intake(spec, bus, actors, shard)
         self._store = open_store(folder, spec, -(-config.capacity // shard.count), config.priority_exponent)
         try:
-            self._go_on_from(bus.progress(self.name))
-            epoch = bus.take_epoch(self.name, self._store.ring.progress.replay_epoch)
+            epoch = self._take_over()
         except BaseException:
             self._store.close()
             raise
@@ -106,6 +105,13 @@ class ReplayServer:
         self._newest: Version | None = None  # of the weights, when last looked at
         self._look_at = 0.0
         self._means, self._rates = Means(), {name: Rate() for name in ("env_steps", "windows", "draws")}
+
+    def _take_over(self) -> int:
+        """Our epoch, taken before we read what was published: the server before us commits nothing after that."""
+        epoch = self.bus.take_epoch(self.name, self._store.ring.progress.replay_epoch)
+        self._go_on_from(self.bus.progress(self.name))
+        newest = self._store.ring.progress.replay_epoch
+        return epoch if epoch > newest else self.bus.take_epoch(self.name, newest)  # published in another Redis
 
     def _go_on_from(self, published: bytes | None) -> None:
         """Where this ring is not the one committed last (its machine is lost), go on from what that one published.

@@ -202,3 +202,8 @@ def test_a_learner_becomes_ten_times_slower(full: Loaded) -> None:
     row = judged("learner 10 times slower", full, 7.0, 1.0, MOST_GROWTH)
     full.slow_down(1.0)
     assert row.passed, row
+
+
+def test_the_replay_server_stands_still_and_is_replaced(full: Loaded) -> None:
+    row = freeze(full, "replay", 1, 1.0)
+    assert row.passed, row

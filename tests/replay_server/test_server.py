@@ -521,6 +521,44 @@ def test_a_newer_server_fences_the_older_before_it_trims(make: Make, kind: str, 
     assert stored(new)["reward"][:, 0].tolist() == [0, 1, 2]
 
 
+def test_what_the_older_server_commits_at_the_last_moment_counts(
+    make: Make, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old, sender = make(folder="old"), Sender(bus)
+    sender.send(3)
+    drain(old)
+    sender.send(2)
+    take_epoch = bus.take_epoch
+
+    def take_after_a_commit(role: str, floor: int = 0) -> int:
+        drain(old)
+        return take_epoch(role, floor)
+
+    monkeypatch.setattr(bus, "take_epoch", take_after_a_commit)
+    new = make(folder="new")
+    drain(new)
+    assert new.stats()["windows"] == old.stats()["windows"] == 5
+    ack = bus.ack(0)
+    assert ack is not None
+    assert ack.id == EntryId(1, 2)
+
+
+def test_what_was_published_in_another_redis_is_older_than_the_next_server(make: Make, bus: MemoryBus) -> None:
+    for _ in range(3):
+        old = make(folder="old")
+        close(old)
+    Sender(bus).send(3)
+    old = make(folder="old")
+    drain(old)
+    published = bus.progress("replay")
+    assert published is not None
+    empty = MemoryBus()
+    empty.set_progress("replay", published)
+    new = make(folder="new", on=empty)
+    assert new.holder.epoch == 5
+    assert new.stats()["windows"] == 3
+
+
 def test_one_server_a_folder(make: Make) -> None:
     make()
     with pytest.raises(ConfigError, match="another replay server holds this folder"):
