@@ -92,6 +92,7 @@ class Learner:
         self._means, self._rate, self._waiting = Means(), Rate(), ""
         self._unexplained: list[float] = []  # of every observation dimension, since the last look at it
         self._look_at = 0.0  # when to ask next whether Redis still has the weights
+        self._published: Version | None = None  # last
         self._save_at, self._checkpoint_error = 0.0, ""
         torch.set_flush_denormal(True)  # into which Adam's moments of idle units decay: 13 % slower on a CPU
         torch.manual_seed(seed)  # the networks' initial weights
@@ -189,15 +190,16 @@ class Learner:
         self._broadcast()
 
     def _publish_if_forgotten(self) -> None:
-        """A Redis that lost its data has no weights for a new actor: it would wait for them, and we for it."""
+        """A Redis that lost data has old weights for a new actor, or none: it would wait for them, and we for it."""
         if time.monotonic() >= self._look_at:
             self._look_at = time.monotonic() + LOOK_SECONDS
-            if self.bus.latest_version() is None:
+            if self.bus.latest_version() != self._published:
                 self.publish()
 
     def _broadcast(self, evaluate: bool = False) -> None:
-        blob = self._sound(self.agent.broadcast_weights())
-        self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate)
+        blob, version = self._sound(self.agent.broadcast_weights()), Version(self.epoch, self.updates)
+        self.bus.publish_weights(version, blob, evaluate)
+        self._published = version
         self._evaluation_due = self._evaluation_due and not evaluate
 
     def _sound(self, weights: dict[str, Tensor]) -> bytes:

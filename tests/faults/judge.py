@@ -22,6 +22,7 @@ class Judgement:
     acknowledged: int
     lost: int
     duplicated: int
+    acted_on_older: int  # windows of older weights than the same environment's before; only one learner's can be told
 
 
 def judge(folder: Path, acks: dict[tuple[int, int], int]) -> Judgement:
@@ -37,8 +38,9 @@ def judge(folder: Path, acks: dict[tuple[int, int], int]) -> Judgement:
         store.close()
     full = progress.valid_from > 0
     lost = sum(_lost(_of(rows, *life), acks.get(life, 0), full) for life in _lives(rows) | set(acks))
+    older = sum(_older(_of(rows, *life)) for life in _lives(rows))
     origins = {tuple(row) for row in rows[["actor", "epoch", "seq", "k"]].tolist()}
-    return Judgement(progress.next_serial, lost, len(rows) - len(origins))
+    return Judgement(progress.next_serial, lost, len(rows) - len(origins), older)
 
 
 def _lives(rows: Rows) -> set[tuple[int, int]]:
@@ -62,6 +64,11 @@ def _lost(own: Rows, acked: int, full: bool) -> int:
     for seq in seqs[1:] if full else seqs:
         missing += int((np.diff(own["k"][own["seq"] == seq], prepend=-1) != 1).sum())
     return missing + sum(_gaps(own[own["env"] == env]) for env in np.unique(own["env"]))
+
+
+def _older(own: Rows) -> int:
+    """Windows of a life whose weights are older than those of the one before."""
+    return sum(int((np.diff(own["weights_update"][own["env"] == env]) < 0).sum()) for env in np.unique(own["env"]))
 
 
 def _gaps(windows: Rows) -> int:

@@ -30,6 +30,7 @@ WRAPPING = ("--capacity", "2000")  # full within a minute
 FILL_SECONDS = 200.0
 HOOKS = Path(__file__).parent / "hooks"
 Acks = dict[tuple[int, int], int]
+NO_WEIGHTS = Version(0, 0)
 
 
 class Loaded(Training):
@@ -151,9 +152,9 @@ class Loaded(Training):
             time.sleep(0.01)
 
     def until_all_go_on(self) -> float:
-        """Wait for acks of every actor, and weights, newer than now; how long that took."""
-        acks, versions = self.acks.copy(), len(self.versions)
-        return self.until(lambda: _all_moved(acks, self.acks.copy()) and len(self.versions) > versions)
+        """Wait for acks of every actor, and weights, newer than all up to now; how long that took."""
+        acks, before = self.acks.copy(), max(self.versions, default=NO_WEIGHTS)
+        return self.until(lambda: _all_moved(acks, self.acks.copy()) and max(self.versions, default=before) > before)
 
     def held(self) -> dict[str, tuple[float, int]]:
         """Of each role, and of an embedded Redis: memory that is no file's, so not the ring's, in MB; open files."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.window import Rows
-from tests.faults.judge import _lost
+from tests.faults.judge import _lost, _older
 from tests.replay_server.support import SPEC, make_rows
 
 
@@ -31,3 +31,14 @@ def test_what_was_acknowledged_and_never_came_is_seen() -> None:
     assert _lost(life(), 4, full=True) == 1
     assert _lost(life()[:0], 4, full=False) == 4
     assert _lost(life()[1:], 3, full=False) > 0
+
+
+def test_windows_of_older_weights_are_seen() -> None:
+    own = life()
+    own["weights_update"] = np.arange(12) // 3
+    assert _older(own) == 0
+    own["weights_update"][7] = 0
+    assert _older(own) == 1
+    own["env"] = np.arange(12) % 2
+    own["weights_update"] = own["env"]  # another environment's are not before
+    assert _older(own) == 0

@@ -113,6 +113,7 @@ def test_redis_is_killed(place: Place, run: Loaded) -> None:
     place.redis.kill()
     place.redis.start()
     run.until_all_go_on()
+    run.versions[:] = [max(run.versions)]  # its log may lack the last second's, which are then published anew
 
 
 @compiler

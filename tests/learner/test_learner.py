@@ -66,6 +66,19 @@ def test_weights_that_redis_forgot_are_out_again(setting):
     assert setting.bus.latest_version() == (1, 0)
 
 
+def test_weights_older_than_the_last_that_redis_has_are_replaced(setting):
+    first = setting.bus._weights[False]
+    setting.feed(60)
+    while setting.learner.step():
+        pass
+    newest = setting.bus.latest_version()
+    assert newest.update >= 8
+    setting.bus._weights[False] = first  # its log lacks the last second
+    setting.learner._look_at = 0.0
+    assert not setting.learner.step()
+    assert setting.bus.latest_version() == (1, setting.learner.updates) >= newest
+
+
 def test_updates_publish_and_give_priorities_back(setting):
     setting.feed(60)
     before = setting.server.stats()["max_priority"]
