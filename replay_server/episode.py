@@ -15,15 +15,15 @@ def find_episode(ring: Ring, serial: int, most: int) -> Slots | None:
     environment lie in the ring in the order of time, those of others between them.
     """
     progress, rows = ring.progress, ring.rows
-    if not progress.valid_from <= serial < progress.next_serial:
+    if not ring.holds(np.array([serial])).all():
         return None
     found = [serial % ring.capacity]
     origin = {name: rows[name][found[0]] for name in ("actor", "epoch", "env")}
     oldest = max(progress.valid_from, serial - FARTHEST)
     while rows["episode_step"][found[-1]] > 0 and serial > oldest:
-        slots = np.arange(serial - 1, max(oldest, serial - CHUNK) - 1, -1) % ring.capacity
-        serial -= len(slots)
-        same = np.logical_and.reduce([rows[name][slots] == value for name, value in origin.items()])
+        serials = np.arange(serial - 1, max(oldest, serial - CHUNK) - 1, -1)
+        slots, serial = serials % ring.capacity, serial - len(serials)
+        same = np.logical_and.reduce([ring.holds(serials), *(rows[name][slots] == origin[name] for name in origin)])
         for slot in slots[same].tolist():
             if rows["episode_step"][found[-1]] == 0:
                 break

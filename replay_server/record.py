@@ -59,6 +59,11 @@ class Progress:
         """How many windows may be sampled."""
         return self.next_serial - self.valid_from
 
+    def is_after(self, other: "Progress") -> bool:
+        """Whether something was taken in or drawn here that the other, of the same ring, does not know of."""
+        news = (actor not in other.streams or at.id > other.streams[actor].id for actor, at in self.streams.items())
+        return self.draws > other.draws or any(news)
+
     def encode(self) -> bytes:
         """Raises ConfigError for more than 4096 streams."""
         if len(self.streams) > MAX_STREAMS:

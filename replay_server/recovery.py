@@ -19,7 +19,6 @@ from replay_server.ring import Ring, reserve
 from replay_server.sum_tree import SumTree, Values
 
 log = logging.getLogger(__name__)
-_CHECK_ROWS = 8192  # serials compared at a time
 
 
 @dataclass
@@ -61,10 +60,11 @@ def open_store(folder: Path, spec: WindowSpec, capacity: int, exponent: float) -
     lock = _lock(folder)
     try:
         ring = Ring(folder / "ring", spec, capacity)
-        _drop_torn_rows(ring)
         priorities = _map_priorities(folder / "priorities", ring)
         store = ReplayStore(ring, priorities, SumTree(capacity), lock, exponent)
-        store.tree.rebuild(valid_leaves(store))
+        leaves = valid_leaves(store)
+        store.tree.rebuild(leaves)
+        _warn_of_torn_rows(ring.progress.windows - int(np.count_nonzero(leaves)))
     except BaseException:
         os.close(lock)
         raise
@@ -73,9 +73,10 @@ def open_store(folder: Path, spec: WindowSpec, capacity: int, exponent: float) -
 
 def valid_leaves(store: ReplayStore) -> Values:
     """(capacity,) what the tree's leaves must be: 0 wherever no window may be sampled."""
-    progress = store.ring.progress
-    leaves = np.zeros(store.ring.capacity)
-    slots = np.arange(progress.valid_from, progress.next_serial) % store.ring.capacity
+    ring = store.ring
+    leaves = np.zeros(ring.capacity)
+    serials = np.arange(ring.progress.valid_from, ring.progress.next_serial)
+    slots = serials[ring.holds(serials)] % ring.capacity
     leaves[slots] = store.leaf_values(store.priorities[slots])
     return leaves
 
@@ -90,18 +91,10 @@ def _lock(folder: Path) -> int:
     return lock
 
 
-def _drop_torn_rows(ring: Ring) -> None:
-    """A committed row without its serial was lost to a power cut: drop it and all before it."""
-    progress = ring.progress
-    torn = -1
-    for start in range(progress.valid_from, progress.next_serial, _CHECK_ROWS):
-        serials = np.arange(start, min(start + _CHECK_ROWS, progress.next_serial))
-        wrong = serials[ring.rows["serial"][serials % ring.capacity] != serials]
-        torn = int(wrong[-1]) if len(wrong) else torn
-    if torn >= 0:
-        log.warning("replay ring: a crash of the machine tore it; %d windows dropped", torn + 1 - progress.valid_from)
-        progress.valid_from = torn + 1
-        ring.commit()
+def _warn_of_torn_rows(torn: int) -> None:
+    """A committed row without its serial was lost to a power cut."""
+    if torn:
+        log.warning("replay ring: a crash of the machine tore it; %d windows are never drawn", torn)
 
 
 def _map_priorities(path: Path, ring: Ring) -> NDArray[np.float32]:
@@ -112,6 +105,6 @@ def _map_priorities(path: Path, ring: Ring) -> NDArray[np.float32]:
         reserve(path, size, ring.capacity)
         priorities = np.memmap(path, np.float32, "r+", shape=(ring.capacity,))
         priorities[:] = ring.progress.max_priority
-    unusable = ~(np.isfinite(priorities) & (priorities >= 0))
+    unusable = ~(np.isfinite(priorities) & (priorities > 0))  # zeros where a power cut kept them from the disk
     priorities[unusable] = ring.progress.max_priority
     return priorities

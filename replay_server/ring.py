@@ -4,7 +4,7 @@ Every window has a serial; its slot is serial mod capacity. An append (a) commit
 rows about to be overwritten, (b) writes the rows, (c) commits ``next_serial`` with all other progress.
 Killed anywhere (kill -9 included), the file says exactly which windows are whole: what the process stored
 in the map outlives it in the page cache. A power cut may lose or tear what the kernel had not yet
-written to disk; that is not promised against (``recovery.py`` drops what it can tell is torn).
+written to disk; that is not promised against. A slot without its serial then holds no window (``holds``).
 """
 
 import errno
@@ -25,6 +25,7 @@ _IDENTITY = struct.Struct("<8s16sQQ")  # magic, fingerprint, capacity, row bytes
 _IDENTITY_BYTES = 4096
 _MAGIC = b"RMCRING3"
 Slots = NDArray[np.int64]
+Serials = NDArray[np.int64]
 
 
 class Ring:
@@ -40,11 +41,11 @@ class Ring:
             _create(path, spec, capacity)
         _check_identity(path, spec, capacity)
         start = _rows_start(spec)
-        self._map = np.memmap(path, np.uint8, "r+", shape=(start + capacity * spec.dtype.itemsize,))
-        plain = self._map.view(np.ndarray)
-        self._blocks = plain[start:].view(np.dtype((np.void, spec.dtype.itemsize)))  # whole rows, copied as such
+        self._head = np.memmap(path, np.uint8, "r+", shape=(start,))
+        self._map = np.memmap(path, np.dtype((np.void, spec.dtype.itemsize)), "r+", offset=start, shape=(capacity,))
+        self._blocks = self._map.view(np.ndarray)  # whole rows, copied as such
         self.rows: Rows = self._blocks.view(spec.dtype)
-        self._records = RecordPair(plain[_IDENTITY_BYTES:start], spec.obs_dim)
+        self._records = RecordPair(self._head.view(np.ndarray)[_IDENTITY_BYTES:], spec.obs_dim)
         self._written = 0
         progress = self._records.read()
         if progress is None:
@@ -78,13 +79,24 @@ class Ring:
         self.progress.valid_from = max(self.progress.valid_from, self.progress.next_serial - self.capacity)
         self._records.write(self.progress)
 
+    def holds(self, serials: Serials) -> NDArray[np.bool_]:
+        """Which of (n,) windows are in the ring, whole as far as their serial tells."""
+        known = (serials >= self.progress.valid_from) & (serials < self.progress.next_serial)
+        found: NDArray[np.bool_] = known & (self.rows["serial"][serials % self.capacity] == serials)
+        return found
+
     def gather(self, slots: Slots, out: Rows) -> None:
         """Copy whole rows (B,) into ``out``."""
         np.take(self._blocks, slots, out=out.view(self._blocks.dtype), mode="clip")  # clip: unbuffered
 
+    def flush_commit(self) -> None:
+        """Hand the last commit to the disk, though perhaps not its rows."""
+        self._head.flush()
+
     def flush(self) -> None:
         """Hand everything to the disk."""
         self._map.flush()
+        self._head.flush()
 
 
 def _rows_start(spec: WindowSpec) -> int:

@@ -21,7 +21,7 @@ from replay_server.episode import find_episode
 from replay_server.intake import Intake, Round
 from replay_server.observation_sums import observation_sums
 from replay_server.rate_limiter import RateLimiter
-from replay_server.record import decode_published
+from replay_server.record import Progress, decode_published
 from replay_server.recovery import open_store, valid_leaves
 
 log = logging.getLogger(__name__)
@@ -91,6 +91,7 @@ class ReplayServer:
         self.holder = Holder(self.name, epoch)
         self._store.ring.progress.replay_epoch = epoch
         self._store.ring.commit()
+        self._store.ring.flush_commit()  # by its epoch this ring is known again after a power cut, too
         self._limiter = RateLimiter(
             config.replay_ratio / self._share,  # a shard's steps are a share, what is drawn from all is the whole
             shard.part(config.warmup_steps, actors),
@@ -107,31 +108,47 @@ class ReplayServer:
         self._means, self._rates = Means(), {name: Rate() for name in ("env_steps", "windows", "draws")}
 
     def _take_over(self) -> int:
-        """Our epoch, taken before we read what was published: the server before us commits nothing after that."""
-        epoch = self.bus.take_epoch(self.name, self._store.ring.progress.replay_epoch)
-        self._go_on_from(self.bus.progress(self.name))
-        newest = self._store.ring.progress.replay_epoch
-        return epoch if epoch > newest else self.bus.take_epoch(self.name, newest)  # published in another Redis
+        """Our epoch. What was published is read once we have it: the server before us commits nothing after that."""
+        ring = self._store.ring
+        epoch = self.bus.take_epoch(self.name, ring.progress.replay_epoch)
+        while (newest := self._read_published()) is not None and newest.replay_epoch >= epoch:  # in another Redis
+            epoch = self.bus.take_epoch(self.name, newest.replay_epoch)
+        if newest is not None:
+            self._go_on_from(newest)
+        if self._store.tree.total == 0.0:
+            self._begin_empty()
+        return epoch
 
-    def _go_on_from(self, published: bytes | None) -> None:
-        """Where this ring is not the one committed last (its machine is lost), go on from what that one published.
+    def _read_published(self) -> Progress | None:
+        published = self.bus.progress(self.name)
+        return decode_published(published, self.spec.obs_dim) if published else None
 
-        What it holds, if anything, is older and goes: no serial may name two windows. The counters go on, and
-        warm-up is collected once more before the next draw.
+    def _go_on_from(self, newest: Progress) -> None:
+        """Of counters that were published and those of this ring, take the later.
+
+        Published by a server that never wrote here: that one's ring is lost, and what this one holds is older and
+        goes, for no serial may name two windows. By one that did: a power cut has lost the end of this ring.
         """
         ring = self._store.ring
-        newest = decode_published(published, self.spec.obs_dim) if published else None
-        if newest is None or newest.env_steps <= ring.progress.env_steps:
+        another = newest.replay_epoch > ring.progress.replay_epoch
+        if not another and not newest.is_after(ring.progress):
             return
-        log.warning(
-            "%s: the ring that held %d windows is lost; begins empty at environment step %d",
-            self.name, newest.windows, newest.env_steps,
-        )  # fmt: skip
-        newest.valid_from = newest.next_serial
-        newest.begun_env_steps = newest.env_steps
-        newest.begun_drawn_steps = newest.drawn_steps + newest.elsewhere_steps
+        if another:
+            newest.valid_from = newest.next_serial
         ring.progress = newest
         self._store.tree.rebuild(valid_leaves(self._store))
+
+    def _begin_empty(self) -> None:
+        """The counters go on, and warm-up is collected once more before the next draw."""
+        progress = self._store.ring.progress
+        progress.valid_from = progress.next_serial
+        progress.begun_env_steps = progress.env_steps
+        progress.begun_drawn_steps = progress.drawn_steps + progress.elsewhere_steps
+        if progress.next_serial:
+            log.warning(
+                "%s: the ring of %d windows is lost; begins empty at environment step %d",
+                self.name, progress.next_serial, progress.env_steps,
+            )  # fmt: skip
 
     # -- in ---------------------------------------------------------------------------------------------
 
@@ -227,7 +244,7 @@ class ReplayServer:
         progress, tree = self._store.ring.progress, self._store.tree
         progress.elsewhere_steps = max(progress.elsewhere_steps, elsewhere)
         draw = self._limiter.draw(self._inserted, self._drawn, batch_size * self.spec.train)
-        if draw is Draw.BATCH and progress.windows == 0:
+        if draw is Draw.BATCH and tree.total == 0.0:
             draw = Draw.WAIT
         self._note_waiting(draw)
         if draw is not Draw.BATCH:
@@ -258,7 +275,7 @@ class ReplayServer:
     def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
         """New priorities of (B,) windows; those evicted since, and those not finite, are dropped and counted."""
         progress = self._store.ring.progress
-        present = (serials >= progress.valid_from) & (serials < progress.next_serial)
+        present = self._store.ring.holds(serials)
         usable = np.isfinite(priorities) & (priorities >= 0)
         progress.evicted_priorities += int((~present).sum())
         self._refused_priorities += int((present & ~usable).sum())

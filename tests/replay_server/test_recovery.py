@@ -140,18 +140,23 @@ def finish(bus: RedisBus, url: str, run: str, folder: Path, senders: list[Sender
     assert not (folder / "r.sock").exists()
 
 
-def test_rows_torn_by_a_power_cut_are_dropped(tmp_path: Path) -> None:
+def test_rows_torn_by_a_power_cut_hold_no_window(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with opened(tmp_path, 10) as store:
         store.set_priorities(store.ring.write(make_rows(14)), np.full(10, 2.0, np.float32))
         store.ring.commit()
         store.ring.rows["serial"][[5, 7]] = 0
     with opened(tmp_path, 10) as store:
-        assert (store.ring.progress.valid_from, store.ring.progress.next_serial) == (8, 14)
-        assert np.flatnonzero(valid_leaves(store)).tolist() == [0, 1, 2, 3, 8, 9]
-        assert store.tree.total == pytest.approx(6 * 2.0**0.6)
+        assert (store.ring.progress.valid_from, store.ring.progress.next_serial) == (4, 14)
+        assert np.flatnonzero(valid_leaves(store)).tolist() == [0, 1, 2, 3, 4, 6, 8, 9]
+        assert store.ring.holds(np.array([3, 4, 5, 7, 13, 14])).tolist() == [False, True, False, False, True, False]
+        assert store.tree.total == pytest.approx(8 * 2.0**0.6)
+    assert "2 windows are never drawn" in caplog.text
 
 
-@pytest.mark.parametrize("damage", ["gone", "short", "garbage"])
+NAN = b"\xff" * 4
+
+
+@pytest.mark.parametrize("damage", ["gone", "short", "garbage", "zeros"])
 def test_damaged_priorities_only_cost_their_values(tmp_path: Path, damage: str) -> None:
     with opened(tmp_path, 10) as store:
         store.set_priorities(store.ring.write(make_rows(6)), np.full(6, 0.25, np.float32))
@@ -161,7 +166,7 @@ def test_damaged_priorities_only_cost_their_values(tmp_path: Path, damage: str) 
     if damage == "gone":
         path.unlink()
     else:
-        path.write_bytes(b"\xff" * (40 if damage == "garbage" else 9))  # as float32: not a number
+        path.write_bytes({"short": NAN * 2, "garbage": NAN * 10, "zeros": bytes(40)}[damage])
     with opened(tmp_path, 10) as store:
         assert store.priorities.tolist() == [3.0] * 10
         assert store.tree.total == pytest.approx(6 * 3.0**0.6)

@@ -1,5 +1,6 @@
 """The replay server without its socket: intake, credit, draws, statistics, restarts, fencing."""
 
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from common.redis_bus import RedisBus
 from common.replay import Draw
 from common.wire import encode_windows
 from replay_server.observation_sums import observation_sums
+from replay_server.recovery import valid_leaves
 from replay_server.server import ReplayConfig, ReplayServer
 from tests.learner.rows import observation_valid
 from tests.replay_server.support import SPEC, Sender, make_rows
@@ -557,6 +559,96 @@ def test_what_was_published_in_another_redis_is_older_than_the_next_server(make:
     new = make(folder="new", on=empty)
     assert new.holder.epoch == 5
     assert new.stats()["windows"] == 3
+
+
+def test_what_another_redis_held_is_read_once_the_older_server_is_fenced(
+    make: Make, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for _ in range(3):
+        close(make(folder="old"))
+    old, sender = make(folder="old"), Sender(bus)
+    sender.send(3)
+    drain(old)
+    published = bus.progress("replay")
+    assert published is not None
+    sender.send(2)
+    bus._epochs.pop("replay")  # Redis is empty but for what the launcher has brought back
+    looks = []
+
+    def progress(role: str) -> bytes | None:
+        looks.append(role)
+        found = bus._progress[role] if len(looks) > 1 else published
+        drain(old) if len(looks) == 1 else None  # which knows of no newer server yet
+        return found
+
+    monkeypatch.setattr(bus, "progress", progress)
+    new = make(folder="new")
+    drain(new)
+    assert new.holder.epoch == 5
+    assert new.stats()["windows"] == 5
+    with pytest.raises(FencedError):
+        old.bus.commit(old.holder, old._acks())
+
+
+def test_a_power_cut_loses_the_end_of_a_ring_alone(make: Make, bus: MemoryBus, tmp_path: Path) -> None:
+    server, sender = make(actors=1), Sender(bus)
+    sender.send(50)
+    drain(server)
+    server.sample(4)
+    shutil.copytree(tmp_path / "replay", tmp_path / "on disk")
+    sender.send(3)
+    drain(server)
+    before = server.stats()
+    server = make(folder="on disk", actors=1)
+    after = server.stats()
+    for name in ("env_steps", "windows", "draws", "drawn_steps"):
+        assert after[name] == before[name], name
+    assert np.count_nonzero(valid_leaves(server._store)) == 50
+    sample = server.sample(64)
+    assert sample.rows is not None
+    assert sample.rows["serial"].max() < 50
+    server.update_priorities(np.array([51]), np.array([9.0], np.float32))  # as drawn before the cut
+    assert server.stats()["evicted_priorities"] == 1
+    sender.send(2)
+    drain(server)
+    assert server._store.ring.holds(np.arange(48, 56)).tolist() == [True] * 2 + [False] * 3 + [True] * 2 + [False]
+
+
+def test_a_ring_of_which_nothing_is_left_begins_empty(make: Make, bus: MemoryBus) -> None:
+    config = ReplayConfig(capacity=100, replay_ratio=2.0, warmup_steps=20)
+    server, sender = make(config, actors=1), Sender(bus)
+    sender.send(12)
+    drain(server)
+    server._store.ring.rows["serial"] = -1
+    close(server)
+    server = make(config, actors=1)
+    drain(server)
+    assert (server.stats()["windows"], server.stats()["ring_fill"]) == (12, 0)
+    assert sender.granted() == 48 + 20 + 16  # or everyone would wait for the other
+    assert server.sample(2).draw is Draw.WAIT
+
+
+def test_a_ring_that_is_ahead_of_another_that_came_after_it_goes(make: Make, bus: MemoryBus) -> None:
+    old, one, other = make(folder="old"), Sender(bus), Sender(bus, 1)
+    for sender in (one, other):
+        sender.send(2)
+    drain(old)
+    one.send(9)
+    taken = old._intake.read(old._store.ring.progress.streams)
+    assert taken is not None
+    old._insert(taken)  # and stands still before it publishes that
+    new = make(folder="new")
+    bus._streams[0].clear()
+    other.send(1)
+    drain(new)
+    close(old)
+    close(new)
+    again = make(folder="old")
+    drain(again)
+    ack = bus.ack(1)
+    assert ack is not None
+    assert ack.id == EntryId(1, 2)
+    assert again.stats()["windows"] == 5
 
 
 def test_one_server_a_folder(make: Make) -> None:
