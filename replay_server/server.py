@@ -328,8 +328,8 @@ class ReplayServer:
         return {**stats, **rates, **self._means.take()}
 
     def waiting_for(self) -> str:
-        """``windows`` from the actors, or ``draws`` by the learner once the actors' credit is spent."""
-        return "draws" if self.stats()["credit_steps"] == 0 else "windows"
+        """``windows`` from the actors where nothing may be drawn before more come, else ``draws`` by the learner."""
+        return "windows" if self._limiter.draw(self._inserted, self._drawn, 0) is Draw.WAIT else "draws"
 
     def checkpoint(self) -> None:
         """Make everything durable: a server opened here afterwards goes on as this one would."""

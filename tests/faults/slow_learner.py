@@ -31,9 +31,10 @@ def judged(fault: str, run: Loaded, seconds: float, settled: float, most_growth:
     """Whether memory stays as it is after ``settled`` seconds, while the actors wait at their credit."""
     growth = memory_growth(watch(run, seconds, settled))
     waits = {_waits_for(run, actor) for actor in range(ACTORS)}
-    passed = max(growth.values()) < most_growth and waits == {"credit"}
+    replay = run.newest("replay", "waiting_for")
+    passed = max(growth.values()) < most_growth and waits == {"credit"} and replay == "draws"
     facts: dict[str, float | int | str] = {f"{role}_grew": round(share, 4) for role, share in growth.items()}
-    facts |= {"actors_wait_for": " ".join(sorted(waits)), "replay_waits_for": run.newest("replay", "waiting_for")}
+    facts |= {"actors_wait_for": " ".join(sorted(waits)), "replay_waits_for": replay}
     return Row(f"{fault}, {seconds / 60:.0f} minutes", 1, passed, found=facts)
 
 

@@ -237,7 +237,7 @@ def test_the_limiter_holds_draws_and_credit(make: Make, bus: MemoryBus) -> None:
     drain(server)
     assert [sender.granted() for sender in senders] == [28, 28]  # (40 + 16) / 2 each
     assert server.sample(4).draw is Draw.WAIT
-    assert server.stats()["learner_waiting_for"] == "warm-up"
+    assert (server.stats()["learner_waiting_for"], server.waiting_for()) == ("warm-up", "windows")
     senders[0].send(5)
     drain(server)
     assert [sender.granted() for sender in senders] == [20 + 18, 18]
@@ -249,7 +249,7 @@ def test_the_limiter_holds_draws_and_credit(make: Make, bus: MemoryBus) -> None:
     while server.sample(4).draw is Draw.BATCH:
         draws += 1
     assert draws == (16 * 2 + 16 * 2 + 16) // 16  # the steps past the warm-up, the slack's worth, one batch
-    assert server.stats()["learner_waiting_for"] == "env_steps"
+    assert (server.stats()["learner_waiting_for"], server.waiting_for()) == ("env_steps", "windows")
     server.step()  # nothing came in, but the learner waits, so the credit of its draws is published
     headroom = 40 + draws * 16 // 2 + 16 - 56
     assert [sender.granted() for sender in senders] == [20 + headroom // 2, 36 + headroom // 2]
