@@ -3,7 +3,9 @@
 Learner and replay server lock their folders, so that the other one has a copy or an empty one, as on another machine.
 """
 
+import dataclasses
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,25 +17,29 @@ from pathlib import Path
 import psutil
 
 from deploy.roles import URL_VARIABLE
-from tests.faults.loaded import Loaded, went_back
+from tests.faults.loaded import ROOMY, Loaded, went_back
 from tests.faults.row import Row, at_length
 from tests.integration.running import alive
 
 ENDS_S = 10.0
+PATIENT = ("--env-timeout", "1000")  # an actor that stood still does not take its environment for hung
 
 
 def freeze_all(tries: int, folder: Path, seconds: float = 90.0) -> Iterator[Row]:
     """One role after the other."""
     for role in ("actor-0", "learner", "replay"):
-        with Loaded(folder / role) as run:
+        with Loaded(folder / role, *ROOMY, *PATIENT) as run:
             run.begin()
-            yield freeze(run, role, tries, seconds)
-            run.end()
+            row = freeze(run, role, tries, seconds)
+            found = run.end()
+        passed = row.passed and not (found.lost or found.duplicated)
+        counts = {"acknowledged": found.acknowledged, "lost": found.lost, "duplicated": found.duplicated}
+        yield dataclasses.replace(row, passed=passed, **counts)
 
 
 def freeze(run: Loaded, role: str, tries: int, seconds: float) -> Row:
     """So often, each time for so long."""
-    slowest, accepted = 0.0, 0
+    slowest, accepted, said = 0.0, 0, _says_replaced(run, role)
     for _ in range(tries):
         old, epoch = run.process_of(role), run.bus.current_epoch(role)
         old.suspend()
@@ -47,7 +53,9 @@ def freeze(run: Loaded, role: str, tries: int, seconds: float) -> Row:
             accepted += run.acks.get((0, epoch), 0) - before if role == "actor-0" else 0
             run.until(lambda epoch=epoch: run.bus.current_epoch(role) > epoch + 1)  # the supervisor's next
         run.until_all_go_on()
+    silent = tries - (_says_replaced(run, role) - said)
     facts = {
+        "ended_for_another_cause": silent,
         "entries_accepted": accepted,
         "acks_went_back": run.acks_went_back,
         "weights_went_back": went_back(run.versions),
@@ -56,6 +64,12 @@ def freeze(run: Loaded, role: str, tries: int, seconds: float) -> Row:
         f"SIGSTOP for {seconds:.0f} s, another in its place: {role}", tries,
         not any(facts.values()) and slowest < ENDS_S, recovery_s_max=round(slowest, 2), found=facts,
     )  # fmt: skip
+
+
+def _says_replaced(run: Loaded, role: str) -> int:
+    """How many of its lives have ended because of a newer one."""
+    text = (run.folder / "logs" / f"{role}.log").read_text()
+    return len(re.findall(r"FencedError: .*replaced", text))
 
 
 def _runs(process: psutil.Process) -> bool:

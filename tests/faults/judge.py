@@ -39,8 +39,7 @@ def judge(folder: Path, acks: dict[tuple[int, int], int]) -> Judgement:
     full = progress.valid_from > 0
     lost = sum(_lost(_of(rows, *life), acks.get(life, 0), full) for life in _lives(rows) | set(acks))
     older = sum(_older(_of(rows, *life)) for life in _lives(rows))
-    origins = {tuple(row) for row in rows[["actor", "epoch", "seq", "k"]].tolist()}
-    return Judgement(progress.next_serial, lost, len(rows) - len(origins), older)
+    return Judgement(progress.next_serial, lost, _doubled(rows), older)
 
 
 def _lives(rows: Rows) -> set[tuple[int, int]]:
@@ -64,6 +63,10 @@ def _lost(own: Rows, acked: int, full: bool) -> int:
     for seq in seqs[1:] if full else seqs:
         missing += int((np.diff(own["k"][own["seq"] == seq], prepend=-1) != 1).sum())
     return missing + sum(_gaps(own[own["env"] == env]) for env in np.unique(own["env"]))
+
+
+def _doubled(rows: Rows) -> int:
+    return len(rows) - len({tuple(row) for row in rows[["actor", "epoch", "seq", "k"]].tolist()})
 
 
 def _older(own: Rows) -> int:

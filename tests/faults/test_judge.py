@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.window import Rows
-from tests.faults.judge import _lost, _older
+from tests.faults.judge import _doubled, _lost, _older
 from tests.replay_server.support import SPEC, make_rows
 
 
@@ -42,3 +42,8 @@ def test_windows_of_older_weights_are_seen() -> None:
     own["env"] = np.arange(12) % 2
     own["weights_update"] = own["env"]  # another environment's are not before
     assert _older(own) == 0
+
+
+def test_a_window_that_is_there_twice_is_seen() -> None:
+    assert _doubled(life()) == 0
+    assert _doubled(np.concatenate([life(), life()[3:5]])) == 2

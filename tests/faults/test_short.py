@@ -88,11 +88,6 @@ def test_an_actor_is_killed(run: Loaded) -> None:
     run.until_all_go_on()
 
 
-def test_the_replay_server_is_killed_at_every_commit_point(run: Loaded) -> None:
-    strike_everywhere(run)
-    assert tree_is_its_rebuild(run)
-
-
 def test_the_learner_is_killed_also_amid_saving(run: Loaded) -> None:
     run.until(CheckpointFolder(run.folder / "checkpoints").numbers)
     run.kill("learner")
@@ -196,6 +191,11 @@ def test_a_full_ring_wraps(full: Loaded) -> None:
     assert row.passed, row
 
 
+def test_the_replay_server_is_killed_at_every_commit_point(full: Loaded) -> None:
+    strike_everywhere(full)
+    assert tree_is_its_rebuild(full)
+
+
 def test_a_learner_becomes_ten_times_slower(full: Loaded) -> None:
     usual = updates_in(full, 5.0)
     full.slow_down(SLOWER)
@@ -208,3 +208,10 @@ def test_a_learner_becomes_ten_times_slower(full: Loaded) -> None:
 def test_the_replay_server_stands_still_and_is_replaced(full: Loaded) -> None:
     row = freeze(full, "replay", 1, 1.0)
     assert row.passed, row
+
+
+def test_of_a_full_ring_nothing_was_lost_but_by_age(full: Loaded) -> None:
+    full.until(lambda: full.newest("replay", "ring_fill") == 1.0)
+    found = full.end()
+    assert (found.lost, found.duplicated, full.acks_went_back) == (0, 0, 0)
+    assert found.acknowledged > 600  # it went round

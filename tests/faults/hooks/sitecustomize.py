@@ -65,23 +65,36 @@ def replay_server() -> None:
     from replay_server.server import ReplayServer
     from replay_server.sum_tree import SumTree
 
-    write, record, step, read = Ring.write, RecordPair.write, ReplayServer.step, Intake.read
+    write, commit, record = Ring.write, Ring.commit, RecordPair.write
+    step, read = ReplayServer.step, Intake.read
+    taking_in = [""]  # ``written`` amid an append's step (a), ``committed`` amid its step (c): draws commit, too
 
     def half_the_rows(self: Any, rows: Any) -> Any:
+        taking_in[0] = "written"
         serials = range(self.progress.next_serial, self.progress.next_serial + len(rows))
         kept = [serial % self.capacity for serial in serials][-self.capacity :][len(rows) // 2 :]
         before = self._blocks[kept].copy()
         slots = write(self, rows)
+        taking_in[0] = ""
         if len(rows) > 1 and strikes("half-the-rows"):
             self._blocks[kept] = before
             die()
         return slots
 
+    def committed(self: Any) -> None:
+        taking_in[0] = "committed" if self._written else ""
+        commit(self)
+        if taking_in[0] and strikes("committed"):
+            die()
+        taking_in[0] = ""
+
     def half_a_record(self: Any, progress: Any) -> None:
         copy = self._copies[(self._sequence + 1) % 2]
         before = bytes(copy)
         record(self, progress)
-        if strikes("half-a-record"):
+        if taking_in[0] == "written" and strikes("record"):
+            die()
+        if taking_in[0] == "committed" and strikes("half-a-record"):
             half = (_HEADER.size + len(progress.encode())) // 2
             copy[half:] = before[half:]
             die()
@@ -99,13 +112,11 @@ def replay_server() -> None:
             say("tree", same=bool((rebuilt._nodes == self._store.tree._nodes).all()))
         return bool(step(self))
 
-    Ring.write, RecordPair.write, ReplayServer.step = half_the_rows, half_a_record, compared  # type: ignore[method-assign]
-    Intake.read = all_there  # type: ignore[method-assign]
+    Ring.write, Ring.commit, RecordPair.write = half_the_rows, committed, half_a_record  # type: ignore[method-assign]
+    ReplayServer.step, Intake.read = compared, all_there  # type: ignore[method-assign]
     after(Intake, "read", "read")
-    after(RecordPair, "write", "record")
     after(Ring, "write", "rows")
     after(ReplayStore, "set_priorities", "priorities")
-    after(Ring, "commit", "committed")
     after(RedisBus, "commit", "acknowledged")
     after(ReplayServer, "sample", "drawn")
 
@@ -131,7 +142,8 @@ def learner() -> None:
         found = self.checkpoints.latest()
         if found is not None:
             said = torch.load(self.checkpoints.path(found[0]) / STATE, weights_only=True)
-            say("resumed", number=found[0], same=_same(said, self.update.state_dict()))
+            newest = found[0] == max(self.checkpoints.numbers())  # which no kill has cut short
+            say("resumed", number=found[0], same=newest and _same(said, self.update.state_dict()))
         return epoch
 
     def slower(self: Any, raw: Any, importance: Any, beta: float) -> Any:
