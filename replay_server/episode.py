@@ -15,7 +15,7 @@ def find_episode(ring: Ring, serial: int, most: int) -> Slots | None:
     environment lie in the ring in the order of time, those of others between them.
     """
     progress, rows = ring.progress, ring.rows
-    if not ring.holds(np.array([serial])).all():
+    if not (progress.valid_from <= serial < progress.next_serial and ring.holds(np.array([serial])).all()):
         return None
     found = [serial % ring.capacity]
     origin = {name: rows[name][found[0]] for name in ("actor", "epoch", "env")}

@@ -1,15 +1,18 @@
 """Messages that were changed at random: ``python -m tests.faults.fuzz [--tries 1000000]``.
 
 Of each kind a lawful one is mutated, read by what reads it in a run, and either taken or refused by name: nothing else
-may come of it, in no more than 10 ms, nor may memory grow. Mutations that keep a checksum right get past it.
+may come of it, in no more than 10 ms, nor may memory grow. Mutations that keep a checksum right get past it. Proofs and
+requests, with right checksums too, go to a replay server's socket.
 """
 
+import logging
 import random
 import resource
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 
+import msgpack
 import numpy as np
 import torch
 from safetensors.torch import save
@@ -24,11 +27,16 @@ from common.record import decode_record, encode_record
 from common.wire import HEADER, Kind, check_rows, decode_header, decode_meta, decode_rows, encode_frame, encode_windows
 from deploy.presets import from_json, robust, to_json
 from replay_server.record import Progress, decode_published
+from tests.faults.asked import LAWFUL_PROOF, Asked
 from tests.faults.row import Row, at_length
 from tests.replay_server.support import SPEC, make_rows
 
 SLOWEST_S, MOST_MB = 0.010, 64
 TAKEN = "taken"
+ODD_VALUES = (
+    None, True, -1, 0, 1, 7, 39, 2**31, 2**62, 2**63 - 1, 2**64 - 1, -(2**63), float("nan"), float("inf"), 1e308,
+    "", "x", b"", bytes(32), [], [1] * 9, {},
+)  # fmt: skip
 AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), normalize_observations=True)
 Reader = Callable[[bytes], object]
 
@@ -59,6 +67,17 @@ def mutate(raw: bytes, rng: random.Random) -> bytes:
     return bytes(changed)
 
 
+def odd(raw: bytes, rng: random.Random) -> bytes:
+    """A request, or a proof, with one or two values of another kind or size, or of another kind itself."""
+    kind, packed = (raw[:1], raw[1:]) if raw != LAWFUL_PROOF else (b"", raw)
+    meta = msgpack.unpackb(packed)
+    for _ in range(rng.randint(1, 2)):
+        meta[rng.choice([*meta, "batch_size", "count"])] = rng.choice(ODD_VALUES)
+    if kind and rng.random() < 0.1:
+        kind = rng.randbytes(1)
+    return kind + msgpack.packb(meta)
+
+
 def window(payload: bytes) -> None:
     """As the replay server's intake reads an entry."""
     check_rows(decode_rows(payload, SPEC), SPEC)
@@ -83,6 +102,21 @@ def weights(blob: bytes) -> None:
     RUNNER.load(join_pieces([blob], crc32(blob)))
 
 
+def proof(meta: bytes) -> None:
+    """As a replay server hears a stranger."""
+    ASKED.connect()
+    ASKED.say_proof(meta)
+
+
+def request(raw: bytes) -> None:
+    """As it hears a learner; the first byte is the kind."""
+    if not ASKED.known:
+        ASKED.connect()
+        ASKED.prove()
+    kind = Kind(raw[0] % len(Kind) + 1) if raw else Kind.STATS
+    ASKED.say(kind, raw[1:], b"".join(PRIORITIES) if kind is Kind.PRIORITIES else b"")
+
+
 def config(raw: bytes) -> None:
     from_json(raw)
 
@@ -92,7 +126,13 @@ def published(raw: bytes) -> None:
     decode_published(raw, SPEC.obs_dim)
 
 
+def _request(kind: Kind, meta: dict[str, int]) -> bytes:
+    packed: bytes = msgpack.packb(meta)
+    return bytes([kind - 1]) + packed
+
+
 torch.manual_seed(0)
+ASKED = Asked()
 RUNNER = PolicyRunner(SPEC.obs_dim, SPEC.action_dim, AGENT, envs=1)
 POLICY = save(Agent(SPEC.obs_dim, SPEC.action_dim, AGENT).policy_weights())
 BODY = make_rows(4).tobytes()
@@ -103,6 +143,11 @@ KINDS: dict[str, tuple[bytes, Reader]] = {
     "batch": (encode_frame(Kind.BATCH, {"mass": 1.0, "windows": 4, "env_steps": 9}, (BODY,)) + BODY, frame),
     "priorities": (encode_frame(Kind.PRIORITIES, {"count": 8}, PRIORITIES) + b"".join(PRIORITIES), frame),
     "weights": (POLICY, weights),
+    "proof": (LAWFUL_PROOF, proof),
+    "sample": (_request(Kind.SAMPLE, {"batch_size": 4, "elsewhere": 9}), request),
+    "priorities, checksum right": (_request(Kind.PRIORITIES, {"count": 8}), request),
+    "episode": (_request(Kind.EPISODE, {"serial": 3}), request),
+    "share": (_request(Kind.SHARE, {"batch_size": 4}), request),
     "record": (encode_record({"time": 1.5, "updates": 7, "waiting_for": "credit"}), decode_record),
     "config": (to_json(robust(EnvConfig("HalfCheetah-v5"))).encode(), config),
     "counters": (Progress(SPEC.obs_dim).encode(), published),
@@ -114,7 +159,8 @@ def cases(count: int, seed: int) -> Iterator[tuple[str, bytes, Reader]]:
     rng, kinds = random.Random(seed), list(KINDS.items())
     for number in range(count):
         name, (lawful, reader) = kinds[number % len(kinds)]
-        yield name, mutate(lawful, rng), reader
+        change = odd if reader in (proof, request) and rng.random() < 0.7 else mutate
+        yield name, change(lawful, rng), reader
 
 
 def peak_mb() -> float:
@@ -151,4 +197,5 @@ def fuzz(count: int, seed: int = 0) -> Row:
 
 
 if __name__ == "__main__":
+    logging.disable(logging.WARNING)  # of every refusal
     at_length(__doc__, 1_000_000, lambda tries, folder: iter([fuzz(tries)]))
