@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -62,6 +62,7 @@ class CheckpointFolder:
         Raises CheckpointError where it cannot be written; those before it stay, and nothing of it.
         """
         temporary, final = self.folder / f".tmp-{number:09d}", self.path(number)
+        _check_names(final, files)
         shutil.rmtree(temporary, ignore_errors=True)
         try:
             temporary.mkdir(parents=True)
@@ -104,7 +105,8 @@ class CheckpointFolder:
         try:
             manifest = (path / MANIFEST).read_bytes()
             digests = dict(json.loads(manifest)["sha256"])
-            files = {name: (path / Path(name).name).read_bytes() for name in digests}
+            _check_names(path, digests)
+            files = {name: (path / name).read_bytes() for name in digests}
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise CheckpointError(f"checkpoint {path}: unreadable ({error})") from None
         for name, content in files.items():
@@ -140,6 +142,15 @@ class CheckpointFolder:
             return int(record["update"]), float(record["eval_return_mean"])
         except (OSError, ValueError, KeyError, TypeError):
             return None, float("-inf")
+
+
+def _check_names(path: Path, names: Iterable[str]) -> None:
+    """Raises CheckpointError where one of a checkpoint's files would lie outside of its folder, or cannot lie there."""
+    for name in names:
+        plain = Path(name).name == name and name not in ("", "..", MANIFEST)
+        if not (plain and name.isprintable()):  # no NUL, and no half of a surrogate pair, which no file can be called
+            fix = "names must be plain, without a folder"
+            raise CheckpointError(f"checkpoint {path}: file name {name!r} refused; {fix}", "file name")
 
 
 def _manifest(number: int, files: Mapping[str, bytes]) -> bytes:

@@ -1,11 +1,21 @@
 """Checkpoints are whole or absent, and damage is seen."""
 
+import hashlib
+import json
+import re
+from contextlib import suppress
+from pathlib import Path
+
 import pytest
 
 from common.checkpoint import CheckpointFolder
 from common.errors import CheckpointError, ConfigError
 
 FILES = {"state": b"\x00" * 100, "progress.json": b"{}"}
+OUTSIDE = [
+    "../../escaped", "../escaped", "/proc/self/escaped", "sub/escaped", "./escaped", "escaped/", "", ".", "..",
+    "nul\0", "\ud800", "manifest.json",
+]  # fmt: skip
 
 
 def test_round_trip_and_pruning(tmp_path):
@@ -61,9 +71,9 @@ def test_every_byte_of_a_manifest_counts(tmp_path, place):
 def test_one_without_room_leaves_nothing(tmp_path):
     folder = CheckpointFolder(tmp_path / "c")
     folder.save(1, FILES)
-    with pytest.raises(CheckpointError, match=r"000000002 cannot be written \(No such file or directory\)") as raised:
-        folder.save(2, {**FILES, "no/such": b""})  # the third of three
-    assert raised.value.reason == "No such file or directory"
+    with pytest.raises(CheckpointError, match=r"000000002 cannot be written \(File name too long\)") as raised:
+        folder.save(2, {**FILES, "x" * 300: b""})  # the third of three
+    assert raised.value.reason == "File name too long"
     assert sorted(path.name for path in folder.folder.iterdir()) == ["000000001"]
 
 
@@ -96,10 +106,39 @@ def test_two_writers_exclude_each_other(tmp_path):
     second.lock()
 
 
-def test_manifest_cannot_name_a_file_outside(tmp_path):
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_a_manifest_cannot_name_a_file_outside(tmp_path, name):
     folder = CheckpointFolder(tmp_path / "c")
     folder.save(1, FILES)
-    (tmp_path / "outside").write_bytes(b"secret")
-    (folder.path(1) / "manifest.json").write_text('{"sha256": {"../../outside": "00"}}')
-    with pytest.raises(CheckpointError):
+    files = {**FILES, name: b"secret"}
+    for place in (folder.path(1) / name, folder.path(1) / Path(name).name):  # it is there, whichever is read
+        with suppress(OSError, ValueError):
+            place.write_bytes(b"secret")
+    (folder.path(1) / "manifest.json").write_bytes(manifest_of(1, files))  # only the name is wrong
+    with pytest.raises(CheckpointError, match=f"file name {re.escape(repr(name))} refused"):
         folder.load(1)
+    assert folder.latest() is None
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_nothing_is_saved_outside(tmp_path, name):
+    folder = CheckpointFolder(tmp_path / "c")
+    folder.save(1, FILES)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(CheckpointError, match=f"file name {re.escape(repr(name))} refused"):
+        folder.save(2, {**FILES, name: b"secret"})
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_manifest_made_by_hand_is_one_that_is_taken(tmp_path):
+    folder = CheckpointFolder(tmp_path)
+    folder.save(1, FILES)
+    (folder.path(1) / "third").write_bytes(b"3")
+    (folder.path(1) / "manifest.json").write_bytes(manifest_of(1, {**FILES, "third": b"3"}))
+    assert folder.load(1) == {**FILES, "third": b"3"}
+
+
+def manifest_of(number: int, files: dict[str, bytes]) -> bytes:
+    """As it is written, to the byte."""
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    return json.dumps({"update": number, "sha256": digests}, indent=1).encode()
