@@ -5,6 +5,7 @@ Shapes: T steps of the episode, O observation, A action, H hidden, K steps ahead
 
 import importlib.util
 import io
+import pickle
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,7 +18,7 @@ from torch import Tensor
 from actors.evaluator import LONGEST_EPISODE
 from common.agent import Agent, Remembered
 from common.errors import ConfigError
-from deploy.evaluation import load_state
+from deploy.evaluation import STATE, load_state
 from deploy.policy import load_policy
 from deploy.presets import RunConfig
 from deploy.run_folder import RunFolder, check_writable
@@ -63,8 +64,13 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     """The whole agent of a checkpoint, with its world model. Raises ConfigError."""
     spec = config.window_spec()
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
-    state = torch.load(io.BytesIO(load_state(folder, checkpoint)), map_location="cpu", weights_only=True)
-    agent.load_state_dict(state["agent"])
+    raw = load_state(folder, checkpoint)
+    try:
+        agent.load_state_dict(torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)["agent"])
+    except (pickle.UnpicklingError, EOFError, RuntimeError, KeyError, TypeError) as error:
+        reason = (str(error).strip() or "empty").splitlines()[0]
+        fix = f"its {STATE} is not this run's ({reason}); use another"
+        raise ConfigError("--checkpoint", checkpoint, fix) from None
     return agent.eval()
 
 

@@ -1,6 +1,9 @@
 """The fast policy against the agent's own modules."""
 
+import pickle
+from collections.abc import Callable
 from itertools import product
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -11,6 +14,7 @@ from safetensors.torch import save
 from actors.policy_runner import PolicyRunner
 from common.agent import Agent, AgentConfig, HeadInput, squashed_sample
 from common.errors import MessageError
+from tests.hostile import Touch, hostile_state
 
 OBS_DIM, ACTION_DIM, ENVS = 5, 3, 4
 
@@ -130,6 +134,14 @@ def test_another_runs_weights_are_refused() -> None:
         make_runner(agent).load(blob[:-4])
     with pytest.raises(MessageError):
         make_runner(agent).load(save({"policy.net.0.weight": torch.zeros(1)}))
+
+
+@pytest.mark.parametrize("written", [hostile_state, lambda mark: pickle.dumps(Touch(mark))], ids=["torch", "pickle"])
+def test_weights_never_execute_code(written: Callable[[Path], bytes], tmp_path: Path) -> None:
+    runner = make_runner(make_agent(AgentConfig(hidden=8, embedding=8, heads=(8, 8))))
+    with pytest.raises(MessageError, match="not a policy of this run"):
+        runner.load(written(tmp_path / "owned"))
+    assert not (tmp_path / "owned").exists()
 
 
 @pytest.mark.parametrize("spoilt", ["policy.net.4.bias", "normalizer.std", "memory.embed.1.weight", "surprise"])

@@ -13,11 +13,13 @@ from safetensors.torch import save
 from common.agent import Agent
 from common.checkpoint import CheckpointFolder
 from common.envs import EnvConfig
+from common.errors import ConfigError
 from deploy import cli, inspection
 from deploy.inspection import HORIZONS, Episode, load_agent, look, play
 from deploy.presets import RunConfig, debug
 from deploy.run_folder import RunFolder, open_run
 from tests.deploy.test_policy import AGENTS
+from tests.hostile import hostile_state
 
 
 def make_run(path: Path, config: RunConfig) -> RunFolder:
@@ -113,3 +115,24 @@ def test_a_model_without_grounding_has_nothing_to_show(tmp_path: Path, capsys: p
     folder = make_run(tmp_path / "run", run)
     assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 2
     assert "--grounding" in capsys.readouterr().err
+
+
+def test_a_checkpoint_never_executes_code(
+    config: RunConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, mark = make_run(tmp_path / "run", config), tmp_path / "owned"
+    checkpoints = CheckpointFolder(folder.checkpoints)
+    checkpoints.save(4, {**checkpoints.load(3), "learner.pt": hostile_state(mark)})
+    assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 2
+    assert "--checkpoint='latest': its learner.pt is not this run's" in capsys.readouterr().err
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("state", [[], {}, {"agent": None}, {"agent": {}}], ids=str)
+def test_another_runs_state_is_said_to_be_so(config: RunConfig, tmp_path: Path, state: object) -> None:
+    folder, file = make_run(tmp_path / "run", config), io.BytesIO()
+    checkpoints = CheckpointFolder(folder.checkpoints)
+    torch.save(state, file)
+    checkpoints.save(4, {**checkpoints.load(3), "learner.pt": file.getvalue()})
+    with pytest.raises(ConfigError, match=r"its learner\.pt is not this run's"):
+        load_agent(folder, config, "latest")

@@ -1,13 +1,17 @@
 """What an actor thinks a window is worth is what the learner would, with the same networks and noise."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import safetensors.torch
 import torch
 
 from common.agent import Agent, AgentConfig, HeadInput
+from common.errors import MessageError
 from learner.initial_priority import InitialPriority
 from learner.update import UpdateConfig, make_update
+from tests.hostile import hostile_state
 from tests.learner.rows import SPEC, random_rows, to_batch
 
 
@@ -39,3 +43,10 @@ def test_critics_are_broadcast_only_where_they_are_needed() -> None:
     ]
     assert not any(name.startswith("critic.") for name in names[0])
     assert {"log_alpha"} | {name for name in names[1] if name.startswith("critic.")} == names[1] - names[0]
+
+
+def test_weights_never_execute_code(tmp_path: Path) -> None:
+    rater = InitialPriority(SPEC, AgentConfig(hidden=SPEC.hidden, heads=(5, 5)), UpdateConfig(), seed=3)
+    with pytest.raises(MessageError, match="not of this run"):
+        rater.load(hostile_state(tmp_path / "owned"))
+    assert not (tmp_path / "owned").exists()

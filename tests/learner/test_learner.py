@@ -1,6 +1,5 @@
 """The learner role against a real replay server in the same thread."""
 
-import io
 import json
 
 import pytest
@@ -15,6 +14,7 @@ from common.wire import encode_hello, encode_windows
 from learner.learner import Learner, LearnerConfig, latent_rank
 from learner.update import UpdateConfig
 from replay_server.server import ReplayConfig, ReplayServer
+from tests.hostile import hostile_state
 from tests.learner.rows import SPEC, random_rows
 
 AGENT = AgentConfig(hidden=SPEC.hidden, embedding=7, heads=(10, 9), normalize_observations=True)
@@ -128,19 +128,15 @@ def test_no_valid_checkpoint_is_an_error(setting):
 
 
 def test_a_checkpoint_never_executes_code(setting):
-    class Hostile:
-        def __reduce__(self):
-            return (print, ("owned",))
-
     setting.feed(60)
     setting.learner.step()
     setting.learner.close()
-    file = io.BytesIO()
-    torch.save({"agent": Hostile()}, file)
+    mark = setting.folder / "owned"
     number, files = setting.learner.checkpoints.latest()
-    setting.learner.checkpoints.save(number + 1, {**files, "learner.pt": file.getvalue()})
+    setting.learner.checkpoints.save(number + 1, {**files, "learner.pt": hostile_state(mark)})
     with pytest.raises(CheckpointError, match=r"learner\.pt"):
         setting.start()
+    assert not mark.exists()
 
 
 def test_ends_with_a_checkpoint_once_the_ratio_is_spent(tmp_path):
