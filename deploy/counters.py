@@ -1,5 +1,6 @@
 """What a run's replay servers have counted, kept in its folder: with it a run goes on though its ring is lost."""
 
+import logging
 import time
 from contextlib import suppress
 
@@ -8,9 +9,10 @@ import msgpack
 from common.bus import Bus
 from common.errors import BusUnavailable
 from common.replay import Shard
-from deploy.run_folder import RunFolder
+from deploy.run_folder import RunFolder, write_whole
 
 KEEP_SECONDS = 10.0
+log = logging.getLogger(__name__)
 
 
 class Counters:
@@ -29,12 +31,28 @@ class Counters:
         with suppress(BusUnavailable, OSError):  # the disk is full: those before stay
             found = {role: raw for role in self._roles if (raw := bus.progress(role)) is not None}
             if found:
-                temporary = self._path.with_suffix(".new")
-                temporary.write_bytes(msgpack.packb(found))
-                temporary.rename(self._path)
+                write_whole(self._path, msgpack.packb(found))
 
     def restore(self, bus: Bus) -> None:
-        """Say them where Redis has nothing; a replay server whose ring is older then goes on from them."""
-        if self._path.exists():
-            for role, raw in msgpack.unpackb(self._path.read_bytes()).items():
-                bus.set_progress(role, raw)
+        """Say them where Redis has nothing; a replay server whose ring is older then goes on from them.
+
+        A file that cannot be read is told, and does not keep the run from going on: most often the ring has them, too.
+        """
+        try:
+            found = self._kept()
+        except (OSError, ValueError) as error:
+            log.warning("%s: cannot be read (%s); going on without what it counted", self._path, error)
+            return
+        for role, raw in found.items():
+            bus.set_progress(role, raw)
+
+    def _kept(self) -> dict[str, bytes]:
+        """By role. Raises OSError, ValueError."""
+        if not self._path.exists():
+            return {}
+        found = msgpack.unpackb(self._path.read_bytes())
+        if not isinstance(found, dict) or not all(
+            role in self._roles and isinstance(raw, bytes) for role, raw in found.items()
+        ):
+            raise ValueError("no counters of this run's replay servers")
+        return found

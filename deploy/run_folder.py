@@ -54,9 +54,7 @@ class RunFolder:
 
     def write_config(self, config: RunConfig) -> None:
         """Write ``config.json``, whole or not at all."""
-        temporary = self.path / ".config.json"
-        temporary.write_text(to_json(config) + "\n")
-        temporary.rename(self.path / "config.json")
+        write_whole(self.path / "config.json", f"{to_json(config)}\n".encode())
 
     def result(self) -> dict[str, Any] | None:
         """What ``result.json`` says, once the run has ended."""
@@ -67,9 +65,7 @@ class RunFolder:
 
     def write_result(self, result: dict[str, Any]) -> None:
         """Write ``result.json``, whole or not at all."""
-        temporary = self.path / ".result.json"
-        temporary.write_text(json.dumps(result, indent=2) + "\n")
-        temporary.rename(self.result_file)
+        write_whole(self.result_file, f"{json.dumps(result, indent=2)}\n".encode())
 
     def secret(self) -> bytes:
         """The run's secret, made at first use; only the owner may read it."""
@@ -135,6 +131,16 @@ class RunFolder:
         except FileNotFoundError:
             return None
         return int(number) if word == "ended" else None
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a small file whole or not at all: what is in it is on the disk before it has its name."""
+    temporary = path.with_name(f".{path.name}")
+    with temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.rename(path)
 
 
 def _locked(handle: int, kind: int) -> bool:

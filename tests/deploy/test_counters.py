@@ -1,10 +1,21 @@
 """A run goes on counting though its ring is gone."""
 
+import os
 from pathlib import Path
+
+import msgpack
+import pytest
 
 from common.bus import Ack, EntryId, Holder, MemoryBus
 from deploy.counters import Counters
 from deploy.run_folder import RunFolder
+
+WHOLE = msgpack.packb({"replay": b"counted"})
+OTHERS = ([1], {"replay": 5}, {"replay": {}}, {"another": b"x"}, {None: b"x"})
+DAMAGED = {
+    "empty": b"", "cut": WHOLE[:-3], "zeros": bytes(len(WHOLE)), "doubled": WHOLE * 2, "no msgpack": b"\xc1",
+    **{str(found): msgpack.packb(found) for found in OTHERS},
+}  # fmt: skip
 
 
 def commit(bus: MemoryBus, role: str, progress: bytes) -> None:
@@ -31,3 +42,36 @@ def test_an_empty_redis_does_not_take_the_copy_away(tmp_path: Path) -> None:
     counters.keep(MemoryBus(), at_once=True)
     counters.restore(again := MemoryBus())
     assert again.progress("replay") == b"counted"
+
+
+@pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
+def test_a_damaged_copy_is_told_and_the_run_goes_on(
+    tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    counters, bus = Counters(RunFolder(tmp_path), shards=1), MemoryBus()
+    (tmp_path / "replay-counters").write_bytes(content)
+    counters.restore(bus)
+    assert bus.progress("replay") is None
+    assert [record.getMessage().count("replay-counters: cannot be read") for record in caplog.records] == [1]
+    commit(bus, "replay", b"newer")
+    counters.keep(bus)
+    counters.restore(again := MemoryBus())
+    assert again.progress("replay") == b"newer"
+    assert len(caplog.records) == 1
+
+
+def test_a_copy_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a power cut leaves an empty one. Who writes does so; only what the disk is told is watched."""
+    synchronised, fsync = [], os.fsync
+
+    def watched(handle: int) -> None:
+        fsync(handle)
+        content = Path(f"/proc/self/fd/{handle}").read_bytes()
+        synchronised.append((content, (tmp_path / "replay-counters").exists()))
+
+    monkeypatch.setattr(os, "fsync", watched)
+    counters, bus = Counters(RunFolder(tmp_path), shards=1), MemoryBus()
+    commit(bus, "replay", b"counted")
+    counters.keep(bus)
+    assert synchronised == [(WHOLE, False)]
+    assert (tmp_path / "replay-counters").read_bytes() == WHOLE
