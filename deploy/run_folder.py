@@ -10,7 +10,9 @@ import json
 import os
 import secrets
 import socket
+import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +20,7 @@ from common.checkpoint import CheckpointFolder
 from common.errors import CheckpointError, ConfigError
 from deploy.presets import RunConfig, from_json, option, to_json
 
+SECRET_LENGTH = 64  # hexadecimal characters
 LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
 IfExists = Literal["resume", "fail", "new"]
 MAY_CHANGE = {
@@ -68,12 +71,33 @@ class RunFolder:
         write_whole(self.result_file, f"{json.dumps(result, indent=2)}\n".encode())
 
     def secret(self) -> bytes:
-        """The run's secret, made at first use; only the owner may read it."""
+        """The run's secret, made at first use. Only the owner may read it: where others could, they no longer can.
+
+        Raises ConfigError where the file is cut short.
+        """
         if not self.secret_file.exists():
-            handle = os.open(self.secret_file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            self._make_secret()
+        if self.secret_file.stat().st_mode & 0o077:
+            with suppress(OSError):  # a disk without modes, or mounted to be read
+                self.secret_file.chmod(0o600)
+        found = self.secret_file.read_bytes().strip()
+        if len(found) < SECRET_LENGTH:
+            fix = f"it holds {len(found)} of {SECRET_LENGTH} characters; remove it, and the run gets another"
+            raise ConfigError("secret", str(self.secret_file), fix)
+        return found
+
+    def _make_secret(self) -> None:
+        """Whole or not at all; of two processes that do so at once, one is first, and both have its secret."""
+        handle, temporary = tempfile.mkstemp(prefix=f".{self.secret_file.name}-", dir=self.path)  # mode 0600
+        try:
             with os.fdopen(handle, "w") as file:
-                file.write(secrets.token_hex(32) + "\n")
-        return self.secret_file.read_bytes().strip()
+                file.write(secrets.token_hex(SECRET_LENGTH // 2) + "\n")
+                file.flush()
+                os.fsync(handle)
+            with suppress(FileExistsError):
+                os.link(temporary, self.secret_file)
+        finally:
+            os.unlink(temporary)
 
     def wall_seconds(self) -> float:
         """How long the run was trained before, over all its starts."""
