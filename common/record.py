@@ -4,8 +4,9 @@ Flat: names to numbers; what a role waits for (``…waiting_for``) and why it ca
 and one metric is a list of numbers.
 """
 
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeGuard
 
 import msgpack
 
@@ -39,6 +40,11 @@ def decode_record(packed: bytes) -> dict[str, Any]:
         if not _is_plain(name) or not _fits(name, value):
             raise MessageError("structure", f"{name!r:.80} is no metric")
     return record
+
+
+def is_finite(value: Any) -> TypeGuard[float]:
+    """Whether a value out of a record, which need not be there, is a number that can be compared and counted with."""
+    return _is_number(value) and math.isfinite(value)
 
 
 def _fits(name: str, value: Any) -> bool:

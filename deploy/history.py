@@ -15,6 +15,7 @@ import numpy as np
 
 from common.envs import EnvConfig
 from common.errors import ConfigError
+from common.record import is_finite
 from deploy.presets import RunConfig, option, preset
 from deploy.run_folder import MAY_CHANGE, RunFolder, flat
 
@@ -167,16 +168,21 @@ def _records(path: Path) -> list[dict[str, Any]]:
 
 def _evaluations(records: list[dict[str, Any]]) -> list[Evaluation]:
     """In order of environment steps; of a checkpoint played twice, what came last."""
-    steps = {r["updates"]: r["env_steps"] for r in records if r.get("role") == "learner" and "updates" in r}
-    walls = {r["time"]: r["wall_s"] for r in records if r.get("role") == "launcher" and "wall_s" in r}
+    steps = {r["updates"]: r["env_steps"] for r in records if _says(r, "learner", "updates", "env_steps")}
+    walls = {r["time"]: r["wall_s"] for r in records if _says(r, "launcher", "time", "wall_s")}
     found = {}
     for record in records:
-        if "eval_return_mean" in record:
-            updates = record["eval_update"]
-            at = int(record.get("eval_env_steps", _between(updates, steps)))  # of ours only the update is known
+        if _says(record, "evaluator", "time", "eval_update", "eval_return_mean", "eval_return_std"):
+            updates, own = record["eval_update"], _says(record, "evaluator", "eval_env_steps")
+            at = int(record["eval_env_steps"] if own else _between(updates, steps))  # of ours only the update is known
             wall, mean, std = _between(record["time"], walls), record["eval_return_mean"], record["eval_return_std"]
             found[at] = Evaluation(at, updates, wall, mean, std)
     return [found[at] for at in sorted(found)]
+
+
+def _says(record: dict[str, Any], role: str, *names: str) -> bool:
+    """Whether it is that role's and has all of these, as finite numbers: half of an evaluation is none."""
+    return record.get("role") == role and all(is_finite(record.get(name)) for name in names)
 
 
 def _between(at: float, known: dict[Any, Any]) -> float:

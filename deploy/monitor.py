@@ -10,6 +10,7 @@ from rich.console import Console
 from common.bus import Bus
 from common.checkpoint import CheckpointFolder
 from common.outage import Outage
+from common.record import is_finite
 from deploy.journal import Journal
 from deploy.presets import RunConfig
 from deploy.run_folder import RunFolder
@@ -72,9 +73,11 @@ class Monitor:
         """Write one record (with its ``role``) and take it into the view."""
         self.board.take(record)
         self._journal.write(record, self.board.env_steps)
-        update = record.get("eval_update")
-        if record["role"] == "evaluator" and isinstance(update, int):
-            self._unmarked[update] = float(record["eval_return_mean"])
+        update, score = record.get("eval_update"), record.get("eval_return_mean")
+        if (
+            record["role"] == "evaluator" and isinstance(update, int) and is_finite(score)
+        ):  # who says half, says nothing
+            self._unmarked[update] = float(score)
         with suppress(OSError):  # no room; the next record tries again
             for update in list(self._unmarked):
                 self._checkpoints.mark_best(update, self._unmarked[update])

@@ -177,7 +177,8 @@ def _locked(handle: int, kind: int) -> bool:
 
 def _wall(line: str) -> float:
     try:
-        return float(json.loads(line).get("wall_s", 0.0))
+        record = json.loads(line)
+        return float(record.get("wall_s", 0.0)) if record.get("role") == "launcher" else 0.0
     except ValueError:  # a line torn by a crash
         return 0.0
 

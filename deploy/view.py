@@ -74,7 +74,8 @@ def _evaluation(board: Board) -> str:
     mean, deviation, update = (
         board.get("evaluator", f"eval_{name}") for name in ("return_mean", "return_std", "update")
     )
-    return NONE_YET if mean is None else f"{mean:,.1f} ± {deviation:,.1f} at update {update:,}"
+    said = f"{number(mean, ',.1f')} ± {number(deviation, ',.1f')} at update {number(update, ',')}"
+    return NONE_YET if mean is None else said
 
 
 def _staleness(learner: dict[str, Any]) -> str:
@@ -83,7 +84,7 @@ def _staleness(learner: dict[str, Any]) -> str:
         return NONE_YET
     stages = [stage for stage in ("stored", "burned") if f"stale_state_{stage}" in learner]
     state, q = (
-        " → ".join(number(learner[f"{name}_{stage}"], ".1%") for stage in stages)
+        " → ".join(number(learner.get(f"{name}_{stage}"), ".1%") for stage in stages)
         for name in ("stale_state", "stale_q_first")
     )
     return f"state {state}, Q {q}, age {number(learner.get('sample_age_mean'), ',.0f')} updates"

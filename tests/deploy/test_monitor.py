@@ -2,6 +2,8 @@
 
 import json
 import math
+import random
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -9,10 +11,13 @@ from rich.console import Console
 
 from common.bus import MemoryBus
 from common.envs import EnvConfig
+from common.errors import ConfigError
+from common.record import decode_record, encode_record
+from deploy import history
 from deploy.monitor import Monitor
 from deploy.presets import RunConfig, debug
-from deploy.run_folder import open_run
-from deploy.view import MOST_NAMES, line, table
+from deploy.run_folder import RunFolder, open_run
+from deploy.view import MOST_NAMES, _evaluation, line, table
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
 
@@ -32,27 +37,57 @@ def monitor(config: RunConfig, tmp_path: Path) -> Monitor:
 NUMBERS = [0, -1, 2**63 - 1, math.nan, math.inf, -math.inf, 1e300, 1.5]
 
 
+NAMES = """
+    env_steps updates eval_update broken_episodes time sample_age_mean latent_rank
+    env_steps_per_s updates_per_s ring_fill replay_ratio busy_share waiting_share
+    q_loss model_loss alpha beta curiosity_share model_unexplained policy_lag_mean
+    episode_return_mean eval_return_mean eval_return_std eval_env_steps stale_state_stored stale_q_first_stored
+    stale_state_burned stale_q_first_burned finished wall_s launcher
+""".split()  # noqa: SIM905
+ROLES = ("learner", "replay", "evaluator", "actor-0")
+
+
 @pytest.mark.parametrize("value", NUMBERS)
 def test_any_number_is_shown(monitor: Monitor, value: float) -> None:
     """All names that the view formats, each as a number that makes no sense."""
     bus = MemoryBus()
-    counts = ["env_steps", "updates", "eval_update", "broken_episodes", "time", "sample_age_mean", "latent_rank"]
-    rates = ["env_steps_per_s", "updates_per_s", "ring_fill", "replay_ratio", "busy_share", "waiting_share"]
-    losses = ["q_loss", "model_loss", "alpha", "beta", "curiosity_share", "model_unexplained", "policy_lag_mean"]
-    returns = [
-        "episode_return_mean",
-        "eval_return_mean",
-        "eval_return_std",
-        "stale_state_stored",
-        "stale_q_first_stored",
-    ]
-    names = counts + rates + losses + returns
-    for role in ("learner", "replay", "evaluator", "actor-0"):
-        bus.emit(role, {"waiting_for": "credit", **dict.fromkeys(names, value)})
+    for role in ROLES:
+        bus.emit(role, {"waiting_for": "credit", **dict.fromkeys(NAMES, value)})
     monitor.watch(bus)
     assert "credit" in line(monitor.board) or not value > 0.5
     Console(quiet=True).print(table(monitor.board))
     assert monitor.board.env_steps == (value if value == 0 else 0) or value == 1.5
+    monitor.close()
+
+
+@pytest.mark.parametrize("seed", range(len(NAMES)))
+def test_whatever_a_role_leaves_out_the_run_goes_on(monitor: Monitor, tmp_path: Path, seed: int) -> None:
+    """One name alone, then any others beside it; and all that reads the run's folder later."""
+    bus, chance = MemoryBus(), random.Random(seed)
+    for count in (0, chance.randrange(len(NAMES))):
+        for role in ROLES:
+            found = {name: chance.choice(NUMBERS) for name in [NAMES[seed], *chance.sample(NAMES, count)]}
+            bus.emit(role, decode_record(encode_record(found)))
+        monitor.watch(bus)
+        assert line(monitor.board)
+        Console(quiet=True).print(table(monitor.board))
+    monitor.close()
+    folder = RunFolder(tmp_path / "run")
+    assert 0 <= folder.wall_seconds() < 60
+    with suppress(ConfigError):  # where no evaluation was whole
+        assert all(math.isfinite(one.return_mean) for one in history.of_run(folder).evaluations)
+
+
+@pytest.mark.parametrize(
+    "said", [{"eval_update": 3}, {"eval_return_mean": 1e9}, {"eval_update": 3, "eval_return_mean": math.inf}]
+)
+def test_half_of_an_evaluation_is_none(monitor: Monitor, said: dict[str, float]) -> None:
+    monitor._checkpoints.save(3, {})
+    monitor.record({"role": "evaluator", **said})
+    assert monitor._checkpoints.best() is None
+    monitor.record({"role": "evaluator", "eval_update": 3, "eval_return_mean": 1})
+    assert monitor._checkpoints.best() == 3
+    assert "± - at update 3" in _evaluation(monitor.board)
     monitor.close()
 
 
