@@ -20,7 +20,7 @@ from actors.policy_runner import PolicyRunner
 from common.agent import AgentConfig
 from common.bus import Bus, Version
 from common.envs import rebuilt, sound_reset
-from common.errors import BusFull, BusUnavailable, ConfigError, RmcError
+from common.errors import BusFull, BusUnavailable, ConfigError, MessageError, RmcError
 from common.wrappers import Env, Floats
 
 log = logging.getLogger(__name__)
@@ -157,7 +157,8 @@ class Evaluator:
         assert observation
         assert action
         self._runner = PolicyRunner(observation[0], action[0], agent, config.episodes)
-        self._version = Version(0, -1)  # none yet
+        self._version = Version(0, -1)  # the newest that was looked at: none yet
+        self._refused_weights = 0
         self._match: Match | None = None
         self._next_look = float("-inf")
         self._records: deque[dict[str, Any]] = deque()
@@ -184,14 +185,24 @@ class Evaluator:
         if found is None:
             return None
         self._version, blob = found
-        self._runner.load(blob)
-        return Match(self._runner, self._envs, self._seed)
+        return Match(self._runner, self._envs, self._seed) if self._load(blob) else None
+
+    def _load(self, blob: bytes) -> bool:
+        """Whether it is a policy; what cannot be read is refused, and the next one is waited for."""
+        try:
+            self._runner.load(blob)
+        except MessageError as error:
+            self._refused_weights += 1
+            self._records.append({"refused_weights": self._refused_weights})
+            log.warning("%s: refused %s: %s", self.name, self._version, error)
+            return False
+        return True
 
     def waiting_for(self) -> str:
         return "a policy to evaluate"
 
     def metrics(self) -> dict[str, Any]:
-        """The oldest evaluation not handed out yet, once; empty if there is none."""
+        """The oldest evaluation or refusal not handed out yet, once; empty if there is none."""
         return self._records.popleft() if self._records else {}
 
     def close(self) -> None:

@@ -4,6 +4,7 @@ Shapes: N environments, O observation, A action, E embedding, H hidden. Float32 
 ``common.agent`` (its modules are the reference) to 1e-5.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -28,6 +29,15 @@ def _of_shape(weights: dict[str, Tensor], name: str, like: Tensor) -> Tensor:
     if found.shape != like.shape:
         raise ValueError(f"{name} has shape {tuple(found.shape)}, expected {tuple(like.shape)}")
     return found
+
+
+def _check_finite(weights: dict[str, Tensor]) -> None:
+    """Also of critics, which others use. Raises ValueError."""
+    for name, value in weights.items():
+        if value.dtype != torch.float32:
+            raise ValueError(f"{name} has {value.dtype}, expected torch.float32")
+        if value.numel() and not all(map(math.isfinite, value.aminmax())):  # a tenth of what isfinite takes
+            raise ValueError(f"{name} holds NaN or infinity, expected finite weights")
 
 
 class _Linear:
@@ -111,6 +121,7 @@ class PolicyRunner:
         """Take over the safetensors of ``Agent.policy_weights()``, or of what is broadcast. Raises MessageError."""
         try:
             weights = load(blob)
+            _check_finite(weights)
             copies = self._copies(weights)
         except (SafetensorError, KeyError, ValueError) as error:
             raise MessageError("weights", f"not a policy of this run ({error})") from None

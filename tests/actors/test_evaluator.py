@@ -92,6 +92,23 @@ def test_plays_what_it_is_asked_to_once() -> None:
     evaluator.close()
 
 
+def test_a_policy_that_cannot_be_read_is_refused_and_the_next_one_played(caplog: pytest.LogCaptureFixture) -> None:
+    bus = MemoryBus()
+    evaluator = Evaluator(1, counting, AGENT, EvaluatorConfig(episodes=2), bus, clock=itertools.count().__next__)
+    spoilt = Agent(OBS_DIM, ACTION_DIM, AGENT).policy_weights()
+    spoilt["policy.net.0.bias"][3] = np.nan
+    for update, blob in ((1, b"torn"), (2, save(spoilt))):
+        bus.publish_weights(Version(1, update), blob, evaluate=True)
+        assert [step_until_idle(evaluator), step_until_idle(evaluator)] == [0, 0]
+        assert (evaluator.metrics(), evaluator.metrics()) == ({"refused_weights": update}, {})
+    assert len(caplog.records) == 2  # each is said once
+    assert "policy.net.0.bias" in caplog.text
+    publish(bus, 3, evaluate=True)
+    assert step_until_idle(evaluator) > 0
+    assert evaluator.metrics()["eval_update"] == 3
+    evaluator.close()
+
+
 def test_close_hands_out_what_is_left() -> None:
     bus = MemoryBus()
     evaluator = Evaluator(1, counting, AGENT, EvaluatorConfig(episodes=2), bus, clock=itertools.count().__next__)

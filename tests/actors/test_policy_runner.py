@@ -154,3 +154,31 @@ def test_refused_weights_change_nothing(spoilt: str) -> None:
     with pytest.raises(MessageError):
         runner.load(save(others | {spoilt: torch.zeros(3, 7)}))
     np.testing.assert_array_equal(runner.act(*given)[0], before)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["memory.gru.weight_hh_l0", "policy.net.4.bias", "normalizer.mean", "critic"])
+def test_weights_that_are_not_finite_are_refused_by_name(name: str, value: float) -> None:
+    config = AgentConfig(
+        hidden=8, embedding=8, heads=(8, 8), normalize_observations=True, initial_priority="actor"
+    )  # fmt: skip
+    agent = make_agent(config)
+    runner = make_runner(agent)
+    given = (np.ones((ENVS, OBS_DIM), np.float32), runner.start()[0], np.zeros(ENVS, np.bool_), runner.start()[1], None)
+    before = runner.act(*given)[0]
+    weights = {key: tensor.clone() for key, tensor in agent.broadcast_weights().items()}
+    name = next(key for key in weights if key.startswith(name))
+    weights[name].view(-1)[-1] = value
+    with pytest.raises(MessageError, match=f"{name} holds NaN or infinity"):
+        runner.load(save(weights))
+    np.testing.assert_array_equal(runner.act(*given)[0], before)
+    runner.load(save(agent.broadcast_weights()))
+
+
+def test_weights_of_another_precision_are_refused() -> None:
+    """A float64 may be finite and yet too large for what acts."""
+    agent = make_agent(AgentConfig(hidden=8, embedding=8, heads=(8, 8)))
+    weights = agent.policy_weights()
+    weights["policy.net.4.bias"] = torch.full_like(weights["policy.net.4.bias"], 1e300, dtype=torch.float64)
+    with pytest.raises(MessageError, match=r"policy\.net\.4\.bias has torch\.float64"):
+        make_runner(agent).load(save(weights))
