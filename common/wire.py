@@ -47,14 +47,14 @@ class Kind(IntEnum):
     PRIORITIES = 8  # client -> server: serials (int64) | priorities (float32); no reply
     STATISTICS = 9  # client -> server, and its reply: count, then sum | sum of squares (float64)
     STATS = 10  # client -> server, and its reply: the server's counters
-    ERROR = 11  # server -> client: why the connection ends; fenced: by a newer learner
+    ERROR = 11  # server -> client: why the connection ends; fenced: its HMAC that a newer learner has come
     EPISODE = 12  # client -> server: serial, and its reply: count, then rows
     SHARE = 13  # client -> server: batch_size, and its reply, with a descriptor where memory can be shared
     SHARED = 14  # server -> client: BATCH without its body, which lies in shared memory: turn and crc32 with the rest
 
 
 def proof(secret: bytes, side: bytes, challenge: bytes, nonce: bytes) -> bytes:
-    """HMAC-SHA256 with which a side, ``client`` or ``server``, shows the other that it knows the run's secret."""
+    """HMAC-SHA256 with which a side, ``client``, ``server`` or (it, too) ``fenced``, shows that it knows the secret."""
     return hmac.new(secret, side + challenge + nonce, hashlib.sha256).digest()
 
 

@@ -3,8 +3,9 @@
 Where both are on one machine, batches lie in memory that they share, and the socket only says so; a learner with pinned
 buffers has them in those.
 
-Frames are those of ``common/wire.py``. A lost connection is found again through the bus; until then draws
-answer WAIT. Statistics travel on a connection of their own, so that they never queue behind batches.
+Frames are those of ``common/wire.py``. A lost connection is found again through the bus; until then, and while who
+listens there proves nothing, draws answer WAIT. Statistics travel on a connection of their own, so that they never
+queue behind batches.
 """
 
 import hmac
@@ -32,6 +33,8 @@ AHEAD = 2  # draws in flight, so that the server gathers while the learner compu
 NONCE_BYTES = 32
 TIMEOUT = 10.0  # seconds until a silent server counts as gone
 RECEIVE_BUFFER = 8 << 20
+# What a server that is gone, another that has taken its port, or an address that is none can lead to.
+AWAY = (OSError, MessageError, AuthenticationError, ValueError, OverflowError)
 
 
 class Connection:
@@ -66,17 +69,27 @@ class Connection:
         if header.kind is not Kind.CHALLENGE or not isinstance(challenge, bytes):
             raise AuthenticationError("the replay server sent no challenge")
         nonce = os.urandom(NONCE_BYTES)
+        self._fenced = proof(secret, b"fenced", nonce, challenge)
         self.send(Kind.PROOF, {"nonce": nonce, "proof": proof(secret, b"client", challenge, nonce), "epoch": epoch})
         header, meta = self.receive_small()
         if header.kind is Kind.ERROR:
-            raise (FencedError if meta.get("fenced") else AuthenticationError)(str(meta.get("error")))
-        answer = meta.get("proof")
-        expected = proof(secret, b"server", nonce, challenge)
-        known = isinstance(answer, bytes) and hmac.compare_digest(answer, expected)
+            self._check_not_fenced(meta)
+            raise AuthenticationError(f"it said {meta.get('error')!r:.200}")
+        known = _equal(meta.get("proof"), proof(secret, b"server", nonce, challenge))
         if header.kind is not Kind.WELCOME or not known:
             raise AuthenticationError("the replay server does not know this run's secret")
         if meta.get("fingerprint") != fingerprint:
             raise MessageError("fingerprint", f"{meta.get('fingerprint')}, this learner has {fingerprint}")
+
+    def _check_not_fenced(self, meta: dict[str, Any]) -> None:
+        """It ends the learner, so it is believed with a proof for this connection alone, at any time of it."""
+        if _equal(meta.get("fenced"), self._fenced):
+            raise FencedError(str(meta.get("error")))
+
+    def raise_error(self, meta: dict[str, Any]) -> NoReturn:
+        """What an ERROR of a server that has proved itself says."""
+        self._check_not_fenced(meta)
+        raise MessageError("replay", f"{meta.get('error')!s:.200}")
 
     def send(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...] = ()) -> None:
         """Send a frame whose body is the parts in order, after what was put off."""
@@ -101,7 +114,7 @@ class Connection:
             header = decode_header(raw + self._exactly(HEADER.size - len(raw)), 0)
             meta = decode_meta(self._exactly(header.meta_length), b"", header)
             if header.kind is not Kind.SHARE:
-                raise MessageError("replay", str(meta.get("error")))
+                self.raise_error(meta)
             return SharedBatches(descriptors[0], spec, batch_size) if descriptors else None
         finally:
             for descriptor in descriptors:
@@ -137,22 +150,32 @@ class Connection:
         self._socket.close()
 
 
-def _raise_error(meta: dict[str, Any]) -> NoReturn:
-    if meta.get("fenced"):
-        raise FencedError(str(meta.get("error")))
-    raise MessageError("replay", str(meta.get("error")))
+def _equal(given: Any, expected: bytes) -> bool:
+    return isinstance(given, bytes) and hmac.compare_digest(given, expected)
+
+
+def _counters(meta: dict[str, Any]) -> tuple[float, int, int, int]:
+    """Mass, windows, env_steps and drawn_steps of an answer to a draw. Raises MessageError."""
+    mass = meta.get("mass")
+    if type(mass) is not float or not 0.0 <= mass < float("inf"):
+        raise MessageError("mass", f"{mass!r:.80}, want a finite number from 0.0 on")
+    return mass, _count(meta, "windows"), _count(meta, "env_steps"), _count(meta, "drawn_steps")
+
+
+def _count(meta: dict[str, Any], name: str) -> int:
+    count = meta.get(name)
+    if type(count) is not int or count < 0:
+        raise MessageError(name, f"{count!r:.80}, want a whole number from 0 on")
+    return count
 
 
 def _connect(address: str, tls: ssl.SSLContext | None) -> socket.socket:
     scheme, _, rest = address.partition(":")
-    if scheme == "unix":
-        connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        target: Any = rest
-    else:
-        host, _, port = rest.rpartition(":")
-        connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    host, _, port = rest.rpartition(":")
+    target: Any = rest if scheme == "unix" else (host, int(port))
+    connection = socket.socket(socket.AF_UNIX if scheme == "unix" else socket.AF_INET, socket.SOCK_STREAM)
+    if scheme != "unix":
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        target = (host, int(port))
     with suppress(OSError):  # macOS refuses more than its limit, Linux takes what it allows
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
     connection.settimeout(TIMEOUT)
@@ -167,9 +190,8 @@ def _connect(address: str, tls: ssl.SSLContext | None) -> socket.socket:
 class ReplayClient:
     """The Replay protocol over the server's socket.
 
-    ``address`` gives the server's present address, or None while it has none. Raises
-    AuthenticationError for a wrong secret, FencedError where a newer learner has come; outages only make draws
-    answer WAIT.
+    ``address`` gives the server's present address, or None while it has none. Raises FencedError where a newer
+    learner has come; outages, and who does not know the run's secret, only make draws answer WAIT.
     """
 
     def __init__(
@@ -205,7 +227,7 @@ class ReplayClient:
         try:
             self._last = self._receive_sample(elsewhere)
             return self._last
-        except (OSError, MessageError, KeyError, TypeError) as error:
+        except AWAY as error:
             self._drop(error)
             return self._away()
 
@@ -224,8 +246,8 @@ class ReplayClient:
         header, meta, body = connection.receive(self._buffers[self._turn])
         self._in_flight -= 1
         if header.kind is Kind.ERROR:
-            _raise_error(meta)
-        self._is_away = False
+            connection.raise_error(meta)
+        about = _counters(meta)
         draw, rows, values = Draw.BATCH, None, None
         if header.kind is Kind.SHARED and self._shared is not None:
             rows, values = self._shared.take(meta)
@@ -233,7 +255,7 @@ class ReplayClient:
             rows, values = self._split(body)
         else:
             draw = Draw.FINISHED if header.kind is Kind.FINISHED else Draw.WAIT
-        about = float(meta["mass"]), int(meta["windows"]), int(meta["env_steps"]), int(meta["drawn_steps"])
+        self._is_away = False
         return Sample(draw, rows, values, *about)
 
     def _split(self, body: memoryview) -> tuple[Rows, NDArray[np.float64]]:
@@ -284,8 +306,8 @@ class ReplayClient:
         try:
             meta, body = self._ask(Kind.STATISTICS, {})
             total, square = np.frombuffer(body, np.float64).reshape(2, obs_dim).copy()
-            return ObservationStatistics(int(meta["count"]), total, square)
-        except (OSError, MessageError, ValueError) as error:
+            return ObservationStatistics(_count(meta, "count"), total, square)
+        except AWAY as error:
             log.warning("no statistics from the replay server: %s", error)
             return ObservationStatistics(0, np.zeros(obs_dim), np.zeros(obs_dim))
 
@@ -294,7 +316,7 @@ class ReplayClient:
         try:
             _, body = self._ask(Kind.EPISODE, {"serial": serial})
             return np.frombuffer(body, self._spec.dtype).copy() if len(body) else None
-        except (OSError, MessageError, ValueError) as error:
+        except AWAY as error:
             log.warning("no episode from the replay server: %s", error)
             return None
 
@@ -302,7 +324,7 @@ class ReplayClient:
         """The server's counters. Raises RmcError while it is away."""
         try:
             return self._ask(Kind.STATS, {})[0]
-        except OSError as error:
+        except AWAY as error:
             raise RmcError(f"the replay server is away: {error}") from None
 
     def _ask(self, kind: Kind, question: dict[str, Any]) -> tuple[dict[str, Any], memoryview]:
@@ -313,7 +335,7 @@ class ReplayClient:
             connection.send(kind, question)
             header, meta, body = connection.receive(self._answer)
             if header.kind is Kind.ERROR:
-                _raise_error(meta)
+                connection.raise_error(meta)
         except (OSError, MessageError, FencedError):
             connection.close()
             self._control = None

@@ -31,6 +31,7 @@ class Connection:
         self.socket, self.challenge = connection, challenge
         self.encrypted = not isinstance(connection, ssl.SSLSocket)  # or need not be
         self.authenticated, self.epoch = False, 0  # and of which learner
+        self.nonce = b""  # of a client that has shown its proof
         self.opened = time.monotonic()
         self._inbox = bytearray()
         self._outbox: deque[memoryview] = deque()

@@ -6,6 +6,7 @@ sides prove that they know the run's secret before anything else is said:
     server -> CHALLENGE {nonce: c}
     client -> PROOF {nonce: n, proof: HMAC(secret, "client" + c + n)}
     server -> WELCOME {proof: HMAC(secret, "server" + n + c), fingerprint}
+    server -> ERROR {fenced: HMAC(secret, "fenced" + n + c)} in its place or later, where a newer learner has come
 
 Requests may be pipelined; each connection's are answered in order. A draw that the limiter holds back is
 answered WAIT at once, and the client asks again.
@@ -162,6 +163,7 @@ class SocketServer:
         expected = proof(self._secret, b"client", connection.challenge, nonce)
         if not isinstance(given, bytes) or not hmac.compare_digest(given, expected):
             raise AuthenticationError("the client does not know this run's secret")
+        connection.nonce = nonce
         self._fence(connection, frame.meta.get("epoch"))
         connection.authenticated = True
         answer = proof(self._secret, b"server", nonce, connection.challenge)
@@ -250,8 +252,9 @@ class SocketServer:
     def _refuse(self, connection: Connection, reason: str, detail: str, fenced: bool = False) -> None:
         log.warning("replay socket: a client was refused: %s", detail)
         self.refused[reason] += 1
+        shown = {"fenced": proof(self._secret, b"fenced", connection.nonce, connection.challenge)} if fenced else {}
         with contextlib.suppress(OSError):  # it may have gone already
-            connection.send(Kind.ERROR, {"error": detail, "fenced": fenced})
+            connection.send(Kind.ERROR, {"error": detail, **shown})
         self._end(connection)
 
     def _end_strangers(self) -> None:

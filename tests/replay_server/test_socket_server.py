@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from common.bus import MemoryBus
-from common.errors import AuthenticationError, ConfigError, FencedError, MessageError
-from common.replay import Draw
+from common.errors import AuthenticationError, ConfigError, FencedError, MessageError, RmcError
+from common.replay import Draw, Sample
 from common.shared_batches import TURNS
-from common.wire import HEADER, MAGIC, VERSION, Kind, encode_frame, proof
+from common.wire import HEADER, MAGIC, VERSION, Kind, decode_header, decode_meta, encode_frame, proof
 from learner.replay_client import Connection, ReplayClient
 from replay_server import socket_server
 from replay_server.server import ReplayConfig, ReplayServer
@@ -83,6 +83,7 @@ class Served:
 
 
 Serve = Callable[..., Served]
+Frame = Callable[[bytes], tuple[Kind, dict[str, Any]]]  # of a client's nonce
 FREE = ReplayConfig(capacity=5000, replay_ratio=1e9, warmup_steps=0)
 
 
@@ -226,25 +227,102 @@ def test_a_client_with_another_secret_is_refused(serve: Serve) -> None:
     works(served)
 
 
-def test_a_server_with_another_secret_is_refused(tmp_path: Path) -> None:
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+@pytest.fixture
+def impostor(tmp_path: Path) -> Iterator[Callable[[Frame], str]]:
+    """Takes a dead server's address: it challenges whoever comes, and answers their nonce with that frame."""
+    listener, stack = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM), ExitStack()
     listener.bind(f"{tmp_path}/r.sock")
     listener.listen()
 
-    def impostor() -> None:
+    def serve_one(frame: Frame) -> None:
         accepted, _ = listener.accept()
-        accepted.sendall(encode_frame(Kind.CHALLENGE, {"nonce": b"c" * 32}))
-        accepted.recv(4096)
-        answer = proof(b"a guess", b"server", b"n" * 32, b"c" * 32)
-        accepted.sendall(encode_frame(Kind.WELCOME, {"proof": answer, "fingerprint": SPEC.fingerprint}))
-        accepted.close()
+        with accepted:
+            accepted.sendall(encode_frame(Kind.CHALLENGE, {"nonce": b"c" * 32}))
+            raw = accepted.recv(4096)
+            header = decode_header(raw[: HEADER.size], 0)
+            meta = decode_meta(raw[HEADER.size :], b"", header)
+            accepted.sendall(encode_frame(*frame(meta["nonce"])))
 
-    thread = threading.Thread(target=impostor)
-    thread.start()
+    def start(frame: Frame) -> str:
+        def loop() -> None:
+            with suppress(OSError):  # closed
+                while True:
+                    serve_one(frame)
+
+        thread = threading.Thread(target=loop)
+        thread.start()
+        stack.callback(thread.join)
+        stack.callback(listener.close)
+        stack.callback(listener.shutdown, socket.SHUT_RDWR)
+        return f"unix:{tmp_path}/r.sock"
+
+    yield start
+    stack.close()
+
+
+def test_a_server_with_another_secret_is_refused(impostor: Callable[[Frame], str]) -> None:
+    def frame(nonce: bytes) -> tuple[Kind, dict[str, Any]]:
+        answer = proof(b"a guess", b"server", nonce, b"c" * 32)
+        return Kind.WELCOME, {"proof": answer, "fingerprint": SPEC.fingerprint}
+
     with pytest.raises(AuthenticationError, match="does not know this run's secret"):
-        Connection(f"unix:{tmp_path}/r.sock", SECRET, SPEC.fingerprint, BIG)
-    thread.join()
-    listener.close()
+        Connection(impostor(frame), SECRET, SPEC.fingerprint, BIG)
+
+
+@pytest.mark.parametrize(
+    "fenced",
+    [
+        lambda nonce: True,
+        lambda nonce: proof(b"a guess", b"fenced", nonce, b"c" * 32),
+        lambda nonce: proof(SECRET, b"fenced", b"n" * 32, b"c" * 32),  # of another connection, heard there
+    ],
+)
+def test_who_proves_nothing_ends_no_learner(
+    serve: Serve, impostor: Callable[[Frame], str], fenced: Callable[[bytes], Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    def frame(nonce: bytes) -> tuple[Kind, dict[str, Any]]:
+        return Kind.ERROR, {"error": "the learner of epoch 4 was replaced by 5", "fenced": fenced(nonce)}
+
+    addresses = [impostor(frame)]
+    client = ReplayClient(lambda: addresses[-1], SECRET, SPEC, 8)
+    assert [client.sample(8).draw for _ in range(3)] == [Draw.WAIT] * 3
+    assert len([record for record in caplog.records if "is away: it said" in record.message]) == 1
+    assert client.statistics().count == 0
+    assert client.episode(0) is None
+    addresses.append(serve().address)
+    assert client.sample(8).draw is Draw.BATCH
+    client.close()
+
+
+@pytest.mark.parametrize("mass", ["x", None, [], True, float("nan"), float("inf"), -1.0])
+def test_a_draw_of_no_mass_is_an_outage(serve: Serve, mass: Any, caplog: pytest.LogCaptureFixture) -> None:
+    away_for(serve(), Sample(Draw.WAIT, None, None, mass, 3, 12, 0), "mass", caplog)
+
+
+@pytest.mark.parametrize("count", ["3", None, {}, True, float("nan"), float("inf"), 1.5, -1])
+def test_a_draw_of_no_counters_is_an_outage(serve: Serve, count: Any, caplog: pytest.LogCaptureFixture) -> None:
+    away_for(serve(), Sample(Draw.WAIT, None, None, 1.0, 3, count, 0), "env_steps", caplog)
+
+
+def away_for(served: Served, sample: Sample, reason: str, caplog: pytest.LogCaptureFixture) -> None:
+    """The client waits, and says once why."""
+    lawful, client = served.replay.sample, served.client(0)
+    served.replay.sample = lambda *_: sample  # type: ignore[method-assign]
+    assert [client.sample(8).draw for _ in range(3)] == [Draw.WAIT] * 3
+    (said,) = [record.message for record in caplog.records if "is away" in record.message]
+    assert f"is away: {reason}: " in said
+    served.replay.sample = lawful  # type: ignore[method-assign]
+    assert client.sample(8).draw is Draw.BATCH
+    client.close()
+
+
+@pytest.mark.parametrize("address", ["tcp:127.0.0.1:no", "tcp:127.0.0.1:99999", "unix:a\0b", "tcp:" + "x" * 99 + ":1"])
+def test_an_address_that_is_none_is_an_outage(address: str) -> None:
+    client = ReplayClient(lambda: address, SECRET, SPEC, 8)
+    assert client.sample(8).draw is Draw.WAIT
+    assert client.statistics().count == 0
+    with pytest.raises(RmcError, match="is away"):
+        client.stats()
 
 
 def test_a_replaced_learner_reads_and_writes_nothing_more(serve: Serve) -> None:
