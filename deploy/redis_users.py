@@ -36,7 +36,7 @@ LEARNER = (
 )
 REPLAY = (
     "+watch +unwatch +multi +exec",
-    "(+get %R~R:weights)",
+    "(+get %R~R:weights %R~R:epoch:learner)",
     "(+smembers %R~R:actors)",
     "(+xread +xtrim +del ~R:windows:*)",
     "(+set +watch ~R:epoch:ROLE)",

@@ -11,7 +11,8 @@ from replay_server.socket_server import SocketServer
 
 IDLE_WAIT = 0.005  # seconds between looks at the bus while nothing comes in
 FIRST_WAIT = 0.0005  # until the first look after something came
-ANNOUNCE_PERIOD = 5.0  # seconds between repeats of the address, in case Redis lost its data
+# Seconds between repeats of the address, in case Redis lost its data, and looks at which learner is the newest.
+ANNOUNCE_PERIOD = 5.0
 
 
 class ReplayProcess:
@@ -35,6 +36,7 @@ class ReplayProcess:
             took = self.server.step()
             if now >= self._next_announcement:
                 self._next_announcement = now + ANNOUNCE_PERIOD
+                self.sockets.fence(self.server.bus.current_epoch("learner"))  # an older one may come to us first
                 self.server.bus.announce_replay(self.server.holder, self.sockets.address)
         except (BusUnavailable, BusFull):
             self._bus_is_away, self._next_intake = True, now + RECONNECT_SLEEP

@@ -66,7 +66,7 @@ class SocketServer:
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, READ)
         self._connections: dict[Connection, int] = {}  # and the events each is registered for
-        self._learner = 0  # the newest epoch that has introduced itself
+        self._learner = 0  # the newest epoch that has introduced itself, or that the bus knows
         self.refused: Counter[str] = Counter()  # connections ended for a fault of theirs, by reason
 
     def poll(self, timeout: float) -> bool:
@@ -164,18 +164,23 @@ class SocketServer:
         if not isinstance(given, bytes) or not hmac.compare_digest(given, expected):
             raise AuthenticationError("the client does not know this run's secret")
         connection.nonce = nonce
-        self._fence(connection, frame.meta.get("epoch"))
+        self._introduce(connection, frame.meta.get("epoch"))
         connection.authenticated = True
         answer = proof(self._secret, b"server", nonce, connection.challenge)
         connection.send(Kind.WELCOME, {"proof": answer, "fingerprint": self._spec.fingerprint})
 
-    def _fence(self, connection: Connection, epoch: Any) -> None:
+    def _introduce(self, connection: Connection, epoch: Any) -> None:
         """Only the newest learner is served, so that one which was stopped and replaced writes nothing any more."""
         if type(epoch) is not int or not 0 <= epoch < 2**62:
             raise AuthenticationError(f"{epoch!r} is no learner's epoch")
         if epoch < self._learner:
             raise FencedError(f"the learner of epoch {epoch} was replaced by {self._learner}")
-        self._learner = connection.epoch = epoch
+        connection.epoch = epoch
+        self.fence(epoch)
+
+    def fence(self, epoch: int) -> None:
+        """Serve no learner of a smaller epoch from now on."""
+        self._learner = max(self._learner, epoch)
         for other in [other for other in self._connections if other.authenticated and other.epoch < epoch]:
             self._refuse(other, "fenced", f"the learner of epoch {other.epoch} was replaced by {epoch}", fenced=True)
 

@@ -84,6 +84,7 @@ def test_every_role_can_do_its_work(server: RedisServer) -> None:
     (_, entry) = replay.read({0: EntryId(4, 0)}, 10)
     replay.dead_letter(entry, "a test")
     replay.announce_replay(holder, "unix:/nowhere")
+    assert replay.current_epoch("learner") == 5
     replay.commit(holder, {0: Ack(EntryId(5, 1), 100)}, b"more")
     replay._trim(holder, {0: Ack(EntryId(5, 1), 100)})
     assert learner.replay_address("replay") is not None

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.errors import BusUnavailable
+from common.errors import BusUnavailable, FencedError
 from common.redis_bus import RedisBus
 from common.replay import Draw
 from common.role import StopSignal, run_role
 from deploy.redis_server import RedisServer
 from learner.replay_client import ReplayClient
+from replay_server import process
 from replay_server.process import ReplayProcess
 from replay_server.server import ReplayConfig, ReplayServer
 from replay_server.socket_server import SocketServer
@@ -45,10 +46,12 @@ def until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
         time.sleep(0.005)
 
 
-def client_of(bus: RedisBus) -> ReplayClient:
+def client_of(bus: RedisBus, epoch: int = 0) -> ReplayClient:
     address = bus.replay_address("replay")
     assert address is not None
-    return ReplayClient(lambda: address.address, SECRET, SPEC, 16)
+    client = ReplayClient(lambda: address.address, SECRET, SPEC, 16)
+    client.introduce(epoch)
+    return client
 
 
 def test_windows_in_batches_out_and_metrics(redis_url: str, run_name: str, tmp_path: Path) -> None:
@@ -76,6 +79,27 @@ def test_windows_in_batches_out_and_metrics(redis_url: str, run_name: str, tmp_p
     finally:
         running.end()
     assert not (tmp_path / "r.sock").exists()
+
+
+def test_a_replaced_learner_that_comes_first_is_not_served(
+    redis_url: str, run_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "ANNOUNCE_PERIOD", 0.05)
+    bus = RedisBus(redis_url, run_name)
+    stale, epoch = bus.take_epoch("learner"), bus.take_epoch("learner")
+    running = Running(tmp_path, RedisBus(redis_url, run_name))
+    try:
+        until(lambda: bus.replay_address("replay") is not None)
+        with pytest.raises(FencedError, match=f"the learner of epoch {stale} was replaced by {epoch}"):
+            client_of(bus, stale).sample(16)
+        client = client_of(bus, epoch)
+        assert client.sample(16).draw is Draw.WAIT
+        bus.take_epoch("learner")  # by a third, which has not come yet
+        with pytest.raises(FencedError):
+            until(lambda: client.sample(16).draw is Draw.BATCH)
+        client.close()
+    finally:
+        running.end()
 
 
 @pytest.mark.timeout(60)
