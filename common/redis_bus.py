@@ -115,11 +115,16 @@ class RedisBus:
             stream, {"p": payload}, id=f"{entry_id.epoch}-{entry_id.seq}", nomkstream=entry_id.seq > 0
         )
         if stored is None:
-            raise BusUnavailable(f"{stream} is gone: Redis has lost its data")
+            raise _gone(stream)
 
     def _check_not_fenced(self, actor: int, stream: str, entry_id: EntryId) -> None:
         """A refused id is ours, stored by a retried call, unless a larger epoch wrote since."""
-        last = _entry_id(self._call(lambda: self._redis.xinfo_stream(stream))["last-generated-id"])
+        try:
+            last = _entry_id(self._call(lambda: self._redis.xinfo_stream(stream))["last-generated-id"])
+        except redis.exceptions.ResponseError as error:
+            if "no such key" not in str(error):
+                raise
+            raise _gone(stream) from None  # it was dropped after it had refused the id
         if last.epoch != entry_id.epoch:
             raise FencedError(f"actor {actor}: epoch {last.epoch} has replaced epoch {entry_id.epoch}")
 
@@ -344,6 +349,10 @@ class RedisBus:
 
     def clear_stop(self) -> None:
         self._call(lambda: self._redis.delete(self._key("stop")))
+
+
+def _gone(stream: str) -> BusUnavailable:
+    return BusUnavailable(f"{stream} is gone: Redis has lost its data")
 
 
 def _entry_id(raw: bytes | str) -> EntryId:

@@ -147,6 +147,22 @@ def test_a_dropped_stream_is_sent_again_from_its_hello(bus):
         bus.drop_stream(holder, 0)
 
 
+@pytest.mark.parametrize("seq", [0, 1])
+def test_a_stream_that_is_dropped_while_it_refuses_is_gone(redis_url, monkeypatch, seq):
+    bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
+    holder, ask = Holder("replay", bus.take_epoch("replay")), bus._redis.xinfo_stream
+    for number in range(2):
+        bus.append(0, EntryId(1, number), b"x")
+
+    def drop_and_ask(stream):
+        bus.drop_stream(holder, 0)
+        return ask(stream)
+
+    monkeypatch.setattr(bus._redis, "xinfo_stream", drop_and_ask)
+    with pytest.raises(BusUnavailable, match="gone"):
+        bus.append(0, EntryId(1, seq), b"x")
+
+
 def test_weights_of_many_pieces(bus):
     epoch = bus.take_epoch("learner")
     blob = os.urandom(700_000)
