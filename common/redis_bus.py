@@ -18,6 +18,7 @@ from common.record import decode_record, encode_record
 DEAD_LETTERS_KEPT = 1_000
 INTEGER = re.compile(rb"-?[0-9]{1,18}")
 PIECES = 4096  # of a policy, at most: 1 GiB
+UNPUBLISHED_SECONDS = 300  # that a piece is kept whose version has not become the newest: far more than all take
 RECORDS_READ = 1_000  # of a role at a time
 DEAD_LETTER_BYTES = 1_024
 ACTOR_DIGITS = 4  # an actor's id is below 4096; what else stands among them is no actor
@@ -73,11 +74,13 @@ class RedisBus:
     def expire(self, seconds: int | None) -> None:
         """Let all that this run has in Redis vanish after so many seconds; None takes that back."""
         pattern = re.sub(r"([*?\[\]\\])", r"\\\1", self._prefix) + ":*"
+        pieces = self._key("weights", "").encode()
+        named = {key.encode() for version, count in self._heads() for key in self._piece_keys(version, count)}
         for key in self._call(lambda: list(self._redis.scan_iter(match=pattern, count=1000))):
-            if seconds is None:
-                self._call(self._redis.persist, key)
-            else:
+            if seconds is not None:
                 self._call(self._redis.expire, key, seconds)
+            elif not key.startswith(pieces) or key in named:  # of other versions, pieces go anyhow
+                self._call(self._redis.persist, key)
 
     def set_config(self, config: bytes) -> None:
         self._call(lambda: self._redis.set(self._key("config"), config))
@@ -241,27 +244,34 @@ class RedisBus:
 
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
         pieces = split_pieces(blob)
-        head = f"{version.epoch} {version.update} {len(pieces)} {crc32(blob)}"
-        for index, piece in enumerate(pieces):  # one call each: a pipeline would join them into one blob again
-            key = self._key("weights", version.epoch, version.update, index)
-            self._call(self._redis.set, key, piece)
-        heads = [self._key("weights")] + [self._key("evaluate")] * evaluate
+        keys = self._piece_keys(version, len(pieces))
+        for key, piece in zip(
+            keys, pieces, strict=True
+        ):  # one call each: a pipeline would join them into one blob again
+            self._call(lambda key=key, piece=piece: self._redis.set(key, piece, ex=UNPUBLISHED_SECONDS))
         before = self._heads()
+        self._make_newest(version, f"{version.epoch} {version.update} {len(pieces)} {crc32(blob)}", keys, evaluate)
+        self._drop_pieces(before - self._heads())
 
+    def _make_newest(self, version: Version, head: str, pieces: list[str], evaluate: bool) -> None:
+        """Name the version as the newest, and keep its pieces: those of a learner that did not come so far expire."""
         epoch_key = self._key("epoch", "learner")
 
         def transaction(pipe: Any) -> None:
             held = int(pipe.get(epoch_key) or 0)
             if held > version.epoch:
                 raise FencedError(f"learner epoch {version.epoch} was replaced by {held}")
+            if pipe.exists(*pieces) < len(pieces):
+                raise BusUnavailable(f"weights {version.update} are gone before they were published")
             pipe.multi()
             if held < version.epoch:  # Redis lost its data: the next learner must not begin below
                 pipe.set(epoch_key, version.epoch)
-            for key in heads:
-                pipe.set(key, head)
+            for key in pieces:
+                pipe.persist(key)
+            for name in ("weights", "evaluate")[: 1 + evaluate]:
+                pipe.set(self._key(name), head)
 
         self._call(lambda: self._redis.transaction(transaction, epoch_key))
-        self._drop_pieces(before - self._heads())
 
     def _integers(self, raw: bytes | None, count: int) -> list[int] | None:
         """So many numbers, as they stand in a value; None where there is no value, or another one, which is counted."""

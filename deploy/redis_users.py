@@ -30,7 +30,8 @@ ACTOR = (
 EVALUATOR = (READS_WEIGHTS, "(+get %R~R:evaluate)")
 LEARNER = (
     "+watch +unwatch +multi +exec",
-    "(+get +set +expire ~R:weights ~R:weights:* ~R:evaluate)",
+    "(+get +set ~R:weights ~R:evaluate)",
+    "(+set +expire +exists +persist ~R:weights:*)",
     "(+set +watch ~R:epoch:ROLE)",
     "(+hget %R~R:replay)",
 )

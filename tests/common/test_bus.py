@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from common.bus import METRICS_KEPT, Ack, Bus, Entry, EntryId, Holder, MemoryBus, ReplayAddress, Version
+from common.bus import METRICS_KEPT, PIECE_BYTES, Ack, Bus, Entry, EntryId, Holder, MemoryBus, ReplayAddress, Version
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
-from common.redis_bus import RECORDS_READ, RedisBus
+from common.redis_bus import RECORDS_READ, UNPUBLISHED_SECONDS, RedisBus
 from deploy.redis_server import RedisServer
 
 
@@ -183,6 +183,50 @@ def test_a_replaced_learner_cannot_publish(bus):
     with pytest.raises(FencedError):
         bus.publish_weights(Version(old, 99), b"old")
     assert bus.latest_version() == Version(new, 1)
+
+
+def piece_lives(bus: RedisBus) -> dict[Version, list[int]]:
+    """Seconds until each piece there expires, by version; -1 where it does not."""
+    found: dict[Version, list[int]] = {}
+    for key in bus._redis.scan_iter(match=bus._key("weights", "*")):
+        epoch, update, _ = map(int, key.decode().rsplit(":", 3)[1:])
+        found.setdefault(Version(epoch, update), []).append(bus._redis.ttl(key))
+    return found
+
+
+def test_what_was_published_stays_and_what_was_fenced_expires(redis_url):
+    bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
+    old, new, blob = bus.take_epoch("learner"), bus.take_epoch("learner"), os.urandom(PIECE_BYTES + 1)
+    bus.publish_weights(Version(new, 1), blob, evaluate=True)
+    bus.publish_weights(Version(new, 2), blob)
+    bus.publish_weights(Version(new, 2), blob, evaluate=True)  # the version that is there already, and by both names
+    bus.publish_weights(Version(new, 3), blob)
+    with pytest.raises(FencedError):
+        bus.publish_weights(Version(old, 9), blob)
+    lives = piece_lives(bus)
+    assert lives[Version(new, 2)] == lives[Version(new, 3)] == [-1, -1]
+    assert all(0 < life <= 5 for life in lives[Version(new, 1)])
+    assert all(0 < life <= UNPUBLISHED_SECONDS for life in lives[Version(old, 9)])
+    assert len(lives[Version(old, 9)]) == 2
+    bus.expire(None)  # the run goes on: what nobody published still goes
+    lives = piece_lives(bus)
+    assert lives[Version(new, 2)] == lives[Version(new, 3)] == [-1, -1]
+    assert all(life > 0 for life in lives[Version(old, 9)])
+
+
+def test_weights_that_went_before_they_were_the_newest_are_not_named(redis_url, monkeypatch):
+    bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
+    bus.publish_weights(Version(1, 1), b"one")
+    transaction = bus._redis.transaction
+
+    def empty_and_go_on(*args):
+        bus._redis.delete(bus._key("weights", 1, 2, 0))
+        return transaction(*args)
+
+    monkeypatch.setattr(bus._redis, "transaction", empty_and_go_on)
+    with pytest.raises(BusUnavailable, match="gone before"):
+        bus.publish_weights(Version(1, 2), b"two")
+    assert bus.weights() == (Version(1, 1), b"one")
 
 
 def test_metrics_by_role(bus):
