@@ -98,9 +98,12 @@ class Loaded(Training):
             time.sleep(0.005)
 
     def process_of(self, role: str) -> psutil.Process:
-        """The process of ``actor-1``, ``learner``, ``replay`` or ``redis``."""
+        """The process of ``actor-1``, ``learner``, ``replay``, ``redis``, the ``nursery`` or the ``launcher``."""
+        if role == "launcher":
+            return self.launcher
         word, _, index = role.partition("-")
-        pattern = "unixsocket" if role == "redis" else rf"deploy\.cli {word} .*{f'--index {index}' if index else ''}"
+        others = {"redis": "unixsocket", "nursery": r"deploy\.nursery"}
+        pattern = others.get(role, rf"deploy\.cli {word} .*{f'--index {index}' if index else ''}")
         found: list[psutil.Process] = []
 
         def there() -> bool:
@@ -157,9 +160,9 @@ class Loaded(Training):
         return self.until(lambda: _all_moved(acks, self.acks.copy()) and max(self.versions, default=before) > before)
 
     def held(self) -> dict[str, tuple[float, int]]:
-        """Of each role, and of an embedded Redis: memory that is no file's, so not the ring's, in MB; open files."""
-        roles = ["replay", "learner", "evaluator", *(f"actor-{actor}" for actor in range(ACTORS))]
-        roles += [] if self._redis_url else ["redis"]
+        """Of each process, and of an embedded Redis: memory that is no file's, so not the ring's, in MB; open files."""
+        roles = ["launcher", "nursery", "replay", "learner", "evaluator"]
+        roles += [f"actor-{actor}" for actor in range(ACTORS)] + ["redis"] * (not self._redis_url)
         processes = {role: self.process_of(role) for role in roles}
         return {role: (_anonymous_mb(process.pid), process.num_fds()) for role, process in processes.items()}
 

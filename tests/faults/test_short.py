@@ -26,6 +26,7 @@ from tests.faults.soak import soaked
 
 OPTIONS = (*ROOMY, "--checkpoint-steps", "1000")  # none is evicted before all is judged
 FULL = ("--capacity", "300")  # windows
+EARLY_RATIO = 0.1  # off its own, as a share
 MOST_GROWTH = 0.05  # of a role's memory within seconds
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="hooks of a nursery, small disks, memory by /proc")
 compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="the other clock is in C")
@@ -187,7 +188,7 @@ def updates_in(run: Loaded, seconds: float) -> int:
 
 
 def test_a_full_ring_wraps(full: Loaded) -> None:
-    row = soaked(full, 10.0, 2.0, MOST_GROWTH)
+    row = soaked(full, 10.0, 2.0, MOST_GROWTH, EARLY_RATIO)
     assert row.passed, row
 
 
