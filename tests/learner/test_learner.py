@@ -11,7 +11,7 @@ from common.bus import EntryId, MemoryBus
 from common.checkpoint import CheckpointFolder
 from common.errors import CheckpointError, FencedError, RmcError
 from common.wire import encode_hello, encode_windows
-from learner.learner import Learner, LearnerConfig, latent_rank
+from learner.learner import Learner, LearnerConfig, is_finite, latent_rank
 from learner.update import UpdateConfig
 from replay_server.server import ReplayConfig, ReplayServer
 from tests.hostile import hostile_state
@@ -223,10 +223,65 @@ def test_divergence_ends_it_and_keeps_the_last_good_checkpoint(setting):
     assert setting.learner.checkpoints.numbers() == saved
 
 
+SPOILT = {
+    "a critic": lambda update: update.agent.critic.parameters(),
+    "a target critic": lambda update: update.target_critic.parameters(),
+    "the target memory": lambda update: update.target_memory.parameters(),
+    "the world model": lambda update: update.agent.world_model.parameters(),
+    "a mean moment": lambda update: [part["exp_avg"] for part in update.optimizers[0].state.values()],
+    "a square moment": lambda update: [part["exp_avg_sq"] for part in update.optimizers[0].state.values()],
+    "curiosity's variance": lambda update: [update.curiosity_variance],
+}
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("part", SPOILT)
+def test_nothing_that_is_not_finite_is_saved(setting, part, value):
+    setting.feed(60)
+    setting.learner.step()
+    assert setting.learner.checkpoint()
+    saved = setting.learner.checkpoints.numbers()
+    setting.learner.step()
+    with torch.no_grad():
+        list(SPOILT[part](setting.learner.update))[-1].view(-1)[-1] = value
+    with pytest.raises(RmcError, match=r"update 2: training has diverged, weights are not finite"):
+        setting.learner.checkpoint()
+    setting.learner.close()
+    assert setting.learner.checkpoints.numbers() == saved == [1]
+    resumed = setting.start()
+    assert resumed.updates == 1
+    resumed.finished = True
+    resumed.close()
+
+
+def test_critics_spoilt_by_one_gradient_are_not_saved_though_the_policy_is_sound(setting):
+    setting.feed(60)
+    setting.learner.step()
+    weight = next(setting.learner.agent.critic.parameters())
+    hook = weight.register_hook(lambda gradient: torch.full_like(gradient, float("inf")))
+    setting.learner.step()
+    hook.remove()
+    assert not weight.isfinite().all()
+    assert all(value.isfinite().all() for value in setting.learner.agent.policy_weights().values())
+    setting.learner.close()  # which saves what is sound
+    assert setting.learner.checkpoints.numbers() == []
+
+
 def step_for_long(setting: Setting) -> None:
     for _ in range(100):
         setting.feed(60)
         setting.learner.step()
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([], True), ([1.0, -2.0], True), ([3e38, 3e38], True), ([0.0, float("nan")], False),
+        ([float("inf"), -float("inf")], False), ([3e38, 3e38, -float("inf")], False),
+    ],
+)  # fmt: skip
+def test_large_values_are_finite(values, expected):
+    assert is_finite(torch.tensor(values)) is expected
 
 
 def test_latent_rank_sees_a_collapse():
