@@ -14,6 +14,7 @@ from common.checksum import crc32
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
 from common.pending_read import PendingRead
 from common.record import decode_record, encode_record
+from common.redis_url import shown
 
 DEAD_LETTERS_KEPT = 1_000
 INTEGER = re.compile(rb"-?[0-9]{1,18}")
@@ -43,8 +44,11 @@ class RedisBus:
             self._redis: Any = redis.Redis.from_url(  # Any: its annotations do not know decode_responses
                 url, retry=Retry(ExponentialBackoff(cap=0.1, base=0.01), retries=3), socket_timeout=10.0
             )
-        except ValueError as error:
-            raise ConfigError("--redis-url", url.split("@")[-1], f"not a Redis URL ({error})") from None
+        except ValueError:  # its words quote parts of the URL, which may be a password's
+            fix = (
+                "not a Redis URL; give unix:///path, redis://host:port or rediss://…, in a password %2F for / and so on"
+            )
+            raise ConfigError("--redis-url", shown(url), fix) from None
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
         self._pending = PendingRead(self._redis.connection_pool)

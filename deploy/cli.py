@@ -58,17 +58,26 @@ def run(words: list[str]) -> int:
 
 
 def _parse_and_run(words: list[str]) -> int:
+    from common.redis_url import without_passwords
     from deploy import commands, options
 
-    said = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(io.StringIO()):
             command = options.parse(words)
     except SystemExit as ending:
         if not ending.code:  # --help
             return 0
-        return _complain(_as_line(said.getvalue()), CONFIG_STATUS)
+        return _complain(_complaint([without_passwords(word) for word in words]), CONFIG_STATUS)
     return commands.execute(command)
+
+
+def _complaint(words: list[str]) -> str:
+    """What is wrong with words that cannot be parsed; it quotes them."""
+    from deploy import options
+
+    with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.suppress(SystemExit):
+        options.parse(words)
+    return _as_line(said.getvalue())
 
 
 def _as_line(boxed: str) -> str:

@@ -21,6 +21,7 @@ from common.envs import make_env
 from common.errors import BusFull, BusUnavailable, ConfigError
 from common.outage import Outage
 from common.redis_bus import RedisBus
+from common.redis_url import shown
 from common.replay import Shard
 from common.role import RECONNECT_SLEEP, StopSignal, run_role
 from common.watchdog import Watchdog
@@ -121,7 +122,7 @@ def connect(url: str, run: str, patience_seconds: float = 0.0) -> RedisBus:
             return bus
         except BusUnavailable as error:
             if time.monotonic() >= deadline:
-                raise ConfigError("--redis-url", without_password(url), f"no Redis answers there ({error})") from None
+                raise ConfigError("--redis-url", shown(url), f"no Redis answers there ({error})") from None
         time.sleep(RECONNECT_SLEEP)
 
 
@@ -130,12 +131,6 @@ def _in_file(path: Path) -> str:
         return path.read_text().strip()
     except OSError as error:
         raise ConfigError("--redis-url", f"file:{path}", f"cannot be read ({error.strerror})") from None
-
-
-def without_password(url: str) -> str:
-    """The URL as it may be shown."""
-    scheme, separator, rest = url.partition("://")
-    return scheme + separator + rest.rpartition("@")[2]
 
 
 def run_actor(place: Place, index: int) -> None:

@@ -19,6 +19,7 @@ from rich.console import Console
 from common.bus import Bus
 from common.checkpoint import CheckpointFolder
 from common.errors import ConfigError, RoleDied
+from common.redis_url import shown
 from common.role import StopSignal
 from deploy import attachment, local, lockstep
 from deploy.evaluation import evaluate_blob, evaluate_checkpoint, initial_policy
@@ -170,7 +171,7 @@ def prepare(config: RunConfig, placement: Placement) -> RunFolder:
     if placement.launcher != "ray":  # there, the learner's node has the device
         check_device(placement.device)
     elif placement.redis_url is not None:
-        raise ConfigError("--redis-url", placement.redis_url, "a run on Ray has a Redis of its own, on the head")
+        raise ConfigError("--redis-url", shown(placement.redis_url), "a run on Ray has a Redis of its own, on the head")
     if placement.all_cpus and placement.launcher != "ray":
         raise ConfigError("--all-cpus", True, "give --launcher ray; elsewhere say how many --actors")
     if placement.tls and placement.launcher != "ray":

@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 
 from common.envs import EnvConfig
+from common.errors import ConfigError
 from deploy import cli, options, presets
 from deploy.presets import to_json
 from deploy.run_folder import RunFolder, open_run
+from deploy.training import Placement, prepare
 
 PENDULUM = "InvertedPendulum-v5"
 DEBUG = ["train", PENDULUM, "--preset", "debug"]
@@ -88,6 +90,11 @@ def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         (["train", "tests.deploy.odd_envs:OddUnbounded-v0"], "unbounded"),
         ([*DEBUG, "--redis-url", "unix:///nowhere/redis.sock"], "--redis-url"),
         ([*DEBUG, "--redis-url", "redis://user:hush@localhost:1"], "redis://localhost:1"),
+        ([*DEBUG, "--redis-url", "redis://localhost:1?password=hush"], "redis://localhost:1"),
+        ([*DEBUG, "--redis-url", "redis://:hush#x@localhost:1"], "--redis-url='redis://…'"),
+        ([*DEBUG, "--launcher", "lockstep", "--redis-url", "redis://:hu/sh@localhost:1"], "--redis-url='redis://…'"),
+        ([*DEBUG, f"--redis-ulr=redis://:{80 * 'x'}hush@localhost:1"], "--redis-ulr=redis://localhost:1"),
+        ([*DEBUG, "--actors", "redis://:hush@localhost:1"], "redis://localhost:1"),
         ([*DEBUG, "--redis-url", "localhost"], "--redis-url"),
         ([*DEBUG, "--gamma", "nan"], "--gamma"),
         ([*DEBUG, "--total-steps", "-5"], "--total-steps"),
@@ -122,6 +129,13 @@ def test_errors_are_one_line(
     assert named in line
     assert "hush" not in line
     assert not list(tmp_path.iterdir())  # nothing was started or written
+
+
+def test_a_redis_beside_ray_is_refused_without_its_password() -> None:
+    """Where the check is made: to get there from the command line takes a cluster."""
+    placement = Placement(None, "fail", "ray", "cpu", "redis://user:hush@localhost:1")
+    with pytest.raises(ConfigError, match="--redis-url='redis://localhost:1': a run on Ray"):
+        prepare(presets.debug(EnvConfig(PENDULUM)), placement)
 
 
 def test_a_full_disk_is_one_line(

@@ -1,0 +1,34 @@
+"""A Redis's URL as it may be shown: its user-info and its query, either of which may hold a password, are left out."""
+
+import re
+from urllib.parse import SplitResult, urlsplit
+
+SCHEMES = ("redis", "rediss", "unix")
+HIDDEN = "…"  # stands for what may hold a password
+
+
+def shown(url: str) -> str:
+    """Scheme and place; the scheme alone where the URL cannot be parsed. A word without ``://`` shows nothing."""
+    scheme, separator, _ = url.partition("://")
+    if not separator or scheme not in SCHEMES:
+        return HIDDEN
+    try:
+        return f"{scheme}://{_place(urlsplit(url)) or HIDDEN}"
+    except ValueError:
+        return f"{scheme}://{HIDDEN}"
+
+
+def _place(parts: SplitResult) -> str:
+    """Host and port, or a socket's path; empty where a password's ``/``, ``?`` or ``#`` may have ended the user-info.
+
+    Raises ValueError where the port is none.
+    """
+    _ = parts.port  # read for its check
+    if parts.fragment or "@" in parts.path + parts.query:
+        return ""
+    return parts.path if parts.scheme == "unix" else parts.netloc.rpartition("@")[2]
+
+
+def without_passwords(word: str) -> str:
+    """A word of a command line, the URL that it may end with as it may be shown."""
+    return re.sub(r"[\w+.-]*://.*", lambda found: shown(found[0]), word, flags=re.DOTALL)
