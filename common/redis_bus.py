@@ -45,9 +45,7 @@ class RedisBus:
                 url, retry=Retry(ExponentialBackoff(cap=0.1, base=0.01), retries=3), socket_timeout=10.0
             )
         except ValueError:  # its words quote parts of the URL, which may be a password's
-            fix = (
-                "not a Redis URL; give unix:///path, redis://host:port or rediss://…, in a password %2F for / and so on"
-            )
+            fix = "not a Redis URL; give unix:///path, redis://host:port or rediss://…, in a password %2F for / and so on"
             raise ConfigError("--redis-url", shown(url), fix) from None
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
@@ -249,9 +247,7 @@ class RedisBus:
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
         pieces = split_pieces(blob)
         keys = self._piece_keys(version, len(pieces))
-        for key, piece in zip(
-            keys, pieces, strict=True
-        ):  # one call each: a pipeline would join them into one blob again
+        for key, piece in zip(keys, pieces, strict=True):  # one by one: a pipeline would join them into a blob again
             self._call(lambda key=key, piece=piece: self._redis.set(key, piece, ex=UNPUBLISHED_SECONDS))
         before = self._heads()
         self._make_newest(version, f"{version.epoch} {version.update} {len(pieces)} {crc32(blob)}", keys, evaluate)
