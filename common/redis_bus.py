@@ -45,7 +45,7 @@ class RedisBus:
                 url, retry=Retry(ExponentialBackoff(cap=0.1, base=0.01), retries=3), socket_timeout=10.0
             )
         except ValueError:  # its words quote parts of the URL, which may be a password's
-            fix = "not a Redis URL; give unix:///path, redis://host:port or rediss://…, in a password %2F for / and so on"
+            fix = "not a Redis URL; give unix:///path, redis://host:port or rediss://…; in a password, %2F is /"
             raise ConfigError("--redis-url", shown(url), fix) from None
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
