@@ -171,7 +171,7 @@ class RedisBus:
             self._commit(holder, acks, progress)
 
     def _trim(self, holder: Holder, acks: Mapping[int, Ack]) -> None:
-        """Trim alone, in a script: a full Redis refuses every transaction."""
+        """Trim alone, in a script: a full Redis refuses all commands in a MULTI, XTRIM too; outside it is not fenced."""
         keys = [self._key("epoch", holder.role), *(self._key("windows", actor) for actor in acks)]
         words = [str(holder.epoch), *(f"{ack.id.epoch}-{ack.id.seq + 1}" for ack in acks.values())]
         if self._call(lambda: self._redis.eval(TRIM_SCRIPT, len(keys), *keys, *words)) < 0:
@@ -247,8 +247,8 @@ class RedisBus:
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
         pieces = split_pieces(blob)
         keys = self._piece_keys(version, len(pieces))
-        for key, piece in zip(keys, pieces, strict=True):  # one by one: a pipeline would join them into a blob again
-            self._call(lambda key=key, piece=piece: self._redis.set(key, piece, ex=UNPUBLISHED_SECONDS))
+        for key, piece in zip(keys, pieces, strict=True):  # one call each: a pipeline would make them one blob again
+            self._call(self._redis.set, key, piece, UNPUBLISHED_SECONDS)
         before = self._heads()
         self._make_newest(version, f"{version.epoch} {version.update} {len(pieces)} {crc32(blob)}", keys, evaluate)
         self._drop_pieces(before - self._heads())

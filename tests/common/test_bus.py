@@ -9,6 +9,7 @@ import uuid
 from pathlib import Path
 
 import pytest
+import redis
 
 from common.bus import METRICS_KEPT, PIECE_BYTES, Ack, Bus, Entry, EntryId, Holder, MemoryBus, ReplayAddress, Version
 from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
@@ -313,6 +314,21 @@ def test_a_full_redis_is_emptied_by_commits():
                 RedisBus(f"{server.url()}?db=99", "full").ping()
     finally:
         shutil.rmtree(folder)
+
+
+def test_a_full_redis_trims_in_no_transaction():
+    """Or trimming would need no script, and no role the right to run one."""
+    with tempfile.TemporaryDirectory(prefix="rmc-full-") as folder, RedisServer(Path(folder)) as server:
+        bus = RedisBus(server.url(), "full")
+        for seq in range(20):
+            bus.append(0, EntryId(1, seq), b"x" * 200_000)
+        bus._redis.config_set("maxmemory", 2 << 20)
+        pipe = bus._redis.pipeline()
+        pipe.xtrim(bus._key("windows", 0), maxlen=1, approximate=False)
+        with pytest.raises(redis.exceptions.OutOfMemoryError):
+            pipe.execute()
+        bus.commit(Holder("replay", 1), {0: Ack(EntryId(1, 18), 5)})
+        assert bus._redis.xlen(bus._key("windows", 0)) == 1
 
 
 def fill(bus: Bus, start: int = 0) -> int:

@@ -1,5 +1,6 @@
 """Every role may do in Redis what its work takes, and nothing else; against a real server."""
 
+import re
 import socket
 import stat
 import tempfile
@@ -12,8 +13,9 @@ import redis
 from common.bus import Ack, EntryId, Holder, Version
 from common.errors import BusUnavailable, ConfigError
 from common.redis_bus import RedisBus
+from common.replay import Shard
 from deploy.redis_server import Port, RedisServer
-from deploy.redis_users import LAUNCHER, RedisUsers
+from deploy.redis_users import LAUNCHER, RedisUsers, actor_patterns
 from deploy.roles import connect
 
 SECRET = b"of the run"
@@ -34,10 +36,14 @@ FORBIDDEN = {  # R for the prefix
         XADD R:metrics:learner * r x|XADD R:dead * reason x
     """,
     "actor-1": "XADD R:windows:0 * p x|XADD R:windows:10 * p x|INCR R:epoch:actor-0|XINFO STREAM R:windows:0",
-    "evaluator": "XADD R:windows:0 * p x|SET R:evaluate x|HGET R:acks 0|SCAN 0|INCR R:epoch:learner",
+    "evaluator": """
+        XADD R:windows:0 * p x|SET R:evaluate x|HGET R:acks 0|SCAN 0|INCR R:epoch:learner
+        SET R:weights x|SET R:weights:1:1:0 x|SET R:config x|SET R:stop x
+    """,
     "learner": """
         XADD R:windows:0 * p x|SET R:config x|INCR R:epoch:replay|HSET R:replay a b|XREAD STREAMS R:windows:0 0
-        SET R:stop x|SCAN 0|DEL R:weights
+        SET R:stop x|SCAN 0|DEL R:weights|HSET R:acks 0 x|HSET R:progress replay x|HSETNX R:progress replay x
+        SADD R:actors 7|XADD R:dead * reason x|EXPIRE R:weights 1|PERSIST R:config
     """,
     "replay": """
         XADD R:windows:0 * p x|SET R:weights x|SET R:config x|SET R:epoch:learner 9|SADD R:actors 7|SCAN 0
@@ -103,10 +109,47 @@ def test_every_role_can_do_its_work(server: RedisServer) -> None:
     launcher.expire(60)
 
 
+SHARDED = RedisUsers(USERS.run, SECRET, ("replay-0", "replay-1", "actor-0", "actor-1"))
+FORBIDDEN_TO_SHARDS = """
+    DEL R:windows:OTHER|XTRIM R:windows:OTHER MAXLEN 0|XREAD STREAMS R:windows:OTHER 0|XADD R:windows:OTHER * p x
+    XREAD STREAMS R:windows:OWN R:windows:OTHER 0 0|DEL R:windows:1OTHER|DEL R:windows:204OTHER|DEL R:windows:1000OTHER
+    DEL R:windows:|DEL R:windows:*|DEL R:windows:x
+    EVAL redis.call('XTRIM',KEYS[1],'MAXLEN',0) 1 R:windows:OTHER|EVAL redis.call('GET',KEYS[1]) 1 R:epoch:replay-OTHER
+    INCR R:epoch:replay-OTHER|SET R:epoch:replay-OTHER 9|SET R:epoch:learner 9|XADD R:metrics:replay-OTHER * r x
+    SET R:weights x|SET R:config x|SADD R:actors 7|SCAN 0
+"""
+
+
+def test_shards_have_their_own_actors_streams() -> None:
+    with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=SHARDED) as server:
+        for own, other in ((0, 1), (1, 0)):
+            bus = RedisBus(server.url(f"replay-{own}"), USERS.run)
+            holder = Holder(f"replay-{own}", bus.take_epoch(f"replay-{own}"))
+            acks = {actor + own: Ack(EntryId(1, 1), 0) for actor in (0, 8, 10, 98, 100, 4094)}
+            bus.commit(holder, acks, b"counted")
+            bus._trim(holder, acks)
+            bus.drop_stream(holder, own)
+            forbidden = FORBIDDEN_TO_SHARDS.replace("OTHER", str(other)).replace("OWN", str(own))
+            with redis.Redis.from_url(server.url(holder.role)) as client:
+                for words in split_commands(forbidden):
+                    assert "permission" in answer(client, words), words
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 7, 8, 16, 1009])
+def test_an_actors_stream_is_one_shards(count: int) -> None:
+    patterns = [re.compile("|".join(actor_patterns(Shard(index, count)))) for index in (0, 1, count // 2, count - 1)]
+    for index, pattern in zip((0, 1, count // 2, count - 1), patterns, strict=True):
+        assert [actor for actor in range(4096) if pattern.fullmatch(str(actor))] == list(range(index, 4096, count))
+    assert len(actor_patterns(Shard(0, count))) <= 400
+
+
 def commands(user: str) -> list[list[str]]:
     """The words of every command that a user may not use."""
-    lines = "\n".join([EVERYWHERE, FORBIDDEN[user]]).replace("\n", "|").split("|")
-    prefix = f"rmc:{USERS.run}:"
+    return split_commands("\n".join([EVERYWHERE, FORBIDDEN[user]]))
+
+
+def split_commands(text: str) -> list[list[str]]:
+    lines, prefix = text.replace("\n", "|").split("|"), f"rmc:{USERS.run}:"
     return [[word.replace("R:", prefix, 1) for word in line.split()] for line in lines if line.strip()]
 
 
