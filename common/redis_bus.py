@@ -171,7 +171,7 @@ class RedisBus:
             self._commit(holder, acks, progress)
 
     def _trim(self, holder: Holder, acks: Mapping[int, Ack]) -> None:
-        """Trim alone, in a script: a full Redis refuses all commands in a MULTI, XTRIM too; outside it is not fenced."""
+        """Trim alone, in a script: a full Redis refuses all commands in a MULTI, XTRIM too; alone it is not fenced."""
         keys = [self._key("epoch", holder.role), *(self._key("windows", actor) for actor in acks)]
         words = [str(holder.epoch), *(f"{ack.id.epoch}-{ack.id.seq + 1}" for ack in acks.values())]
         if self._call(lambda: self._redis.eval(TRIM_SCRIPT, len(keys), *keys, *words)) < 0:

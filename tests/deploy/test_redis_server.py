@@ -12,7 +12,7 @@ import pytest
 import redis
 
 from common.errors import ConfigError
-from deploy.redis_server import RedisServer
+from deploy.redis_server import MAX_VALUE, RedisServer
 
 HOLDER = """
 import sys, time
@@ -48,6 +48,14 @@ def test_dies_with_its_parent(tmp_path: Path) -> None:
     while server.is_running() and server.status() != psutil.STATUS_ZOMBIE and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not server.is_running() or server.status() == psutil.STATUS_ZOMBIE
+
+
+def test_takes_no_larger_value_than_a_role_may_need(tmp_path: Path) -> None:
+    with RedisServer(tmp_path) as server, redis.Redis.from_url(server.url()) as client:
+        assert client.set("large", bytes(MAX_VALUE))
+        with pytest.raises(redis.exceptions.RedisError), redis.Redis.from_url(server.url(), retry=None) as liar:
+            liar.set("larger", bytes(MAX_VALUE + 1))
+        assert client.keys() == [b"large"]
 
 
 def test_long_path_is_refused(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from common.bus import MemoryBus
@@ -522,6 +523,16 @@ def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> Non
         served.close = lambda: None  # type: ignore[method-assign]
     assert client.sample(16).draw in (Draw.WAIT, Draw.BATCH)
     client.close()
+
+
+def test_it_listens_on_the_interface_named_alone(serve: Serve) -> None:
+    served = serve(address="tcp:127.0.0.1:0")
+    port = int(served.address.rpartition(":")[2])
+    own = [found.address for each in psutil.net_if_addrs().values() for found in each if found.family == socket.AF_INET]
+    for other in {"127.0.0.2", *own} - {"127.0.0.1"}:
+        with pytest.raises(OSError, match=r"refused|assign"), socket.create_connection((other, port), 5.0):
+            pass
+    works(served)
 
 
 @pytest.mark.parametrize(
