@@ -23,9 +23,8 @@ START_SECONDS = 10.0
 STOP_SECONDS = 2.0
 SOCKET_PATH_LIMIT = 107  # bytes of a unix socket's path that the kernel takes
 MAXMEMORY = 2 << 30  # the last backstop: what is on its way is far less, and a full server refuses instead of evicting
-MAX_VALUE = (
-    64 << 20
-)  # bytes that a role may send as one value; a policy's pieces have 256 KiB, windows some MiB at most
+# Bytes of one value at most: a policy's pieces have 256 KiB, windows some MiB; Redis would take 512 MiB.
+MAX_VALUE = 64 << 20
 # No ``timeout``: a role that was stopped for a while would find its connection gone. No smaller ``maxclients``:
 # strangers would only fill it sooner.
 

@@ -50,8 +50,10 @@ class ReplayProcess:
         return "redis" if self._bus_is_away else self.server.waiting_for()
 
     def metrics(self) -> dict[str, Any]:
-        """The server's, and how many clients the socket refused."""
-        return {**self.server.metrics(), "refused_clients": self.sockets.refused.total()}
+        """The server's, and how many clients the socket refused, also by reason."""
+        refused = self.sockets.refused
+        reasons = {f"refused_clients_{reason}": count for reason, count in refused.items()}
+        return {**self.server.metrics(), "refused_clients": refused.total(), **reasons}
 
     def close(self) -> None:
         """Close the socket, then the server."""

@@ -92,6 +92,8 @@ def test_a_replaced_learner_that_comes_first_is_not_served(
         until(lambda: bus.replay_address("replay") is not None)
         with pytest.raises(FencedError, match=f"the learner of epoch {stale} was replaced by {epoch}"):
             client_of(bus, stale).sample(16)
+        metrics = running.process.metrics()
+        assert (metrics["refused_clients"], metrics["refused_clients_fenced"]) == (1, 1)
         client = client_of(bus, epoch)
         assert client.sample(16).draw is Draw.WAIT
         bus.take_epoch("learner")  # by a third, which has not come yet
