@@ -1,0 +1,108 @@
+"""What a real run leaves or shows, searched for every password of its Redis and for its secret."""
+
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import psutil
+
+from deploy.redis_server import server_binary
+from deploy.redis_users import LAUNCHER, RedisUsers
+from deploy.run_folder import RunFolder
+from tests.integration.running import Training
+
+PASSWORD = "hunter2-of-the-users-own-redis"
+
+
+class Watched(Training):
+    """Keeps the command lines of all its processes and what stands beside its sockets, whenever it is waited for."""
+
+    def look(self) -> None:
+        """Once."""
+        self.seen: dict[str, bytes] = getattr(self, "seen", {})
+        for process in [self.launcher, *self.launcher.children(recursive=True)]:
+            with suppress(psutil.NoSuchProcess):
+                words = " ".join(process.cmdline())
+                self.seen[words] = words.encode()
+        for path in self.sockets():
+            if path.is_file():
+                self.seen[str(path)] = path.read_bytes()
+
+    def go_on(self, updates: int) -> None:
+        """So many updates more, looking on."""
+        goal = self.newest("learner", "updates") + updates
+        self.wait_for(lambda: (self.look(), self.newest("learner", "updates") >= goal)[1])
+
+    def left(self) -> dict[str, bytes]:
+        """All that was seen, all that it printed, and every file in its folder."""
+        files = {str(path): path.read_bytes() for path in (self.output, *self.folder.rglob("*")) if path.is_file()}
+        return self.seen | files
+
+
+def holding(left: dict[str, bytes], words: set[bytes]) -> set[str]:
+    """Where one of these words stands."""
+    return {name for name, content in left.items() if any(word in content for word in words)}
+
+
+def check_all_was_searched(left: dict[str, bytes], folder: Path) -> None:
+    """Every kind of what a run leaves or shows was among it."""
+    for name in ("config.json", "metrics.jsonl", "logs/learner.log", "logs/actor-0.log", "logs/evaluator.log"):
+        assert str(folder / name) in left
+    for part in ("events.out.tfevents", "checkpoints/", ".out", "cli actor", "cli replay", "cli learner"):
+        assert any(part in name for name in left), part
+    assert left[str(folder / "logs" / "actor-0.log")] + left[f"{folder}.out"]
+
+
+def test_passwords_and_secret_of_an_embedded_redis_are_nowhere(tmp_path: Path) -> None:
+    """Nor after it was killed, of which all roles tell; the secret stands in its own file."""
+    with Watched(tmp_path / "run", "--total-steps", "100000000", "--checkpoint-steps", "500") as training:
+        training.go_on(1)
+        redis = training.role("redis")
+        assert redis is not None
+        redis.kill()
+        training.go_on(20)
+        training.interrupt()
+    run = RunFolder(training.folder)
+    users = RedisUsers(run.name, run.secret(), run.config().roles())
+    passwords = {users.password(user).encode() for user in (LAUNCHER, *users.roles)}
+    left = training.left()
+    check_all_was_searched(left, training.folder)
+    assert any(name.endswith("users.acl") for name in left)
+    assert b"Redis is back" in b"".join(left.values())
+    assert holding(left, passwords) == set()
+    assert holding(left, {run.secret()}) == {str(run.secret_file)}
+
+
+@contextmanager
+def own_redis() -> Iterator[str]:
+    """A user's, which asks for a password; its URL."""
+    with tempfile.TemporaryDirectory(prefix="rmc-own-") as folder:
+        socket = Path(folder) / "own.sock"
+        words = f'port 0\nunixsocket {socket}\nsave ""\ndir {folder}\nrequirepass {PASSWORD}\n'
+        server = subprocess.Popen([server_binary(), "-"], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+        assert server.stdin is not None
+        with server.stdin as settings:
+            settings.write(words.encode())
+        while not socket.exists():
+            assert server.poll() is None
+            time.sleep(0.05)
+        yield f"unix://:{PASSWORD}@{socket}"
+        server.kill()
+        server.wait()
+
+
+def test_the_password_of_the_users_own_redis_is_nowhere(tmp_path: Path) -> None:
+    """It stands in a file, which the command line names."""
+    with own_redis() as url:
+        (tmp_path / "redis-url").write_text(f"{url}\n")
+        options = ("--total-steps", "700", "--checkpoint-steps", "600", "--redis-url", f"file:{tmp_path}/redis-url")
+        with Watched(tmp_path / "run", *options) as training:
+            training.go_on(1)
+            assert training.finish(150) == 0, training.text()
+    left = training.left()
+    check_all_was_searched(left, training.folder)
+    assert holding(left, {PASSWORD.encode()}) == set()
+    assert holding(left, {RunFolder(training.folder).secret()}) == {str(training.folder / "secret")}
