@@ -34,6 +34,7 @@ from deploy import tls
 from deploy.counters import Counters
 from deploy.local import PREFIX, TICK_SECONDS, register, sweep, watch
 from deploy.monitor import Monitor
+from deploy.nursery import URL_VARIABLE
 from deploy.presets import RunConfig, to_json
 from deploy.ray_host import NAMESPACE, Task, host_name
 from deploy.ray_hosted import Hosted
@@ -51,7 +52,7 @@ from deploy.ray_places import (
 from deploy.redis_server import Port, RedisServer
 from deploy.redis_users import RedisUsers
 from deploy.rings import Rings
-from deploy.roles import PATIENCE_VARIABLE, URL_VARIABLE, connect
+from deploy.roles import PATIENCE_VARIABLE, connect
 from deploy.run_folder import RunFolder
 from deploy.supervisor import QUICK_DEATHS
 

@@ -18,14 +18,26 @@ from rich.console import Console
 from common.errors import ConfigError
 from deploy import attachment, curves, env_check, export, history, inspection, options, roles, training, video
 from deploy.evaluation import evaluate_checkpoint
+from deploy.nursery import SECRET_VARIABLE, URL_VARIABLE
 from deploy.policy import load_policy
 from deploy.run_folder import RunFolder
 from deploy.view import Board, table
 
+Role = options.ActorRole | options.ReplayRole | options.LearnerRole | options.EvaluatorRole
+
 
 def execute(command: options.Command) -> int:
     """Run a parsed command; its exit status. Raises RmcError."""
-    return ACTIONS.get(type(command), run_role)(command)
+    given = Given()
+    act = ACTIONS.get(type(command))
+    return act(command) if act is not None else run_role(command, given)
+
+
+class Given:
+    """What the environment told this process alone: taken out of it, before anything is started that would inherit."""
+
+    def __init__(self) -> None:
+        self.redis_url, self.secret = (os.environ.pop(name, "") for name in (URL_VARIABLE, SECRET_VARIABLE))
 
 
 def train(command: options.Train) -> int:
@@ -34,18 +46,18 @@ def train(command: options.Train) -> int:
     return training.train(command.config(), command.placement(), Console())
 
 
-def run_role(command: options.ActorRole | options.ReplayRole | options.LearnerRole | options.EvaluatorRole) -> int:
+def run_role(command: Role, given: Given) -> int:
     """Be one role of a run until it ends."""
-    url = command.redis_url or os.environ.get(roles.URL_VARIABLE, "")
+    url = command.redis_url or given.redis_url
     if not url:
-        raise ConfigError("--redis-url", url, f"say where the run's Redis is, or set {roles.URL_VARIABLE}")
+        raise ConfigError("--redis-url", url, f"say where the run's Redis is, or set {URL_VARIABLE}")
     if isinstance(command, options.ActorRole):
         roles.run_actor(roles.Place(command.run, url), command.index)
     elif isinstance(command, options.ReplayRole):
-        place = roles.Place(command.run, url, command.secret_file, command.tls_folder)
+        place = roles.Place(command.run, url, given.secret, command.secret_file, command.tls_folder)
         roles.run_replay(place, command.folder, command.listen, command.shard)
     elif isinstance(command, options.LearnerRole):
-        place = roles.Place(command.run, url, command.secret_file, command.tls_folder)
+        place = roles.Place(command.run, url, given.secret, command.secret_file, command.tls_folder)
         roles.run_learner(place, command.folder, command.device)
     else:
         roles.run_evaluator(roles.Place(command.run, url))

@@ -16,10 +16,11 @@ from common.replay import Shard
 from common.role import StopSignal
 from deploy.counters import Counters
 from deploy.monitor import Monitor
+from deploy.nursery import URL_VARIABLE
 from deploy.presets import RunConfig, to_json
 from deploy.redis_server import RedisServer
 from deploy.redis_users import LAUNCHER, RedisUsers
-from deploy.roles import PATIENCE_VARIABLE, URL_VARIABLE, connect
+from deploy.roles import PATIENCE_VARIABLE, connect
 from deploy.run_folder import RunFolder
 from deploy.supervisor import STOP_SECONDS, RoleCommand, Supervisor
 

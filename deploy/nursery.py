@@ -25,6 +25,7 @@ from common.errors import RoleDied
 from deploy import lifeline
 
 SINGLE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+SECRET_VARIABLE, URL_VARIABLE = "RMC_SECRET", "RMC_REDIS_URL"  # each for one role: what it starts does not inherit it
 LARGEST = 65_536  # bytes of a request
 POLL_SECONDS = 0.01
 END_SECONDS = 2.0
@@ -35,6 +36,11 @@ FAILED_STATUS = 1
 def command_line(words: Sequence[str]) -> list[str]:
     """A role's, in a process of its own; one that is forked bears it as its title."""
     return [sys.executable, "-P", "-m", "deploy.cli", *words]
+
+
+def inherited() -> dict[str, str]:
+    """What a role's process has of this one's environment: no secret, whoever set it here."""
+    return {name: value for name, value in os.environ.items() if name not in (SECRET_VARIABLE, URL_VARIABLE)}
 
 
 class Forked:
@@ -97,7 +103,7 @@ class Nursery:
             return
         self.close()
         self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        environment = {**os.environ, **SINGLE_THREAD, lifeline.PARENT_VARIABLE: str(os.getpid())}
+        environment = {**inherited(), **SINGLE_THREAD, lifeline.PARENT_VARIABLE: str(os.getpid())}
         words = [sys.executable, "-P", "-m", "deploy.nursery", str(theirs.fileno())]
         with theirs, self._log.open("ab") as log:
             self._program = subprocess.Popen(

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -27,6 +27,7 @@ from common.role import RECONNECT_SLEEP, StopSignal, run_role
 from common.watchdog import Watchdog
 from common.wrappers import Env
 from deploy import tls
+from deploy.nursery import SECRET_VARIABLE
 from deploy.presets import RunConfig, from_json
 from learner.initial_priority import InitialPriority
 from learner.learner import Learner
@@ -36,7 +37,6 @@ from replay_server.process import ReplayProcess
 from replay_server.server import ReplayServer
 from replay_server.socket_server import SocketServer
 
-SECRET_VARIABLE, URL_VARIABLE = "RMC_SECRET", "RMC_REDIS_URL"
 PATIENCE_VARIABLE = "RMC_PATIENCE"  # seconds that a role which starts while Redis is coming back waits for it
 PATIENCE_SECONDS = "5"  # of one that is started by hand
 EVALUATOR_NICENESS = 10  # it must not take the learner's core
@@ -48,14 +48,15 @@ class Place:
     """Where a role finds its run."""
 
     run: str
-    redis_url: str
+    redis_url: str = field(repr=False)
+    given_secret: str = field(repr=False, default="")
     secret_file: Path | None = None
     tls_folder: Path | None = None
 
     def secret(self) -> bytes:
-        """The run's secret, from its file or the environment. Raises ConfigError."""
+        """The run's secret, from its file or as it was given. Raises ConfigError."""
         if self.secret_file is None:
-            secret = os.environ.get(SECRET_VARIABLE, "").encode()
+            secret = self.given_secret.encode()
         else:
             try:
                 secret = self.secret_file.read_bytes().strip()

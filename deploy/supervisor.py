@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from common.errors import RoleDied
 from deploy.lifeline import PARENT_VARIABLE
-from deploy.nursery import SINGLE_THREAD, Forked, Nursery, command_line
+from deploy.nursery import SINGLE_THREAD, Forked, Nursery, command_line, inherited
 
 # So many deaths of a role's own in a row, each within so long of its start, end the run.
 QUICK_DEATHS, QUICK_SECONDS = 3, 60.0
@@ -78,7 +78,7 @@ class RoleProcess:
                 self._process = self._new_process(log)
 
     def _new_process(self, log: BinaryIO) -> subprocess.Popen[bytes]:
-        environment = {**os.environ, **self._environment, PARENT_VARIABLE: str(os.getpid())}
+        environment = {**inherited(), **self._environment, PARENT_VARIABLE: str(os.getpid())}
         words = command_line(self.command.words)
         return subprocess.Popen(
             words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0

@@ -35,6 +35,18 @@ def test_the_learner_may_end(quick: Path) -> None:
     assert (role.finished, role.restarts) == (True, 0)
 
 
+def test_what_was_exported_for_one_role_is_not_passed_on(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each has its own Redis user, and its secret from a file; the shell that began a cluster may know others."""
+    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\nenv > {quick}/told\n")
+    for name in ("RMC_SECRET", "RMC_REDIS_URL", "ANOTHER"):
+        monkeypatch.setenv(name, "exported")
+    role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {"RMC_REDIS_URL": "own"}, quick)
+    role.start()
+    tend_until(role)
+    told = dict(row.split("=", 1) for row in (quick / "told").read_text().splitlines() if "=" in row)
+    assert (told.get("RMC_SECRET"), told["RMC_REDIS_URL"], told["ANOTHER"]) == (None, "own", "exported")
+
+
 def test_any_other_role_that_ends_unasked_is_started_again(quick: Path) -> None:
     role = RoleProcess(RoleCommand("actor-0", ("actor",)), {}, quick)
     role.start()

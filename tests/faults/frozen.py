@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 
-from deploy.roles import URL_VARIABLE
+from deploy.nursery import URL_VARIABLE
 from tests.faults.loaded import ROOMY, Loaded, went_back
 from tests.faults.row import Row, at_length
 from tests.integration.running import alive

@@ -13,7 +13,9 @@ from deploy.redis_server import server_binary
 from deploy.redis_users import LAUNCHER, RedisUsers
 from deploy.run_folder import RunFolder
 from tests.integration.running import Training
+from tests.integration.telling_env import TELLS
 
+TELLING, ROLES = "tests.integration.telling_env:Telling-v0", ("actor", "evaluator")  # who plays, beside the launcher
 PASSWORD = "hunter2-of-the-users-own-redis"
 
 
@@ -95,13 +97,24 @@ def own_redis() -> Iterator[str]:
 
 
 def test_the_password_of_the_users_own_redis_is_nowhere(tmp_path: Path) -> None:
-    """It stands in a file, which the command line names."""
+    """It stands in a file that the command line names. What was exported is neither passed on nor inherited."""
+    told = tmp_path / "told"
+    told.mkdir()
     with own_redis() as url:
         (tmp_path / "redis-url").write_text(f"{url}\n")
         options = ("--total-steps", "700", "--checkpoint-steps", "600", "--redis-url", f"file:{tmp_path}/redis-url")
-        with Watched(tmp_path / "run", *options) as training:
+        exported = {"RMC_SECRET": PASSWORD, "RMC_REDIS_URL": f"redis://:{PASSWORD}@localhost:1", TELLS: str(told)}
+        with Watched(tmp_path / "run", *options, env=TELLING, environment=exported) as training:
             training.go_on(1)
+            players = {str(role.pid) for name in ROLES if (role := training.role(name)) is not None}
+            passed_on = [child.environ() for child in training.launcher.children(recursive=True)]
             assert training.finish(150) == 0, training.text()
+    inherited = {path.name: path.read_text() for path in told.iterdir()}
+    assert len(players) == len(ROLES)
+    assert inherited.keys() >= {str(training.process.pid), *players}
+    assert not any("RMC_SECRET" in words or "RMC_REDIS_URL" in words for words in inherited.values())
+    assert len(passed_on) >= len(ROLES)
+    assert not any(PASSWORD in value for variables in passed_on for value in variables.values())
     left = training.left()
     check_all_was_searched(left, training.folder)
     assert holding(left, {PASSWORD.encode()}) == set()
