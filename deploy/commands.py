@@ -29,8 +29,9 @@ Role = options.ActorRole | options.ReplayRole | options.LearnerRole | options.Ev
 def execute(command: options.Command) -> int:
     """Run a parsed command; its exit status. Raises RmcError."""
     given = Given()
-    act = ACTIONS.get(type(command))
-    return act(command) if act is not None else run_role(command, given)
+    if isinstance(command, Role):
+        return run_role(command, given)
+    return ACTIONS[type(command)](command)
 
 
 class Given:
@@ -226,7 +227,7 @@ def _records(path: Path) -> list[dict[str, object]]:
     return records
 
 
-ACTIONS: dict[type, Callable[[Any], int]] = {  # any other is a role
+ACTIONS: dict[type, Callable[[Any], int]] = {  # of all that are no roles
     options.Train: train,
     options.Evaluate: evaluate,
     options.Export: export_policy,
