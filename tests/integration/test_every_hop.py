@@ -61,6 +61,7 @@ def client(bus: RedisBus, redis_url: str, run_name: str, tmp_path: Path) -> Iter
     roles = [["replay", *place, *listen], *(["actor", *place, "--index", str(index)] for index in range(CONFIG.actors))]
     processes = [subprocess.Popen([sys.executable, "-m", "deploy.cli", *words], env=os.environ) for words in roles]
     found = ReplayClient(lambda: f"unix:{tmp_path}/s", b"every hop", CONFIG.window_spec(), BATCH)
+    found.introduce(bus.current_epoch("learner"))  # only the newest learner is served
     yield found
     found.close()
     bus.request_stop("the test is over")
