@@ -1,7 +1,7 @@
 """A Redis's URL as it may be shown: its user-info and its query, either of which may hold a password, are left out."""
 
 import re
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import SplitResult, parse_qs, urlsplit
 
 SCHEMES = ("redis", "rediss", "unix")
 HIDDEN = "…"  # stands for what may hold a password
@@ -27,6 +27,15 @@ def _place(parts: SplitResult) -> str:
     if parts.fragment or "@" in parts.path + parts.query:
         return ""
     return parts.path if parts.scheme == "unix" else parts.netloc.rpartition("@")[2]
+
+
+def has_password(url: str) -> bool:
+    """Whether it holds one, in its user-info or in its query; False where it cannot be parsed, which is told anyway."""
+    try:
+        parts = urlsplit(url)
+    except ValueError:
+        return False
+    return bool(parts.password) or "password" in parse_qs(parts.query)
 
 
 def without_passwords(word: str) -> str:

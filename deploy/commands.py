@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from common.errors import ConfigError
+from common.redis_url import has_password, shown
 from deploy import attachment, curves, env_check, export, history, inspection, options, roles, training, video
 from deploy.evaluation import evaluate_checkpoint
 from deploy.nursery import SECRET_VARIABLE, URL_VARIABLE
@@ -23,15 +24,24 @@ from deploy.policy import load_policy
 from deploy.run_folder import RunFolder
 from deploy.view import Board, table
 
+log = logging.getLogger(__name__)
 Role = options.ActorRole | options.ReplayRole | options.LearnerRole | options.EvaluatorRole
 
 
 def execute(command: options.Command) -> int:
     """Run a parsed command; its exit status. Raises RmcError."""
     given = Given()
+    if isinstance(command, options.Train | Role):
+        _warn_of_password(command.redis_url or "")
     if isinstance(command, Role):
         return run_role(command, given)
     return ACTIONS[type(command)](command)
+
+
+def _warn_of_password(url: str) -> None:
+    if has_password(url):
+        fix = "write the URL to a file that only you may read, and give --redis-url file:PATH"
+        log.warning("--redis-url=%r: everybody here can read its password in ps; %s", shown(url), fix)
 
 
 class Given:

@@ -132,6 +132,8 @@ def _in_file(path: Path) -> str:
         return path.read_text().strip()
     except OSError as error:
         raise ConfigError("--redis-url", f"file:{path}", f"cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise ConfigError("--redis-url", f"file:{path}", "is no text; write the URL into it, in one line") from None
 
 
 def run_actor(place: Place, index: int) -> None:

@@ -4,7 +4,7 @@ import pytest
 
 from common.errors import ConfigError
 from common.redis_bus import RedisBus
-from common.redis_url import shown, without_passwords
+from common.redis_url import has_password, shown, without_passwords
 
 SHOWN = {
     "redis://host:6379": "redis://host:6379",
@@ -39,6 +39,11 @@ OTHERS = {"hunter2": "…", "hunter2:x@host:1": "…", "": "…", "hunter2://hos
 def test_a_url_is_shown_without_its_password(url: str, expected: str) -> None:
     assert shown(url) == expected
     assert without_passwords(f"--redis-ulr={url}") == f"--redis-ulr={expected}" or "://" not in url
+
+
+@pytest.mark.parametrize("url", [*SHOWN])
+def test_a_password_is_seen(url: str) -> None:
+    assert has_password(url) == ("hun" in url)
 
 
 @pytest.mark.parametrize("url", [*UNPARSED, *OTHERS])

@@ -1,8 +1,11 @@
 """The command line: its flags, and that every error is one line and exit status 2 before anything starts."""
 
 import dataclasses
+import os
 import re
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -129,6 +132,19 @@ def test_errors_are_one_line(
     assert named in line
     assert "hush" not in line
     assert not list(tmp_path.iterdir())  # nothing was started or written
+
+
+@pytest.mark.parametrize("words", [DEBUG, ["actor", "--run", "x"]])
+@pytest.mark.parametrize("login", ["", ":hush@"])
+def test_a_password_on_the_command_line_is_warned_of_once(words: list[str], login: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "deploy.cli", *words, "--redis-url", f"redis://{login}localhost:1"],
+        capture_output=True, text=True, env=os.environ | {"RMC_PATIENCE": "0"},
+    )  # fmt: skip
+    *warnings, error = done.stderr.splitlines()
+    assert error.startswith("rmc: --redis-url='redis://localhost:1': no Redis answers there")
+    assert ["file:PATH" in line for line in warnings] == [True] * bool(login)
+    assert "hush" not in done.stderr + done.stdout
 
 
 def test_a_redis_beside_ray_is_refused_without_its_password() -> None:

@@ -15,6 +15,7 @@ from common.errors import ConfigError
 from common.redis_bus import RedisBus
 from common.role import StopSignal
 from deploy.redis_server import RedisServer
+from deploy.redis_users import RedisUsers
 from deploy.roles import connect, wait_for_room
 
 
@@ -34,6 +35,29 @@ def test_a_role_waits_for_a_redis_that_is_coming_back(short: Path) -> None:
         time.sleep(0.7)
         with server:
             waiting.result().ping()
+
+
+def test_a_url_is_read_from_a_file(short: Path) -> None:
+    """With the login that the server asks for, and the end of line that every editor writes."""
+    users = RedisUsers("run", b"of the run", ("actor-0",))
+    with RedisServer(short, users=users) as server:
+        (short / "redis-url").write_text(f"{server.url('actor-0')}\n")
+        connect(f"file:{short}/redis-url", "run").ping()
+        (short / "redis-url").write_text(f"unix://{server.socket}\n")
+        with pytest.raises(ConfigError, match=r"--redis-url='unix:///.*no Redis answers there .*authenticat"):
+            connect(f"file:{short}/redis-url", "run")
+
+
+@pytest.mark.parametrize(
+    ("content", "named"), [(None, "No such file"), (b"\xff\xfe", "is no text"), (b"hush", "not a")]
+)
+def test_a_file_that_holds_no_url_is_named_in_one_line(short: Path, content: bytes | None, named: str) -> None:
+    if content is not None:
+        (short / "redis-url").write_bytes(content)
+    with pytest.raises(ConfigError, match=named) as raised:
+        connect(f"file:{short}/redis-url", "run")
+    assert "\n" not in str(raised.value)
+    assert "hush" not in str(raised.value)
 
 
 def test_without_room_it_waits(short: Path, caplog: pytest.LogCaptureFixture) -> None:
