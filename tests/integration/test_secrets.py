@@ -16,6 +16,7 @@ from tests.integration.running import Training
 from tests.integration.telling_env import TELLS
 
 TELLING, ROLES = "tests.integration.telling_env:Telling-v0", ("actor", "evaluator")  # who plays, beside the launcher
+ENDLESS = ("--total-steps", "100000000", "--checkpoint-steps", "500")
 PASSWORD = "hunter2-of-the-users-own-redis"
 
 
@@ -60,7 +61,7 @@ def check_all_was_searched(left: dict[str, bytes], folder: Path) -> None:
 
 def test_passwords_and_secret_of_an_embedded_redis_are_nowhere(tmp_path: Path) -> None:
     """Nor after it was killed, of which all roles tell; the secret stands in its own file."""
-    with Watched(tmp_path / "run", "--total-steps", "100000000", "--checkpoint-steps", "500") as training:
+    with Watched(tmp_path / "run", *ENDLESS) as training:
         training.go_on(1)
         redis = training.role("redis")
         assert redis is not None
@@ -88,12 +89,14 @@ def own_redis() -> Iterator[str]:
         assert server.stdin is not None
         with server.stdin as settings:
             settings.write(words.encode())
-        while not socket.exists():
-            assert server.poll() is None
-            time.sleep(0.05)
-        yield f"unix://:{PASSWORD}@{socket}"
-        server.kill()
-        server.wait()
+        try:
+            while not socket.exists():
+                assert server.poll() is None
+                time.sleep(0.05)
+            yield f"unix://:{PASSWORD}@{socket}"
+        finally:
+            server.kill()
+            server.wait()
 
 
 def test_the_password_of_the_users_own_redis_is_nowhere(tmp_path: Path) -> None:
@@ -102,13 +105,13 @@ def test_the_password_of_the_users_own_redis_is_nowhere(tmp_path: Path) -> None:
     told.mkdir()
     with own_redis() as url:
         (tmp_path / "redis-url").write_text(f"{url}\n")
-        options = ("--total-steps", "700", "--checkpoint-steps", "600", "--redis-url", f"file:{tmp_path}/redis-url")
+        options = (*ENDLESS, "--redis-url", f"file:{tmp_path}/redis-url")
         exported = {"RMC_SECRET": PASSWORD, "RMC_REDIS_URL": f"redis://:{PASSWORD}@localhost:1", TELLS: str(told)}
         with Watched(tmp_path / "run", *options, env=TELLING, environment=exported) as training:
             training.go_on(1)
             players = {str(role.pid) for name in ROLES if (role := training.role(name)) is not None}
             passed_on = [child.environ() for child in training.launcher.children(recursive=True)]
-            assert training.finish(150) == 0, training.text()
+            training.interrupt()
     inherited = {path.name: path.read_text() for path in told.iterdir()}
     assert len(players) == len(ROLES)
     assert inherited.keys() >= {str(training.process.pid), *players}
