@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import psutil
 import pytest
 from xdist.scheduler import LoadScopeScheduling
@@ -28,6 +29,8 @@ os.environ["TMPDIR"] = tempfile.tempdir = TEMPORARY
 
 from deploy.redis_server import RedisServer  # noqa: E402
 
+hypothesis.settings.register_profile("unhurried", deadline=None)  # a core is shared
+hypothesis.settings.load_profile("unhurried")
 BEFORE = pytest.StashKey[set[str]]()
 
 

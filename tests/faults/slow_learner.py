@@ -30,17 +30,17 @@ def slow_down(tries: int, folder: Path, minutes: float = MINUTES, settled: float
 def judged(fault: str, run: Loaded, seconds: float, settled: float, most_growth: float = MOST_GROWTH) -> Row:
     """Whether memory stays as it is after ``settled`` seconds, while the actors wait at their credit."""
     growth = memory_growth(watch(run, seconds, settled))
-    waits = {_waits_for(run, actor) for actor in range(ACTORS)}
-    replay = run.newest("replay", "waiting_for")
+    waits = {_waits_for(run, f"actor-{actor}") for actor in range(ACTORS)}
+    replay = _waits_for(run, "replay")
     passed = max(growth.values()) < most_growth and waits == {"credit"} and replay == "draws"
     facts: dict[str, float | int | str] = {f"{role}_grew": round(share, 4) for role, share in growth.items()}
     facts |= {"actors_wait_for": " ".join(sorted(waits)), "replay_waits_for": replay}
     return Row(f"{fault}, {seconds / 60:.0f} minutes", 1, passed, found=facts)
 
 
-def _waits_for(run: Loaded, actor: int) -> str:
+def _waits_for(run: Loaded, role: str) -> str:
     """What it waited for in most of its last seconds."""
-    return mode(record["waiting_for"] for record in run.records(f"actor-{actor}")[-5:])
+    return mode(record["waiting_for"] for record in run.records(role)[-5:])
 
 
 if __name__ == "__main__":

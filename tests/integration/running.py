@@ -15,7 +15,7 @@ from typing import Any
 
 import psutil
 
-START_SECONDS = 90.0  # five processes import torch on two cores that other tests may use
+START_SECONDS = 120.0  # five processes import torch on two cores that other tests may use
 ENVIRONMENT = {**os.environ, "RMC_SECRET": "", "COLUMNS": "200"}
 
 
