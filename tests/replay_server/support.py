@@ -1,11 +1,16 @@
-"""What the replay server's tests share: a small window, lawful rows, an actor's end of the bus."""
+"""What the replay server's tests share: a small window, lawful rows, an actor's end of the bus, a server's state."""
+
+from collections.abc import Callable
 
 import numpy as np
 
 from common.bus import Bus, EntryId
 from common.window import Rows, WindowSpec
 from common.wire import encode_hello, encode_windows
+from replay_server.server import ReplayConfig, ReplayServer
 
+Make = Callable[..., ReplayServer]
+OPEN = ReplayConfig(capacity=100, replay_ratio=1e6, warmup_steps=0)  # the limiter never holds anything back
 SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=4, burn_in=2, train=4)
 
 
@@ -53,3 +58,25 @@ class Sender:
         """Steps that the newest ack allows in this life."""
         ack = self.bus.ack(self.actor)
         return ack.granted_steps if ack is not None and ack.id.epoch == self.epoch else 0
+
+
+def close(server: ReplayServer) -> None:
+    """Close once, however often it is called."""
+    if server._store.lock >= 0:
+        server.close()
+        server._store.lock = -1
+
+
+def drain(server: ReplayServer) -> None:
+    """Until there is nothing more to take in."""
+    while server.step():
+        pass
+
+
+def stored(server: ReplayServer) -> np.ndarray:
+    """All windows that may be sampled, by serial."""
+    progress = server._store.ring.progress
+    serials = np.arange(progress.valid_from, progress.next_serial)
+    rows = server._store.ring.rows[serials % server.config.capacity]
+    assert rows["serial"].tolist() == serials.tolist()
+    return rows

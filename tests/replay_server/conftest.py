@@ -1,0 +1,30 @@
+"""A bus, and replay servers upon it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from common.bus import Bus, MemoryBus
+from replay_server.server import ReplayConfig, ReplayServer
+from tests.replay_server.support import OPEN, SPEC, Make, close
+
+
+@pytest.fixture
+def bus() -> MemoryBus:
+    return MemoryBus()
+
+
+@pytest.fixture
+def make(tmp_path: Path, bus: MemoryBus) -> Iterator[Make]:
+    """Servers in one folder unless another is named, closed at the end."""
+    made: list[ReplayServer] = []
+
+    def build(config: ReplayConfig = OPEN, folder: str = "replay", actors: int = 2, total: int = 10**6,
+              slack: int = 16, seed: int = 7, on: Bus | None = None) -> ReplayServer:  # fmt: skip
+        made.append(ReplayServer(SPEC, config, tmp_path / folder, seed, total, actors, slack, on or bus))
+        return made[-1]
+
+    yield build
+    for server in made:
+        server._store.lock >= 0 and close(server)
