@@ -31,6 +31,7 @@ from learner.update import UpdateConfig, Updated, make_update
 
 log = logging.getLogger(__name__)
 STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
+NOT_OURS = (pickle.UnpicklingError, EOFError, RuntimeError, LookupError, ValueError, TypeError, AttributeError)
 METRICS_UPDATES = 20  # updates between looks at the update's metrics: each look waits for the device
 SAVE_AGAIN_SECONDS = 10.0  # after a checkpoint that could not be written
 LOOK_SECONDS = 5.0  # between looks, while waiting, whether Redis still has the weights
@@ -277,8 +278,8 @@ class Learner:
             progress = json.loads(files[PROGRESS])
             self.updates = self.last_checkpoint = int(progress["updates"])
             self.env_steps, epoch = int(progress["env_steps"]), int(progress["epoch"])
-        except (pickle.UnpicklingError, RuntimeError, KeyError, ValueError, TypeError) as error:
-            reason = str(error).strip().splitlines()[0]
+        except NOT_OURS as error:
+            reason = (str(error).strip() or "empty").splitlines()[0]
             raise CheckpointError(f"{self.checkpoints.path(number)}: {STATE} is not this run's ({reason})") from None
         self._next_checkpoint = self._after(self.env_steps)
         log.info("resumed at update %d, environment step %d", self.updates, self.env_steps)

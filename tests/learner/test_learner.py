@@ -1,5 +1,6 @@
 """The learner role against a real replay server in the same thread."""
 
+import io
 import json
 
 import pytest
@@ -137,6 +138,33 @@ def test_a_checkpoint_never_executes_code(setting):
     with pytest.raises(CheckpointError, match=r"learner\.pt"):
         setting.start()
     assert not mark.exists()
+
+
+@pytest.mark.parametrize("state", [None, [], {}, {"agent": None}, {"agent": {}}, {"generator": 3}], ids=str)
+def test_a_checkpoint_of_something_else_is_said_to_be_so(setting, state):
+    setting.feed(60)
+    setting.learner.step()
+    setting.learner.close()
+    file = io.BytesIO()
+    number, files = setting.learner.checkpoints.latest()
+    if isinstance(state, dict) and "generator" in state:
+        state = torch.load(io.BytesIO(files["learner.pt"]), weights_only=True) | state
+    if state is not None:
+        torch.save(state, file)
+    setting.learner.checkpoints.save(number + 1, {**files, "learner.pt": file.getvalue()})
+    with pytest.raises(CheckpointError, match=r"learner\.pt is not this run's"):
+        setting.start()
+
+
+@pytest.mark.parametrize("progress", ["", "[]", "{}", '{"updates": "x"}'])
+def test_progress_that_makes_no_sense_is_said_to_be_so(setting, progress):
+    setting.feed(60)
+    setting.learner.step()
+    setting.learner.close()
+    number, files = setting.learner.checkpoints.latest()
+    setting.learner.checkpoints.save(number + 1, {**files, "progress.json": progress.encode()})
+    with pytest.raises(CheckpointError, match="is not this run's"):
+        setting.start()
 
 
 def test_ends_with_a_checkpoint_once_the_ratio_is_spent(tmp_path):
