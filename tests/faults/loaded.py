@@ -21,7 +21,7 @@ from deploy.presets import from_json
 from deploy.redis_users import LAUNCHER, RedisUsers
 from deploy.run_folder import RunFolder
 from tests.faults.judge import Judgement, judge, newest
-from tests.integration.running import Training
+from tests.integration.running import START_SECONDS, Training
 
 ACTORS = 2
 ENDLESS = ("--total-steps", "100000000", "--replay-ratio", "4", "--actors", str(ACTORS), "--checkpoint-steps", "20000")
@@ -141,7 +141,7 @@ class Loaded(Training):
         self.until(lambda: len(self.said("died")) > deaths)
         return self.until(lambda: self.bus.current_epoch(role) > epoch)
 
-    def until(self, condition: Callable[[], object], seconds: float = 60.0) -> float:
+    def until(self, condition: Callable[[], object], seconds: float = START_SECONDS) -> float:
         """Wait for it, however Redis is; how long that took."""
         began = time.monotonic()
         while True:
