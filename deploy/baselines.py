@@ -47,7 +47,7 @@ def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: 
     folder = _open_folder(config, run_dir)
     torch.set_num_threads(config.threads)
     torch.set_flush_denormal(True)  # as our learner does
-    console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
+    console.print(f"run folder {folder.path}", soft_wrap=True)
     folder.lock()
     try:
         return _conduct(config, folder, console, stop)
@@ -60,12 +60,12 @@ def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: 
         run.train(stop)
         if stop.requested:
             words = f"the same command with --run-dir {folder.path} goes on"
-            console.print(f"stopped at environment step {run.steps:,}; {words}", soft_wrap=True, highlight=False)
+            console.print(f"stopped at environment step {run.steps:,}; {words}", soft_wrap=True)
             return STOPPED
         result = run.result()
     folder.write_result(result)
     mean, deviation = result["eval_return_mean"], result["eval_return_std"]
-    console.print(f"after training: return {mean:,.1f} ± {deviation:,.1f}; {folder.result_file}", highlight=False)
+    console.print(f"after training: return {mean:,.1f} ± {deviation:,.1f}; {folder.result_file}")
     return 0
 
 
@@ -235,7 +235,7 @@ class _Run(BaseCallback):
         self._write("evaluator", {**found, "eval_update": self.updates, "eval_env_steps": self.steps})
         mean, deviation = found["eval_return_mean"], found["eval_return_std"]
         said = f"environment step {self.steps:,}: return {mean:,.1f} ± {deviation:,.1f}, {self._wall():,.0f} s"
-        self._console.print(said, highlight=False)
+        self._console.print(said)
 
     def _write_progress(self) -> None:
         self._write("launcher", {"wall_s": self._wall()})

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from common.errors import ConfigError
 from common.redis_url import has_password, shown
@@ -22,7 +21,7 @@ from deploy.evaluation import evaluate_checkpoint
 from deploy.nursery import SECRET_VARIABLE, URL_VARIABLE
 from deploy.policy import load_policy
 from deploy.run_folder import RunFolder
-from deploy.view import Board, table
+from deploy.view import Board, table, terminal
 
 log = logging.getLogger(__name__)
 Role = options.ActorRole | options.ReplayRole | options.LearnerRole | options.EvaluatorRole
@@ -54,7 +53,7 @@ class Given:
 def train(command: options.Train) -> int:
     """Train a run."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
-    return training.train(command.config(), command.placement(), Console())
+    return training.train(command.config(), command.placement(), terminal())
 
 
 def run_role(command: Role, given: Given) -> int:
@@ -82,17 +81,17 @@ def evaluate(command: options.Evaluate) -> int:
     for flicker in command.flicker:
         if not 0.0 <= flicker <= 1.0:
             raise ConfigError("--flicker", flicker, "take probabilities from 0 to 1")
-    folder, console = RunFolder(command.run), Console()
+    folder, console = RunFolder(command.run), terminal()
     for probability in command.flicker or (None,):
         played = _played(folder, command, probability)
         text = json.dumps(played) if command.json else _said(played)
-        console.print(text, soft_wrap=True, highlight=False, markup=False)
+        console.print(text, soft_wrap=True)
     if command.video is not None:
         policy, config = load_policy(command.run, command.checkpoint), folder.config()
         env = dataclasses.replace(config.env, flicker=command.flicker[0]) if command.flicker else config.env
         total = video.record(policy, env, config.seed, command.video)
         if not command.json:
-            console.print(f"{command.video}: an episode with return {total:,.1f}", soft_wrap=True, highlight=False)
+            console.print(f"{command.video}: an episode with return {total:,.1f}", soft_wrap=True)
     return 0
 
 
@@ -123,22 +122,21 @@ def _said(played: dict[str, Any]) -> str:
 def export_policy(command: options.Export) -> int:
     """Write a policy as ONNX."""
     export.export(RunFolder(command.run), command.checkpoint, command.out)
-    Console().print(f"{command.out}: inputs {', '.join(export.INPUTS)}; outputs {', '.join(export.OUTPUTS)}")
+    terminal().print(f"{command.out}: inputs {', '.join(export.INPUTS)}; outputs {', '.join(export.OUTPUTS)}")
     return 0
 
 
 def inspect(command: options.Inspect) -> int:
     """Write a picture of what the world model knows, and say it in numbers."""
-    found, console = inspection.inspect(command.run, command.checkpoint, command.out), Console()
+    found, console = inspection.inspect(command.run, command.checkpoint, command.out), terminal()
     ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in found.open_loop.items())
     worst = ", ".join(f"{i} ({found.unexplained[i]:.0%})" for i in np.argsort(-found.unexplained)[: inspection.SHOWN])
     console.print(
         f"unexplained of the observation's change: {ahead} (100% is a guess of no change)",
         soft_wrap=True,
-        highlight=False,
     )
-    console.print(f"worst dimensions one step ahead: {worst}", highlight=False)
-    console.print(f"{command.out}", soft_wrap=True, highlight=False)
+    console.print(f"worst dimensions one step ahead: {worst}")
+    console.print(f"{command.out}", soft_wrap=True)
     return 0
 
 
@@ -146,7 +144,7 @@ def check_env(command: options.CheckEnv) -> int:
     """Say what the agent will make of an environment."""
     if not 1 <= command.steps <= 10_000_000:
         raise ConfigError("--steps", command.steps, "take 1 to 10_000_000")
-    return env_check.check(command.env.config(), command.steps, Console())
+    return env_check.check(command.env.config(), command.steps, terminal())
 
 
 def baseline(command: options.Baseline) -> int:
@@ -155,7 +153,7 @@ def baseline(command: options.Baseline) -> int:
     from deploy import baselines  # an extra, and slow to import
 
     with training.signals_caught() as stop:
-        return baselines.train(command.config(), command.run_dir, Console(), stop)
+        return baselines.train(command.config(), command.run_dir, terminal(), stop)
 
 
 def plot(command: options.Plot) -> int:
@@ -165,16 +163,16 @@ def plot(command: options.Plot) -> int:
     groups = curves.grouped([found for path in command.runs for found in history.read(path)])
     shown = curves.tables(groups, command.reference)
     curves.draw(groups, command.by, command.out)
-    console = Console(width=max(Console().width, curves.WIDTH))
+    console = terminal(max(terminal().width, curves.WIDTH))
     console.print(*shown, sep="\n")
-    console.print(f"{command.out}", soft_wrap=True, highlight=False)
+    console.print(f"{command.out}", soft_wrap=True)
     return 0
 
 
 def stats(command: options.Stats) -> int:
     """Print the newest metrics of a run, and its result if it has one."""
     folder = RunFolder(command.run)
-    config, console = folder.config(), Console()
+    config, console = folder.config(), terminal()
     board = Board(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
     for record in _records(folder.metrics):
         board.take(record)
@@ -189,12 +187,12 @@ def stats(command: options.Stats) -> int:
 
 def attach(command: options.Attach) -> int:
     """Watch a run until it ends, or until Ctrl-C."""
-    folder, console = RunFolder(command.run), Console()
+    folder, console = RunFolder(command.run), terminal()
     attachment.trained_now(folder)
     try:
         attachment.watch(folder, console, attachment.Absence(folder))
     except KeyboardInterrupt:
-        console.print(f"it goes on; rmc stop {command.run} ends it", soft_wrap=True, highlight=False)
+        console.print(f"it goes on; rmc stop {command.run} ends it", soft_wrap=True)
         return 0
     return training.say_end(folder, console)
 
@@ -203,7 +201,7 @@ def stop(command: options.Stop) -> int:
     """End a run in order."""
     folder = RunFolder(command.run)
     attachment.stop(folder)
-    training.say_end(folder, Console())
+    training.say_end(folder, terminal())
     return 0
 
 
@@ -212,7 +210,7 @@ def cluster(command: options.Cluster) -> int:
     from deploy import machines  # needs what only the extra "ray" installs
 
     act = machines.up if command.action == "up" else machines.down
-    act(command.config, Console())
+    act(command.config, terminal())
     return 0
 
 
@@ -226,7 +224,7 @@ def launch(command: options.LauncherRole) -> int:
     placement = training.Placement(
         folder.path, "resume", "ray", command.device, None, command.ray_address, command.all_cpus, command.tls
     )
-    return training.conduct(config, folder, placement, Console(width=400))
+    return training.conduct(config, folder, placement, terminal(400))
 
 
 def _records(path: Path) -> list[dict[str, object]]:

@@ -63,10 +63,10 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
     while stages and not _faults(found):  # what comes later needs what was before to be sound
         found += stages.pop(0)()
     for line in [*_facts(env, played), *dict.fromkeys(found)]:
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+        console.print(line, soft_wrap=True)
     env.close()
     sound = not _faults(found)
-    console.print("it can be trained on" if sound else "mend the fault first", highlight=False)
+    console.print("it can be trained on" if sound else "mend the fault first")
     return 0 if sound else 1
 
 

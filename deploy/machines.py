@@ -29,7 +29,7 @@ def up(path: Path, console: Console) -> None:
     """Bring a cluster up and wait until every node that its file promises is there. Raises RmcError."""
     config = read(path)
     secure_token()
-    console.print(f"ray up {path}", soft_wrap=True, highlight=False)
+    console.print(f"ray up {path}", soft_wrap=True)
     _ray("up", "-y", str(path))
     expected = expected_nodes(config)
     deadline = time.monotonic() + UP_SECONDS
@@ -38,13 +38,13 @@ def up(path: Path, console: Console) -> None:
             fix = "look at the workers' setup by ray monitor, and mend or take them out of the file"
             raise RmcError(f"{path}: {alive} of {expected} nodes are there after {UP_SECONDS:.0f} s; {fix}")
         time.sleep(LOOK_SECONDS)
-    console.print(f"{alive} nodes are up; ray attach {path} goes to the head", soft_wrap=True, highlight=False)
+    console.print(f"{alive} nodes are up; ray attach {path} goes to the head", soft_wrap=True)
 
 
 def down(path: Path, console: Console) -> None:
     """Take a cluster down; on machines of one's own also what ``ray down`` leaves running. Raises RmcError."""
     config = read(path)
-    console.print(f"ray down {path}", soft_wrap=True, highlight=False)
+    console.print(f"ray down {path}", soft_wrap=True)
     _ray("down", "-y", str(path))
     if config["provider"]["type"] != "local":
         return
@@ -56,7 +56,7 @@ def down(path: Path, console: Console) -> None:
             left[address] = " ".join(count) or "no answer"
     if left:
         raise RmcError(f"{path}: Ray still runs on {left}; ssh there and run ray stop --force")
-    console.print("no process of Ray is left on any node", highlight=False)
+    console.print("no process of Ray is left on any node")
 
 
 def read(path: Path) -> dict[str, Any]:

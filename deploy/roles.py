@@ -38,7 +38,7 @@ from replay_server.server import ReplayServer
 from replay_server.socket_server import SocketServer
 
 PATIENCE_VARIABLE = "RMC_PATIENCE"  # seconds that a role which starts while Redis is coming back waits for it
-PATIENCE_SECONDS = "5"  # of one that is started by hand
+PATIENCE_SECONDS = "30"  # of one that is started by hand, at the same time as its run perhaps
 EVALUATOR_NICENESS = 10  # it must not take the learner's core
 log = logging.getLogger(__name__)
 
@@ -71,6 +71,28 @@ class Place:
         return secret
 
 
+class Patience:
+    """So many seconds for something that is about to come, less where a stop is asked for.
+
+    The log says once what is waited for.
+    """
+
+    def __init__(self, seconds: float, stop: StopSignal) -> None:
+        self._seconds, self._deadline = seconds, time.monotonic() + seconds
+        self._stop = stop
+        self._said = False
+
+    def on(self, awaited: str) -> bool:
+        """Wait a moment; False once there is none left."""
+        if self._stop.requested or time.monotonic() >= self._deadline:
+            return False
+        if not self._said:
+            log.warning("waiting up to %g s for %s", self._seconds, awaited)
+            self._said = True
+        time.sleep(RECONNECT_SLEEP)
+        return True
+
+
 class Process:
     """What every role's process has: stop signal, bus, the run's config."""
 
@@ -79,18 +101,17 @@ class Process:
         self.stop = StopSignal()
         self.stop.install()
         patience = float(os.environ.get(PATIENCE_VARIABLE, PATIENCE_SECONDS))
-        self.bus = connect(place.redis_url, place.run, patience)
-        self.config = self._registered_config(place.run, time.monotonic() + patience)
+        self.bus = connect(place.redis_url, place.run, Patience(patience, self.stop))
+        self.config = self._registered_config(place.run, Patience(patience, self.stop))
 
-    def _registered_config(self, run: str, deadline: float) -> RunConfig:
+    def _registered_config(self, run: str, waits: Patience) -> RunConfig:
         """The run's config; a Redis that has just come back empty gets it again within moments."""
         while True:
             with suppress(BusUnavailable):
                 if (raw := self.bus.config()) is not None:
                     return from_json(raw)
-            if self.stop.requested or time.monotonic() >= deadline:
+            if not waits.on(f"run {run} to be registered in that Redis"):
                 raise ConfigError("--run", run, "no run of this name is registered in that Redis; start it first")
-            time.sleep(RECONNECT_SLEEP)
 
     def make_env(self) -> Env:
         """A new environment of the run."""
@@ -111,20 +132,19 @@ def wait_for_room(bus: Bus, role: str, stop: StopSignal) -> None:
             return
 
 
-def connect(url: str, run: str, patience_seconds: float = 0.0) -> RedisBus:
-    """A bus whose Redis answers, within so long; ``file:PATH`` holds the URL. Raises ConfigError."""
+def connect(url: str, run: str, waits: Patience | None = None) -> RedisBus:
+    """A bus whose Redis answers, at once or within that patience; ``file:PATH`` holds the URL. Raises ConfigError."""
     if url.startswith("file:"):
         url = _in_file(Path(url.removeprefix("file:")))
-    bus, deadline = RedisBus(url, run), time.monotonic() + patience_seconds
+    bus = RedisBus(url, run)
     while True:
         try:
             with suppress(BusFull):  # that is an answer
                 bus.ping()
             return bus
         except BusUnavailable as error:
-            if time.monotonic() >= deadline:
+            if waits is None or not waits.on(f"the Redis at {shown(url)}: {error}"):
                 raise ConfigError("--redis-url", shown(url), f"no Redis answers there ({error})") from None
-        time.sleep(RECONNECT_SLEEP)
 
 
 def _in_file(path: Path) -> str:

@@ -61,12 +61,12 @@ def conduct(config: RunConfig, folder: RunFolder, placement: Placement, console:
     """Be the launcher of a run whose folder is locked, from its first evaluation to its last."""
     status = 1
     try:
-        console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
+        console.print(f"run folder {folder.path}", soft_wrap=True)
         before = evaluate_blob(config, initial_policy(config), FINAL_EPISODES)
-        console.print(f"before training: {_said(before)}", highlight=False)
-        if placement.launcher == "manual":
-            console.print(f"start the roles with --run {folder.name}", soft_wrap=True, highlight=False)
+        console.print(f"before training: {_said(before)}")
         monitor = Monitor(folder, config, console)
+        if placement.launcher == "manual":
+            console.print(f"start the roles with --run {folder.name}", soft_wrap=True)
         try:
             with signals_caught() as stop:  # before and after, nothing runs that Ctrl-C could not end at once
                 finished = _launch(config, folder, placement, monitor, stop)
@@ -87,7 +87,7 @@ def conduct(config: RunConfig, folder: RunFolder, placement: Placement, console:
         raise
     finally:
         folder.unlock(status)
-    console.print(f"before training: {_said(before)}", highlight=False)
+    console.print(f"before training: {_said(before)}")
     return _say_result(folder, console)
 
 
@@ -112,7 +112,7 @@ def _watched_on_ray(config: RunConfig, placement: Placement, console: Console) -
     folder = prepare(config, placement)
     folder.unlock()
     ray_launcher.launch(config, folder, placement.device, placement.all_cpus, placement.tls)
-    console.print(f"run folder {folder.path}", soft_wrap=True, highlight=False)
+    console.print(f"run folder {folder.path}", soft_wrap=True)
     with signals_caught(hangup=False) as stop:
         attachment.watch(folder, console, _passes_on(stop, folder))
     return say_end(folder, console)
@@ -145,7 +145,7 @@ def say_end(folder: RunFolder, console: Console) -> int:
         return _say_stopped(folder, config, steps, console)
     log_file = folder.logs / "launcher.log"
     words = log_file.read_text(errors="replace").strip().splitlines()[-30:] if log_file.exists() else []
-    console.print("\n".join(words), soft_wrap=True, highlight=False, markup=False)
+    console.print("\n".join(words), soft_wrap=True)
     raise RoleDied(f"the launcher of {folder.path} ended with status {status}; the whole of its words: {log_file}")
 
 
@@ -232,14 +232,14 @@ def _said(evaluation: dict[str, Any]) -> str:
 def _say_stopped(folder: RunFolder, config: RunConfig, env_steps: int, console: Console) -> int:
     command = f"rmc train {config.env.id} --preset {config.preset} --seed {config.seed} --run-dir {folder.path}"
     console.print(f"stopped at environment step {env_steps:,}; to go on, give the same options and")
-    console.print(f"  {command}", soft_wrap=True, highlight=False)
+    console.print(f"  {command}", soft_wrap=True)
     return STOPPED
 
 
 def _say_result(folder: RunFolder, console: Console) -> int:
     result = folder.result()
     assert result is not None
-    console.print(f"after training:  {_said(result)}", highlight=False)
+    console.print(f"after training:  {_said(result)}")
     facts = f"{result['env_steps']:,} environment steps, {result['updates']:,} updates, {result['wall_s']:,.0f} s"
-    console.print(f"{facts}; {folder.result_file}", soft_wrap=True, highlight=False)
+    console.print(f"{facts}; {folder.result_file}", soft_wrap=True)
     return 0

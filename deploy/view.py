@@ -9,6 +9,7 @@ from typing import Any
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 NONE_YET = "-"
 REFRESH_SECONDS = 0.5  # of a live view
@@ -16,6 +17,11 @@ LINE_SECONDS = 10.0  # between plain lines
 MOST_NAMES = 1000
 LARGEST_STEP = 2**53
 SILENT_SECONDS = 5.0  # after which a role's silence is shown
+
+
+def terminal(width: int | None = None) -> Console:
+    """What is printed, shown as it is: a name may hold what a console takes for markup."""
+    return Console(width=width, markup=False, emoji=False, highlight=False)
 
 
 class Board:
@@ -138,7 +144,8 @@ def table(board: Board) -> Group:
         facts.add_row("not running", board.get("launcher", "not_running"))
     if board.get("learner", "checkpoint_error"):
         facts.add_row("not saved", str(board.get("learner", "checkpoint_error")))
-    return Group(f"[bold]{board.env}[/] · {board.preset} · seed {board.seed}", facts, _stages(board))
+    title = Text.assemble((board.env, "bold"), f" · {board.preset} · seed {board.seed}")
+    return Group(title, facts, _stages(board))
 
 
 def line(board: Board) -> str:
@@ -198,7 +205,7 @@ class View:
         if self._live is not None:
             self._live.update(table(self._board), refresh=True)
         else:
-            self._console.print(line(self._board), soft_wrap=True, highlight=False)
+            self._console.print(line(self._board), soft_wrap=True)
 
     def close(self) -> None:
         """Show the last state, and leave it there."""

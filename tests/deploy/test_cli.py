@@ -221,8 +221,9 @@ def test_runs_without_checkpoint_or_metrics_say_so(capsys: pytest.CaptureFixture
 
 
 def test_a_role_needs_its_runs_secret(
-    redis_url: str, run_name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    redis_url: str, run_name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("RMC_PATIENCE", "0.2")
     words = ["replay", "--run", run_name, "--redis-url", redis_url, "--folder", str(tmp_path / "replay")]
     assert "RMC_SECRET" in complaint(words, capsys)
     assert "cannot be read" in complaint([*words, "--secret-file", str(tmp_path / "none")], capsys)

@@ -17,7 +17,7 @@ from deploy import history
 from deploy.monitor import Monitor
 from deploy.presets import RunConfig, debug
 from deploy.run_folder import RunFolder, open_run
-from deploy.view import MOST_NAMES, _evaluation, line, table
+from deploy.view import MOST_NAMES, Board, _evaluation, line, table, terminal
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
 
@@ -58,6 +58,15 @@ def test_any_number_is_shown(monitor: Monitor, value: float) -> None:
     Console(quiet=True).print(table(monitor.board))
     assert monitor.board.env_steps == (value if value == 0 else 0) or value == 1.5
     monitor.close()
+
+
+def test_names_are_shown_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And not taken for a console's markup, which would swallow or refuse them."""
+    board = Board("mine:[red]Env[/x]-v0", "debug", 0, 100, 32.0)
+    terminal(200).print(table(board), "run folder /runs/[words] :tada: [/]")
+    shown = capsys.readouterr().out
+    assert "mine:[red]Env[/x]-v0 · debug" in shown
+    assert "/runs/[words] :tada: [/]" in shown
 
 
 @pytest.mark.parametrize("seed", range(len(NAMES)))

@@ -39,7 +39,17 @@ def fork(shared: Nursery, log: Path, *words: str, **environment: str) -> Forked:
 
 
 def test_it_is_rmc_with_its_words(shared: Nursery, tmp_path: Path) -> None:
-    role = fork(shared, tmp_path / "log", "actor", "--run", "x", "--index", "0", RMC_REDIS_URL="unix:///nowhere")
+    role = fork(
+        shared,
+        tmp_path / "log",
+        "actor",
+        "--run",
+        "x",
+        "--index",
+        "0",
+        RMC_REDIS_URL="unix:///nowhere",
+        RMC_PATIENCE="0",
+    )
     assert role.wait(20) == 2
     assert "--redis-url='unix:///nowhere'" in (tmp_path / "log").read_text()
     assert role.poll() == 2  # it is still known
@@ -66,7 +76,7 @@ def test_with_the_nursery_go_those_it_forked_and_another_begins(shared: Nursery,
     shared._program.kill()
     assert role.wait(5) == -signal.SIGKILL
     process.wait(5)
-    after = fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a")
+    after = fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a", RMC_PATIENCE="1")
     assert after.poll() is None
     assert role.poll() == -signal.SIGKILL
     after.wait(20)
@@ -99,7 +109,7 @@ def test_one_that_hangs_is_given_up_for_another(
     process.wait(5)
     assert hung.returncode == -signal.SIGKILL
     monkeypatch.undo()
-    assert fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a").wait(20) == 2
+    assert fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a", RMC_PATIENCE="0").wait(20) == 2
 
 
 def test_a_system_without_room_for_a_process_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

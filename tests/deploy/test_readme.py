@@ -104,7 +104,7 @@ def test_the_docs_name_options_that_exist() -> None:
     made = subprocess.run([sys.executable, "-m", "deploy.cli", "train", "--help"], capture_output=True, text=True)
     others = {"--listen", "--run", "--seconds", "--episodes", "--json", "--checkpoint", "--steps", "--out"}
     others |= {"--no-restart", "--node-ip-address", "--generate"}  # Ray's own
-    others |= {"--folder", "--index", "--secret-file"}  # the roles'
+    others |= {"--folder", "--index", "--shard", "--secret-file"}  # the roles'
     others |= {"--alone"}  # of benchmarks
     others |= {"--settings", "--reference", "--by", "--scale", "--only", "--env"}  # of baselines, plots and studies
     there = set(re.findall(r"--[a-z][a-z-]*[a-z]", made.stdout)) | others | {"--logdir", "--video"}

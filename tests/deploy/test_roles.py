@@ -1,5 +1,6 @@
 """How a role finds its run, and waits for a Redis that is away or full."""
 
+import signal
 import subprocess
 import sys
 import tempfile
@@ -11,12 +12,15 @@ from pathlib import Path
 import pytest
 import redis
 
+from common.envs import EnvConfig
 from common.errors import ConfigError
 from common.redis_bus import RedisBus
 from common.role import StopSignal
+from deploy.local import register
+from deploy.presets import debug
 from deploy.redis_server import RedisServer
 from deploy.redis_users import RedisUsers
-from deploy.roles import connect, wait_for_room
+from deploy.roles import Patience, Place, Process, connect, wait_for_room
 
 
 @pytest.fixture
@@ -26,15 +30,53 @@ def short() -> Iterator[Path]:
         yield Path(folder)
 
 
-def test_a_role_waits_for_a_redis_that_is_coming_back(short: Path) -> None:
+def test_a_role_waits_for_a_redis_that_is_coming_back(short: Path, caplog: pytest.LogCaptureFixture) -> None:
     server, url = RedisServer(short), f"unix://{short}/redis.sock"
     with pytest.raises(ConfigError, match="no Redis answers"):
         connect(url, "run")
     with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(connect, url, "run", 20.0)
+        waiting = pool.submit(connect, url, "run", Patience(20.0, StopSignal()))
         time.sleep(0.7)
         with server:
             waiting.result().ping()
+    (said,) = caplog.messages
+    assert said.startswith(f"waiting up to 20 s for the Redis at unix://{short}/redis.sock: ")
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Those of this process are back afterwards."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_role_waits_for_its_run(
+    redis_url: str, run_name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RMC_PATIENCE", "0.3")
+    place = Place(run_name, redis_url)
+    with pytest.raises(ConfigError, match=f"--run='{run_name}': no run of this name is registered"):
+        Process(place)
+    assert caplog.messages == [f"waiting up to 0.3 s for run {run_name} to be registered in that Redis"]
+    monkeypatch.setenv("RMC_PATIENCE", "60")
+    config = debug(EnvConfig("Pendulum-v1"))
+    with ThreadPoolExecutor(1) as pool:
+        later = pool.submit(lambda: (time.sleep(0.5), register(RedisBus(redis_url, run_name), config)))
+        assert Process(place).config == config
+        later.result()
+
+
+def test_who_is_told_to_stop_waits_no_longer(short: Path) -> None:
+    stop = StopSignal()
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(connect, f"unix://{short}/redis.sock", "run", Patience(60.0, stop))
+        time.sleep(0.3)
+        stop.request()
+        with pytest.raises(ConfigError, match="no Redis answers"):
+            waiting.result(10.0)
 
 
 def test_a_url_is_read_from_a_file(short: Path) -> None:

@@ -4,32 +4,42 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import mode
 
+from common.bus import METRICS_KEPT
 from tests.faults.loaded import ACTORS, Loaded
 from tests.faults.row import Row, at_length
 from tests.faults.soak import MOST_GROWTH, memory_growth, watch
 
-MINUTES, SETTLED = 16.0, 6.0  # from when on Redis keeps as many metrics as it ever will
+MINUTES = 10.0
+SETTLE_SECONDS = 1800.0  # at most, until Redis keeps as many metrics as it ever will: a slow learner says few
 SLOWER = 10.0
+OTHERS = ("replay", "evaluator", *(f"actor-{actor}" for actor in range(ACTORS)))
 
 
-def slow_down(tries: int, folder: Path, minutes: float = MINUTES, settled: float = SETTLED) -> Iterator[Row]:
+def slow_down(tries: int, folder: Path) -> Iterator[Row]:
     """So often, both."""
     for number in range(tries):
         with Loaded(folder / f"slow-{number}") as run:
             run.begin()
             run.slow_down(SLOWER)
-            yield judged("learner 10 times slower", run, 60 * minutes, 60 * settled)
+            settle(run, "learner", *OTHERS)
+            yield judged("learner 10 times slower", run, 60 * MINUTES)
         with Loaded(folder / f"stopped-{number}") as run:
             run.begin()
             learner = run.process_of("learner")
             learner.suspend()
-            yield judged("learner stopped", run, 60 * minutes, 60 * settled)
+            settle(run, *OTHERS)
+            yield judged("learner stopped", run, 60 * MINUTES)
             learner.resume()
 
 
-def judged(fault: str, run: Loaded, seconds: float, settled: float, most_growth: float = MOST_GROWTH) -> Row:
-    """Whether memory stays as it is after ``settled`` seconds, while the actors wait at their credit."""
-    growth = memory_growth(watch(run, seconds, settled))
+def settle(run: Loaded, *roles: str) -> None:
+    """Wait until Redis has as many metrics of each as it keeps."""
+    run.until(lambda: all(len(run.records(role)) > METRICS_KEPT for role in roles), SETTLE_SECONDS)
+
+
+def judged(fault: str, run: Loaded, seconds: float, most_growth: float = MOST_GROWTH) -> Row:
+    """Whether memory stays as it is, while the actors wait at their credit."""
+    growth = memory_growth(watch(run, seconds, 0.0))
     waits = {_waits_for(run, f"actor-{actor}") for actor in range(ACTORS)}
     replay = _waits_for(run, "replay")
     passed = max(growth.values()) < most_growth and waits == {"credit"} and replay == "draws"

@@ -148,7 +148,7 @@ def test_a_checkpoint_has_no_room(place: Place, run: Loaded) -> None:
 def test_the_learner_stands_still(run: Loaded) -> None:
     learner = run.process_of("learner")
     learner.suspend()
-    row = judged("learner stopped", run, 7.0, 1.0, MOST_GROWTH)
+    row = judged("learner stopped", run, 7.0, MOST_GROWTH)
     learner.resume()
     run.until_all_go_on()
     assert row.passed, row
@@ -201,7 +201,7 @@ def test_a_learner_becomes_ten_times_slower(full: Loaded) -> None:
     usual = updates_in(full, 5.0)
     full.slow_down(SLOWER)
     assert updates_in(full, 5.0) < usual / 2
-    row = judged("learner 10 times slower", full, 7.0, 1.0, MOST_GROWTH)
+    row = judged("learner 10 times slower", full, 7.0, MOST_GROWTH)
     full.slow_down(1.0)
     assert row.passed, row
 

@@ -8,9 +8,12 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
+import pytest
 import redis
 
 from tests.integration.running import Training
+
+MANUAL = Path(__file__).parents[2] / "docs" / "manual.md"
 
 RESULT_KEYS = {
     "env", "preset", "seed", "env_steps", "updates", "wall_s", "eval_return_mean", "eval_return_std", "eval_episodes",
@@ -57,29 +60,32 @@ def test_train_evaluate_stats_and_resume(tmp_path: Path) -> None:
     assert longer["wall_s"] > result["wall_s"]
 
 
-def test_roles_by_hand_over_tcp(redis_url: str, run_name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("told", ["words", "environment"])
+def test_roles_by_hand_over_tcp(told: str, redis_url: str, run_name: str, tmp_path: Path) -> None:
+    """As docs/manual.md says it, from files that the command lines name or from the environment."""
     folder = tmp_path / run_name
-    options = ("--total-steps", "1200", "--checkpoint-steps", "600")
+    (tmp_path / "redis-url").write_text(redis_url + "\n")
+    begin, *commands = re.findall(r"^rmc (.*)$", MANUAL.read_text(), re.MULTILINE)
+    options = ("--launcher", "manual", "--redis-url", f"file:{tmp_path}/redis-url")
+    assert " ".join(options[:3]) in begin
+    assert [command.split()[0] for command in commands] == ["replay", "learner", "actor", "evaluator"]
+    environment, said = dict(os.environ), r"$^"
     with ExitStack() as stack:
-        training = stack.enter_context(Training(folder, *options, "--launcher", "manual", "--redis-url", redis_url))
+        training = stack.enter_context(Training(folder, "--total-steps", "1200", "--checkpoint-steps", "600", *options))
         training.wait_for(lambda: "start the roles with" in training.text())
         name = training.text().partition("--run ")[2].split()[0]
-        secret = (folder / "secret").read_text().strip()
-        environment = {**os.environ, "RMC_SECRET": secret, "RMC_REDIS_URL": redis_url}
-        roles = [
-            subprocess.Popen(
-                [sys.executable, "-m", "deploy.cli", *words, "--run", name],
-                env=environment,
-                stdout=subprocess.DEVNULL,
-                stderr=stack.enter_context((tmp_path / f"{words[0]}.log").open("wb")),
-            )
-            for words in (
-                ["replay", "--folder", str(folder / "replay")],
-                ["learner", "--folder", str(folder / "checkpoints")],
-                ["actor"],
-                ["evaluator"],
-            )
-        ]
+        if told == "environment":
+            environment |= {"RMC_SECRET": (folder / "secret").read_text().strip(), "RMC_REDIS_URL": redis_url}
+            said = r" --(secret-file|redis-url) \S+"
+        places = {"NAME": name, "file:redis-url": options[-1], "runs/by-hand": str(folder)}
+        roles = []
+        for command in commands:
+            words = re.sub(said, "", command)
+            for word, place in places.items():
+                words = words.replace(word, place)
+            log = stack.enter_context((tmp_path / f"{words.split()[0]}.log").open("wb"))
+            line = [sys.executable, "-m", "deploy.cli", *words.split()]
+            roles.append(subprocess.Popen(line, env=environment, stdout=subprocess.DEVNULL, stderr=log))
         for role in roles:
             stack.callback(role.wait)
             stack.callback(role.kill)
@@ -87,7 +93,7 @@ def test_roles_by_hand_over_tcp(redis_url: str, run_name: str, tmp_path: Path) -
         assert [role.wait(20) for role in roles] == [0, 0, 0, 0]
     assert json.loads((folder / "result.json").read_bytes())["env_steps"] == 1200
     left = redis.Redis.from_url(redis_url)
-    keys = list(left.scan_iter(match=f"rmc:{name}:*"))
+    keys = [key for key in left.scan_iter() if key.startswith(f"rmc:{name}:".encode())]
     assert keys
     assert all(0 < left.ttl(key) <= 3600 for key in keys)
 
