@@ -94,9 +94,11 @@ def _draw_agent(panel: Any, runs: list[History], by: Axis, color: str) -> Any:
 
 
 def _named(agent: str, groups: Groups) -> str:
-    fewest = min(len(found[agent]) for found in groups.values() if agent in found)
+    counts = [len(found[agent]) for found in groups.values() if agent in found]
+    fewest, most = min(counts), max(counts)
     how = "interquartile mean, 95 %" if fewest >= ENOUGH_SEEDS else "each a line"
-    return f"{agent} ({fewest} seed{'s' * (fewest > 1)}, {how})"
+    seeds = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+    return f"{agent} ({seeds} seed{'s' * (most > 1)}, {how})"
 
 
 def last_returns(runs: list[History]) -> Scores:

@@ -148,3 +148,16 @@ def test_bad_input_is_one_line_that_names_the_fault(words, fault, tmp_path, caps
     said = capsys.readouterr().err
     assert fault in said
     assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("counts", "said"),
+    [
+        ((1,), "1 seed, each a line"),
+        ((3, 1), "1 to 3 seeds, each a line"),
+        ((5, 5), "5 seeds, interquartile mean, 95 %"),
+    ],
+)
+def test_the_legend_says_how_many_seeds_its_panels_have(counts, said):
+    groups = {f"env {i}": {"RMC": [made(seed=seed) for seed in range(count)]} for i, count in enumerate(counts)}
+    assert curves._named("RMC", groups) == f"RMC ({said})"
