@@ -86,6 +86,12 @@ class _GRU:
         return torch.lerp(self._new, hidden, self._z, out=self.out)
 
 
+def _head(inputs: int, hidden: tuple[int, int], outputs: int, rows: int) -> tuple[_Linear, ...]:
+    first, second = hidden
+    relu = _Linear(inputs, first, rows, relu=True), _Linear(first, second, rows, relu=True)
+    return (*relu, _Linear(second, outputs, rows))
+
+
 class PolicyRunner:
     """Observation, previous action and hidden state in; action and next hidden state out, for N environments."""
 
@@ -104,12 +110,9 @@ class PolicyRunner:
         normed = config.layer_norm and config.embedding > 0
         self._norm = (torch.ones(embedding), torch.zeros(embedding)) if normed else ()
         self._gru = _GRU(self._from_embedding, self._from_hidden, envs, config.hidden)
-        first, second = config.heads
-        self._head = (
-            _Linear(features, first, envs, relu=True),
-            _Linear(first, second, envs, relu=True),
-            _Linear(second, 2 * action_dim, envs),
-        )
+        self._head = _head(features, config.heads, 2 * action_dim, envs)
+        predicted = config.hidden + obs_dim + 1
+        self._model = _head(config.hidden + action_dim, config.heads, predicted, envs) if config.fill_blanks else ()
 
     def start(self) -> tuple[Floats, Floats]:
         """Previous action (N, A) and hidden state (N, H) at the start of episodes: new zeros."""
@@ -134,7 +137,8 @@ class PolicyRunner:
     def _copies(self, weights: dict[str, Tensor]) -> list[Callable[[], object]]:
         """What fills every part, once called; takes what it uses out of ``weights``."""
         layers = {"memory.gru.{}_ih_l0": self._from_embedding, "memory.gru.{}_hh_l0": self._from_hidden}
-        layers |= {f"policy.net.{place}.{{}}": layer for place, layer in zip((0, 2, 4), self._head, strict=True)}
+        for net, head in (("policy", self._head), ("world_model", self._model)):
+            layers |= {f"{net}.net.{place}.{{}}": layer for place, layer in zip((0, 2, 4), head, strict=False)}
         if self._embed is not None:
             layers["memory.embed.0.{}"] = self._embed
         copies = [layer.take(weights, name) for name, layer in layers.items()]
@@ -151,6 +155,8 @@ class PolicyRunner:
         the next call overwrites; none of the arguments is changed.
         """
         seen = self._seen(observation, prev_action, blank)
+        if self._model and blank.any():
+            self._input[blank, : self._obs_dim] = self._expected(hidden, prev_action)[blank]
         if self._config.head_input == "observation":
             x, new_hidden = seen[:, : self._obs_dim], self._gru.out.zero_()
         else:
@@ -178,6 +184,13 @@ class PolicyRunner:
         if self._config.blank_flag:
             x[:, -1] = blank
         return torch.from_numpy(x)
+
+    def _expected(self, hidden: Floats, prev_action: Floats) -> Floats:
+        """(N, H), (N, A) -> (N, O), the normalised observation that the world model expects."""
+        x = torch.from_numpy(np.concatenate([hidden, prev_action], 1))
+        for layer in self._model:
+            x = layer(x)
+        return x.numpy()[:, self._config.hidden : -1]
 
     def _embedded(self, x: Tensor) -> Tensor:
         if self._embed is None:

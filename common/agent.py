@@ -18,6 +18,7 @@ STD_FLOOR = 1e-2  # a constant dimension is not blown up
 Grounding = Literal["off", "change", "observation"]
 HeadInput = Literal["hidden", "hidden+embedding", "hidden+observation", "observation"]
 POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what it takes to act
+MODEL_PARTS = ("world_model.",)  # what else it takes where blanks are filled
 CRITIC_PARTS = ("critic.", "log_alpha")  # what else it takes to rate a window
 
 
@@ -45,6 +46,8 @@ class AgentConfig:
     neither."""
     blank_flag: bool = False
     """The memory is told which observations are blank (flickered out), not left to tell them from zeros."""
+    fill_blanks: bool = False
+    """The memory is given what the world model expected to see in the place of a blank observation."""
     initial_priority: Literal["max", "actor"] = "max"
     """Priority that a window enters the replay with: the largest seen, or its TD error by the networks of its actor, to
     which the critics are then sent, too."""
@@ -113,6 +116,11 @@ class Memory(nn.Module):
         embedding = self._embedded(observation, blank, prev_action)
         hidden = self._unroll(embedding, hidden.unsqueeze(0).contiguous())
         return Remembered(hidden, self._beside(observation, embedding))
+
+    def step(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
+        """One step of it: (B, O) normalised, (B,) bool, (B, A), (B, H) -> (B, H) float32."""
+        embedding = self._embedded(observation, blank, prev_action)
+        return torch.gru_cell(embedding, hidden, *self.gru.all_weights[0])
 
     def beside(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
         """What the heads read beside h: (..., O) normalised, (...) bool, (..., A) -> (..., S)."""
@@ -265,13 +273,33 @@ class Agent(nn.Module):
                 return remembered.beside
         return torch.cat(remembered, dim=-1)
 
+    @torch.no_grad()
+    def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
+        """Where configured, a blank o_t becomes what the world model expects from (h_{t-1}, a_{t-1}). No gradient.
+
+        (B, T, O) normalised, (B, T) bool, (B, T, A), (B, H) the state before the first step -> (B, T, O).
+        """
+        if not self.config.fill_blanks:
+            return observation
+        frames = [observation[:, :0]]
+        with torch.autocast(observation.device.type, enabled=False):  # at a step at a time the casts outweigh the rest
+            for o, was_blank, a in zip(observation.unbind(1), blank.unbind(1), prev_action.unbind(1), strict=True):
+                expected = self.world_model(hidden, a).observation
+                seen = torch.where(was_blank.unsqueeze(1), expected, o)
+                hidden = self.memory.step(seen, was_blank, a, hidden)
+                frames.append(seen.unsqueeze(1))
+        return torch.cat(frames, 1)
+
     def policy_weights(self) -> dict[str, Tensor]:
-        """What it takes to act, detached, on the CPU."""
-        return self._weights(POLICY_PARTS)
+        """What it takes to act, detached, on the CPU: the world model, too, where it fills blanks."""
+        return self._weights(self._acting())
 
     def broadcast_weights(self) -> dict[str, Tensor]:
         """What actors are sent: the critics, too, where they rate their windows."""
-        return self._weights(POLICY_PARTS + (CRITIC_PARTS if self.config.initial_priority == "actor" else ()))
+        return self._weights(self._acting() + (CRITIC_PARTS if self.config.initial_priority == "actor" else ()))
+
+    def _acting(self) -> tuple[str, ...]:
+        return POLICY_PARTS + (MODEL_PARTS if self.config.fill_blanks else ())
 
     def _weights(self, parts: tuple[str, ...]) -> dict[str, Tensor]:
         return {

@@ -36,8 +36,9 @@ class _Step(nn.Module):
         self, observation: Tensor, previous_action: Tensor, blank: Tensor, hidden: Tensor
     ) -> tuple[Tensor, Tensor]:
         """See the module's docstring."""
-        seen = self.agent.normalizer(observation, blank)
-        remembered = self.agent.memory(seen.unsqueeze(1), blank.unsqueeze(1), previous_action.unsqueeze(1), hidden)
+        seen = self.agent.normalizer(observation, blank).unsqueeze(1)
+        now = blank.unsqueeze(1), previous_action.unsqueeze(1), hidden
+        remembered = self.agent.memory(self.agent.fill(seen, *now), *now)
         mean, _ = self.agent.policy(self.agent.features(remembered).squeeze(1))
         return torch.tanh(mean), remembered.hidden.squeeze(1)
 

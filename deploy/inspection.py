@@ -106,7 +106,9 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     ``norm`` is that of the world model's error.
     """
     previous = torch.cat([torch.zeros_like(episode.action[:, :1]), episode.action], 1)
-    memory = agent.memory(episode.observation, episode.blank, previous, torch.zeros(1, agent.config.hidden))
+    start = torch.zeros(1, agent.config.hidden)
+    seen = agent.fill(episode.observation, episode.blank, previous, start)
+    memory = agent.memory(seen, episode.blank, previous, start)
     prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
     latent_change = memory.hidden[0].diff(dim=0)
     real = episode.observation[0, 1:]

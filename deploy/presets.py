@@ -265,6 +265,9 @@ def validate(config: RunConfig) -> None:
         raise ConfigError("--stride", config.actor.stride, "an episode is one window; leave it, or use burn-in")
     if config.agent.blank_flag and config.env.frame_stack > 1:
         raise ConfigError("--blank-flag", True, "a stack of frames has no flag; leave it, or use --frame-stack 1")
+    if config.agent.fill_blanks and (config.agent.grounding, config.agent.head_input) != ("observation", "hidden"):
+        fix = "the model must predict observations from the memory alone: --grounding observation --head-input hidden"
+        raise ConfigError("--fill-blanks", True, fix)
     if not config.update.policy_through_q and config.update.scheme < 4:
         raise ConfigError("--policy-through-q", False, "schemes 1 to 3 have no such way; take --scheme 4, 5 or 6")
     if config.total_steps <= config.replay.warmup_steps:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.agent import Agent
+from common.agent import Agent, Remembered
 from common.window import BoolArray, Rows, WindowSpec
 
 Floats = NDArray[np.float32]
@@ -33,13 +33,13 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
     device = agent.log_alpha.device
     observation, blank, action = (torch.from_numpy(x).to(device).unsqueeze(0) for x in _joined(episode, spec))
     stored = torch.from_numpy(episode["hidden"][-1:].copy()).to(device)
-    o = agent.normalizer(observation, blank)
+    o, start = agent.normalizer(observation, blank), torch.zeros_like(stored)
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
     window = slice(-spec.steps - 1, -1)  # its steps; the bootstrap observation starts none
     past = slice(None, -spec.steps - 1)
-    before = agent.memory(o[:, past], blank[:, past], prev_action[:, past], torch.zeros_like(stored)).hidden[:, -1]
+    before = _remembered(agent, o[:, past], blank[:, past], prev_action[:, past], start).hidden[:, -1]
     replayed, recomputed = (
-        agent.memory(o[:, window], blank[:, window], prev_action[:, window], h) for h in (stored, before)
+        _remembered(agent, o[:, window], blank[:, window], prev_action[:, window], h) for h in (stored, before)
     )
     q, q_replayed = (
         agent.critic(agent.features(remembered), action[:, -spec.steps :]).mean(0).squeeze(0)
@@ -59,6 +59,11 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
             "stale_q_last_burned": gap[-1],
         }
     return {name: float(value) for name, value in found.items()}
+
+
+def _remembered(agent: Agent, o: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Remembered:
+    found: Remembered = agent.memory(agent.fill(o, blank, prev_action, hidden), blank, prev_action, hidden)
+    return found
 
 
 def _distance(replayed: Tensor, recomputed: Tensor) -> Tensor:

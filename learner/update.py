@@ -127,6 +127,7 @@ class JointUpdate:
             o = agent.normalizer(batch.observation, batch.blank)
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
+            o = filled(agent, o, batch, self.burn_in)
             memory = remember(agent.memory, o, batch, self.burn_in)
             z = self._low(agent.features(memory))
             trains = TRAINS_MEMORY[c.scheme]
@@ -293,14 +294,33 @@ class AlternateUpdate(JointUpdate):
 
 def remember(memory: Memory, o: Tensor, batch: Batch, burn_in: int) -> Remembered:
     """(B, L_t + 1, ·) from the stored state, which starts the trained part itself where the burn-in is padding."""
-    n, hidden = burn_in, batch.hidden
-    if n:
-        with torch.no_grad():
-            burned = memory(o[:, :n], batch.blank[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
-        torch.clear_autocast_cache()  # older torch would go on with these casts, which carry no gradient
-        hidden = torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
+    n, hidden = burn_in, _burned_in(memory, o, batch, burn_in)
     remembered: Remembered = memory(o[:, n:], batch.blank[:, n:], batch.prev_action[:, n:], hidden)
     return remembered
+
+
+@torch.no_grad()
+def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
+    """(B, H), the state before the first trained step."""
+    if not n:
+        return batch.hidden
+    burned = memory(o[:, :n], batch.blank[:, :n], batch.prev_action[:, :n], batch.hidden).hidden[:, -1].float()
+    torch.clear_autocast_cache()  # older torch would go on with these casts, which carry no gradient
+    return torch.where(batch.burned_in.unsqueeze(1), burned, batch.hidden)
+
+
+def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
+    """(B, L + 1, O) with blank frames filled where configured, along the states that ``remember`` goes through."""
+    if not agent.config.fill_blanks:
+        return o
+
+    def part(steps: slice, hidden: Tensor) -> Tensor:
+        return agent.fill(o[:, steps], batch.blank[:, steps], batch.prev_action[:, steps], hidden)
+
+    past = part(slice(burn_in), batch.hidden)
+    trained = part(slice(burn_in, None), _burned_in(agent.memory, past, batch, burn_in))
+    torch.clear_autocast_cache()
+    return torch.cat([past, trained], 1)
 
 
 def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:

@@ -44,6 +44,9 @@ def reference(
     noise: torch.Tensor | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     normalized = agent.normalizer(observation, blank)
+    if agent.config.fill_blanks:
+        expected = agent.world_model(hidden, prev_action).observation
+        normalized = torch.where(blank.unsqueeze(1), expected, normalized)
     remembered = agent.memory(normalized.unsqueeze(1), blank.unsqueeze(1), prev_action.unsqueeze(1), hidden)
     mean, log_std = agent.policy(agent.features(remembered).squeeze(1))
     action = torch.tanh(mean) if noise is None else squashed_sample(mean, log_std, noise)[0]
@@ -51,15 +54,18 @@ def reference(
 
 
 @pytest.mark.parametrize(
-    ("embedding", "layer_norm", "head_input", "normalize", "blank_flag"),
-    list(product((0, 16), (False, True), get_args(HeadInput), (False, True), (False, True))),
+    ("embedding", "layer_norm", "head_input", "normalize", "blank_flag", "fill_blanks"),
+    [
+        *product((0, 16), (False, True), get_args(HeadInput), (False, True), (False, True), (False,)),
+        *product((0, 16), (False, True), ("hidden",), (False, True), (False, True), (True,)),
+    ],
 )
 def test_agrees_with_the_agent(
-    embedding: int, layer_norm: bool, head_input: HeadInput, normalize: bool, blank_flag: bool
+    embedding: int, layer_norm: bool, head_input: HeadInput, normalize: bool, blank_flag: bool, fill_blanks: bool
 ) -> None:
     config = AgentConfig(
         hidden=12, embedding=embedding, heads=(9, 7), layer_norm=layer_norm, head_input=head_input,
-        normalize_observations=normalize, blank_flag=blank_flag,
+        normalize_observations=normalize, blank_flag=blank_flag, fill_blanks=fill_blanks, grounding="observation",
     )  # fmt: skip
     agent = make_agent(config)
     runner = make_runner(agent)

@@ -1,5 +1,7 @@
 """Stored state + burn-in gives the learner the very h that the actor had, at every trained step."""
 
+import dataclasses
+
 import numpy as np
 import torch
 from hypothesis import given, settings
@@ -9,7 +11,7 @@ from actors.window_builder import WindowBuilder
 from common.agent import AgentConfig
 from common.window import Rows, WindowSpec
 from learner.batch import Batch, view_batch
-from learner.update import remember
+from learner.update import filled, remember
 from tests.actors.support import join_rows
 from tests.actors.test_policy_runner import ACTION_DIM, OBS_DIM, make_agent, make_runner
 
@@ -28,6 +30,9 @@ AGENTS = {
     )
     for shape, embedding in (("embedded", 12), ("raw", 0))
 }
+AGENTS["filled"] = make_agent(
+    dataclasses.replace(AGENTS["embedded"].config, head_input="hidden", grounding="observation", fill_blanks=True)
+)
 
 
 def play(
@@ -70,7 +75,7 @@ def relearned(agent_name: str, rows: Rows, spec: WindowSpec) -> tuple[Batch, tor
     agent = AGENTS[agent_name]
     raw = torch.from_numpy(rows.view(np.uint8).reshape(len(rows), -1))
     batch = view_batch(raw, torch.ones(len(rows)), spec)
-    o = agent.normalizer(batch.observation, batch.blank)
+    o = filled(agent, agent.normalizer(batch.observation, batch.blank), batch, spec.burn_in)
     return batch, remember(agent.memory, o, batch, spec.burn_in).hidden
 
 

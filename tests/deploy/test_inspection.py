@@ -37,7 +37,7 @@ def make_run(path: Path, config: RunConfig) -> RunFolder:
     return folder
 
 
-@pytest.fixture(params=["robust", "layer norm"])
+@pytest.fixture(params=["robust", "layer norm", "filling blanks"])
 def config(request: pytest.FixtureRequest) -> RunConfig:
     run = debug(EnvConfig("Pendulum-v1", flicker=0.1, time_limit=40))
     return RunConfig(env=run.env, preset="debug", agent=AGENTS[request.param])
@@ -48,7 +48,10 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
     """The observation that the model expects ``horizon`` steps after ``start``, one step at a time."""
     hidden, previous = torch.zeros(1, agent.config.hidden), torch.zeros(1, 1, agent.action_dim)
     for t in range(start + 1):
-        seen = agent.memory(episode.observation[:, t : t + 1], episode.blank[:, t : t + 1], previous, hidden)
+        frame, blank = episode.observation[:, t : t + 1], episode.blank[:, t : t + 1]
+        if agent.config.fill_blanks and blank:
+            frame = agent.world_model(hidden.unsqueeze(1), previous).observation
+        seen = agent.memory(frame, blank, previous, hidden)
         hidden, previous = seen.hidden[:, 0], episode.action[:, t : t + 1]
     observation = episode.observation[:, start : start + 1]
     for t in range(start, start + horizon):

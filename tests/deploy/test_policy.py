@@ -28,6 +28,9 @@ AGENTS = {
     "without a memory": AgentConfig(
         hidden=16, embedding=12, heads=(10, 9), head_input="observation", grounding="observation"
     ),
+    "filling blanks": AgentConfig(
+        hidden=16, embedding=12, heads=(10, 9), normalize_observations=True, grounding="observation", fill_blanks=True
+    ),
     "paper": AgentConfig(hidden=16, embedding=0, heads=(10, 9), grounding="off"),
 }
 

@@ -59,6 +59,8 @@ VARIANTS: list[dict[str, Any]] = [
     {"layer_norm": True, "head_input": "hidden+embedding", "normalize_observations": True},
     {"flicker": 0.5},
     {"flicker": 0.5, "blank_flag": True, "normalize_observations": True},
+    {"flicker": 0.5, "fill_blanks": True, "grounding": "observation"},
+    {"flicker": 0.5, "fill_blanks": True, "grounding": "observation", "initial_priority": "actor"},
     {"hide": "velocities"},
     {"hide": "positions"},
     {"noise": 0.1},

@@ -75,18 +75,32 @@ class PlainUpdate:
 
     def unroll(self, memory: Memory, row: np.void) -> dict[int, Known]:
         """By observation, from the first trained one on; the burn-in without gradient."""
-        h, known = torch.tensor(row["hidden"]), {}
+        h, known, filled = torch.tensor(row["hidden"]), {}, self.filled(row)
         for t in range(int(row["first"]), int(row["last"]) + 1):
             if t == self.burn_in:
                 h = h.detach()
             previous = row["prev_action"] if t == row["first"] else row["action"][t - 1]
-            o = self.seen(row, t)
-            inputs = [o, torch.tensor(previous)]
-            inputs += [torch.tensor([float(row["blank"][t])])] if self.agent.config.blank_flag else []
-            e = memory.embed(torch.cat(inputs))
+            e = self.embedded(memory, row, t, filled[t], torch.tensor(previous))
             h = torch.zeros_like(h) if self.agent.config.head_input == "observation" else gru(memory, e, h)
-            known[t] = Known(h, e, o)
+            known[t] = Known(h, e, filled[t])
         return {t: known[t] for t in range(self.burn_in, int(row["last"]) + 1)}
+
+    def embedded(self, memory: Memory, row: np.void, t: int, o: Tensor, previous: Tensor) -> Tensor:
+        flag = [torch.tensor([float(row["blank"][t])])] if self.agent.config.blank_flag else []
+        return memory.embed(torch.cat([o, previous, *flag]))
+
+    @torch.no_grad()
+    def filled(self, row: np.void) -> dict[int, Tensor]:
+        """By observation, what the memory is given: for a blank one what the model expects, where it is asked."""
+        memory, h, found = self.agent.memory, torch.tensor(row["hidden"]), {}
+        for t in range(int(row["first"]), int(row["last"]) + 1):
+            previous = torch.tensor(row["prev_action"] if t == row["first"] else row["action"][t - 1])
+            found[t] = self.seen(row, t)
+            if self.agent.config.fill_blanks and row["blank"][t]:
+                found[t] = self.agent.world_model(h, previous).observation
+            if self.agent.config.head_input != "observation":
+                h = gru(memory, self.embedded(memory, row, t, found[t], previous), h)
+        return found
 
     def seen(self, row: np.void, t: int) -> Tensor:
         """The observation as the networks see it."""

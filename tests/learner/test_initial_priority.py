@@ -16,11 +16,11 @@ from tests.learner.rows import SPEC, random_rows, to_batch
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
-@pytest.mark.parametrize("head_input", ["hidden", "hidden+observation"])
-def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput) -> None:
+@pytest.mark.parametrize(("head_input", "fill"), [("hidden", False), ("hidden", True), ("hidden+observation", False)])
+def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput, fill: bool) -> None:
     config = AgentConfig(
         hidden=SPEC.hidden, embedding=7, heads=(10, 9), head_input=head_input, normalize_observations=True,
-        initial_priority="actor",
+        initial_priority="actor", grounding="observation", fill_blanks=fill,
     )  # fmt: skip
     torch.manual_seed(0)
     agent = Agent(SPEC.obs_dim, SPEC.action_dim, config)

@@ -11,12 +11,13 @@ from learner.staleness import measurable, staleness
 SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=4, train=5)
 UNBURNED = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=0, train=5)
 AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), head_input="hidden+embedding", normalize_observations=True)
+FILLING = AgentConfig(hidden=8, embedding=6, heads=(7, 6), grounding="observation", fill_blanks=True)
 STEPS = 32  # of the episode
 
 
-def make_agent(seed: int) -> Agent:
+def make_agent(seed: int, config: AgentConfig = AGENT) -> Agent:
     torch.manual_seed(seed)
-    agent = Agent(SPEC.obs_dim, SPEC.action_dim, AGENT)
+    agent = Agent(SPEC.obs_dim, SPEC.action_dim, config)
     agent.normalizer.mean += 0.3
     return agent
 
@@ -31,7 +32,10 @@ def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray,
             torch.from_numpy(np.asarray(x))[None, None]
             for x in (episode["observation"][k], episode["blank"][k], episode["action"][k], before)
         )
-        step = agent.memory(agent.normalizer(o, blank), blank, previous, state)
+        seen = agent.normalizer(o, blank)
+        if agent.config.fill_blanks and blank:
+            seen = agent.world_model(state.unsqueeze(1), previous).observation
+        step = agent.memory(seen, blank, previous, state)
         state = step.hidden[:, 0]
         found.append((state[0].numpy(), float(agent.critic(agent.features(step), a).mean())))
     return found
@@ -60,9 +64,10 @@ def play(agent: Agent, spec: WindowSpec) -> tuple[dict[str, np.ndarray], Rows]:
     return episode, rows
 
 
+@pytest.mark.parametrize("config", [AGENT, FILLING], ids=["zeros", "filled"])
 @pytest.mark.parametrize("spec", [SPEC, UNBURNED])
-def test_todays_weights_find_nothing_stale(spec: WindowSpec) -> None:
-    agent = make_agent(1)
+def test_todays_weights_find_nothing_stale(spec: WindowSpec, config: AgentConfig) -> None:
+    agent = make_agent(1, config)
     _, rows = play(agent, spec)
     chosen = np.flatnonzero(measurable(rows, spec))
     assert chosen.tolist() == [1, 2, 3, 4, 5]  # not the first, not the short
@@ -72,9 +77,10 @@ def test_todays_weights_find_nothing_stale(spec: WindowSpec) -> None:
         assert max(found.values()) < 1e-5
 
 
+@pytest.mark.parametrize("config", [AGENT, FILLING], ids=["zeros", "filled"])
 @pytest.mark.parametrize("window", [1, 4])
-def test_as_a_plain_loop_has_it(window: int) -> None:
-    actor, today = make_agent(1), make_agent(2)
+def test_as_a_plain_loop_has_it(window: int, config: AgentConfig) -> None:
+    actor, today = make_agent(1, config), make_agent(2, config)
     episode, rows = play(actor, SPEC)
     start = window * SPEC.train - SPEC.burn_in
     stored = rows["hidden"][window]

@@ -52,6 +52,7 @@ AGENTS = [
     dataclasses.replace(ROBUST, layer_norm=True, head_input="hidden"),
     dataclasses.replace(ROBUST, critic_norm=True, head_input="hidden+observation"),
     dataclasses.replace(ROBUST, head_input="observation", grounding="observation"),
+    dataclasses.replace(ROBUST, head_input="hidden", grounding="observation", fill_blanks=True),
 ]
 
 
