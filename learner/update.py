@@ -311,7 +311,7 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
 
 def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
     """(B, L + 1, O) with blank frames filled where configured, along the states that ``remember`` goes through."""
-    if not agent.config.fill_blanks:
+    if not agent.config.fill_blanks or (o.device.type == "cpu" and not batch.blank.any()):  # a GPU would have to wait
         return o
 
     def part(steps: slice, hidden: Tensor) -> Tensor:

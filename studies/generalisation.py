@@ -23,7 +23,11 @@ AREA = slice(1, 10)  # p = 0.1 … 0.9
 EPISODES = 10
 STUDY = Study(
     "generalisation",
-    {"RMC": "train ENV", "SAC": "baseline sac ENV"},
+    {
+        "RMC": "train ENV",
+        "RMC, filling": "train ENV --grounding observation --fill-blanks",
+        "SAC": "baseline sac ENV",
+    },
     full=Scale(1_000_000, (1, 2, 3, 4, 5), ENVS),
 )
 
