@@ -58,7 +58,7 @@ WHEN = {
     "critic_norm": "rarely: it cost return in the [trial](results.md)",
     "normalize_observations": "off where observations are scaled already and their statistics keep moving",
     "grounding": "`off` for the paper's model; without it the latent can collapse in other schemes than 1",
-    "fill_blanks": "with flicker; every step of the memory then waits for the model, see docs/results.md",
+    "fill_blanks": "where frames may be missing, with `--grounding observation`; see [results](results.md)",
     "blank_flag": "with flicker, to see what the flag is worth; the paper has none",
     "initial_priority": "`actor` where new windows should not all be drawn soon; it costs the actors a forward pass",
     "envs_per_actor": "up where actors are the bottleneck: they share one forward pass",

@@ -1,6 +1,7 @@
 """Generalisation (a) of the paper: trained where everything is seen, played with more and more frames blank.
 
-After the runs, ``python -m studies.generalisation --scale SCALE --play`` plays each with p = 0 … 1 and tells the areas.
+After the runs, ``python -m studies.generalisation --scale SCALE --play`` plays each with p = 0 … 1 and tells the areas;
+``--draw PICTURE FILE …`` draws the lines of such files, a panel an environment.
 """
 
 import argparse
@@ -41,7 +42,8 @@ def play(job: Job, episodes: int = EPISODES) -> dict[str, object]:
         else:
             played = evaluate_checkpoint(folder, folder.config(), "latest", episodes, probability)
         returns.append(played["eval_return_mean"])
-    return {"agent": job.agent, "env": job.env, "seed": job.seed, "flicker": PROBABILITIES, "returns": returns}
+    about = {"agent": job.agent, "env": job.env, "seed": job.seed, "env_steps": played["env_steps"]}
+    return about | {"flicker": PROBABILITIES, "returns": returns}
 
 
 def area(returns: list[float]) -> float:
@@ -63,15 +65,42 @@ def tell(path: Path) -> None:
         print(text)
 
 
+def draw(out: Path, paths: list[Path]) -> None:
+    """Returns over p: a panel an environment, a line a run."""
+    from matplotlib.figure import Figure  # an extra
+
+    lines = [json.loads(line) for path in paths for line in path.read_text().splitlines()]
+    envs = list(dict.fromkeys(line["env"] for line in lines))
+    figure = Figure(figsize=(6.0 * len(envs), 4.2), layout="constrained")
+    for panel, env in zip(figure.subplots(1, len(envs), squeeze=False).flat, envs, strict=True):
+        for line in lines:
+            if line["env"] == env:
+                name = f"{line['agent']}, seed {line['seed']}, {line['env_steps']:,} steps"
+                panel.plot(line["flicker"], line["returns"], marker="o", markersize=3, label=name)
+        panel.set(title=env, xlabel="probability that a frame is blank", ylabel="return")
+        panel.grid(alpha=0.3)
+        panel.legend()
+    figure.savefig(out, dpi=110)
+
+
 def main() -> None:
-    """Train, or play what was trained."""
-    if "--play" not in sys.argv:
+    """Train, or play what was trained, or draw how it played."""
+    if not {"--play", "--draw"} & set(sys.argv):
         STUDY.main()
         return
     parser = argparse.ArgumentParser()
     parser.add_argument("--play", action="store_true")
+    parser.add_argument("--draw", type=Path, nargs="+")
     parser.add_argument("--scale", default="small")
-    scale = parser.parse_args().scale
+    options = parser.parse_args()
+    if options.draw:
+        draw(options.draw[0], options.draw[1:])
+    else:
+        play_all(options.scale)
+
+
+def play_all(scale: str) -> None:
+    """Every run that has not been played yet."""
     target = STUDY.results(scale).with_suffix(".flicker.jsonl")
     lines = [json.loads(line) for line in target.read_text().splitlines()] if target.exists() else []
     done = {(line["agent"], line["env"], line["seed"]) for line in lines}

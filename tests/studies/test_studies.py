@@ -103,3 +103,17 @@ def test_an_area_is_over_partial_views_only(tmp_path, capsys):
     assert generalisation.area(returns) == 20.0
     generalisation.tell(tmp_path / "lines")
     assert capsys.readouterr().out == "Hopper-v5, RMC: 20 (20, 20)\n"
+
+
+def test_how_it_was_played_is_drawn(tmp_path):
+    line = {
+        "agent": "RMC",
+        "env": "Hopper-v5",
+        "seed": 1,
+        "env_steps": 300,
+        "flicker": [0.0, 0.5],
+        "returns": [9.0, 4.0],
+    }
+    (tmp_path / "lines").write_text(json.dumps(line))
+    generalisation.draw(tmp_path / "seen.png", [tmp_path / "lines"] * 2)
+    assert (tmp_path / "seen.png").read_bytes().startswith(b"\x89PNG")
