@@ -90,9 +90,11 @@ def main() -> None:
         return
     parser = argparse.ArgumentParser()
     parser.add_argument("--play", action="store_true")
-    parser.add_argument("--draw", type=Path, nargs="+")
+    parser.add_argument("--draw", type=Path, nargs="+", metavar=("PICTURE", "FILE"))
     parser.add_argument("--scale", default="small")
     options = parser.parse_args()
+    if options.draw and len(options.draw) < 2:
+        parser.error(f"--draw={options.draw[0]}: name the files of lines after the picture")
     if options.draw:
         draw(options.draw[0], options.draw[1:])
     else:
