@@ -126,13 +126,17 @@ class Memory(nn.Module):
         """What the heads read beside h: (..., O) normalised, (...) bool, (..., A) -> (..., S)."""
         return self._beside(observation, self._embedded(observation, blank, prev_action))
 
+    def inputs(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
+        """What is embedded: (..., O) normalised, (...) bool, (..., A) -> (..., O + A), or one more with the flag."""
+        flag = [blank.unsqueeze(-1).to(observation.dtype)] if self.blank_flag else []
+        return torch.cat([observation, prev_action, *flag], dim=-1)
+
     def _beside(self, observation: Tensor, embedding: Tensor) -> Tensor:
         return (embedding if self.head_input == "hidden+embedding" else observation)[..., : self.beside_dim]
 
     def _embedded(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
         """(..., O) normalised, (...) bool, (..., A) -> (..., E)."""
-        flag = [blank.unsqueeze(-1).to(observation.dtype)] if self.blank_flag else []
-        embedding: Tensor = self.embed(torch.cat([observation, prev_action, *flag], dim=-1))
+        embedding: Tensor = self.embed(self.inputs(observation, blank, prev_action))
         return embedding
 
     def _unroll(self, embedding: Tensor, hidden: Tensor) -> Tensor:

@@ -21,7 +21,8 @@ ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
 def fuse(agent: Agent) -> None:
-    """Swap an agent's parts in place; parameters and their names stay."""
+    """Swap an agent's class and parts in place; parameters and their names stay."""
+    agent.__class__ = FusedAgent
     agent.memory.gru = _as(FusedGRU, agent.memory.gru)
     agent.world_model.net = _as(FusedHead, agent.world_model.net)
     agent.policy.net = _as(FusedHead, agent.policy.net)
@@ -37,6 +38,21 @@ def _as(kind: type[ModuleT], module: nn.Module) -> ModuleT:
 
 def _applies(x: Tensor) -> bool:
     return x.device.type == "cpu" and torch.is_autocast_enabled("cpu") and torch.get_autocast_dtype("cpu") is LOW
+
+
+class FusedAgent(Agent):
+    """Fills blanks with every weight rounded once for all steps, not once a step."""
+
+    @torch.no_grad()
+    def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
+        """As ``Agent.fill``, which it is where the embedding has no plain layer."""
+        c = self.config
+        if not (c.fill_blanks and c.embedding and _applies(observation)) or c.layer_norm:
+            return super().fill(observation, blank, prev_action, hidden)
+        with torch.autocast("cpu", enabled=False):
+            inputs = self.memory.inputs(observation, blank, prev_action).to(LOW).transpose(0, 1).contiguous()
+            expected = _expected(self, inputs, blank.t(), prev_action.to(LOW).transpose(0, 1), hidden)
+        return torch.where(blank.unsqueeze(-1), expected.transpose(0, 1).float(), observation)
 
 
 class FusedGRU(nn.GRU):
@@ -90,6 +106,28 @@ def _heads(features: Tensor, action: Tensor, float32_last: bool, parameters: lis
 def _bits(x: Tensor) -> NDArray[np.uint16]:
     bits: NDArray[np.uint16] = x.view(torch.uint16).numpy()
     return bits
+
+
+def _expected(agent: Agent, inputs: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
+    """Of the memory's inputs (T, B, ·), o_t, what the model expects where it is blank; those are filled in place.
+
+    (T, B), (T, B, A), (B, H) the state before the first step -> (T, B, O).
+    """
+    gru, size, seen = agent.memory.gru, hidden.shape[1], inputs[:, :, : agent.obs_dim]
+    linear = [
+        layer for net in (agent.world_model.net, agent.memory.embed) for layer in net if isinstance(layer, nn.Linear)
+    ]
+    w1, w2, w3, w_embed, wi, wh = (w.to(LOW).t() for w in (*(x.weight for x in linear), *gru.all_weights[0][:2]))
+    b1, b2, b3, b_embed = (x.bias for x in linear)
+    bi, bh = (b.numpy() for b in gru.all_weights[0][2:])
+    rows = slice(size, size + agent.obs_dim)  # of the model's last layer
+    h, low, kept = hidden.clone().numpy(), hidden.to(LOW), np.empty((len(hidden), 4 * size), np.float32)
+    for o, was_blank, a, x in zip(seen, blank.unsqueeze(2), prev_action, inputs, strict=True):
+        second = _layer(_layer(torch.cat([low, a], 1), w1, b1), w2, b2)
+        torch.where(was_blank, torch.mm(second, w3[:, rows]).add_(b3[rows]), o, out=o)
+        gi, gh = torch.mm(_layer(x, w_embed, b_embed), wi), torch.mm(low, wh)
+        kernels.gru_step(_bits(gi), _bits(gh), bi, bh, h, kept, h, _bits(low))
+    return seen
 
 
 class _GRU(torch.autograd.Function):

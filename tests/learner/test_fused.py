@@ -1,6 +1,7 @@
 """The fused networks against the plain ones they take the place of: values, gradients, names, NaN."""
 
 import copy
+import dataclasses
 
 import numba
 import numpy as np
@@ -110,6 +111,40 @@ def test_parameters_keep_their_names_and_values(pair):
     ours, theirs = fused.state_dict(), plain.state_dict()
     assert list(ours) == list(theirs)
     assert all(torch.equal(ours[name], value) for name, value in theirs.items())
+
+
+FILLING = AgentConfig(hidden=24, embedding=20, heads=(40, 28), grounding="observation", fill_blanks=True)
+
+
+def filled(config, low):
+    """By a plain and a fused agent, and the observations and which of them were blank."""
+    torch.manual_seed(0)
+    plain = Agent(3, 2, config)
+    fused = copy.deepcopy(plain)
+    fuse(fused)
+    generator = torch.Generator().manual_seed(3)
+    o, action, hidden = (torch.randn(shape, generator=generator) for shape in ((B, T, 3), (B, T, 2), (B, 24)))
+    blank = torch.rand(B, T, generator=generator) < 0.5
+    o[blank] = 0.0
+    with torch.autocast("cpu", torch.bfloat16, enabled=low):
+        found = [agent.fill(o, blank, action, hidden) for agent in (plain, fused)]
+    return *found, o, blank
+
+
+@pytest.mark.parametrize("flag", [False, True])
+def test_blanks_are_filled_to_the_precision_of_bfloat16_and_nothing_else_is_touched(flag):
+    plain, fused, o, blank = filled(dataclasses.replace(FILLING, blank_flag=flag), low=True)
+    assert torch.equal(fused[~blank], o[~blank])
+    gap = (fused - plain)[blank].norm() / plain[blank].norm()
+    assert 1e-5 < gap < 0.01
+    assert (plain - o)[blank].norm() > 0.1
+
+
+@pytest.mark.parametrize("changed", [{"embedding": 0}, {"layer_norm": True}, {"fill_blanks": False}, {}])
+def test_where_the_fused_way_does_not_fit_blanks_are_filled_the_plain_way_to_the_bit(changed):
+    plain, fused, o, blank = filled(dataclasses.replace(FILLING, **changed), low=bool(changed))
+    assert torch.equal(fused, plain)
+    assert torch.equal(plain[blank], o[blank]) == ("fill_blanks" in changed)
 
 
 @pytest.mark.parametrize("asked", ["features", "action", "neither"])
