@@ -102,7 +102,7 @@ def robust(env: EnvConfig) -> RunConfig:
     return RunConfig(
         env=env,
         preset="robust",
-        agent=AgentConfig(normalize_observations=True),
+        agent=AgentConfig(normalize_observations=True, grounding="observation", fill_blanks=True),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0),
         learner=LearnerConfig(batch_size=8, importance_exponent=0.0),
@@ -266,7 +266,8 @@ def validate(config: RunConfig) -> None:
     if config.agent.blank_flag and config.env.frame_stack > 1:
         raise ConfigError("--blank-flag", True, "a stack of frames has no flag; leave it, or use --frame-stack 1")
     if config.agent.fill_blanks and (config.agent.grounding, config.agent.head_input) != ("observation", "hidden"):
-        fix = "the model must predict observations from the memory alone: --grounding observation --head-input hidden"
+        fix = "the model must predict observations from the memory alone: --grounding observation --head-input hidden;"
+        fix += " or leave blanks as they are: --no-fill-blanks"
         raise ConfigError("--fill-blanks", True, fix)
     if not config.update.policy_through_q and config.update.scheme < 4:
         raise ConfigError("--policy-through-q", False, "schemes 1 to 3 have no such way; take --scheme 4, 5 or 6")

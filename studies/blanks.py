@@ -3,16 +3,16 @@
 from studies.study import Study
 
 WAYS = {
-    "robust": "",
-    "told which are blank": "--blank-flag",
-    "grounded by o itself": "--grounding observation",
-    "o itself, told": "--grounding observation --blank-flag",
-    "filled": "--grounding observation --fill-blanks",
-    "filled, told": "--grounding observation --fill-blanks --blank-flag",
+    "filled: robust": "",
+    "filled, told": "--blank-flag",
+    "o itself": "--no-fill-blanks",
+    "o itself, told": "--no-fill-blanks --blank-flag",
+    "change": "--no-fill-blanks --grounding change",
+    "change, told": "--no-fill-blanks --grounding change --blank-flag",
     "longer burn-in": "--burn-in 30",
     "longer windows": "--burn-in 20 --trained-steps 30",
-    "observation beside": "--head-input hidden+observation",
-    "no grounding": "--grounding off",
+    "observation beside": "--no-fill-blanks --head-input hidden+observation",
+    "no grounding": "--no-fill-blanks --grounding off",
 }
 STUDY = Study("blanks", {name: f"train ENV --flicker 0.5 {words}" for name, words in WAYS.items()})
 

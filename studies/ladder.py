@@ -7,7 +7,8 @@ and learner. Every later one keeps what the one before has, as far as it is not 
 from studies.study import Scale, Study
 
 ALONE = "--head-input observation --hidden 8 --embedding 0"  # the agent without a memory
-FLAT = f"--heads 256 256 --no-normalize-observations --grounding off --scheme 2 --clip-norm 0 {ALONE}"
+BARE = "--no-fill-blanks --grounding off"
+FLAT = f"--heads 256 256 --no-normalize-observations {BARE} --scheme 2 --clip-norm 0 {ALONE}"
 ONE = "--envs-per-actor 1 --chunk-windows 1 --burn-in 0 --capacity 1000000"
 EVERY_STEP = "--replay-ratio 256 --batch-size"
 RUNGS = {
@@ -16,11 +17,11 @@ RUNGS = {
     "windows of 16": f"train ENV {FLAT} --burn-in 0 {EVERY_STEP} 16 --trained-steps 16 --envs-per-actor 1",
     "8 environments": f"train ENV {FLAT} --burn-in 0 {EVERY_STEP} 16 --trained-steps 16",
     "an update every 10 steps": f"train ENV {FLAT} --burn-in 0",
-    "heads 400 300, clipped": f"train ENV --no-normalize-observations --grounding off --scheme 2 {ALONE}",
-    "normalised observations": f"train ENV --grounding off --scheme 2 {ALONE}",
-    "a memory beside o": "train ENV --grounding off --scheme 2 --head-input hidden+observation",
-    "a memory alone": "train ENV --grounding off --scheme 2",
-    "the model's loss": "train ENV --grounding off",
+    "heads 400 300, clipped": f"train ENV --no-normalize-observations {BARE} --scheme 2 {ALONE}",
+    "normalised observations": f"train ENV {BARE} --scheme 2 {ALONE}",
+    "a memory beside o": f"train ENV {BARE} --scheme 2 --head-input hidden+observation",
+    "a memory alone": f"train ENV {BARE} --scheme 2",
+    "the model's loss": f"train ENV {BARE}",
     "grounding: robust": "train ENV",
     "curiosity": "train ENV --curiosity 0.1 --curiosity-scale std",
 }

@@ -119,8 +119,9 @@ def test_values_that_do_not_go_together_are_refused() -> None:
         validate(with_value(with_value(config, "actor.stride", 5), "actor.state_strategy", "episode"))
     with pytest.raises(ConfigError, match="--blank-flag"):
         validate(with_value(with_value(config, "agent.blank_flag", True), "env.frame_stack", 2))
-    with pytest.raises(ConfigError, match=r"--fill-blanks=True: .*--grounding observation"):
-        validate(with_value(config, "agent.fill_blanks", True))
+    for path, value in (("agent.grounding", "change"), ("agent.head_input", "hidden+embedding")):
+        with pytest.raises(ConfigError, match=r"--fill-blanks=True: .*--grounding observation .*--no-fill-blanks"):
+            validate(with_value(config, path, value))
     with pytest.raises(ConfigError, match="--policy-through-q"):
         validate(with_value(config, "update.policy_through_q", False))
     with pytest.raises(ConfigError, match=r"--replay-shards=2: .*--actors=1"):
