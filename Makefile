@@ -68,7 +68,7 @@ trial_prioritized := --priority-exponent 0.6 --importance-exponent 0.4
 trial_ema_latent := --latent-target ema
 trial_ema_memory := --target-memory ema
 trial_curiosity := --curiosity 0.1 --curiosity-scale std
-trial_shortcut := --no-fill-blanks --head-input hidden+embedding
+trial_shortcut := --head-input hidden+embedding
 trial_raw_observations := --no-normalize-observations
 TRIALS := base layer_norm prioritized ema_latent ema_memory curiosity shortcut raw_observations
 
@@ -76,7 +76,7 @@ trial: $(STAMP)
 	$(foreach name,$(TRIALS),$(foreach seed,1 2,$(BIN)/rmc train HalfCheetah-v5 --seed $(seed) --total-steps 100000 --run-dir runs/trial-$(name)-$(seed) $(trial_$(name)) && )) true
 
 # With flicker, what the flag of blank frames is worth; and windows that begin with a stored state or with none.
-MEMORY40 := --hidden 64 --embedding 64 --heads 128 128 --head-input hidden+embedding --no-fill-blanks --learning-rate 5e-4 \
+MEMORY40 := --hidden 64 --embedding 64 --heads 128 128 --head-input hidden+embedding --normalize-observations --learning-rate 5e-4 \
 	--polyak 0.99 --target-memory ema --batch-size 16 --capacity 5000 --warmup-steps 1000 --priority-exponent 0 \
 	--episodes 10 --replay-ratio 96 --alpha-learning-rate 5e-3 --trained-steps 42 --stride 14
 

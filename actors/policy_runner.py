@@ -111,14 +111,14 @@ class PolicyRunner:
         self._norm = (torch.ones(embedding), torch.zeros(embedding)) if normed else ()
         self._gru = _GRU(self._from_embedding, self._from_hidden, envs, config.hidden)
         self._head = _head(features, config.heads, 2 * action_dim, envs)
-        predicted = config.hidden + obs_dim + 1
-        self._model = _head(config.hidden + action_dim, config.heads, predicted, envs) if config.fill_blanks else ()
+        known, predicted = config.hidden + obs_dim + action_dim, config.hidden + obs_dim + 1
+        self._model = _head(known, config.heads, predicted, envs) if config.fill_blanks else ()
 
     def start(self) -> tuple[Floats, Floats]:
-        """Previous action (N, A) and hidden state (N, H) at the start of episodes: new zeros."""
-        sizes = (self._action_dim, self._config.hidden)
-        prev_action, hidden = (np.zeros((self._envs, size), np.float32) for size in sizes)
-        return prev_action, hidden
+        """Previous action (N, A) and state (N, S) at the start of episodes: new zeros."""
+        sizes = (self._action_dim, self._config.state_size(self._obs_dim))
+        prev_action, state = (np.zeros((self._envs, size), np.float32) for size in sizes)
+        return prev_action, state
 
     def load(self, blob: bytes) -> None:
         """Take over the safetensors of ``Agent.policy_weights()``, or of what is broadcast. Raises MessageError."""
@@ -147,16 +147,16 @@ class PolicyRunner:
         return copies + [partial(mine.copy_, _of_shape(weights, name, mine)) for name, mine in plain.items()]
 
     def act(
-        self, observation: Floats, prev_action: Floats, blank: BoolArray, hidden: Floats, noise: Floats | None
+        self, observation: Floats, prev_action: Floats, blank: BoolArray, state: Floats, noise: Floats | None
     ) -> tuple[Floats, Floats]:
-        """(N, O) raw, (N, A), (N,), (N, H), and (N, A) standard normal noise -> (N, A) in [-1, 1], (N, H).
+        """(N, O) raw, (N, A), (N,), (N, S), and (N, A) standard normal noise -> (N, A) in [-1, 1], (N, S).
 
-        a = tanh(mean + std * noise); without noise, tanh(mean). The hidden state returned is a buffer that
-        the next call overwrites; none of the arguments is changed.
+        a = tanh(mean + std * noise); without noise, tanh(mean). The state returned is a buffer that
+        the next call may overwrite; none of the arguments is changed.
         """
-        seen = self._seen(observation, prev_action, blank)
+        seen, hidden = self._seen(observation, prev_action, blank), state[:, : self._config.hidden]
         if self._model and blank.any():
-            self._input[blank, : self._obs_dim] = self._expected(hidden, prev_action)[blank]
+            self._input[blank, : self._obs_dim] = self._expected(state, prev_action)[blank]
         if self._config.head_input == "observation":
             x, new_hidden = seen[:, : self._obs_dim], self._gru.out.zero_()
         else:
@@ -167,7 +167,8 @@ class PolicyRunner:
                 x = torch.cat([x, beside[:, : self._beside]], 1)
         for layer in self._head:
             x = layer(x)
-        return self._action(x.numpy(), noise), new_hidden.numpy()
+        action, new_state = self._action(x.numpy(), noise), new_hidden.numpy()
+        return action, np.concatenate([new_state, self._input[:, : self._obs_dim]], 1) if self._model else new_state
 
     def _seen(self, observation: Floats, prev_action: Floats, blank: BoolArray) -> Tensor:
         x = self._input
@@ -185,12 +186,14 @@ class PolicyRunner:
             x[:, -1] = blank
         return torch.from_numpy(x)
 
-    def _expected(self, hidden: Floats, prev_action: Floats) -> Floats:
-        """(N, H), (N, A) -> (N, O), the normalised observation that the world model expects."""
-        x = torch.from_numpy(np.concatenate([hidden, prev_action], 1))
+    def _expected(self, state: Floats, prev_action: Floats) -> Floats:
+        """(N, S), (N, A) -> (N, O), the normalised observation that the world model expects."""
+        x = torch.from_numpy(np.concatenate([state, prev_action], 1))
         for layer in self._model:
             x = layer(x)
-        return x.numpy()[:, self._config.hidden : -1]
+        size = self._config.hidden
+        expected: Floats = state[:, size:] + x.numpy()[:, size:-1]
+        return expected.clip(-NORMALIZED_CLIP, NORMALIZED_CLIP)
 
     def _embedded(self, x: Tensor) -> Tensor:
         if self._embed is None:

@@ -169,7 +169,7 @@ def main() -> None:
     parser.add_argument("--alone", choices=["redis", "replay"], default="", help="what has the first core for itself")
     options = parser.parse_args()
     obs_dim, action_dim, _ = env_spaces(EnvConfig(options.env))
-    spec = WindowSpec(obs_dim, action_dim, robust(EnvConfig(options.env)).agent.hidden)
+    spec = WindowSpec(obs_dim, action_dim, robust(EnvConfig(options.env)).agent.state_size(obs_dim))
     path = Path(__file__).parent / "results" / "scaling.jsonl"
     for shards in options.shards:
         rate, kept_up = options.first_rate, True

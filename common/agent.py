@@ -15,7 +15,6 @@ from torch.nn import functional as F
 LOG_STD_RANGE = (-20.0, 2.0)  # of the policy's Gaussian before the tanh
 NORMALIZED_CLIP = 10.0  # standard deviations
 STD_FLOOR = 1e-2  # a constant dimension is not blown up
-Grounding = Literal["off", "change", "observation"]
 HeadInput = Literal["hidden", "hidden+embedding", "hidden+observation", "observation"]
 POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what it takes to act
 MODEL_PARTS = ("world_model.",)  # what else it takes where blanks are filled
@@ -41,16 +40,20 @@ class AgentConfig:
     """LayerNorm before the ReLUs of the critics."""
     normalize_observations: bool = False
     """Observations are normalised by the replay server's running statistics."""
-    grounding: Grounding = "change"
-    """What the world model also predicts, beside the reward: the next observation's change, or that observation; or
-    neither."""
+    grounding: bool = True
+    """The world model also reads the observation, and predicts its change and the reward."""
     blank_flag: bool = False
     """The memory is told which observations are blank (flickered out), not left to tell them from zeros."""
     fill_blanks: bool = False
-    """The memory is given what the world model expected to see in the place of a blank observation."""
+    """The memory is given what the world model expected to see in the place of a blank observation. The recurrent state
+    then is h and what was last seen."""
     initial_priority: Literal["max", "actor"] = "max"
     """Priority that a window enters the replay with: the largest seen, or its TD error by the networks of its actor, to
     which the critics are then sent, too."""
+
+    def state_size(self, obs_dim: int) -> int:
+        """S, numbers that an actor carries from step to step, and stores: h, and what was last seen where it fills."""
+        return self.hidden + self.fill_blanks * obs_dim
 
 
 class Normalizer(nn.Module):
@@ -86,7 +89,7 @@ class Remembered(NamedTuple):
     """What the memory makes of a sequence."""
 
     hidden: Tensor  # (B, T, H), h_t after (o_t, a_{t-1}); zeros without a memory
-    beside: Tensor  # (B, T, S), what the heads read beside it: e_t, o_t, or nothing
+    beside: Tensor  # (B, T, ·), what the heads read beside it: e_t, o_t, or nothing
 
 
 class Memory(nn.Module):
@@ -110,21 +113,17 @@ class Memory(nn.Module):
         self.gru = nn.GRU(embedding, config.hidden, batch_first=True)
 
     def forward(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Remembered:
-        """(B, T, O) normalised, (B, T) bool, (B, T, A), (B, H) the state before the first step."""
+        """(B, T, O) normalised, (B, T) bool, (B, T, A), (B, S) the state before the first step, which begins with h."""
         if self.head_input == "observation":
             return Remembered(observation.new_zeros(*observation.shape[:2], self.gru.hidden_size), observation)
         embedding = self._embedded(observation, blank, prev_action)
-        hidden = self._unroll(embedding, hidden.unsqueeze(0).contiguous())
+        hidden = self._unroll(embedding, hidden[:, : self.gru.hidden_size].unsqueeze(0).contiguous())
         return Remembered(hidden, self._beside(observation, embedding))
 
     def step(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
         """One step of it: (B, O) normalised, (B,) bool, (B, A), (B, H) -> (B, H) float32."""
         embedding = self._embedded(observation, blank, prev_action)
         return torch.gru_cell(embedding, hidden, *self.gru.all_weights[0])
-
-    def beside(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
-        """What the heads read beside h: (..., O) normalised, (...) bool, (..., A) -> (..., S)."""
-        return self._beside(observation, self._embedded(observation, blank, prev_action))
 
     def inputs(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
         """What is embedded: (..., O) normalised, (...) bool, (..., A) -> (..., O + A), or one more with the flag."""
@@ -163,33 +162,28 @@ class Float32Linear(nn.Linear):
 
 
 class Prediction(NamedTuple):
-    """One step ahead, from (z_t, a_t)."""
+    """One step ahead, from (h_t, a_t), or (h_t, o_t, a_t) with grounding."""
 
     hidden_change: Tensor  # (B, T, H), of h_{t+1} - h_t
-    observation: Tensor  # (B, T, O), the normalised o_{t+1} - o_t, or o_{t+1}, as grounded; O = 0 without
+    observation_change: Tensor  # (B, T, O), of the normalised o_{t+1} - o_t; O = 0 without grounding
     reward: Tensor  # (B, T), or zeros without grounding
 
 
 class WorldModel(nn.Module):
-    """Eq. 7: f(h_t, a_t): predicts the change of the hidden state, and the grounding signals if asked."""
+    """Eq. 7: f(h_t, a_t) predicts the change of the hidden state; grounded, f(h_t, o_t, a_t) that of o and r, too."""
 
-    def __init__(self, inputs: int, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
+    def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
-        self.grounding = config.grounding
-        self.sizes = [config.hidden, *((0, 0) if config.grounding == "off" else (obs_dim, 1))]
-        self.net = _mlp(inputs + action_dim, config.heads, nn.Linear(config.heads[1], sum(self.sizes)))
+        grounded = (obs_dim, 1) if config.grounding else (0, 0)
+        self.sizes = [config.hidden, *grounded]
+        inputs = config.hidden + grounded[0] + action_dim
+        self.net = _mlp(inputs, config.heads, nn.Linear(config.heads[1], sum(self.sizes)))
 
-    def forward(self, features: Tensor, action: Tensor) -> Prediction:
-        """(B, T, Z), (B, T, A)."""
-        out = self.net(torch.cat([features, action.to(features.dtype)], dim=-1))
-        hidden_change, observation, reward = out.split(self.sizes, dim=-1)
-        return Prediction(hidden_change, observation, reward.sum(-1))
-
-    def next_observation(self, observation: Tensor, prediction: Prediction) -> Tensor:
-        """Normalised o_t and what is predicted from there -> o_{t+1}, (..., O) each."""
-        if self.grounding == "change":
-            return observation + prediction.observation
-        return prediction.observation
+    def forward(self, hidden: Tensor, observation: Tensor, action: Tensor) -> Prediction:
+        """(..., H), (..., O) normalised, (..., A)."""
+        inputs = [hidden, observation[..., : self.sizes[1]].to(hidden.dtype), action.to(hidden.dtype)]
+        hidden_change, change, reward = self.net(torch.cat(inputs, dim=-1)).split(self.sizes, dim=-1)
+        return Prediction(hidden_change, change, reward.sum(-1))
 
 
 class StackedLinear(nn.Module):
@@ -263,7 +257,7 @@ class Agent(nn.Module):
         self.normalizer = Normalizer(obs_dim, config.normalize_observations)
         self.memory = Memory(obs_dim, action_dim, config)
         features = self.memory.beside_dim + (config.hidden if config.head_input != "observation" else 0)
-        self.world_model = WorldModel(features, obs_dim, action_dim, config)
+        self.world_model = WorldModel(obs_dim, action_dim, config)
         self.critic = TwinQ(features, action_dim, config)
         self.policy = Policy(features, action_dim, config)
         self.log_alpha = nn.Parameter(torch.zeros(()))
@@ -278,21 +272,31 @@ class Agent(nn.Module):
         return torch.cat(remembered, dim=-1)
 
     @torch.no_grad()
-    def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
-        """Where configured, a blank o_t becomes what the world model expects from (h_{t-1}, a_{t-1}). No gradient.
+    def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """A blank o_t becomes what the world model expects from (h_{t-1}, o_{t-1}, a_{t-1}), o_{t-1} filled itself.
 
-        (B, T, O) normalised, (B, T) bool, (B, T, A), (B, H) the state before the first step -> (B, T, O).
+        (B, T, O) normalised, (B, T) bool, (B, T, A), (B, S) the state before the first step -> (B, T, O) and the state
+        after the last. No gradient.
         """
-        if not self.config.fill_blanks:
-            return observation
+        hidden, seen = state[:, : self.config.hidden], state[:, self.config.hidden :]
         frames = [observation[:, :0]]
         with torch.autocast(observation.device.type, enabled=False):  # at a step at a time the casts outweigh the rest
             for o, was_blank, a in zip(observation.unbind(1), blank.unbind(1), prev_action.unbind(1), strict=True):
-                expected = self.world_model(hidden, a).observation
-                seen = torch.where(was_blank.unsqueeze(1), expected, o)
+                expected = seen + self.world_model(hidden, seen, a).observation_change
+                seen = torch.where(was_blank.unsqueeze(1), expected.clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP), o)
                 hidden = self.memory.step(seen, was_blank, a, hidden)
                 frames.append(seen.unsqueeze(1))
-        return torch.cat(frames, 1)
+        return torch.cat(frames, 1), torch.cat([hidden, seen], 1)
+
+    def remember(
+        self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor
+    ) -> tuple[Remembered, Tensor, Tensor]:
+        """The memory along a sequence; what it was given, (B, T, O), blanks filled; and the state after, (B, S)."""
+        if not self.config.fill_blanks:
+            remembered: Remembered = self.memory(observation, blank, prev_action, state)
+            return remembered, observation, remembered.hidden[:, -1]
+        seen, after = self.fill(observation, blank, prev_action, state)
+        return self.memory(seen, blank, prev_action, state), seen, after
 
     def policy_weights(self) -> dict[str, Tensor]:
         """What it takes to act, detached, on the CPU: the world model, too, where it fills blanks."""

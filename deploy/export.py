@@ -1,7 +1,7 @@
 """A policy as an ONNX file, for programs without torch.
 
-Inputs: observation (N, O) raw, previous_action (N, A), blank (N,) bool, hidden (N, H); zeros at an episode's start.
-Outputs: action (N, A) in [-1, 1], the policy's mean, and the next hidden (N, H).
+Inputs: observation (N, O) raw, previous_action (N, A), blank (N,) bool, hidden (N, S), the state, zeros at an episode's
+start. Outputs: action (N, A) in [-1, 1], the policy's mean, and the next hidden (N, S).
 """
 
 import contextlib
@@ -38,9 +38,9 @@ class _Step(nn.Module):
         """See the module's docstring."""
         seen = self.agent.normalizer(observation, blank).unsqueeze(1)
         now = blank.unsqueeze(1), previous_action.unsqueeze(1), hidden
-        remembered = self.agent.memory(self.agent.fill(seen, *now), *now)
+        remembered, _, state = self.agent.remember(seen, *now)
         mean, _ = self.agent.policy(self.agent.features(remembered).squeeze(1))
-        return torch.tanh(mean), remembered.hidden.squeeze(1)
+        return torch.tanh(mean), state
 
 
 def export(folder: RunFolder, checkpoint: str, out: Path) -> None:
@@ -53,7 +53,7 @@ def export(folder: RunFolder, checkpoint: str, out: Path) -> None:
     spec = config.window_spec()
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
     agent.load_state_dict(safetensors.torch.load(blob), strict=False)
-    two = [torch.zeros(2, size) for size in (spec.obs_dim, spec.action_dim, config.agent.hidden)]
+    two = [torch.zeros(2, size) for size in (spec.obs_dim, spec.action_dim, spec.hidden)]
     example = (two[0], two[1], torch.zeros(2, dtype=torch.bool), two[2])
     rows = torch.export.Dim("rows", min=1)
     with _quiet():

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from actors.evaluator import LONGEST_EPISODE
-from common.agent import Agent, Remembered
+from common.agent import Agent
 from common.errors import ConfigError
 from deploy.evaluation import STATE, load_state
 from deploy.policy import load_policy
@@ -106,13 +106,12 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     ``norm`` is that of the world model's error.
     """
     previous = torch.cat([torch.zeros_like(episode.action[:, :1]), episode.action], 1)
-    start = torch.zeros(1, agent.config.hidden)
-    seen = agent.fill(episode.observation, episode.blank, previous, start)
-    memory = agent.memory(seen, episode.blank, previous, start)
-    prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
+    start = torch.zeros(1, agent.config.state_size(agent.obs_dim))
+    memory, seen, _ = agent.remember(episode.observation, episode.blank, previous, start)
+    prediction = agent.world_model(memory.hidden[:, :-1], seen[:, :-1], episode.action)
     latent_change = memory.hidden[0].diff(dim=0)
     real = episode.observation[0, 1:]
-    ahead = _open_loop(agent, memory, episode)
+    ahead = _open_loop(agent, memory.hidden[0, :-1], seen[0, :-1], episode.action[0])
     return Insight(
         real=real.numpy(),
         predicted=ahead[1].numpy(),
@@ -125,21 +124,17 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     )
 
 
-def _open_loop(agent: Agent, memory: Remembered, episode: Episode) -> dict[int, Tensor]:
-    """Horizon K -> (T - K + 1, O): from every step on, the model's own states and observations in place of the real."""
-    steps = episode.action.shape[1]
-    hidden, beside = memory.hidden[0, :-1], memory.beside[0, :-1]
-    observation = episode.observation[0, :-1]
-    found = {}
+def _open_loop(agent: Agent, hidden: Tensor, observation: Tensor, action: Tensor) -> dict[int, Tensor]:
+    """Horizon K -> (T - K + 1, O): from every step on, the model's own states and observations in place of the real.
+
+    (T, H), (T, O), (T, A).
+    """
+    steps, found = len(action), {}
     for ahead in range(1, min(max(HORIZONS), steps) + 1):
         count = steps - ahead + 1  # starts from which so many steps were played
-        hidden, beside, observation = hidden[:count], beside[:count], observation[:count]
-        action = episode.action[0, ahead - 1 :]
-        features = agent.features(Remembered(hidden.unsqueeze(1), beside.unsqueeze(1)))
-        step = agent.world_model(features, action.unsqueeze(1))
-        hidden = hidden + step.hidden_change.squeeze(1)
-        observation = agent.world_model.next_observation(observation.unsqueeze(1), step).squeeze(1)
-        beside = agent.memory.beside(observation, torch.zeros(count, dtype=torch.bool), action)
+        hidden, observation = hidden[:count], observation[:count]
+        step = agent.world_model(hidden, observation, action[ahead - 1 :])
+        hidden, observation = hidden + step.hidden_change, observation + step.observation_change
         if ahead in HORIZONS:
             found[ahead] = observation
     return found
@@ -164,8 +159,8 @@ def inspect(run: Path, checkpoint: str, out: Path) -> Insight:
     check_writable("--out", out, PICTURES)
     folder = RunFolder(run)
     config = folder.config()
-    if config.agent.grounding == "off":
-        raise ConfigError("RUN", str(run), "its world model predicts no observations; train with --grounding change")
+    if not config.agent.grounding:
+        raise ConfigError("RUN", str(run), "its world model predicts no observations; train with --grounding")
     agent = load_agent(folder, config, checkpoint)
     insight = look(agent, play(folder, agent, config, checkpoint), config.update.model_norm)
     draw(insight, f"{config.env.id}, {config.preset}, seed {config.seed}", out)

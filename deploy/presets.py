@@ -72,7 +72,8 @@ class RunConfig:
                     "--state-strategy", strategy, f"{self.env.id} has no time limit; give --time-limit, or use burn-in"
                 )
             train = time_limit
-        return WindowSpec(obs_dim, action_dim, self.agent.hidden, burn_in if strategy == "burn-in" else 0, train)
+        state = self.agent.state_size(obs_dim)
+        return WindowSpec(obs_dim, action_dim, state, burn_in if strategy == "burn-in" else 0, train)
 
     def shards(self) -> list[Shard]:
         """The replay servers."""
@@ -102,7 +103,7 @@ def robust(env: EnvConfig) -> RunConfig:
     return RunConfig(
         env=env,
         preset="robust",
-        agent=AgentConfig(normalize_observations=True, grounding="observation", fill_blanks=True),
+        agent=AgentConfig(normalize_observations=True, fill_blanks=True),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0),
         learner=LearnerConfig(batch_size=8, importance_exponent=0.0),
@@ -114,7 +115,7 @@ def paper(env: EnvConfig) -> RunConfig:
     return RunConfig(
         env=env,
         preset="paper",
-        agent=AgentConfig(embedding=0, grounding="off"),
+        agent=AgentConfig(embedding=0, grounding=False),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(warmup_steps=10_000),
         update=UpdateConfig(
@@ -265,9 +266,8 @@ def validate(config: RunConfig) -> None:
         raise ConfigError("--stride", config.actor.stride, "an episode is one window; leave it, or use burn-in")
     if config.agent.blank_flag and config.env.frame_stack > 1:
         raise ConfigError("--blank-flag", True, "a stack of frames has no flag; leave it, or use --frame-stack 1")
-    if config.agent.fill_blanks and (config.agent.grounding, config.agent.head_input) != ("observation", "hidden"):
-        fix = "the model must predict observations from the memory alone: --grounding observation --head-input hidden;"
-        fix += " or leave blanks as they are: --no-fill-blanks"
+    if config.agent.fill_blanks and not (config.agent.grounding and config.agent.normalize_observations):
+        fix = "it takes --grounding and --normalize-observations; or leave blanks as they are: --no-fill-blanks"
         raise ConfigError("--fill-blanks", True, fix)
     if not config.update.policy_through_q and config.update.scheme < 4:
         raise ConfigError("--policy-through-q", False, "schemes 1 to 3 have no such way; take --scheme 4, 5 or 6")

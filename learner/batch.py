@@ -23,7 +23,7 @@ class Batch:
     action: Tensor  # (B, T, A)
     reward: Tensor  # (B, T)
     terminated: Tensor  # (B, T), d_t: 1 at a true termination
-    hidden: Tensor  # (B, H), the state before the first real observation
+    hidden: Tensor  # (B, S), the state before the first real observation
     blank: Tensor  # (B, T + 1) bool
     observation_valid: Tensor  # (B, T + 1) bool
     step_valid: Tensor  # (B, T) bool

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from common.agent import Agent, Float32Linear, StackedLinear, TwinQ
+from common.agent import NORMALIZED_CLIP, Agent, Float32Linear, StackedLinear, TwinQ
 from learner import kernels
 
 LOW = torch.bfloat16
@@ -44,15 +44,12 @@ class FusedAgent(Agent):
     """Fills blanks with every weight rounded once for all steps, not once a step."""
 
     @torch.no_grad()
-    def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
+    def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """As ``Agent.fill``, which it is where the embedding has no plain layer."""
-        c = self.config
-        if not (c.fill_blanks and c.embedding and _applies(observation)) or c.layer_norm:
-            return super().fill(observation, blank, prev_action, hidden)
+        if not (self.config.embedding and _applies(observation)) or self.config.layer_norm:
+            return super().fill(observation, blank, prev_action, state)
         with torch.autocast("cpu", enabled=False):
-            inputs = self.memory.inputs(observation, blank, prev_action).to(LOW).transpose(0, 1).contiguous()
-            expected = _expected(self, inputs, blank.t(), prev_action.to(LOW).transpose(0, 1), hidden)
-        return torch.where(blank.unsqueeze(-1), expected.transpose(0, 1).float(), observation)
+            return _fill(self, observation, blank, prev_action, state)
 
 
 class FusedGRU(nn.GRU):
@@ -108,12 +105,11 @@ def _bits(x: Tensor) -> NDArray[np.uint16]:
     return bits
 
 
-def _expected(agent: Agent, inputs: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
-    """Of the memory's inputs (T, B, ·), o_t, what the model expects where it is blank; those are filled in place.
-
-    (T, B), (T, B, A), (B, H) the state before the first step -> (T, B, O).
-    """
-    gru, size, seen = agent.memory.gru, hidden.shape[1], inputs[:, :, : agent.obs_dim]
+def _fill(
+    agent: Agent, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(B, T, O), (B, T), (B, T, A), (B, S) -> (B, T, O), (B, S)."""
+    gru, size = agent.memory.gru, agent.config.hidden
     linear = [
         layer for net in (agent.world_model.net, agent.memory.embed) for layer in net if isinstance(layer, nn.Linear)
     ]
@@ -121,13 +117,23 @@ def _expected(agent: Agent, inputs: Tensor, blank: Tensor, prev_action: Tensor, 
     b1, b2, b3, b_embed = (x.bias for x in linear)
     bi, bh = (b.numpy() for b in gru.all_weights[0][2:])
     rows = slice(size, size + agent.obs_dim)  # of the model's last layer
-    h, low, kept = hidden.clone().numpy(), hidden.to(LOW), np.empty((len(hidden), 4 * size), np.float32)
-    for o, was_blank, a, x in zip(seen, blank.unsqueeze(2), prev_action, inputs, strict=True):
-        second = _layer(_layer(torch.cat([low, a], 1), w1, b1), w2, b2)
-        torch.where(was_blank, torch.mm(second, w3[:, rows]).add_(b3[rows]), o, out=o)
-        gi, gh = torch.mm(_layer(x, w_embed, b_embed), wi), torch.mm(low, wh)
+    inputs = agent.memory.inputs(observation, blank, prev_action).to(LOW)
+    h, low, kept = (
+        state[:, :size].clone().numpy(),
+        state[:, :size].to(LOW),
+        np.empty((len(state), 4 * size), np.float32),
+    )
+    seen, before = observation.clone(), state[:, size:]
+    by_step = (x.transpose(0, 1) for x in (seen, blank.unsqueeze(2), prev_action.to(LOW), inputs))
+    for o, was_blank, a, x in zip(*by_step, strict=True):
+        second = _layer(_layer(torch.cat([low, before.to(LOW), a], 1), w1, b1), w2, b2)
+        expected = torch.mm(second, w3[:, rows]).float().add_(b3[rows]).add_(before)
+        torch.where(was_blank, expected.clamp_(-NORMALIZED_CLIP, NORMALIZED_CLIP), o, out=o)
+        x[:, : agent.obs_dim] = o
+        gi, gh = torch.mm(_layer(x.contiguous(), w_embed, b_embed), wi), torch.mm(low, wh)
         kernels.gru_step(_bits(gi), _bits(gh), bi, bh, h, kept, h, _bits(low))
-    return seen
+        before = o
+    return seen, torch.cat([torch.from_numpy(h), before], 1)
 
 
 class _GRU(torch.autograd.Function):

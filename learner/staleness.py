@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.agent import Agent, Remembered
+from common.agent import Agent
 from common.window import BoolArray, Rows, WindowSpec
 
 Floats = NDArray[np.float32]
@@ -37,9 +37,9 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
     window = slice(-spec.steps - 1, -1)  # its steps; the bootstrap observation starts none
     past = slice(None, -spec.steps - 1)
-    before = _remembered(agent, o[:, past], blank[:, past], prev_action[:, past], start).hidden[:, -1]
+    _, _, before = agent.remember(o[:, past], blank[:, past], prev_action[:, past], start)
     replayed, recomputed = (
-        _remembered(agent, o[:, window], blank[:, window], prev_action[:, window], h) for h in (stored, before)
+        agent.remember(o[:, window], blank[:, window], prev_action[:, window], state)[0] for state in (stored, before)
     )
     q, q_replayed = (
         agent.critic(agent.features(remembered), action[:, -spec.steps :]).mean(0).squeeze(0)
@@ -47,7 +47,7 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
     )
     gap = (q_replayed - q).abs() / q.abs().max().clamp(min=1e-8)
     found = {
-        "stale_state_stored": _distance(stored, before),
+        "stale_state_stored": _distance(*(state[:, : agent.config.hidden] for state in (stored, before))),
         "stale_q_first_stored": gap[0],
         "stale_q_last_stored": gap[spec.train - 1],
     }
@@ -59,11 +59,6 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
             "stale_q_last_burned": gap[-1],
         }
     return {name: float(value) for name, value in found.items()}
-
-
-def _remembered(agent: Agent, o: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Remembered:
-    found: Remembered = agent.memory(agent.fill(o, blank, prev_action, hidden), blank, prev_action, hidden)
-    return found
 
 
 def _distance(replayed: Tensor, recomputed: Tensor) -> Tensor:

@@ -131,12 +131,13 @@ class JointUpdate:
             memory = remember(agent.memory, o, batch, self.burn_in)
             z = self._low(agent.features(memory))
             trains = TRAINS_MEMORY[c.scheme]
-            z_model, z_value, z_policy = (z if loss in trains else z.detach() for loss in ("model", "value", "policy"))
+            z_value, z_policy = (z if loss in trains else z.detach() for loss in ("value", "policy"))
+            h_model = memory.hidden if "model" in trains else memory.hidden.detach()
 
             # Prediction, and curiosity from its error
             target = self._remember_target(o, batch) if self._has_target_memory else memory
             latent = (target if c.latent_target == "ema" else memory).hidden.detach().float()
-            prediction = agent.world_model(z_model[:, :-1], a)
+            prediction = agent.world_model(self._low(h_model[:, :-1]), o[:, steps][:, :-1], a)
             change = latent[:, 1:] - latent[:, :-1]
             error = losses.model_error(prediction.hidden_change.float(), change, c.model_norm)
             i, curiosity_variance = self._scaled(losses.curiosity(error, d, m), m)
@@ -163,11 +164,11 @@ class JointUpdate:
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
         unexplained = o.new_zeros(0)
-        if agent.config.grounding != "off":
+        if agent.config.grounding:
             now, after = o[:, steps][:, :-1], o[:, steps][:, 1:]
             seen_now, seen_after = _seen(batch)[:, steps][:, :-1], _seen(batch)[:, steps][:, 1:]
-            predicted = agent.world_model.next_observation(now, prediction).float()
-            seen = seen_after * seen_now if agent.config.grounding == "change" else seen_after
+            predicted = now + prediction.observation_change.float()
+            seen = seen_after if agent.config.fill_blanks else seen_after * seen_now
             parts["grounding_loss"] = losses.grounding_loss(predicted, after, prediction.reward.float(), r, seen, m)
             unexplained = _unexplained(predicted.detach() - now, after - now, m * seen_after * seen_now)
 
@@ -304,9 +305,10 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
     """(B, H), the state before the first trained step."""
     if not n:
         return batch.hidden
-    burned = memory(o[:, :n], batch.blank[:, :n], batch.prev_action[:, :n], batch.hidden).hidden[:, -1].float()
+    hidden = batch.hidden[:, : memory.gru.hidden_size]
+    burned = memory(o[:, :n], batch.blank[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
     torch.clear_autocast_cache()  # older torch would go on with these casts, which carry no gradient
-    return torch.where(batch.burned_in.unsqueeze(1), burned, batch.hidden)
+    return torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
 
 
 def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
@@ -314,13 +316,12 @@ def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
     if not agent.config.fill_blanks or (o.device.type == "cpu" and not batch.blank.any()):  # a GPU would have to wait
         return o
 
-    def part(steps: slice, hidden: Tensor) -> Tensor:
-        return agent.fill(o[:, steps], batch.blank[:, steps], batch.prev_action[:, steps], hidden)
+    def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:
+        return agent.fill(o[:, steps], batch.blank[:, steps], batch.prev_action[:, steps], state)
 
-    past = part(slice(burn_in), batch.hidden)
-    trained = part(slice(burn_in, None), _burned_in(agent.memory, past, batch, burn_in))
-    torch.clear_autocast_cache()
-    return torch.cat([past, trained], 1)
+    past, state = part(slice(burn_in), batch.hidden)
+    state = torch.where(batch.burned_in.unsqueeze(1), state, batch.hidden)
+    return torch.cat([past, part(slice(burn_in, None), state)[0]], 1)
 
 
 def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:

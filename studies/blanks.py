@@ -3,16 +3,14 @@
 from studies.study import Study
 
 WAYS = {
-    "filled: robust": "",
-    "filled, told": "--blank-flag",
-    "o itself": "--no-fill-blanks",
-    "o itself, told": "--no-fill-blanks --blank-flag",
-    "change": "--no-fill-blanks --grounding change",
-    "change, told": "--no-fill-blanks --grounding change --blank-flag",
+    "robust": "",
+    "told": "--blank-flag",
+    "not filled": "--no-fill-blanks",
+    "not filled, told": "--no-fill-blanks --blank-flag",
     "longer burn-in": "--burn-in 30",
     "longer windows": "--burn-in 20 --trained-steps 30",
-    "observation beside": "--no-fill-blanks --head-input hidden+observation",
-    "no grounding": "--no-fill-blanks --grounding off",
+    "observation beside": "--head-input hidden+observation",
+    "no grounding": "--no-fill-blanks --no-grounding",
 }
 STUDY = Study("blanks", {name: f"train ENV --flicker 0.5 {words}" for name, words in WAYS.items()})
 

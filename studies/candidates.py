@@ -15,12 +15,11 @@ CHANGES = {
     "heads 256 256": "--batch-size 32 --heads 256 256",
     "memory's rate 0.1": "--batch-size 32 --memory-learning-scale 0.1",
     "critics normalised": "--batch-size 32 --critic-norm",
-    "observation beside": "--batch-size 32 --no-fill-blanks --head-input hidden+observation",
+    "observation beside": "--batch-size 32 --head-input hidden+observation",
     "stride 5": "--batch-size 32 --stride 5",
     "prioritized": "--batch-size 32 --priority-exponent 0.6 --importance-exponent 0.4",
     "first critic": "--batch-size 32 --policy-q first",
-    "no grounding": "--batch-size 32 --no-fill-blanks --grounding off",
-    "grounded by change": "--batch-size 32 --no-fill-blanks --grounding change",
+    "no grounding": "--batch-size 32 --no-fill-blanks --no-grounding",
     "not clipped": "--batch-size 32 --clip-norm 0",
     "optimisers apart": "--batch-size 32 --update-order alternate",
     "reward scale 5": "--batch-size 32 --reward-scale 5",
@@ -35,7 +34,7 @@ CHANGES = {
     "batch 16, heads 256 256": "--batch-size 16 --heads 256 256",
     "batch 16, memory's rate 0.3": "--batch-size 16 --memory-learning-scale 0.3",
     "batch 16, critics normalised": "--batch-size 16 --critic-norm",
-    "batch 16, observation beside": "--batch-size 16 --no-fill-blanks --head-input hidden+observation",
+    "batch 16, observation beside": "--batch-size 16 --head-input hidden+observation",
 }
 STUDY = Study(
     "candidates",

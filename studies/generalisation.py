@@ -26,7 +26,7 @@ STUDY = Study(
     "generalisation",
     {
         "RMC": "train ENV",
-        "RMC, not filling": "train ENV --no-fill-blanks --grounding change",
+        "RMC, not filling": "train ENV --no-fill-blanks",
         "SAC": "baseline sac ENV",
     },
     full=Scale(1_000_000, (1, 2, 3, 4, 5), ENVS),

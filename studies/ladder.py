@@ -7,7 +7,7 @@ and learner. Every later one keeps what the one before has, as far as it is not 
 from studies.study import Scale, Study
 
 ALONE = "--head-input observation --hidden 8 --embedding 0"  # the agent without a memory
-BARE = "--no-fill-blanks --grounding off"
+BARE = "--no-fill-blanks --no-grounding"
 FLAT = f"--heads 256 256 --no-normalize-observations {BARE} --scheme 2 --clip-norm 0 {ALONE}"
 ONE = "--envs-per-actor 1 --chunk-windows 1 --burn-in 0 --capacity 1000000"
 EVERY_STEP = "--replay-ratio 256 --batch-size"
@@ -22,7 +22,7 @@ RUNGS = {
     "a memory beside o": f"train ENV {BARE} --scheme 2 --head-input hidden+observation",
     "a memory alone": f"train ENV {BARE} --scheme 2",
     "the model's loss": f"train ENV {BARE}",
-    "grounding: robust": "train ENV",
+    "grounding, robust": "train ENV",
     "curiosity": "train ENV --curiosity 0.1 --curiosity-scale std",
 }
 STUDY = Study("ladder", RUNGS, small=Scale(60_000, (1, 2)))

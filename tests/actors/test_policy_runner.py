@@ -40,24 +40,26 @@ def make_runner(agent: Agent, envs: int = ENVS) -> PolicyRunner:
 
 @torch.no_grad()
 def reference(
-    agent: Agent, observation: torch.Tensor, prev_action: torch.Tensor, blank: torch.Tensor, hidden: torch.Tensor,
+    agent: Agent, observation: torch.Tensor, prev_action: torch.Tensor, blank: torch.Tensor, state: torch.Tensor,
     noise: torch.Tensor | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     normalized = agent.normalizer(observation, blank)
+    hidden, last = state[:, : agent.config.hidden], state[:, agent.config.hidden :]
     if agent.config.fill_blanks:
-        expected = agent.world_model(hidden, prev_action).observation
+        expected = (last + agent.world_model(hidden, last, prev_action).observation_change).clamp(-10.0, 10.0)
         normalized = torch.where(blank.unsqueeze(1), expected, normalized)
     remembered = agent.memory(normalized.unsqueeze(1), blank.unsqueeze(1), prev_action.unsqueeze(1), hidden)
     mean, log_std = agent.policy(agent.features(remembered).squeeze(1))
     action = torch.tanh(mean) if noise is None else squashed_sample(mean, log_std, noise)[0]
-    return action, remembered.hidden.squeeze(1)
+    after = remembered.hidden.squeeze(1)
+    return action, torch.cat([after, normalized], 1) if agent.config.fill_blanks else after
 
 
 @pytest.mark.parametrize(
     ("embedding", "layer_norm", "head_input", "normalize", "blank_flag", "fill_blanks"),
     [
         *product((0, 16), (False, True), get_args(HeadInput), (False, True), (False, True), (False,)),
-        *product((0, 16), (False, True), ("hidden",), (False, True), (False, True), (True,)),
+        *product((0, 16), (False, True), get_args(HeadInput), (True,), (False, True), (True,)),
     ],
 )
 def test_agrees_with_the_agent(
@@ -65,7 +67,7 @@ def test_agrees_with_the_agent(
 ) -> None:
     config = AgentConfig(
         hidden=12, embedding=embedding, heads=(9, 7), layer_norm=layer_norm, head_input=head_input,
-        normalize_observations=normalize, blank_flag=blank_flag, fill_blanks=fill_blanks, grounding="observation",
+        normalize_observations=normalize, blank_flag=blank_flag, fill_blanks=fill_blanks,
     )  # fmt: skip
     agent = make_agent(config)
     runner = make_runner(agent)

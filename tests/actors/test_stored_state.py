@@ -31,7 +31,7 @@ AGENTS = {
     for shape, embedding in (("embedded", 12), ("raw", 0))
 }
 AGENTS["filled"] = make_agent(
-    dataclasses.replace(AGENTS["embedded"].config, head_input="hidden", grounding="observation", fill_blanks=True)
+    dataclasses.replace(AGENTS["embedded"].config, head_input="hidden+observation", fill_blanks=True)
 )
 
 
@@ -57,7 +57,7 @@ def play(
         builder.begin(env, observation, blank=False)
     for time in range(1, 3 * max(lengths) + 1):
         action, hidden = runner.act(*builder.now(), rng.standard_normal((envs, ACTION_DIM), np.float32))
-        states.append(hidden.copy())
+        states.append(hidden[:, :HIDDEN].copy())
         done, terminates = np.array([time % length == 0 for length in lengths]), rng.random(envs) < 0.5
         blank = rng.random(envs) < 0.2
         ended = builder.add(
@@ -91,7 +91,8 @@ def relearned(agent_name: str, rows: Rows, spec: WindowSpec) -> tuple[Batch, tor
 def test_the_learner_reproduces_the_actors_memory(
     agent_name: str, burn_in: int, train: int, data: st.DataObject, lengths: list[int], seed: int
 ) -> None:
-    spec = WindowSpec(OBS_DIM, ACTION_DIM, HIDDEN, burn_in, train)
+    state = AGENTS[agent_name].config.state_size(OBS_DIM)
+    spec = WindowSpec(OBS_DIM, ACTION_DIM, state, burn_in, train)
     rows, states = play(agent_name, spec, data.draw(st.integers(1, train), label="stride"), lengths, seed)
     rows = rows[data.draw(st.permutations(range(len(rows))), label="batch positions")]
     batch, hidden = relearned(agent_name, rows, spec)

@@ -47,24 +47,17 @@ def config(request: pytest.FixtureRequest) -> RunConfig:
 def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torch.Tensor:
     """The observation that the model expects ``horizon`` steps after ``start``, one step at a time."""
     hidden, previous = torch.zeros(1, agent.config.hidden), torch.zeros(1, 1, agent.action_dim)
+    frame = torch.zeros(1, 1, agent.obs_dim)
     for t in range(start + 1):
-        frame, blank = episode.observation[:, t : t + 1], episode.blank[:, t : t + 1]
+        last, frame, blank = frame, episode.observation[:, t : t + 1], episode.blank[:, t : t + 1]
         if agent.config.fill_blanks and blank:
-            frame = agent.world_model(hidden.unsqueeze(1), previous).observation
+            frame = last + agent.world_model(hidden.unsqueeze(1), last, previous).observation_change
         seen = agent.memory(frame, blank, previous, hidden)
         hidden, previous = seen.hidden[:, 0], episode.action[:, t : t + 1]
-    observation = episode.observation[:, start : start + 1]
     for t in range(start, start + horizon):
-        action = episode.action[:, t : t + 1]
-        step = agent.world_model(agent.features(seen), action)
-        change = agent.config.grounding == "change"
-        observation = observation * change + step.observation
-        embedding = agent.memory.embed(torch.cat([observation, action], -1))
-        beside = {"hidden": observation[..., :0], "hidden+embedding": embedding}.get(
-            agent.config.head_input, observation
-        )
-        seen = seen._replace(hidden=seen.hidden + step.hidden_change, beside=beside)
-    return observation[0, 0]
+        step = agent.world_model(hidden, frame[:, 0], episode.action[:, t])
+        frame, hidden = frame + step.observation_change.unsqueeze(1), hidden + step.hidden_change
+    return frame[0, 0]
 
 
 def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -> None:

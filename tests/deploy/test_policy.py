@@ -25,13 +25,11 @@ AGENTS = {
     ),
     "layer norm": AgentConfig(hidden=16, embedding=12, heads=(10, 9), layer_norm=True),
     "observation beside": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="hidden+observation"),
-    "without a memory": AgentConfig(
-        hidden=16, embedding=12, heads=(10, 9), head_input="observation", grounding="observation"
-    ),
+    "without a memory": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="observation"),
     "filling blanks": AgentConfig(
-        hidden=16, embedding=12, heads=(10, 9), normalize_observations=True, grounding="observation", fill_blanks=True
+        hidden=16, embedding=12, heads=(10, 9), normalize_observations=True, fill_blanks=True
     ),
-    "paper": AgentConfig(hidden=16, embedding=0, heads=(10, 9), grounding="off"),
+    "paper": AgentConfig(hidden=16, embedding=0, heads=(10, 9), grounding=False),
 }
 
 
@@ -88,7 +86,7 @@ def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureF
     rng, policy = np.random.default_rng(0), load_policy(run.path)
     feed = {
         "previous_action": np.zeros((3, 1), np.float32),
-        "hidden": np.zeros((3, run.config().agent.hidden), np.float32),
+        "hidden": np.zeros((3, run.config().window_spec().hidden), np.float32),
     }
     for step in range(20):  # three rows, though it was traced with two; the first one beside the policy
         observation, blank = rng.normal(size=(3, 3)).astype(np.float32), np.array([step % 5 == 2, False, True])

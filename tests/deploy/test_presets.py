@@ -30,7 +30,7 @@ def test_presets_are_valid_and_come_back_from_json(name: presets.Preset) -> None
 
 def test_the_paper_preset_is_the_papers() -> None:
     config = presets.paper(ENV)
-    assert (config.agent.embedding, config.agent.heads, config.agent.grounding) == (0, (400, 300), "off")
+    assert (config.agent.embedding, config.agent.heads, config.agent.grounding) == (0, (400, 300), False)
     assert (config.update.learning_rate, config.update.alpha_learning_rate) == (1e-4, 1e-5)
     assert (config.update.curiosity, config.update.curiosity_scale) == (0.5, "raw")
     assert (config.update.gamma, config.update.polyak, config.update.policy_q) == (0.99, 0.995, "first")
@@ -119,9 +119,9 @@ def test_values_that_do_not_go_together_are_refused() -> None:
         validate(with_value(with_value(config, "actor.stride", 5), "actor.state_strategy", "episode"))
     with pytest.raises(ConfigError, match="--blank-flag"):
         validate(with_value(with_value(config, "agent.blank_flag", True), "env.frame_stack", 2))
-    for path, value in (("agent.grounding", "change"), ("agent.head_input", "hidden+embedding")):
-        with pytest.raises(ConfigError, match=r"--fill-blanks=True: .*--grounding observation .*--no-fill-blanks"):
-            validate(with_value(config, path, value))
+    for path in ("agent.grounding", "agent.normalize_observations"):
+        with pytest.raises(ConfigError, match=r"--fill-blanks=True: .*--grounding and .*--no-fill-blanks"):
+            validate(with_value(config, path, False))
     with pytest.raises(ConfigError, match="--policy-through-q"):
         validate(with_value(config, "update.policy_through_q", False))
     with pytest.raises(ConfigError, match=r"--replay-shards=2: .*--actors=1"):

@@ -21,7 +21,7 @@ SMALL = [
     "128",
     "--head-input",
     "hidden+embedding",
-    "--no-fill-blanks",
+    "--normalize-observations",
 ]
 FAST = ["--learning-rate", "5e-4", "--polyak", "0.99", "--target-memory", "ema", "--batch-size", "16"]
 DATA = ["--capacity", "5000", "--warmup-steps", "1000", "--priority-exponent", "0", "--episodes", "10"]

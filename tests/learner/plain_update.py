@@ -75,7 +75,7 @@ class PlainUpdate:
 
     def unroll(self, memory: Memory, row: np.void) -> dict[int, Known]:
         """By observation, from the first trained one on; the burn-in without gradient."""
-        h, known, filled = torch.tensor(row["hidden"]), {}, self.filled(row)
+        h, known, filled = torch.tensor(row["hidden"])[: memory.gru.hidden_size], {}, self.filled(row)
         for t in range(int(row["first"]), int(row["last"]) + 1):
             if t == self.burn_in:
                 h = h.detach()
@@ -92,12 +92,14 @@ class PlainUpdate:
     @torch.no_grad()
     def filled(self, row: np.void) -> dict[int, Tensor]:
         """By observation, what the memory is given: for a blank one what the model expects, where it is asked."""
-        memory, h, found = self.agent.memory, torch.tensor(row["hidden"]), {}
+        memory, found = self.agent.memory, {}
+        h, last = torch.tensor(row["hidden"]).tensor_split([self.agent.config.hidden])
         for t in range(int(row["first"]), int(row["last"]) + 1):
             previous = torch.tensor(row["prev_action"] if t == row["first"] else row["action"][t - 1])
             found[t] = self.seen(row, t)
             if self.agent.config.fill_blanks and row["blank"][t]:
-                found[t] = self.agent.world_model(h, previous).observation
+                found[t] = (last + self.agent.world_model(h, last, previous).observation_change).clamp(-10, 10)
+            last = found[t]
             if self.agent.config.head_input != "observation":
                 h = gru(memory, self.embedded(memory, row, t, found[t], previous), h)
         return found
@@ -138,18 +140,16 @@ class PlainUpdate:
             for t in range(self.burn_in, int(row["last"])):
                 z = self.z(online[t])
                 a = torch.tensor(row["action"][t])
-                predicted = agent.world_model(self.reaching("M", z), a)
+                predicted = agent.world_model(self.reaching("M", online[t].h), online[t].o, a)
                 difference = predicted.hidden_change - (latent[t + 1].h - latent[t].h).detach()
                 error = difference.abs().mean() if c.model_norm == "l1" else difference.square().mean().sqrt()
                 if not self.ends(row, t):
                     sums["M"].append(error)
                 window[t] = 0.0 if self.ends(row, t) else error.item()
-                if agent.config.grounding != "off":
-                    wanted = self.seen(row, t + 1)
-                    if agent.config.grounding == "change":
-                        wanted = wanted - self.seen(row, t)
-                    if not row["blank"][t + 1] and not (agent.config.grounding == "change" and row["blank"][t]):
-                        sums["observation"].append((predicted.observation - wanted).abs().mean())
+                if agent.config.grounding:
+                    wanted = self.seen(row, t + 1) - online[t].o
+                    if not row["blank"][t + 1] and (agent.config.fill_blanks or not row["blank"][t]):
+                        sums["observation"].append((predicted.observation_change - wanted).abs().mean())
                     sums["reward"].append((predicted.reward - float(row["reward"][t])).abs())
                 pi, log_pi = self.sample(self.reaching("P", z), noise[b, t - self.burn_in])
                 climbed = self.reaching("P", z) if c.policy_through_q else z.detach()

@@ -50,16 +50,17 @@ def run_policy(agent, low, x):
         return torch.cat(agent.policy(x), -1)
 
 
-def run_model(agent, low, x, action):
+def run_model(agent, low, x, o, action):
     with torch.autocast("cpu", torch.bfloat16, enabled=low):
-        return torch.cat([part.flatten(2) if part.ndim > 2 else part for part in agent.world_model(x, action)[:2]], -1)
+        found = agent.world_model(x, o, action)
+        return torch.cat([found.hidden_change, found.observation_change, found.reward.unsqueeze(-1)], -1)
 
 
 CASES = {
     "memory": (run_gru, [(B, T, 20), (1, B, 24)]),
     "critic": (run_critic, [(B, T, 44), (B, T, 2)]),
     "policy": (run_policy, [(B, T, 44)]),
-    "world_model": (run_model, [(B, T, 44), (B, T, 2)]),
+    "world_model": (run_model, [(B, T, 24), (B, T, 3), (B, T, 2)]),
 }
 
 
@@ -113,7 +114,7 @@ def test_parameters_keep_their_names_and_values(pair):
     assert all(torch.equal(ours[name], value) for name, value in theirs.items())
 
 
-FILLING = AgentConfig(hidden=24, embedding=20, heads=(40, 28), grounding="observation", fill_blanks=True)
+FILLING = AgentConfig(hidden=24, embedding=20, heads=(40, 28), fill_blanks=True)
 
 
 def filled(config, low):
@@ -123,28 +124,29 @@ def filled(config, low):
     fused = copy.deepcopy(plain)
     fuse(fused)
     generator = torch.Generator().manual_seed(3)
-    o, action, hidden = (torch.randn(shape, generator=generator) for shape in ((B, T, 3), (B, T, 2), (B, 24)))
+    o, action, state = (torch.randn(shape, generator=generator) for shape in ((B, T, 3), (B, T, 2), (B, 27)))
     blank = torch.rand(B, T, generator=generator) < 0.5
     o[blank] = 0.0
     with torch.autocast("cpu", torch.bfloat16, enabled=low):
-        found = [agent.fill(o, blank, action, hidden) for agent in (plain, fused)]
+        found = [agent.fill(o, blank, action, state) for agent in (plain, fused)]
     return *found, o, blank
 
 
 @pytest.mark.parametrize("flag", [False, True])
 def test_blanks_are_filled_to_the_precision_of_bfloat16_and_nothing_else_is_touched(flag):
-    plain, fused, o, blank = filled(dataclasses.replace(FILLING, blank_flag=flag), low=True)
+    (plain, plain_after), (fused, after), o, blank = filled(dataclasses.replace(FILLING, blank_flag=flag), low=True)
     assert torch.equal(fused[~blank], o[~blank])
     gap = (fused - plain)[blank].norm() / plain[blank].norm()
     assert 1e-5 < gap < 0.01
+    assert 1e-5 < (after - plain_after).norm() / plain_after.norm() < 0.01
     assert (plain - o)[blank].norm() > 0.1
 
 
-@pytest.mark.parametrize("changed", [{"embedding": 0}, {"layer_norm": True}, {"fill_blanks": False}, {}])
+@pytest.mark.parametrize("changed", [{"embedding": 0}, {"layer_norm": True}, {}])
 def test_where_the_fused_way_does_not_fit_blanks_are_filled_the_plain_way_to_the_bit(changed):
     plain, fused, o, blank = filled(dataclasses.replace(FILLING, **changed), low=bool(changed))
-    assert torch.equal(fused, plain)
-    assert torch.equal(plain[blank], o[blank]) == ("fill_blanks" in changed)
+    assert all(map(torch.equal, plain, fused))
+    assert not torch.equal(plain[0][blank], o[blank])
 
 
 @pytest.mark.parametrize("asked", ["features", "action", "neither"])
@@ -161,7 +163,7 @@ def test_the_way_back_through_the_critics_gives_what_is_asked_for(pair, asked):
     for exact, found in zip(*grads, strict=True):
         assert (exact is None) == (found is None)
         if exact is not None:
-            assert float((found - exact).norm() / exact.norm()) < 0.05  # a ReLU near 0 may open or close by rounding
+            assert float((found - exact).norm() / exact.norm()) < 0.1  # a ReLU near 0 may open or close by rounding
 
 
 def test_an_update_in_bfloat16_is_fused_and_one_in_float32_is_not():

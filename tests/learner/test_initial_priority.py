@@ -1,5 +1,6 @@
 """What an actor thinks a window is worth is what the learner would, with the same networks and noise."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,12 @@ from tests.learner.rows import SPEC, random_rows, to_batch
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
-@pytest.mark.parametrize(("head_input", "fill"), [("hidden", False), ("hidden", True), ("hidden+observation", False)])
+@pytest.mark.parametrize("fill", [False, True])
+@pytest.mark.parametrize("head_input", ["hidden", "hidden+observation"])
 def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput, fill: bool) -> None:
     config = AgentConfig(
         hidden=SPEC.hidden, embedding=7, heads=(10, 9), head_input=head_input, normalize_observations=True,
-        initial_priority="actor", grounding="observation", fill_blanks=fill,
+        initial_priority="actor", fill_blanks=fill,
     )  # fmt: skip
     torch.manual_seed(0)
     agent = Agent(SPEC.obs_dim, SPEC.action_dim, config)
@@ -28,11 +30,12 @@ def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput, fil
     with torch.no_grad():
         agent.log_alpha.fill_(-1.0)
     update = UpdateConfig(n_step=n_step, gamma=0.9, eta=0.6)
-    rater = InitialPriority(SPEC, config, update, seed=3)
+    spec = dataclasses.replace(SPEC, hidden=config.state_size(SPEC.obs_dim))
+    rater = InitialPriority(spec, config, update, seed=3)
     rater.load(safetensors.torch.save(agent.broadcast_weights()))
-    rows = random_rows(6)
+    rows = random_rows(6, spec=spec)
     learner = make_update(agent, SPEC.burn_in, update, seed=3)
-    expected = learner.forward(to_batch(rows), torch.zeros(()))[1].priorities
+    expected = learner.forward(to_batch(rows, spec), torch.zeros(()))[1].priorities
     np.testing.assert_allclose(rater(rows), expected, rtol=1e-5)
 
 

@@ -1,5 +1,7 @@
 """Staleness: nothing where the weights are those that acted, and a plain loop's figures where they are not."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,7 @@ from learner.staleness import measurable, staleness
 SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=4, train=5)
 UNBURNED = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=0, train=5)
 AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), head_input="hidden+embedding", normalize_observations=True)
-FILLING = AgentConfig(hidden=8, embedding=6, heads=(7, 6), grounding="observation", fill_blanks=True)
+FILLING = dataclasses.replace(AGENT, fill_blanks=True)
 STEPS = 32  # of the episode
 
 
@@ -24,8 +26,8 @@ def make_agent(seed: int, config: AgentConfig = AGENT) -> Agent:
 
 @torch.no_grad()
 def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray, start: int, stop: int) -> list:
-    """(h, Q of the action taken) of every step from ``start`` on, one at a time, from the state before it."""
-    found, state = [], torch.from_numpy(hidden).reshape(1, -1)
+    """(state, Q of the action taken) of every step from ``start`` on, one at a time, from the state before it."""
+    found, (state, last) = [], torch.from_numpy(hidden).reshape(1, -1).tensor_split([AGENT.hidden], dim=1)
     for k in range(start, stop):
         before = episode["action"][k - 1] if k else np.zeros(SPEC.action_dim, np.float32)
         o, blank, a, previous = (
@@ -34,11 +36,16 @@ def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray,
         )
         seen = agent.normalizer(o, blank)
         if agent.config.fill_blanks and blank:
-            seen = agent.world_model(state.unsqueeze(1), previous).observation
+            seen = (last + agent.world_model(state, last, previous[0]).observation_change).unsqueeze(1)
         step = agent.memory(seen, blank, previous, state)
-        state = step.hidden[:, 0]
-        found.append((state[0].numpy(), float(agent.critic(agent.features(step), a).mean())))
+        state, last = step.hidden[:, 0], seen[:, 0] if agent.config.fill_blanks else last
+        carried = torch.cat([state, last], 1)[0].numpy()
+        found.append((carried, float(agent.critic(agent.features(step), a).mean())))
     return found
+
+
+def with_state(spec: WindowSpec, config: AgentConfig) -> WindowSpec:
+    return dataclasses.replace(spec, hidden=config.state_size(spec.obs_dim))
 
 
 def play(agent: Agent, spec: WindowSpec) -> tuple[dict[str, np.ndarray], Rows]:
@@ -67,7 +74,7 @@ def play(agent: Agent, spec: WindowSpec) -> tuple[dict[str, np.ndarray], Rows]:
 @pytest.mark.parametrize("config", [AGENT, FILLING], ids=["zeros", "filled"])
 @pytest.mark.parametrize("spec", [SPEC, UNBURNED])
 def test_todays_weights_find_nothing_stale(spec: WindowSpec, config: AgentConfig) -> None:
-    agent = make_agent(1, config)
+    agent, spec = make_agent(1, config), with_state(spec, config)
     _, rows = play(agent, spec)
     chosen = np.flatnonzero(measurable(rows, spec))
     assert chosen.tolist() == [1, 2, 3, 4, 5]  # not the first, not the short
@@ -80,24 +87,25 @@ def test_todays_weights_find_nothing_stale(spec: WindowSpec, config: AgentConfig
 @pytest.mark.parametrize("config", [AGENT, FILLING], ids=["zeros", "filled"])
 @pytest.mark.parametrize("window", [1, 4])
 def test_as_a_plain_loop_has_it(window: int, config: AgentConfig) -> None:
-    actor, today = make_agent(1, config), make_agent(2, config)
-    episode, rows = play(actor, SPEC)
+    actor, today, spec = make_agent(1, config), make_agent(2, config), with_state(SPEC, config)
+    episode, rows = play(actor, spec)
     start = window * SPEC.train - SPEC.burn_in
     stored = rows["hidden"][window]
-    truth = remembered(today, episode, np.zeros(SPEC.hidden, np.float32), 0, start + SPEC.steps)
+    truth = remembered(today, episode, np.zeros(spec.hidden, np.float32), 0, start + SPEC.steps)
     replayed = remembered(today, episode, stored, start, start + SPEC.steps)
     q = np.array([value for _, value in truth[start:]])
     gap = np.abs(np.array([value for _, value in replayed]) - q) / np.abs(q).max()
-    burned, true_burned, before = replayed[SPEC.burn_in - 1][0], truth[start + SPEC.burn_in - 1][0], truth[start - 1][0]
+    states = replayed[SPEC.burn_in - 1][0], truth[start + SPEC.burn_in - 1][0], truth[start - 1][0], stored
+    burned, true_burned, before, h = (state[: AGENT.hidden] for state in states)
     expected = {
-        "stale_state_stored": np.linalg.norm(stored - before) / np.linalg.norm(before),
+        "stale_state_stored": np.linalg.norm(h - before) / np.linalg.norm(before),
         "stale_state_burned": np.linalg.norm(burned - true_burned) / np.linalg.norm(true_burned),
         "stale_q_first_stored": gap[0],
         "stale_q_last_stored": gap[SPEC.train - 1],
         "stale_q_first_burned": gap[SPEC.burn_in],
         "stale_q_last_burned": gap[-1],
     }
-    found = staleness(today, SPEC, rows[: window + 1])
+    found = staleness(today, spec, rows[: window + 1])
     assert found == pytest.approx(expected, abs=1e-5)
     assert found["stale_state_stored"] > found["stale_state_burned"] > 0.0
 

@@ -21,7 +21,7 @@ ROBUST = AgentConfig(
     head_input="hidden+embedding",
     normalize_observations=True,
 )
-PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding="off")
+PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding=False)
 BETA = torch.tensor(0.5)
 
 

@@ -12,7 +12,7 @@ from learner.update import UpdateConfig, make_update
 from tests.learner.plain_update import PlainUpdate
 from tests.learner.rows import SPEC, random_rows, to_batch
 
-PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding="off")
+PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding=False)
 ROBUST = AgentConfig(
     hidden=SPEC.hidden,
     embedding=7,
@@ -51,8 +51,9 @@ AGENTS = [
     ROBUST,
     dataclasses.replace(ROBUST, layer_norm=True, head_input="hidden"),
     dataclasses.replace(ROBUST, critic_norm=True, head_input="hidden+observation"),
-    dataclasses.replace(ROBUST, head_input="observation", grounding="observation"),
-    dataclasses.replace(ROBUST, head_input="hidden", grounding="observation", fill_blanks=True),
+    dataclasses.replace(ROBUST, head_input="observation"),
+    dataclasses.replace(ROBUST, head_input="hidden", fill_blanks=True),
+    dataclasses.replace(ROBUST, fill_blanks=True),
 ]
 
 
@@ -65,10 +66,11 @@ def test_three_updates_are_those_of_the_equations(agent: AgentConfig, options: d
     config = UpdateConfig(curiosity=BETA, learning_rate=1e-2, **options)  # type: ignore[arg-type]
     plain = PlainUpdate(copy.deepcopy(network), SPEC.burn_in, config, seed=3)
     update = make_update(network, SPEC.burn_in, config, seed=3)
+    spec = dataclasses.replace(SPEC, hidden=agent.state_size(SPEC.obs_dim))
     for turn in range(3):
-        rows, importance = random_rows(4, seed=turn), np.linspace(0.3, 1.0, 4).astype(np.float32)
+        rows, importance = random_rows(4, turn, spec), np.linspace(0.3, 1.0, 4).astype(np.float32)
         expected, priorities = plain(rows, importance, BETA)
-        found = update(to_batch(rows, importance=importance), torch.tensor(BETA))
+        found = update(to_batch(rows, spec, importance), torch.tensor(BETA))
         for name, value in expected.items():
             if NAMES[name] in found.metrics:
                 assert found.metrics[NAMES[name]].item() == pytest.approx(value, rel=2e-3, abs=1e-4), (turn, name)
