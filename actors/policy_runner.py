@@ -111,8 +111,8 @@ class PolicyRunner:
         self._norm = (torch.ones(embedding), torch.zeros(embedding)) if normed else ()
         self._gru = _GRU(self._from_embedding, self._from_hidden, envs, config.hidden)
         self._head = _head(features, config.heads, 2 * action_dim, envs)
-        known, predicted = config.hidden + obs_dim + action_dim, config.hidden + obs_dim + 1
-        self._model = _head(known, config.heads, predicted, envs) if config.fill_blanks else ()
+        known = config.hidden + obs_dim + action_dim
+        self._next_frame = _head(known, config.heads, obs_dim, envs) if config.fill_blanks else ()
 
     def start(self) -> tuple[Floats, Floats]:
         """Previous action (N, A) and state (N, S) at the start of episodes: new zeros."""
@@ -137,7 +137,7 @@ class PolicyRunner:
     def _copies(self, weights: dict[str, Tensor]) -> list[Callable[[], object]]:
         """What fills every part, once called; takes what it uses out of ``weights``."""
         layers = {"memory.gru.{}_ih_l0": self._from_embedding, "memory.gru.{}_hh_l0": self._from_hidden}
-        for net, head in (("policy", self._head), ("world_model", self._model)):
+        for net, head in (("policy", self._head), ("next_frame", self._next_frame)):
             layers |= {f"{net}.net.{place}.{{}}": layer for place, layer in zip((0, 2, 4), head, strict=False)}
         if self._embed is not None:
             layers["memory.embed.0.{}"] = self._embed
@@ -155,7 +155,7 @@ class PolicyRunner:
         the next call may overwrite; none of the arguments is changed.
         """
         seen, hidden = self._seen(observation, prev_action, blank), state[:, : self._config.hidden]
-        if self._model and blank.any():
+        if self._next_frame and blank.any():
             self._input[blank, : self._obs_dim] = self._expected(state, prev_action)[blank]
         if self._config.head_input == "observation":
             x, new_hidden = seen[:, : self._obs_dim], self._gru.out.zero_()
@@ -168,7 +168,9 @@ class PolicyRunner:
         for layer in self._head:
             x = layer(x)
         action, new_state = self._action(x.numpy(), noise), new_hidden.numpy()
-        return action, np.concatenate([new_state, self._input[:, : self._obs_dim]], 1) if self._model else new_state
+        return action, np.concatenate(
+            [new_state, self._input[:, : self._obs_dim]], 1
+        ) if self._next_frame else new_state
 
     def _seen(self, observation: Floats, prev_action: Floats, blank: BoolArray) -> Tensor:
         x = self._input
@@ -187,12 +189,11 @@ class PolicyRunner:
         return torch.from_numpy(x)
 
     def _expected(self, state: Floats, prev_action: Floats) -> Floats:
-        """(N, S), (N, A) -> (N, O), the normalised observation that the world model expects."""
+        """(N, S), (N, A) -> (N, O), the normalised observation that fills a blank."""
         x = torch.from_numpy(np.concatenate([state, prev_action], 1))
-        for layer in self._model:
+        for layer in self._next_frame:
             x = layer(x)
-        size = self._config.hidden
-        expected: Floats = state[:, size:] + x.numpy()[:, size:-1]
+        expected: Floats = state[:, self._config.hidden :] + x.numpy()
         return expected.clip(-NORMALIZED_CLIP, NORMALIZED_CLIP)
 
     def _embedded(self, x: Tensor) -> Tensor:

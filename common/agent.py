@@ -17,7 +17,7 @@ NORMALIZED_CLIP = 10.0  # standard deviations
 STD_FLOOR = 1e-2  # a constant dimension is not blown up
 HeadInput = Literal["hidden", "hidden+embedding", "hidden+observation", "observation"]
 POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what it takes to act
-MODEL_PARTS = ("world_model.",)  # what else it takes where blanks are filled
+FILL_PARTS = ("next_frame.",)  # what else it takes where blanks are filled
 CRITIC_PARTS = ("critic.", "log_alpha")  # what else it takes to rate a window
 
 
@@ -41,12 +41,12 @@ class AgentConfig:
     normalize_observations: bool = False
     """Observations are normalised by the replay server's running statistics."""
     grounding: bool = True
-    """The world model also reads the observation, and predicts its change and the reward."""
+    """The world model also predicts the next observation's change and the reward."""
     blank_flag: bool = False
     """The memory is told which observations are blank (flickered out), not left to tell them from zeros."""
     fill_blanks: bool = False
-    """The memory is given what the world model expected to see in the place of a blank observation. The recurrent state
-    then is h and what was last seen."""
+    """The memory is given, in the place of a blank observation, what a network of its own expects there from what was
+    last seen, the memory and the action. The recurrent state then is h and what was last seen."""
     initial_priority: Literal["max", "actor"] = "max"
     """Priority that a window enters the replay with: the largest seen, or its TD error by the networks of its actor, to
     which the critics are then sent, too."""
@@ -125,6 +125,10 @@ class Memory(nn.Module):
         embedding = self._embedded(observation, blank, prev_action)
         return torch.gru_cell(embedding, hidden, *self.gru.all_weights[0])
 
+    def beside(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
+        """What the heads read beside h: (..., O) normalised, (...) bool, (..., A) -> (..., ·)."""
+        return self._beside(observation, self._embedded(observation, blank, prev_action))
+
     def inputs(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
         """What is embedded: (..., O) normalised, (...) bool, (..., A) -> (..., O + A), or one more with the flag."""
         flag = [blank.unsqueeze(-1).to(observation.dtype)] if self.blank_flag else []
@@ -162,7 +166,7 @@ class Float32Linear(nn.Linear):
 
 
 class Prediction(NamedTuple):
-    """One step ahead, from (h_t, a_t), or (h_t, o_t, a_t) with grounding."""
+    """One step ahead, from (z_t, a_t)."""
 
     hidden_change: Tensor  # (B, T, H), of h_{t+1} - h_t
     observation_change: Tensor  # (B, T, O), of the normalised o_{t+1} - o_t; O = 0 without grounding
@@ -170,20 +174,34 @@ class Prediction(NamedTuple):
 
 
 class WorldModel(nn.Module):
-    """Eq. 7: f(h_t, a_t) predicts the change of the hidden state; grounded, f(h_t, o_t, a_t) that of o and r, too."""
+    """Eq. 7: f(h_t, a_t): predicts the change of the hidden state, and the grounding signals if asked."""
+
+    def __init__(self, inputs: int, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
+        super().__init__()
+        self.sizes = [config.hidden, *((obs_dim, 1) if config.grounding else (0, 0))]
+        self.net = _mlp(inputs + action_dim, config.heads, nn.Linear(config.heads[1], sum(self.sizes)))
+
+    def forward(self, features: Tensor, action: Tensor) -> Prediction:
+        """(B, T, Z), (B, T, A)."""
+        out = self.net(torch.cat([features, action.to(features.dtype)], dim=-1))
+        hidden_change, observation_change, reward = out.split(self.sizes, dim=-1)
+        return Prediction(hidden_change, observation_change, reward.sum(-1))
+
+
+class NextFrame(nn.Module):
+    """g(h_t, o_t, a_t): the normalised o_{t+1} that fills a blank. It trains nothing but itself.
+
+    It reads o_t, which the world model does not: that one's errors are what makes h hold o.
+    """
 
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
-        grounded = (obs_dim, 1) if config.grounding else (0, 0)
-        self.sizes = [config.hidden, *grounded]
-        inputs = config.hidden + grounded[0] + action_dim
-        self.net = _mlp(inputs, config.heads, nn.Linear(config.heads[1], sum(self.sizes)))
+        self.net = _mlp(config.hidden + obs_dim + action_dim, config.heads, nn.Linear(config.heads[1], obs_dim))
 
-    def forward(self, hidden: Tensor, observation: Tensor, action: Tensor) -> Prediction:
-        """(..., H), (..., O) normalised, (..., A)."""
-        inputs = [hidden, observation[..., : self.sizes[1]].to(hidden.dtype), action.to(hidden.dtype)]
-        hidden_change, change, reward = self.net(torch.cat(inputs, dim=-1)).split(self.sizes, dim=-1)
-        return Prediction(hidden_change, change, reward.sum(-1))
+    def forward(self, hidden: Tensor, observation: Tensor, action: Tensor) -> Tensor:
+        """(..., H), (..., O) normalised, (..., A) -> (..., O) in float32."""
+        change: Tensor = self.net(torch.cat([x.to(hidden.dtype) for x in (hidden, observation, action)], dim=-1))
+        return observation + change.float()
 
 
 class StackedLinear(nn.Module):
@@ -257,10 +275,11 @@ class Agent(nn.Module):
         self.normalizer = Normalizer(obs_dim, config.normalize_observations)
         self.memory = Memory(obs_dim, action_dim, config)
         features = self.memory.beside_dim + (config.hidden if config.head_input != "observation" else 0)
-        self.world_model = WorldModel(obs_dim, action_dim, config)
+        self.world_model = WorldModel(features, obs_dim, action_dim, config)
         self.critic = TwinQ(features, action_dim, config)
         self.policy = Policy(features, action_dim, config)
         self.log_alpha = nn.Parameter(torch.zeros(()))
+        self.next_frame = NextFrame(obs_dim, action_dim, config) if config.fill_blanks else None
 
     def features(self, remembered: Remembered) -> Tensor:
         """What the heads read: h_t, what is beside it, or both."""
@@ -273,17 +292,18 @@ class Agent(nn.Module):
 
     @torch.no_grad()
     def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """A blank o_t becomes what the world model expects from (h_{t-1}, o_{t-1}, a_{t-1}), o_{t-1} filled itself.
+        """A blank o_t becomes what is expected from (h_{t-1}, o_{t-1}, a_{t-1}), o_{t-1} filled itself.
 
         (B, T, O) normalised, (B, T) bool, (B, T, A), (B, S) the state before the first step -> (B, T, O) and the state
         after the last. No gradient.
         """
+        assert self.next_frame is not None
         hidden, seen = state[:, : self.config.hidden], state[:, self.config.hidden :]
         frames = [observation[:, :0]]
         with torch.autocast(observation.device.type, enabled=False):  # at a step at a time the casts outweigh the rest
             for o, was_blank, a in zip(observation.unbind(1), blank.unbind(1), prev_action.unbind(1), strict=True):
-                expected = seen + self.world_model(hidden, seen, a).observation_change
-                seen = torch.where(was_blank.unsqueeze(1), expected.clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP), o)
+                expected = self.next_frame(hidden, seen, a).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+                seen = torch.where(was_blank.unsqueeze(1), expected, o)
                 hidden = self.memory.step(seen, was_blank, a, hidden)
                 frames.append(seen.unsqueeze(1))
         return torch.cat(frames, 1), torch.cat([hidden, seen], 1)
@@ -307,7 +327,7 @@ class Agent(nn.Module):
         return self._weights(self._acting() + (CRITIC_PARTS if self.config.initial_priority == "actor" else ()))
 
     def _acting(self) -> tuple[str, ...]:
-        return POLICY_PARTS + (MODEL_PARTS if self.config.fill_blanks else ())
+        return POLICY_PARTS + (FILL_PARTS if self.config.fill_blanks else ())
 
     def _weights(self, parts: tuple[str, ...]) -> dict[str, Tensor]:
         return {

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from actors.evaluator import LONGEST_EPISODE
-from common.agent import Agent
+from common.agent import Agent, Remembered
 from common.errors import ConfigError
 from deploy.evaluation import STATE, load_state
 from deploy.policy import load_policy
@@ -108,10 +108,10 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     previous = torch.cat([torch.zeros_like(episode.action[:, :1]), episode.action], 1)
     start = torch.zeros(1, agent.config.state_size(agent.obs_dim))
     memory, seen, _ = agent.remember(episode.observation, episode.blank, previous, start)
-    prediction = agent.world_model(memory.hidden[:, :-1], seen[:, :-1], episode.action)
+    prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
     latent_change = memory.hidden[0].diff(dim=0)
     real = episode.observation[0, 1:]
-    ahead = _open_loop(agent, memory.hidden[0, :-1], seen[0, :-1], episode.action[0])
+    ahead = _open_loop(agent, memory, seen[0, :-1], episode.action[0])
     return Insight(
         real=real.numpy(),
         predicted=ahead[1].numpy(),
@@ -124,17 +124,19 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     )
 
 
-def _open_loop(agent: Agent, hidden: Tensor, observation: Tensor, action: Tensor) -> dict[int, Tensor]:
+def _open_loop(agent: Agent, memory: Remembered, observation: Tensor, action: Tensor) -> dict[int, Tensor]:
     """Horizon K -> (T - K + 1, O): from every step on, the model's own states and observations in place of the real.
 
-    (T, H), (T, O), (T, A).
+    Observations (T, O) to start from, actions (T, A).
     """
+    hidden, beside = memory.hidden[0, :-1], memory.beside[0, :-1]
     steps, found = len(action), {}
     for ahead in range(1, min(max(HORIZONS), steps) + 1):
         count = steps - ahead + 1  # starts from which so many steps were played
-        hidden, observation = hidden[:count], observation[:count]
-        step = agent.world_model(hidden, observation, action[ahead - 1 :])
+        hidden, beside, observation, a = hidden[:count], beside[:count], observation[:count], action[ahead - 1 :]
+        step = agent.world_model(agent.features(Remembered(hidden, beside)), a)
         hidden, observation = hidden + step.hidden_change, observation + step.observation_change
+        beside = agent.memory.beside(observation, torch.zeros(count, dtype=torch.bool), a)
         if ahead in HORIZONS:
             found[ahead] = observation
     return found

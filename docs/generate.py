@@ -57,7 +57,7 @@ WHEN = {
     "head_input": "rarely: the embedding beside it cost return in the [trial](results.md)",
     "critic_norm": "rarely: it cost return in the [trial](results.md)",
     "normalize_observations": "off where observations are scaled already and their statistics keep moving",
-    "grounding": "off, with `--no-fill-blanks`, for the paper's model, which can collapse in other schemes than 1",
+    "grounding": "off for the paper's model; without it the latent can collapse in other schemes than 1",
     "fill_blanks": "rarely: without it blank frames cost far more return, see [results](results.md)",
     "blank_flag": "with flicker, to see what the flag is worth; the paper has none",
     "initial_priority": "`actor` where new windows should not all be drawn soon; it costs the actors a forward pass",

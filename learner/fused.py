@@ -25,6 +25,8 @@ def fuse(agent: Agent) -> None:
     agent.__class__ = FusedAgent
     agent.memory.gru = _as(FusedGRU, agent.memory.gru)
     agent.world_model.net = _as(FusedHead, agent.world_model.net)
+    if agent.next_frame is not None:
+        agent.next_frame.net = _as(FusedHead, agent.next_frame.net)
     agent.policy.net = _as(FusedHead, agent.policy.net)
     agent.critic = _as(FusedTwinQ, agent.critic)
 
@@ -109,14 +111,13 @@ def _fill(
     agent: Agent, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor
 ) -> tuple[Tensor, Tensor]:
     """(B, T, O), (B, T), (B, T, A), (B, S) -> (B, T, O), (B, S)."""
+    assert agent.next_frame is not None
     gru, size = agent.memory.gru, agent.config.hidden
-    linear = [
-        layer for net in (agent.world_model.net, agent.memory.embed) for layer in net if isinstance(layer, nn.Linear)
-    ]
+    nets = agent.next_frame.net, agent.memory.embed
+    linear = [layer for net in nets for layer in net if isinstance(layer, nn.Linear)]
     w1, w2, w3, w_embed, wi, wh = (w.to(LOW).t() for w in (*(x.weight for x in linear), *gru.all_weights[0][:2]))
     b1, b2, b3, b_embed = (x.bias for x in linear)
     bi, bh = (b.numpy() for b in gru.all_weights[0][2:])
-    rows = slice(size, size + agent.obs_dim)  # of the model's last layer
     inputs = agent.memory.inputs(observation, blank, prev_action).to(LOW)
     h, low, kept = (
         state[:, :size].clone().numpy(),
@@ -127,7 +128,7 @@ def _fill(
     by_step = (x.transpose(0, 1) for x in (seen, blank.unsqueeze(2), prev_action.to(LOW), inputs))
     for o, was_blank, a, x in zip(*by_step, strict=True):
         second = _layer(_layer(torch.cat([low, before.to(LOW), a], 1), w1, b1), w2, b2)
-        expected = torch.mm(second, w3[:, rows]).float().add_(b3[rows]).add_(before)
+        expected = torch.mm(second, w3).float().add_(b3).add_(before)
         torch.where(was_blank, expected.clamp_(-NORMALIZED_CLIP, NORMALIZED_CLIP), o, out=o)
         x[:, : agent.obs_dim] = o
         gi, gh = torch.mm(_layer(x.contiguous(), w_embed, b_embed), wi), torch.mm(low, wh)

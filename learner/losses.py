@@ -85,6 +85,11 @@ def grounding_loss(
     return error + masked_mean((predicted_reward - r).abs(), m)
 
 
+def fill_loss(expected: Tensor, observation: Tensor, seen: Tensor, m: Tensor) -> Tensor:
+    """L1 of o_{t+1} (mean over O) that is to fill a blank, where ``seen``: it was none."""
+    return masked_mean((expected - observation).abs().mean(-1), m * seen)
+
+
 def priority(td_error: Tensor, eta: float, m: Tensor) -> Tensor:
     """eta max|td| + (1 - eta) mean|td| over a window's real trained steps; (B, T) -> (B,)."""
     size = td_error.abs() * m

@@ -107,7 +107,7 @@ class JointUpdate:
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
-        return [_adam(self.agent, self.config, "memory", "world_model", "critic", "policy", "log_alpha")]
+        return [_adam(self.agent, self.config, "memory", "world_model", "next_frame", "critic", "policy", "log_alpha")]
 
     def __call__(self, batch: Batch, beta: Tensor) -> Updated:
         """One update from a Batch; ``beta`` is a scalar tensor."""
@@ -131,13 +131,12 @@ class JointUpdate:
             memory = remember(agent.memory, o, batch, self.burn_in)
             z = self._low(agent.features(memory))
             trains = TRAINS_MEMORY[c.scheme]
-            z_value, z_policy = (z if loss in trains else z.detach() for loss in ("value", "policy"))
-            h_model = memory.hidden if "model" in trains else memory.hidden.detach()
+            z_model, z_value, z_policy = (z if loss in trains else z.detach() for loss in ("model", "value", "policy"))
 
             # Prediction, and curiosity from its error
             target = self._remember_target(o, batch) if self._has_target_memory else memory
             latent = (target if c.latent_target == "ema" else memory).hidden.detach().float()
-            prediction = agent.world_model(self._low(h_model[:, :-1]), o[:, steps][:, :-1], a)
+            prediction = agent.world_model(z_model[:, :-1], a)
             change = latent[:, 1:] - latent[:, :-1]
             error = losses.model_error(prediction.hidden_change.float(), change, c.model_norm)
             i, curiosity_variance = self._scaled(losses.curiosity(error, d, m), m)
@@ -164,9 +163,13 @@ class JointUpdate:
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
         unexplained = o.new_zeros(0)
+        now, after = o[:, steps][:, :-1], o[:, steps][:, 1:]
+        seen_now, seen_after = _seen(batch)[:, steps][:, :-1], _seen(batch)[:, steps][:, 1:]
+        if agent.next_frame is not None:
+            with self._autocast():
+                expected = agent.next_frame(self._low(memory.hidden.detach()[:, :-1]), now, a)
+            parts["fill_loss"] = losses.fill_loss(expected, after, seen_after, m)
         if agent.config.grounding:
-            now, after = o[:, steps][:, :-1], o[:, steps][:, 1:]
-            seen_now, seen_after = _seen(batch)[:, steps][:, :-1], _seen(batch)[:, steps][:, 1:]
             predicted = now + prediction.observation_change.float()
             seen = seen_after if agent.config.fill_blanks else seen_after * seen_now
             parts["grounding_loss"] = losses.grounding_loss(predicted, after, prediction.reward.float(), r, seen, m)
@@ -270,19 +273,23 @@ class AlternateUpdate(JointUpdate):
 
     _STAGES = (
         ("world_model", ("model_loss", "grounding_loss")),
+        ("next_frame", ("fill_loss",)),
         ("critic", ("q_loss",)),
         ("policy", ("policy_loss",)),
         ("log_alpha", ("temperature_loss",)),
     )
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
-        return [_adam(self.agent, self.config, "memory", part) for part, _ in self._STAGES]
+        return [_adam(self.agent, self.config, "memory", part) for part, _ in self._stages()]
+
+    def _stages(self) -> list[tuple[str, tuple[str, ...]]]:
+        return [(part, names) for part, names in self._STAGES if getattr(self.agent, part) is not None]
 
     def __call__(self, batch: Batch, beta: Tensor) -> Updated:
         """One round from a Batch. Each metric is from its own stage's forward; priorities from the critics'."""
         metrics: dict[str, Tensor] = {}
         norms = []
-        for optimizer, (part, names) in zip(self.optimizers, self._STAGES, strict=True):
+        for optimizer, (part, names) in zip(self.optimizers, self._stages(), strict=True):
             parts, found = self.forward(batch, beta)
             own = {name: loss for name, loss in parts.items() if name in names}
             norms.append(self._step(optimizer, own.values()))
@@ -341,7 +348,7 @@ def _target_copy(module: ModuleT) -> ModuleT:
 
 def _adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
     """Adam for the parts of the agent that are named; memory and temperature have step sizes of their own."""
-    heads = [part for part in parts if part not in ("memory", "log_alpha")]
+    heads = [part for part in parts if part not in ("memory", "log_alpha") and getattr(agent, part) is not None]
     groups = [
         {"params": list(agent.memory.parameters()), "lr": config.learning_rate * config.memory_learning_scale},
         {

@@ -10,7 +10,7 @@ WAYS = {
     "longer burn-in": "--burn-in 30",
     "longer windows": "--burn-in 20 --trained-steps 30",
     "observation beside": "--head-input hidden+observation",
-    "no grounding": "--no-fill-blanks --no-grounding",
+    "no grounding": "--no-grounding",
 }
 STUDY = Study("blanks", {name: f"train ENV --flicker 0.5 {words}" for name, words in WAYS.items()})
 

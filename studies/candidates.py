@@ -19,7 +19,7 @@ CHANGES = {
     "stride 5": "--batch-size 32 --stride 5",
     "prioritized": "--batch-size 32 --priority-exponent 0.6 --importance-exponent 0.4",
     "first critic": "--batch-size 32 --policy-q first",
-    "no grounding": "--batch-size 32 --no-fill-blanks --no-grounding",
+    "no grounding": "--batch-size 32 --no-grounding",
     "not clipped": "--batch-size 32 --clip-norm 0",
     "optimisers apart": "--batch-size 32 --update-order alternate",
     "reward scale 5": "--batch-size 32 --reward-scale 5",

@@ -46,7 +46,7 @@ def reference(
     normalized = agent.normalizer(observation, blank)
     hidden, last = state[:, : agent.config.hidden], state[:, agent.config.hidden :]
     if agent.config.fill_blanks:
-        expected = (last + agent.world_model(hidden, last, prev_action).observation_change).clamp(-10.0, 10.0)
+        expected = agent.next_frame(hidden, last, prev_action).clamp(-10.0, 10.0)
         normalized = torch.where(blank.unsqueeze(1), expected, normalized)
     remembered = agent.memory(normalized.unsqueeze(1), blank.unsqueeze(1), prev_action.unsqueeze(1), hidden)
     mean, log_std = agent.policy(agent.features(remembered).squeeze(1))

@@ -51,12 +51,16 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
     for t in range(start + 1):
         last, frame, blank = frame, episode.observation[:, t : t + 1], episode.blank[:, t : t + 1]
         if agent.config.fill_blanks and blank:
-            frame = last + agent.world_model(hidden.unsqueeze(1), last, previous).observation_change
+            frame = agent.next_frame(hidden.unsqueeze(1), last, previous)
         seen = agent.memory(frame, blank, previous, hidden)
         hidden, previous = seen.hidden[:, 0], episode.action[:, t : t + 1]
     for t in range(start, start + horizon):
-        step = agent.world_model(hidden, frame[:, 0], episode.action[:, t])
-        frame, hidden = frame + step.observation_change.unsqueeze(1), hidden + step.hidden_change
+        action = episode.action[:, t : t + 1]
+        step = agent.world_model(agent.features(seen), action)
+        frame = frame + step.observation_change
+        embedding = agent.memory.embed(torch.cat([frame, action], -1))
+        beside = {"hidden": frame[..., :0], "hidden+embedding": embedding}.get(agent.config.head_input, frame)
+        seen = seen._replace(hidden=seen.hidden + step.hidden_change, beside=beside)
     return frame[0, 0]
 
 

@@ -16,7 +16,7 @@ from common.agent import Agent, Memory
 from learner.update import UpdateConfig
 
 REACHES_MEMORY = {1: "MV", 2: "V", 3: "M", 4: "MVP", 5: "MP", 6: "VP"}  # model, value, policy: table 1 of the paper
-ALTERNATE = (("MG", "world_model"), ("V", "critic"), ("P", "policy"), ("T", None))
+ALTERNATE = (("MG", "world_model"), ("F", "next_frame"), ("V", "critic"), ("P", "policy"), ("T", None))
 
 
 class Known(NamedTuple):
@@ -28,20 +28,26 @@ class Known(NamedTuple):
 
 
 class PlainUpdate:
-    """Losses by name: M model, G grounding, V value, P policy, T temperature."""
+    """Losses by name: M model, G grounding, F fill, V value, P policy, T temperature."""
 
     def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int) -> None:
         self.agent, self.burn_in, self.c = agent, burn_in, config
         self.target_critic, self.target_memory = copy.deepcopy(agent.critic), copy.deepcopy(agent.memory)
         self.generator = torch.Generator().manual_seed(seed)
         self.variance_sum = self.variance_weight = 0.0
-        everything = ["world_model", "critic", "policy", None]
-        groups = [everything] if config.update_order == "joint" else [[part] for _, part in ALTERNATE]
+        everything = ["world_model", "next_frame", "critic", "policy", None]
+        self.stages = [names for names, part in ALTERNATE if part != "next_frame" or agent.config.fill_blanks]
+        groups = (
+            [everything]
+            if config.update_order == "joint"
+            else [[part] for names, part in ALTERNATE if names in self.stages]
+        )
         self.optimizers = [self._optimizer(parts) for parts in groups]
 
     def _optimizer(self, parts: Sequence[str | None]) -> torch.optim.Adam:
         rate = self.c.learning_rate
-        heads = [p for part in parts if part is not None for p in getattr(self.agent, part).parameters()]
+        own = [getattr(self.agent, part) for part in parts if part is not None]
+        heads = [p for module in own if module is not None for p in module.parameters()]
         groups = [
             {"params": list(self.agent.memory.parameters()), "lr": self.c.memory_learning_scale * rate},
             {"params": heads, "lr": rate},
@@ -52,7 +58,7 @@ class PlainUpdate:
 
     def __call__(self, rows: np.ndarray, importance: np.ndarray, beta: float) -> tuple[dict[str, float], list[float]]:
         """One update; the losses as they were before it, and the windows' priorities."""
-        wholes = ["MGVPT"] if self.c.update_order == "joint" else [names for names, _ in ALTERNATE]
+        wholes = ["MGFVPT"] if self.c.update_order == "joint" else self.stages
         found: dict[str, float] = {}
         priorities: list[float] = []
         for names, optimizer in zip(wholes, self.optimizers, strict=True):
@@ -98,7 +104,7 @@ class PlainUpdate:
             previous = torch.tensor(row["prev_action"] if t == row["first"] else row["action"][t - 1])
             found[t] = self.seen(row, t)
             if self.agent.config.fill_blanks and row["blank"][t]:
-                found[t] = (last + self.agent.world_model(h, last, previous).observation_change).clamp(-10, 10)
+                found[t] = self.agent.next_frame(h, last, previous).clamp(-10, 10)
             last = found[t]
             if self.agent.config.head_input != "observation":
                 h = gru(memory, self.embedded(memory, row, t, found[t], previous), h)
@@ -131,7 +137,7 @@ class PlainUpdate:
         noise = torch.randn(
             (len(rows), rows["action"].shape[1] - self.burn_in + 1, agent.action_dim), generator=self.generator
         )
-        sums: dict[str, list[Tensor]] = {name: [] for name in ("M", "observation", "reward", "V", "P", "T")}
+        sums: dict[str, list[Tensor]] = {name: [] for name in ("M", "observation", "reward", "F", "V", "P", "T")}
         errors = []  # of every window, by step
         for b, row in enumerate(rows):
             online, target = self.unroll(agent.memory, row), self.unroll(self.target_memory, row)
@@ -140,7 +146,7 @@ class PlainUpdate:
             for t in range(self.burn_in, int(row["last"])):
                 z = self.z(online[t])
                 a = torch.tensor(row["action"][t])
-                predicted = agent.world_model(self.reaching("M", online[t].h), online[t].o, a)
+                predicted = agent.world_model(self.reaching("M", z), a)
                 difference = predicted.hidden_change - (latent[t + 1].h - latent[t].h).detach()
                 error = difference.abs().mean() if c.model_norm == "l1" else difference.square().mean().sqrt()
                 if not self.ends(row, t):
@@ -151,6 +157,9 @@ class PlainUpdate:
                     if not row["blank"][t + 1] and (agent.config.fill_blanks or not row["blank"][t]):
                         sums["observation"].append((predicted.observation_change - wanted).abs().mean())
                     sums["reward"].append((predicted.reward - float(row["reward"][t])).abs())
+                if agent.config.fill_blanks and not row["blank"][t + 1]:
+                    expected = agent.next_frame(online[t].h.detach(), online[t].o, a)
+                    sums["F"].append((expected - self.seen(row, t + 1)).abs().mean())
                 pi, log_pi = self.sample(self.reaching("P", z), noise[b, t - self.burn_in])
                 climbed = self.reaching("P", z) if c.policy_through_q else z.detach()
                 q_pi = twin_q(agent.critic, climbed, pi, frozen=True)

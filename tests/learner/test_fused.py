@@ -15,7 +15,7 @@ from learner.update import UpdateConfig, make_update
 from tests.learner.rows import SPEC, random_rows, to_batch
 
 B, T = 6, 5
-CONFIG = AgentConfig(hidden=24, embedding=20, heads=(40, 28), head_input="hidden+embedding")
+CONFIG = AgentConfig(hidden=24, embedding=20, heads=(40, 28), head_input="hidden+embedding", fill_blanks=True)
 
 
 def floats(bits):
@@ -50,9 +50,14 @@ def run_policy(agent, low, x):
         return torch.cat(agent.policy(x), -1)
 
 
-def run_model(agent, low, x, o, action):
+def run_next_frame(agent, low, x, o, action):
     with torch.autocast("cpu", torch.bfloat16, enabled=low):
-        found = agent.world_model(x, o, action)
+        return agent.next_frame(x, o, action) - o
+
+
+def run_model(agent, low, x, action):
+    with torch.autocast("cpu", torch.bfloat16, enabled=low):
+        found = agent.world_model(x, action)
         return torch.cat([found.hidden_change, found.observation_change, found.reward.unsqueeze(-1)], -1)
 
 
@@ -60,7 +65,8 @@ CASES = {
     "memory": (run_gru, [(B, T, 20), (1, B, 24)]),
     "critic": (run_critic, [(B, T, 44), (B, T, 2)]),
     "policy": (run_policy, [(B, T, 44)]),
-    "world_model": (run_model, [(B, T, 24), (B, T, 3), (B, T, 2)]),
+    "world_model": (run_model, [(B, T, 44), (B, T, 2)]),
+    "next_frame": (run_next_frame, [(B, T, 24), (B, T, 3), (B, T, 2)]),
 }
 
 

@@ -36,7 +36,7 @@ def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray,
         )
         seen = agent.normalizer(o, blank)
         if agent.config.fill_blanks and blank:
-            seen = (last + agent.world_model(state, last, previous[0]).observation_change).unsqueeze(1)
+            seen = agent.next_frame(state, last, previous[0]).unsqueeze(1)
         step = agent.memory(seen, blank, previous, state)
         state, last = step.hidden[:, 0], seen[:, 0] if agent.config.fill_blanks else last
         carried = torch.cat([state, last], 1)[0].numpy()

@@ -22,7 +22,8 @@ ROBUST = AgentConfig(
     blank_flag=True,
 )
 NAMES = {
-    "M": "model_loss", "G": "grounding_loss", "V": "q_loss", "P": "policy_loss", "T": "temperature_loss",
+    "M": "model_loss", "G": "grounding_loss", "F": "fill_loss",
+    "V": "q_loss", "P": "policy_loss", "T": "temperature_loss",
 }  # fmt: skip
 BETA = 0.5
 VARIANTS = [
