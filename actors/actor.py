@@ -1,6 +1,6 @@
 """The actor: steps N environments with the newest policy and sends what happens as windows.
 
-Shapes: N environments, O observation, A action, H hidden.
+Shapes: N environments, O observation, A action, S state (see ``AgentConfig.state_size``).
 """
 
 import hashlib

@@ -1,6 +1,6 @@
 """The evaluator: plays whole episodes with the policy's mean, without exploring.
 
-Shapes: N episodes played side by side, O observation, A action, H hidden.
+Shapes: N episodes played side by side, O observation, A action, S state.
 """
 
 import logging
@@ -40,7 +40,7 @@ class Player(Protocol):
     """What plays: a ``PolicyRunner``, or another agent that acts like one."""
 
     def start(self) -> tuple[Floats, Floats]:
-        """Previous action (N, A) and hidden state (N, H) at the start of episodes."""
+        """Previous action (N, A) and state (N, S) at the start of episodes."""
 
     def act(
         self,
@@ -51,7 +51,7 @@ class Player(Protocol):
         noise: Floats | None,
         /,
     ) -> tuple[Floats, Floats]:
-        """(N, O), (N, A), (N,), (N, H), and noise or None for the mean -> (N, A) in [-1, 1], (N, H)."""
+        """(N, O), (N, A), (N,), (N, S), and noise or None for the mean -> (N, A) in [-1, 1], (N, S)."""
 
 
 class Match:

@@ -1,6 +1,6 @@
 """The policy on the CPU, fast at small batches: every product and every result in a buffer of its own.
 
-Shapes: N environments, O observation, A action, E embedding, H hidden. Float32 throughout; agrees with
+Shapes: N environments, O observation, A action, E embedding, H hidden, S state. Float32 throughout; agrees with
 ``common.agent`` (its modules are the reference) to 1e-5.
 """
 

@@ -1,6 +1,6 @@
 """Cuts the steps of N environments into windows: order, episode ends, burn-in, stored state.
 
-Shapes: N environments, T = burn_in + train, O observation, A action, H hidden.
+Shapes: N environments, T = burn_in + train, O observation, A action, S state (see ``AgentConfig.state_size``).
 
 All environments step together, so one ring of T + 1 slots over time serves them all. A slot holds what
 is known when an observation arrives: it, the action, reward and weights version that led to it, and the
@@ -23,7 +23,7 @@ class Now(NamedTuple):
     observation: Floats  # (N, O)
     prev_action: Floats  # (N, A)
     blank: BoolArray  # (N,)
-    hidden: Floats  # (N, H), the state before ``observation``
+    hidden: Floats  # (N, S), the state before ``observation``
 
 
 class WindowBuilder:
@@ -108,7 +108,7 @@ class WindowBuilder:
         terminated: BoolArray,
         truncated: BoolArray,
     ) -> BoolArray:
-        """One step of every environment: (N, A), (N, H) state after ``now().observation``, (N,), (N, O), (N,).
+        """One step of every environment: (N, A), (N, S) state after ``now().observation``, (N,), (N, O), (N,).
 
         ``observation`` is the true next one, of an ended episode its final one. Returns (N,) which episodes
         have ended; ``begin`` must follow for each of them.

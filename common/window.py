@@ -1,6 +1,6 @@
 """The window: the one definition of what a sequence is, from actor to learner.
 
-Shapes: T = burn_in + train steps; T + 1 observations; O observation, A action, H hidden.
+Shapes: T = burn_in + train steps; T + 1 observations; O observation, A action, S state (``AgentConfig.state_size``).
 
 A window is a row of a structured dtype, laid out as ``[burn_in | train | 1 bootstrap]``. Two indices
 say what is real: observations ``first <= t <= last`` and steps ``first <= t < last``. The last

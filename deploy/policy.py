@@ -7,7 +7,7 @@
     action = policy.act(observation, info.get("blank", False))
     observation, reward, terminated, truncated, info = env.step(action)
 
-Shapes: O observation, A action, H hidden.
+Shapes: O observation, A action, S state.
 """
 
 from pathlib import Path

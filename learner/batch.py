@@ -1,6 +1,6 @@
 """A batch of rows as tensors: views into one block of bytes.
 
-Shapes: B batch, T steps, O observation, A action, H hidden; L_b burn-in.
+Shapes: B batch, T steps, O observation, A action, S state; L_b burn-in.
 """
 
 from dataclasses import dataclass

@@ -1,6 +1,7 @@
 """The joint update: gradients reach what scheme 1 says, padding reaches nothing, state comes back bit for bit."""
 
 import copy
+import dataclasses
 import io
 
 import numpy as np
@@ -111,6 +112,19 @@ def test_each_stage_of_alternate_starts_from_what_the_one_before_left():
 def test_grounding_reaches_memory_and_world_model(monkeypatch):
     update = make(ROBUST)
     assert gradients(update, "grounding_loss", monkeypatch) == part(update, "memory.", "world_model.")
+
+
+def test_what_fills_blanks_trains_itself_alone():
+    config = dataclasses.replace(ROBUST, fill_blanks=True)
+    spec, update = dataclasses.replace(SPEC, hidden=config.state_size(SPEC.obs_dim)), make(config, scheme=4)
+    parts, _ = update.forward(to_batch(random_rows(8, spec=spec), spec), BETA)
+    named = dict(update.agent.named_parameters())
+    for loss in parts:
+        found = torch.autograd.grad(parts[loss], list(named.values()), retain_graph=True, allow_unused=True)
+        reached = {name for name, grad in zip(named, found, strict=True) if grad is not None and grad.abs().sum() > 0}
+        assert reached
+        own = part(update, "next_frame.")
+        assert reached == own if loss == "fill_loss" else not reached & own, loss
 
 
 def test_garbage_in_padding_changes_nothing():
