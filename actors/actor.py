@@ -258,7 +258,7 @@ class Actor:
         assert self._version is not None
         now, n = self._builder.now(), len(self._envs)
         noise = self._rng.standard_normal((n, self._spec.action_dim), np.float32)
-        action, hidden = self._runner.act(*now, noise)
+        action, state = self._runner.act(*now, noise)
         if self._version.update == 0:  # the policy has learnt nothing yet
             action = self._rng.uniform(-1.0, 1.0, action.shape).astype(np.float32)
         for i in range(n):
@@ -270,7 +270,7 @@ class Actor:
         for i in self._faults:
             self._steps -= self._builder.forget(i) + 1
         ended = self._builder.add(
-            action, hidden, self._version.update, self._config.reward_scale * self._reward, self._observation,
+            action, state, self._version.update, self._config.reward_scale * self._reward, self._observation,
             self._blank, self._terminated, self._truncated,
         )  # fmt: skip
         self._next_poll = float("-inf")

@@ -47,7 +47,7 @@ class Player(Protocol):
         observation: Floats,
         prev_action: Floats,
         blank: NDArray[np.bool_],
-        hidden: Floats,
+        state: Floats,
         noise: Floats | None,
         /,
     ) -> tuple[Floats, Floats]:
@@ -65,7 +65,7 @@ class Match:
         self._runner, self._envs = runner, envs
         shape = envs[0].observation_space.shape
         self._observation = np.zeros((len(envs), *(shape or ())), np.float32)
-        self._prev_action, self._hidden = runner.start()
+        self._prev_action, self._state = runner.start()
         self._playing = np.ones(len(envs), np.bool_)
         self._blank, self.broken = np.zeros((2, len(envs)), np.bool_)
         self._returns = np.zeros(len(envs))
@@ -78,8 +78,8 @@ class Match:
     def step(self) -> bool:
         """One step of every episode that goes on; whether any does."""
         self._rounds += 1
-        action, hidden = self._runner.act(self._observation, self._prev_action, self._blank, self._hidden, None)
-        self._prev_action, self._hidden[:] = action, hidden
+        action, state = self._runner.act(self._observation, self._prev_action, self._blank, self._state, None)
+        self._prev_action, self._state[:] = action, state
         for i in np.flatnonzero(self._playing).tolist():
             self._guarded(i, self._step_environment, action[i])
         return bool(self._playing.any())

@@ -23,7 +23,7 @@ class Now(NamedTuple):
     observation: Floats  # (N, O)
     prev_action: Floats  # (N, A)
     blank: BoolArray  # (N,)
-    hidden: Floats  # (N, S), the state before ``observation``
+    state: Floats  # (N, S), the state before ``observation``
 
 
 class WindowBuilder:
@@ -48,7 +48,7 @@ class WindowBuilder:
         self._blank = np.zeros((slots, envs), np.bool_)
         self._prev_action = np.zeros((slots, envs, spec.action_dim), np.float32)
         self._reward = np.zeros((slots, envs), np.float32)
-        self._hidden = np.zeros((slots, envs, spec.hidden), np.float32)
+        self._state = np.zeros((slots, envs, spec.state), np.float32)
         self._update = np.zeros(slots, np.int64)
         self._time = 0  # of the newest observation; its slot is time mod slots
         self._start = np.zeros(envs, np.int64)  # time of each episode's first observation
@@ -75,7 +75,7 @@ class WindowBuilder:
     def now(self) -> Now:
         """The newest observations, and the memory before them."""
         slot = self._time % self._slots
-        return Now(self._observation[slot], self._prev_action[slot], self._blank[slot], self._hidden[slot])
+        return Now(self._observation[slot], self._prev_action[slot], self._blank[slot], self._state[slot])
 
     def begin(self, env: int, observation: Floats, blank: bool) -> None:
         """A new episode: (O,) its first observation; what was open of the one before is forgotten."""
@@ -83,7 +83,7 @@ class WindowBuilder:
         self._observation[slot, env] = observation
         self._blank[slot, env] = blank
         self._prev_action[slot, env] = 0.0
-        self._hidden[slot, env] = 0.0
+        self._state[slot, env] = 0.0
         self._start[env] = self._time
         self._block[env] = self._covered[env] = 0
 
@@ -100,7 +100,7 @@ class WindowBuilder:
     def add(
         self,
         action: Floats,
-        hidden: Floats,
+        state: Floats,
         update: int,
         reward: Floats,
         observation: Floats,
@@ -116,7 +116,7 @@ class WindowBuilder:
         self._time += 1
         slot = self._time % self._slots
         self._prev_action[slot] = action
-        self._hidden[slot] = hidden
+        self._state[slot] = state
         self._update[slot] = update
         self._reward[slot] = reward
         self._observation[slot] = observation
@@ -160,7 +160,7 @@ class WindowBuilder:
         fields["reward"][row, first:last] = self._reward[slots[1:], env]
         fields["prev_action"][row] = self._prev_action[slots[0], env]
         if self._store_states:
-            fields["hidden"][row] = self._hidden[slots[0], env]
+            fields["state"][row] = self._state[slots[0], env]
         self.count += 1
         self._covered[env] = steps
         self._block[env] = block + self._stride

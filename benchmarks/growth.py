@@ -26,7 +26,7 @@ from deploy.presets import RunConfig, robust
 from replay_server.recovery import open_store
 
 ENV = EnvConfig("HalfCheetah-v5")
-SMALL = WindowSpec(obs_dim=4, action_dim=1, hidden=8, burn_in=2, train=3)  # a million of them fit the memory
+SMALL = WindowSpec(obs_dim=4, action_dim=1, state=8, burn_in=2, train=3)  # a million of them fit the memory
 DRAWN = 256  # windows, of the ring
 OFFERED = 1_000.0  # windows a second, by each simulated actor
 Table = list[tuple[int, list[Row]]]  # size, its measurements

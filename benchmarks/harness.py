@@ -198,7 +198,7 @@ def random_rows(spec: WindowSpec, count: int) -> Rows:
     rows = np.zeros(count, spec.dtype)
     rows["last"] = spec.steps
     rows["new_steps"] = rows["new_observations"] = spec.train
-    for name in ("observation", "action", "prev_action", "reward", "hidden"):
+    for name in ("observation", "action", "prev_action", "reward", "state"):
         rows[name] = rng.uniform(-1.0, 1.0, rows[name].shape)
     return rows
 

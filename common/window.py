@@ -5,7 +5,7 @@ Shapes: T = burn_in + train steps; T + 1 observations; O observation, A action, 
 A window is a row of a structured dtype, laid out as ``[burn_in | train | 1 bootstrap]``. Two indices
 say what is real: observations ``first <= t <= last`` and steps ``first <= t < last``. The last
 observation (and the bootstrap one) is real but starts no step. Burn-in is all real or all padding, so
-``first`` is either 0 or ``burn_in``; everything outside is zero. ``hidden`` is the recurrent state *before*
+``first`` is either 0 or ``burn_in``; everything outside is zero. ``state`` is the recurrent state *before*
 observation ``first``: the GRU's, and where blank frames are filled what was last seen, normalised. ``prev_action`` is
 the action before it.
 
@@ -31,7 +31,7 @@ class WindowSpec:
 
     obs_dim: int
     action_dim: int
-    hidden: int
+    state: int
     burn_in: int = 10
     train: int = 15
 
@@ -67,7 +67,7 @@ class WindowSpec:
             ("action", "<f4", (self.steps, self.action_dim)),  # in [-1, 1]
             ("prev_action", "<f4", (self.action_dim,)),
             ("reward", "<f4", (self.steps,)),  # extrinsic
-            ("hidden", "<f4", (self.hidden,)),
+            ("state", "<f4", (self.state,)),
             ("blank", "u1", (self.observations,)),  # 1: a flickered-out frame
         ]
         packed = np.dtype(fields)
@@ -99,7 +99,7 @@ def first_fault(rows: Rows, spec: WindowSpec) -> str | None:
     new = rows["new_observations"]
     if not ((new >= rows["new_steps"]) & (new <= rows["new_steps"] + 1)).all():
         return "new_observations is neither new_steps nor one more"
-    for name in ("observation", "action", "prev_action", "reward", "hidden", "initial_priority"):
+    for name in ("observation", "action", "prev_action", "reward", "state", "initial_priority"):
         if not np.isfinite(rows[name]).all():
             return f"{name} is not finite"
     for name in ("initial_priority", "env", "episode_step"):

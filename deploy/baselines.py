@@ -102,20 +102,20 @@ class Opponent:
         self._begins = np.ones(envs, np.bool_)
 
     def start(self) -> tuple[Floats, Floats]:
-        """Previous actions (N, A), and in place of a hidden state (N, 0), at the start of episodes."""
+        """Previous actions (N, A), and in place of a state (N, 0), at the start of episodes."""
         self._state, self._begins = None, np.ones(self._envs, np.bool_)
         sizes = (*self._model.action_space.shape, 0)
         actions, nothing = (np.zeros((self._envs, size), np.float32) for size in sizes)
         return actions, nothing
 
     def act(
-        self, observation: Floats, _prev_action: Floats, _blank: NDArray[np.bool_], hidden: Floats, _: Floats | None
+        self, observation: Floats, _prev_action: Floats, _blank: NDArray[np.bool_], state: Floats, _: Floats | None
     ) -> tuple[Floats, Floats]:
         """(N, O) -> (N, A), as ``PolicyRunner.act``; of the rest nothing is used."""
         seen = self._scaled(observation)
         action, self._state = self._model.predict(seen, self._state, self._begins, deterministic=True)
         self._begins = np.zeros(self._envs, np.bool_)
-        return action.astype(np.float32), hidden
+        return action.astype(np.float32), state
 
 
 class _Run(BaseCallback):

@@ -1,7 +1,7 @@
 """A policy as an ONNX file, for programs without torch.
 
-Inputs: observation (N, O) raw, previous_action (N, A), blank (N,) bool, hidden (N, S), the state, zeros at an episode's
-start. Outputs: action (N, A) in [-1, 1], the policy's mean, and the next hidden (N, S).
+Inputs: observation (N, O) raw, previous_action (N, A), blank (N,) bool, state (N, S), zeros at an episode's start.
+Outputs: action (N, A) in [-1, 1], the policy's mean, and next_state (N, S).
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from common.errors import ConfigError
 from deploy.evaluation import load_checkpoint
 from deploy.run_folder import RunFolder, check_writable
 
-INPUTS, OUTPUTS = ("observation", "previous_action", "blank", "hidden"), ("action", "next_hidden")
+INPUTS, OUTPUTS = ("observation", "previous_action", "blank", "state"), ("action", "next_state")
 NEEDED = ("onnx", "onnxscript")
 
 
@@ -33,11 +33,11 @@ class _Step(nn.Module):
         self.agent = agent
 
     def forward(
-        self, observation: Tensor, previous_action: Tensor, blank: Tensor, hidden: Tensor
+        self, observation: Tensor, previous_action: Tensor, blank: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor]:
         """See the module's docstring."""
         seen = self.agent.normalizer(observation, blank).unsqueeze(1)
-        now = blank.unsqueeze(1), previous_action.unsqueeze(1), hidden
+        now = blank.unsqueeze(1), previous_action.unsqueeze(1), state
         remembered, _, state = self.agent.remember(seen, *now)
         mean, _ = self.agent.policy(self.agent.features(remembered).squeeze(1))
         return torch.tanh(mean), state
@@ -53,7 +53,7 @@ def export(folder: RunFolder, checkpoint: str, out: Path) -> None:
     spec = config.window_spec()
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
     agent.load_state_dict(safetensors.torch.load(blob), strict=False)
-    two = [torch.zeros(2, size) for size in (spec.obs_dim, spec.action_dim, spec.hidden)]
+    two = [torch.zeros(2, size) for size in (spec.obs_dim, spec.action_dim, spec.state)]
     example = (two[0], two[1], torch.zeros(2, dtype=torch.bool), two[2])
     rows = torch.export.Dim("rows", min=1)
     with _quiet():

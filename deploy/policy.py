@@ -48,7 +48,7 @@ class Policy:
 
     def reset(self) -> None:
         """Forget: a new episode begins."""
-        self._prev_action, self._hidden = self._runner.start()
+        self._prev_action, self._state = self._runner.start()
 
     def act(self, observation: Floats, blank: bool = False, explore: bool = False) -> Floats:
         """(O,) -> (A,) in [-1, 1]: the policy's mean, or a sample of it.
@@ -57,7 +57,7 @@ class Policy:
         """
         noise = self._rng.standard_normal(self._prev_action.shape, np.float32) if explore else None
         seen = np.asarray(observation, np.float32)[None]
-        action, hidden = self._runner.act(seen, self._prev_action, np.array([blank]), self._hidden, noise)
-        self._prev_action, self._hidden[:] = action, hidden
+        action, state = self._runner.act(seen, self._prev_action, np.array([blank]), self._state, noise)
+        self._prev_action, self._state[:] = action, state
         found: Floats = action[0].copy()
         return found

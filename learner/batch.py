@@ -23,7 +23,7 @@ class Batch:
     action: Tensor  # (B, T, A)
     reward: Tensor  # (B, T)
     terminated: Tensor  # (B, T), d_t: 1 at a true termination
-    hidden: Tensor  # (B, S), the state before the first real observation
+    state: Tensor  # (B, S), the state before the first real observation
     blank: Tensor  # (B, T + 1) bool
     observation_valid: Tensor  # (B, T + 1) bool
     step_valid: Tensor  # (B, T) bool
@@ -92,7 +92,7 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec) -> Batch:
         action=action,
         reward=field(floats, "reward"),
         terminated=ends.float(),
-        hidden=field(floats, "hidden"),
+        state=field(floats, "state"),
         blank=field(raw, "blank") > 0,
         observation_valid=observation_valid,
         step_valid=step_valid,

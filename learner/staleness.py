@@ -32,7 +32,7 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
     """
     device = agent.log_alpha.device
     observation, blank, action = (torch.from_numpy(x).to(device).unsqueeze(0) for x in _joined(episode, spec))
-    stored = torch.from_numpy(episode["hidden"][-1:].copy()).to(device)
+    stored = torch.from_numpy(episode["state"][-1:].copy()).to(device)
     o, start = agent.normalizer(observation, blank), torch.zeros_like(stored)
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
     window = slice(-spec.steps - 1, -1)  # its steps; the bootstrap observation starts none

@@ -311,8 +311,8 @@ def remember(memory: Memory, o: Tensor, batch: Batch, burn_in: int) -> Remembere
 def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
     """(B, H), the state before the first trained step."""
     if not n:
-        return batch.hidden
-    hidden = batch.hidden[:, : memory.gru.hidden_size]
+        return batch.state
+    hidden = batch.state[:, : memory.gru.hidden_size]
     burned = memory(o[:, :n], batch.blank[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
     torch.clear_autocast_cache()  # older torch would go on with these casts, which carry no gradient
     return torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
@@ -326,8 +326,8 @@ def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
     def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:
         return agent.fill(o[:, steps], batch.blank[:, steps], batch.prev_action[:, steps], state)
 
-    past, state = part(slice(burn_in), batch.hidden)
-    state = torch.where(batch.burned_in.unsqueeze(1), state, batch.hidden)
+    past, state = part(slice(burn_in), batch.state)
+    state = torch.where(batch.burned_in.unsqueeze(1), state, batch.state)
     return torch.cat([past, part(slice(burn_in, None), state)[0]], 1)
 
 

@@ -55,13 +55,13 @@ def run(play: Play, steps: int, cut: bool = True, store_states: bool = True) -> 
         now = builder.now()
         here = np.stack([name(env, episode[env], k[env]) for env in range(envs)])
         np.testing.assert_array_equal(now.observation, here)
-        np.testing.assert_array_equal(now.hidden, np.where(k[:, None] > 0, here, 0))
+        np.testing.assert_array_equal(now.state, np.where(k[:, None] > 0, here, 0))
         np.testing.assert_array_equal(now.prev_action, np.where(k[:, None] > 0, -(here - [0, 0, 1]), 0))
         k += 1
         then = here + np.float32([0, 0, 1])
         done = np.array([k[env] == play.length(env, episode[env]) for env in range(envs)])
         ended = builder.add(
-            action=-here, hidden=then, update=time, reward=k.astype(np.float32), observation=then,
+            action=-here, state=then, update=time, reward=k.astype(np.float32), observation=then,
             blank=k % 5 == 3, terminated=done & (k % 2 == 0), truncated=done & (k % 2 == 1),
         )  # fmt: skip
         np.testing.assert_array_equal(ended, done)
@@ -83,8 +83,8 @@ def _is_blank(k: int) -> bool:
 @given(plays(), st.integers(1, 80))
 def test_without_stored_states_only_these_are_missing(play: Play, steps: int) -> None:
     stored, zero = (run(play, steps, store_states=store_states)[0] for store_states in (True, False))
-    assert not zero["hidden"].any()
-    for field in set(play.spec.dtype.names or ()) - {"hidden"}:
+    assert not zero["state"].any()
+    for field in set(play.spec.dtype.names or ()) - {"state"}:
         np.testing.assert_array_equal(stored[field], zero[field])
 
 
@@ -110,7 +110,7 @@ def test_windows(play: Play, steps: int) -> None:
         np.testing.assert_array_equal(row["reward"][first:last], expected[1:, 2])
         assert row["blank"][first : last + 1].tolist() == [_is_blank(k0 + i) for i in range(last - first + 1)]
         # the stored state is the one before the first real observation
-        np.testing.assert_array_equal(row["hidden"], expected[0] if k0 else 0 * expected[0])
+        np.testing.assert_array_equal(row["state"], expected[0] if k0 else 0 * expected[0])
         np.testing.assert_array_equal(row["prev_action"], -(expected[0] - [0, 0, 1]) if k0 else 0 * expected[0])
         # burn-in is real where there were enough steps; blocks come at the stride
         assert (first == 0) == (block >= spec.burn_in)

@@ -9,7 +9,7 @@ from common.errors import MessageError
 from common.shared_batches import TURNS, SharedBatches, reserve_memory, shared_bytes
 from common.window import WindowSpec
 
-SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=4, burn_in=2, train=4)
+SPEC = WindowSpec(obs_dim=3, action_dim=2, state=4, burn_in=2, train=4)
 BATCH = 8
 pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="Linux")
 

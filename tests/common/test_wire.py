@@ -76,7 +76,7 @@ def test_refusals_name_their_reason(payload, reason):
 @pytest.mark.parametrize(
     ("field", "value"),
     [("first", 1), ("last", 99), ("last", 0), ("new_steps", -1), ("new_steps", 99), ("new_observations", 50)]
-    + [(name, np.nan) for name in ("observation", "action", "prev_action", "reward", "hidden", "initial_priority")]
+    + [(name, np.nan) for name in ("observation", "action", "prev_action", "reward", "state", "initial_priority")]
     + [("initial_priority", -1.0)],
 )
 def test_unlawful_windows_are_refused(field, value):

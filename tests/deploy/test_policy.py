@@ -81,18 +81,18 @@ def test_exploring_actions_vary_and_are_seeded(run: RunFolder) -> None:
 def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "policy.onnx"
     assert cli.run(["export", str(run.path), "--out", str(file)]) == 0
-    assert "inputs observation, previous_action, blank, hidden" in capsys.readouterr().out
+    assert "inputs observation, previous_action, blank, state" in capsys.readouterr().out
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     rng, policy = np.random.default_rng(0), load_policy(run.path)
     feed = {
         "previous_action": np.zeros((3, 1), np.float32),
-        "hidden": np.zeros((3, run.config().window_spec().hidden), np.float32),
+        "state": np.zeros((3, run.config().window_spec().state), np.float32),
     }
     for step in range(20):  # three rows, though it was traced with two; the first one beside the policy
         observation, blank = rng.normal(size=(3, 3)).astype(np.float32), np.array([step % 5 == 2, False, True])
-        action, hidden = session.run(None, {"observation": observation, "blank": blank, **feed})
+        action, state = session.run(None, {"observation": observation, "blank": blank, **feed})
         np.testing.assert_allclose(action[0], policy.act(observation[0], bool(blank[0])), atol=1e-5)
-        feed = {"previous_action": action, "hidden": hidden}
+        feed = {"previous_action": action, "state": state}
 
 
 def test_export_says_what_is_wrong_in_one_line(

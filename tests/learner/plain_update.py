@@ -81,7 +81,7 @@ class PlainUpdate:
 
     def unroll(self, memory: Memory, row: np.void) -> dict[int, Known]:
         """By observation, from the first trained one on; the burn-in without gradient."""
-        h, known, filled = torch.tensor(row["hidden"])[: memory.gru.hidden_size], {}, self.filled(row)
+        h, known, filled = torch.tensor(row["state"])[: memory.gru.hidden_size], {}, self.filled(row)
         for t in range(int(row["first"]), int(row["last"]) + 1):
             if t == self.burn_in:
                 h = h.detach()
@@ -99,7 +99,7 @@ class PlainUpdate:
     def filled(self, row: np.void) -> dict[int, Tensor]:
         """By observation, what the memory is given: for a blank one what the model expects, where it is asked."""
         memory, found = self.agent.memory, {}
-        h, last = torch.tensor(row["hidden"]).tensor_split([self.agent.config.hidden])
+        h, last = torch.tensor(row["state"]).tensor_split([self.agent.config.hidden])
         for t in range(int(row["first"]), int(row["last"]) + 1):
             previous = torch.tensor(row["prev_action"] if t == row["first"] else row["action"][t - 1])
             found[t] = self.seen(row, t)

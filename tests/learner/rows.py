@@ -6,7 +6,7 @@ import torch
 from common.window import Rows, WindowSpec
 from learner.batch import Batch, clear_padding, view_batch
 
-SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=4, train=5)
+SPEC = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=5)
 
 
 def observation_valid(rows: Rows, spec: WindowSpec = SPEC) -> np.ndarray:
@@ -30,7 +30,7 @@ def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC) -> Rows:
     rows["last"] = rng.integers(spec.burn_in + 1, spec.steps + 1, count)
     rows["terminated"] = rng.integers(0, 2, count)
     rows["blank"] = rng.uniform(size=rows["blank"].shape) < 0.3
-    for name in ("observation", "action", "prev_action", "reward", "hidden"):
+    for name in ("observation", "action", "prev_action", "reward", "state"):
         rows[name] = rng.uniform(-1.0, 1.0, rows[name].shape)
     observed, stepped = observation_valid(rows, spec), step_valid(rows, spec)
     rows["observation"] *= observed[..., None]

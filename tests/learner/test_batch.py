@@ -21,7 +21,7 @@ def test_fields_match_the_rows():
             assert bool(batch.step_valid[b, t]) == real
             assert float(batch.reward[b, t]) == (row["reward"][t] if real else 0.0)
             assert bool(batch.terminated[b, t]) == bool(row["terminated"] and t == row["last"] - 1)
-        np.testing.assert_array_equal(batch.hidden[b], row["hidden"])
+        np.testing.assert_array_equal(batch.state[b], row["state"])
         assert bool(batch.burned_in[b]) == (row["first"] == 0)
 
 

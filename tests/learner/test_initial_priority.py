@@ -21,7 +21,7 @@ from tests.learner.rows import SPEC, random_rows, to_batch
 @pytest.mark.parametrize("head_input", ["hidden", "hidden+observation"])
 def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput, fill: bool) -> None:
     config = AgentConfig(
-        hidden=SPEC.hidden, embedding=7, heads=(10, 9), head_input=head_input, normalize_observations=True,
+        hidden=SPEC.state, embedding=7, heads=(10, 9), head_input=head_input, normalize_observations=True,
         initial_priority="actor", fill_blanks=fill,
     )  # fmt: skip
     torch.manual_seed(0)
@@ -30,7 +30,7 @@ def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput, fil
     with torch.no_grad():
         agent.log_alpha.fill_(-1.0)
     update = UpdateConfig(n_step=n_step, gamma=0.9, eta=0.6)
-    spec = dataclasses.replace(SPEC, hidden=config.state_size(SPEC.obs_dim))
+    spec = dataclasses.replace(SPEC, state=config.state_size(SPEC.obs_dim))
     rater = InitialPriority(spec, config, update, seed=3)
     rater.load(safetensors.torch.save(agent.broadcast_weights()))
     rows = random_rows(6, spec=spec)
@@ -49,7 +49,7 @@ def test_critics_are_broadcast_only_where_they_are_needed() -> None:
 
 
 def test_weights_never_execute_code(tmp_path: Path) -> None:
-    rater = InitialPriority(SPEC, AgentConfig(hidden=SPEC.hidden, heads=(5, 5)), UpdateConfig(), seed=3)
+    rater = InitialPriority(SPEC, AgentConfig(hidden=SPEC.state, heads=(5, 5)), UpdateConfig(), seed=3)
     with pytest.raises(MessageError, match="not of this run"):
         rater.load(hostile_state(tmp_path / "owned"))
     assert not (tmp_path / "owned").exists()

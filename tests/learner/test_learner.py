@@ -18,7 +18,7 @@ from replay_server.server import ReplayConfig, ReplayServer
 from tests.hostile import hostile_state
 from tests.learner.rows import SPEC, random_rows
 
-AGENT = AgentConfig(hidden=SPEC.hidden, embedding=7, heads=(10, 9), normalize_observations=True)
+AGENT = AgentConfig(hidden=SPEC.state, embedding=7, heads=(10, 9), normalize_observations=True)
 CONFIG = LearnerConfig(batch_size=8, publish_updates=4, checkpoint_steps=2_000, precision="fp32")
 
 

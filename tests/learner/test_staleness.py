@@ -10,8 +10,8 @@ from common.agent import Agent, AgentConfig
 from common.window import Rows, WindowSpec
 from learner.staleness import measurable, staleness
 
-SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=4, train=5)
-UNBURNED = WindowSpec(obs_dim=3, action_dim=2, hidden=8, burn_in=0, train=5)
+SPEC = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=5)
+UNBURNED = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=0, train=5)
 AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), head_input="hidden+embedding", normalize_observations=True)
 FILLING = dataclasses.replace(AGENT, fill_blanks=True)
 STEPS = 32  # of the episode
@@ -45,7 +45,7 @@ def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray,
 
 
 def with_state(spec: WindowSpec, config: AgentConfig) -> WindowSpec:
-    return dataclasses.replace(spec, hidden=config.state_size(spec.obs_dim))
+    return dataclasses.replace(spec, state=config.state_size(spec.obs_dim))
 
 
 def play(agent: Agent, spec: WindowSpec) -> tuple[dict[str, np.ndarray], Rows]:
@@ -56,7 +56,7 @@ def play(agent: Agent, spec: WindowSpec) -> tuple[dict[str, np.ndarray], Rows]:
         "action": rng.uniform(-1, 1, (STEPS, spec.action_dim)).astype(np.float32),
         "blank": rng.random(STEPS + 1) < 0.2,
     }
-    states = [np.zeros(spec.hidden, np.float32)]
+    states = [np.zeros(spec.state, np.float32)]
     states += [h for h, _ in remembered(agent, episode, states[0], 0, STEPS)]
     rows = np.zeros(-(-STEPS // spec.train), spec.dtype)
     for row, block in zip(rows, range(0, STEPS, spec.train), strict=True):
@@ -67,7 +67,7 @@ def play(agent: Agent, spec: WindowSpec) -> tuple[dict[str, np.ndarray], Rows]:
         row["observation"][first : last + 1] = episode["observation"][start : end + 1]
         row["blank"][first : last + 1] = episode["blank"][start : end + 1]
         row["action"][first:last] = episode["action"][start:end]
-        row["hidden"] = states[start]
+        row["state"] = states[start]
     return episode, rows
 
 
@@ -90,8 +90,8 @@ def test_as_a_plain_loop_has_it(window: int, config: AgentConfig) -> None:
     actor, today, spec = make_agent(1, config), make_agent(2, config), with_state(SPEC, config)
     episode, rows = play(actor, spec)
     start = window * SPEC.train - SPEC.burn_in
-    stored = rows["hidden"][window]
-    truth = remembered(today, episode, np.zeros(spec.hidden, np.float32), 0, start + SPEC.steps)
+    stored = rows["state"][window]
+    truth = remembered(today, episode, np.zeros(spec.state, np.float32), 0, start + SPEC.steps)
     replayed = remembered(today, episode, stored, start, start + SPEC.steps)
     q = np.array([value for _, value in truth[start:]])
     gap = np.abs(np.array([value for _, value in replayed]) - q) / np.abs(q).max()
@@ -113,5 +113,5 @@ def test_as_a_plain_loop_has_it(window: int, config: AgentConfig) -> None:
 def test_a_state_of_zeros_is_wholly_stale() -> None:
     agent = make_agent(1)
     _, rows = play(agent, UNBURNED)
-    rows["hidden"] = 0.0
+    rows["state"] = 0.0
     assert staleness(agent, UNBURNED, rows[:3])["stale_state_stored"] == pytest.approx(1.0)

@@ -20,7 +20,7 @@ from learner.update import JointUpdate, UpdateConfig, make_update
 from tests.learner.rows import SPEC, random_rows
 
 EVERYTHING = AgentConfig(
-    hidden=SPEC.hidden,
+    hidden=SPEC.state,
     embedding=7,
     heads=(10, 9),
     layer_norm=True,

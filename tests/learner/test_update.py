@@ -15,14 +15,14 @@ from learner.update import TRAINS_MEMORY, JointUpdate, UpdateConfig, make_update
 from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
 
 ROBUST = AgentConfig(
-    hidden=SPEC.hidden,
+    hidden=SPEC.state,
     embedding=7,
     heads=(10, 9),
     layer_norm=True,
     head_input="hidden+embedding",
     normalize_observations=True,
 )
-PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding=False)
+PAPER = AgentConfig(hidden=SPEC.state, embedding=0, heads=(10, 9), grounding=False)
 BETA = torch.tensor(0.5)
 
 
@@ -116,7 +116,7 @@ def test_grounding_reaches_memory_and_world_model(monkeypatch):
 
 def test_what_fills_blanks_trains_itself_alone():
     config = dataclasses.replace(ROBUST, fill_blanks=True)
-    spec, update = dataclasses.replace(SPEC, hidden=config.state_size(SPEC.obs_dim)), make(config, scheme=4)
+    spec, update = dataclasses.replace(SPEC, state=config.state_size(SPEC.obs_dim)), make(config, scheme=4)
     parts, _ = update.forward(to_batch(random_rows(8, spec=spec), spec), BETA)
     named = dict(update.agent.named_parameters())
     for loss in parts:
@@ -154,7 +154,7 @@ def test_padded_burn_in_starts_from_the_stored_state():
     found = remember(update.agent.memory, batch.observation, batch, SPEC.burn_in).hidden
     n = SPEC.burn_in
     o, blank, previous = batch.observation[:, n:], batch.blank[:, n:], batch.prev_action[:, n:]
-    alone = update.agent.memory(o, blank, previous, batch.hidden).hidden
+    alone = update.agent.memory(o, blank, previous, batch.state).hidden
     assert torch.equal(found, alone)
 
 

@@ -12,9 +12,9 @@ from learner.update import UpdateConfig, make_update
 from tests.learner.plain_update import PlainUpdate
 from tests.learner.rows import SPEC, random_rows, to_batch
 
-PAPER = AgentConfig(hidden=SPEC.hidden, embedding=0, heads=(10, 9), grounding=False)
+PAPER = AgentConfig(hidden=SPEC.state, embedding=0, heads=(10, 9), grounding=False)
 ROBUST = AgentConfig(
-    hidden=SPEC.hidden,
+    hidden=SPEC.state,
     embedding=7,
     heads=(10, 9),
     head_input="hidden+embedding",
@@ -67,7 +67,7 @@ def test_three_updates_are_those_of_the_equations(agent: AgentConfig, options: d
     config = UpdateConfig(curiosity=BETA, learning_rate=1e-2, **options)  # type: ignore[arg-type]
     plain = PlainUpdate(copy.deepcopy(network), SPEC.burn_in, config, seed=3)
     update = make_update(network, SPEC.burn_in, config, seed=3)
-    spec = dataclasses.replace(SPEC, hidden=agent.state_size(SPEC.obs_dim))
+    spec = dataclasses.replace(SPEC, state=agent.state_size(SPEC.obs_dim))
     for turn in range(3):
         rows, importance = random_rows(4, turn, spec), np.linspace(0.3, 1.0, 4).astype(np.float32)
         expected, priorities = plain(rows, importance, BETA)

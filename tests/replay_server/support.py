@@ -11,7 +11,7 @@ from replay_server.server import ReplayConfig, ReplayServer
 
 Make = Callable[..., ReplayServer]
 OPEN = ReplayConfig(capacity=100, replay_ratio=1e6, warmup_steps=0)  # the limiter never holds anything back
-SPEC = WindowSpec(obs_dim=3, action_dim=2, hidden=4, burn_in=2, train=4)
+SPEC = WindowSpec(obs_dim=3, action_dim=2, state=4, burn_in=2, train=4)
 
 
 def make_rows(count: int, first_mark: int = 0, spec: WindowSpec = SPEC) -> Rows:

@@ -106,7 +106,7 @@ def test_another_layout_or_capacity_is_named(tmp_path: Path) -> None:
     Ring(tmp_path / "ring", SPEC, 10)
     with pytest.raises(ConfigError, match=r"--capacity=11: the ring in .* has 10"):
         Ring(tmp_path / "ring", SPEC, 11)
-    other = WindowSpec(obs_dim=4, action_dim=2, hidden=4, burn_in=2, train=4)
+    other = WindowSpec(obs_dim=4, action_dim=2, state=4, burn_in=2, train=4)
     with pytest.raises(ConfigError, match=f"layout {SPEC.fingerprint}, this run's of {other.fingerprint}"):
         Ring(tmp_path / "ring", other, 10)
 
