@@ -79,7 +79,7 @@ def draw(out: Path, paths: list[Path]) -> None:
                 panel.plot(line["flicker"], line["returns"], marker="o", markersize=3, label=name)
         panel.set(title=env, xlabel="probability that a frame is blank", ylabel="return")
         panel.grid(alpha=0.3)
-        panel.legend()
+        panel.legend(fontsize="small")
     figure.savefig(out, dpi=110)
 
 
