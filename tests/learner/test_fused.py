@@ -123,10 +123,12 @@ def test_parameters_keep_their_names_and_values(pair):
 FILLING = AgentConfig(hidden=24, embedding=20, heads=(40, 28), fill_blanks=True)
 
 
-def filled(config, low):
+def filled(config, low, scale=1.0):
     """By a plain and a fused agent, and the observations and which of them were blank."""
     torch.manual_seed(0)
     plain = Agent(3, 2, config)
+    with torch.no_grad():
+        plain.next_frame.net[4].weight *= scale
     fused = copy.deepcopy(plain)
     fuse(fused)
     generator = torch.Generator().manual_seed(3)
@@ -146,6 +148,11 @@ def test_blanks_are_filled_to_the_precision_of_bfloat16_and_nothing_else_is_touc
     assert 1e-5 < gap < 0.01
     assert 1e-5 < (after - plain_after).norm() / plain_after.norm() < 0.01
     assert (plain - o)[blank].norm() > 0.1
+
+
+def test_what_fills_a_blank_stays_where_observations_are():
+    for found, _ in filled(FILLING, low=True, scale=1e6)[:2]:
+        assert found.abs().max() == 10.0
 
 
 @pytest.mark.parametrize("changed", [{"embedding": 0}, {"layer_norm": True}, {}])
