@@ -167,10 +167,10 @@ class PolicyRunner:
                 x = torch.cat([x, beside[:, : self._beside]], 1)
         for layer in self._head:
             x = layer(x)
-        action, new_state = self._action(x.numpy(), noise), new_hidden.numpy()
-        return action, np.concatenate(
-            [new_state, self._input[:, : self._obs_dim]], 1
-        ) if self._next_frame else new_state
+        new_state: Floats = new_hidden.numpy()
+        if self._next_frame:
+            new_state = np.concatenate([new_state, self._input[:, : self._obs_dim]], 1)
+        return self._action(x.numpy(), noise), new_state
 
     def _seen(self, observation: Floats, prev_action: Floats, blank: BoolArray) -> Tensor:
         x = self._input
