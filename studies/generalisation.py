@@ -29,6 +29,7 @@ STUDY = Study(
         "RMC, not filling": "train ENV --no-fill-blanks",
         "SAC": "baseline sac ENV",
     },
+    small=Scale(100_000, (1, 2, 3)),
     full=Scale(1_000_000, (1, 2, 3, 4, 5), ENVS),
 )
 
