@@ -122,6 +122,8 @@ class Memory(nn.Module):
 
     def step(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
         """One step of it: (B, O) normalised, (B,) bool, (B, A), (B, H) -> (B, H) float32."""
+        if self.head_input == "observation":
+            return torch.zeros_like(hidden)
         embedding = self._embedded(observation, blank, prev_action)
         return torch.gru_cell(embedding, hidden, *self.gru.all_weights[0])
 

@@ -47,8 +47,9 @@ class FusedAgent(Agent):
 
     @torch.no_grad()
     def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """As ``Agent.fill``, which it is where the embedding has no plain layer."""
-        if not (self.config.embedding and _applies(observation)) or self.config.layer_norm:
+        """As ``Agent.fill``, which it is without a memory, or where the embedding has no plain layer."""
+        c = self.config
+        if not (c.embedding and _applies(observation)) or c.layer_norm or c.head_input == "observation":
             return super().fill(observation, blank, prev_action, state)
         with torch.autocast("cpu", enabled=False):
             return _fill(self, observation, blank, prev_action, state)

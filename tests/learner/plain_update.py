@@ -106,8 +106,8 @@ class PlainUpdate:
             if self.agent.config.fill_blanks and row["blank"][t]:
                 found[t] = self.agent.next_frame(h, last, previous).clamp(-10, 10)
             last = found[t]
-            if self.agent.config.head_input != "observation":
-                h = gru(memory, self.embedded(memory, row, t, found[t], previous), h)
+            without = self.agent.config.head_input == "observation"
+            h = 0 * h if without else gru(memory, self.embedded(memory, row, t, found[t], previous), h)
         return found
 
     def seen(self, row: np.void, t: int) -> Tensor:

@@ -155,7 +155,7 @@ def test_what_fills_a_blank_stays_where_observations_are():
         assert found.abs().max() == 10.0
 
 
-@pytest.mark.parametrize("changed", [{"embedding": 0}, {"layer_norm": True}, {}])
+@pytest.mark.parametrize("changed", [{"embedding": 0}, {"layer_norm": True}, {"head_input": "observation"}, {}])
 def test_where_the_fused_way_does_not_fit_blanks_are_filled_the_plain_way_to_the_bit(changed):
     plain, fused, o, blank = filled(dataclasses.replace(FILLING, **changed), low=bool(changed))
     assert all(map(torch.equal, plain, fused))

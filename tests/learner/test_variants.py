@@ -55,6 +55,7 @@ AGENTS = [
     dataclasses.replace(ROBUST, head_input="observation"),
     dataclasses.replace(ROBUST, head_input="hidden", fill_blanks=True),
     dataclasses.replace(ROBUST, fill_blanks=True),
+    dataclasses.replace(ROBUST, head_input="observation", fill_blanks=True),
 ]
 
 
