@@ -3,7 +3,7 @@
 from studies.study import Study
 
 WAYS = {
-    "robust": "",
+    "RMC": "",
     "told": "--blank-flag",
     "not filled": "--no-fill-blanks",
     "not filled, told": "--no-fill-blanks --blank-flag",
