@@ -93,7 +93,7 @@ def _head(inputs: int, hidden: tuple[int, int], outputs: int, rows: int) -> tupl
 
 
 class PolicyRunner:
-    """Observation, previous action and hidden state in; action and next hidden state out, for N environments."""
+    """Observation, previous action and state in; action and next state out, for N environments."""
 
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig, envs: int) -> None:
         self._config, self._envs = config, envs

@@ -266,7 +266,7 @@ class JointUpdate:
 
 
 class AlternateUpdate(JointUpdate):
-    """Algorithm 1 as printed: model, critics, policy and temperature in turn, each from a fresh forward.
+    """Algorithm 1 as printed: model, what fills, critics, policy, temperature in turn, each from a fresh forward.
 
     Each has an optimiser of its own, so that a memory that several losses train is moved by several.
     """
