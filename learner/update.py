@@ -1,6 +1,6 @@
 """The joint update: all four losses from the parameters as they stood, one backward, one step.
 
-Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, H hidden, Z head input.
+Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, H hidden, S state, Z head input.
 Nothing here waits for the host: no ``.item()``, no branch on a tensor, static shapes.
 """
 
