@@ -11,6 +11,7 @@ WAYS = {
     "longer windows": "--burn-in 20 --trained-steps 30",
     "observation beside": "--head-input hidden+observation",
     "no grounding": "--no-grounding",
+    "the model alone trains the memory": "--scheme 3",
 }
 STUDY = Study("blanks", {name: f"train ENV --flicker 0.5 {words}" for name, words in WAYS.items()})
 
