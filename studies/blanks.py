@@ -10,8 +10,8 @@ WAYS = {
     "longer burn-in": "--burn-in 30",
     "longer windows": "--burn-in 20 --trained-steps 30",
     "observation beside": "--head-input hidden+observation",
-    "no grounding": "--no-grounding",
-    "the model alone trains the memory": "--scheme 3",
+    "no grounding": "--no-grounding --scheme 1",
+    "scheme 1": "--scheme 1",
 }
 STUDY = Study("blanks", {name: f"train ENV --flicker 0.5 {words}" for name, words in WAYS.items()})
 

@@ -27,6 +27,7 @@ STUDY = Study(
     {
         "RMC": "train ENV",
         "RMC, not filling": "train ENV --no-fill-blanks",
+        "RMC, scheme 1": "train ENV --scheme 1",
         "SAC": "baseline sac ENV",
     },
     small=Scale(100_000, (1, 2, 3)),

@@ -21,8 +21,9 @@ RUNGS = {
     "normalised observations": f"train ENV {BARE} --scheme 2 {ALONE}",
     "a memory beside o": f"train ENV {BARE} --scheme 2 --head-input hidden+observation",
     "a memory alone": f"train ENV {BARE} --scheme 2",
-    "the model's loss": f"train ENV {BARE}",
-    "grounding, robust": "train ENV",
+    "the model's loss": f"train ENV {BARE} --scheme 1",
+    "grounding": "train ENV --scheme 1",
+    "no value in the memory, robust": "train ENV",
     "curiosity": "train ENV --curiosity 0.1 --curiosity-scale std",
 }
 STUDY = Study("ladder", RUNGS, small=Scale(60_000, (1, 2)))
