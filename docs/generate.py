@@ -57,7 +57,7 @@ WHEN = {
     "head_input": "rarely: the embedding beside it cost return in the [trial](results.md)",
     "critic_norm": "rarely: it cost return in the [trial](results.md)",
     "normalize_observations": "off where observations are scaled already and their statistics keep moving",
-    "grounding": "off for the paper's model, with --scheme 1; without it the latent can collapse in others",
+    "grounding": "off for the paper's model, with `--scheme 1`; without it the latent can collapse in others",
     "fill_blanks": "rarely: without it blank frames cost far more return, see [results](results.md)",
     "blank_flag": "with flicker, to see what the flag is worth; the paper has none",
     "initial_priority": "`actor` where new windows should not all be drawn soon; it costs the actors a forward pass",
