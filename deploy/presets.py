@@ -119,9 +119,7 @@ def paper(env: EnvConfig) -> RunConfig:
         agent=AgentConfig(embedding=0, grounding=False),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(warmup_steps=10_000),
-        update=UpdateConfig(
-            learning_rate=1e-4, alpha_learning_rate=1e-5, clip_norm=0.0, policy_q="first", curiosity=0.5
-        ),
+        update=UpdateConfig(learning_rate=1e-4, alpha_learning_rate=1e-5, policy_q="first", curiosity=0.5),
     )
 
 

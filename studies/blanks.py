@@ -10,8 +10,9 @@ WAYS = {
     "longer burn-in": "--burn-in 30",
     "longer windows": "--burn-in 20 --trained-steps 30",
     "observation beside": "--head-input hidden+observation",
-    "no grounding": "--no-grounding --scheme 1",
-    "scheme 1": "--scheme 1",
+    "no grounding": "--no-grounding --scheme 1 --clip-norm 40",
+    "clipped": "--clip-norm 40",
+    "scheme 1": "--scheme 1 --clip-norm 40",
 }
 STUDY = Study("blanks", {name: f"train ENV --flicker 0.5 {words}" for name, words in WAYS.items()})
 

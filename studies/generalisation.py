@@ -27,7 +27,8 @@ STUDY = Study(
     {
         "RMC": "train ENV",
         "RMC, not filling": "train ENV --no-fill-blanks",
-        "RMC, scheme 1": "train ENV --scheme 1",
+        "RMC, clipped": "train ENV --clip-norm 40",
+        "RMC, scheme 1": "train ENV --scheme 1 --clip-norm 40",
         "SAC": "baseline sac ENV",
     },
     small=Scale(100_000, (1, 2, 3)),

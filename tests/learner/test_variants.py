@@ -41,7 +41,7 @@ VARIANTS = [
     {"n_step": 2},
     {"n_step": 9},
     {"clip_norm": 0.3},
-    {"clip_norm": 0.0},
+    {"clip_norm": 40.0},
     {"memory_learning_scale": 0.1},
     {"gamma": 0.5, "polyak": 0.9, "eta": 0.3, "target_memory": "ema"},
 ]
