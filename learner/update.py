@@ -217,8 +217,10 @@ class JointUpdate:
         """Backward from the losses' sum, clip, Adam; returns the gradient's norm before clipping."""
         self.agent.zero_grad(set_to_none=True)
         sum(parts, torch.zeros_like(self.agent.log_alpha)).backward()  # type: ignore[no-untyped-call]
-        limit = self.config.clip_norm or float("inf")
-        norm = nn.utils.clip_grad_norm_(self.agent.parameters(), limit)
+        gradients = [value.grad for value in self.agent.parameters() if value.grad is not None]
+        norm = nn.utils.get_total_norm(gradients)
+        if self.config.clip_norm:
+            nn.utils.clip_grads_with_norm_(self.agent.parameters(), self.config.clip_norm, norm)
         optimizer.step()
         return norm.detach()
 
