@@ -152,11 +152,15 @@ def _trained(job: Job, cores: set[int]) -> history.History:
         last = log.read_text().strip().splitlines()[-1:]
         raise ConfigError(job.agent, shlex.join(job.words), f"ended with {status}: {' '.join(last)}; see {log}")
     (found,) = history.read(job.folder)
-    return dataclasses.replace(found, agent=job.agent, commit=_commit())
+    return dataclasses.replace(found, agent=job.agent, commit=commit())
 
 
-def _commit() -> str:
-    """Of the code that runs; with a + where it has changed since."""
-    git = ["git", "-C", str(RESULTS.parent), "describe", "--always", "--abbrev=7", "--dirty=+", "--exclude=*"]
-    found = subprocess.run(git, capture_output=True, text=True, check=False)
-    return found.stdout.strip()
+def commit(studies: Path = RESULTS.parent) -> str:
+    """Of the code that runs; with a + where it has changed since. Results are no code; "" outside a repository."""
+
+    def git(*words: str) -> str:
+        found = subprocess.run(["git", "-C", str(studies), *words], capture_output=True, text=True, check=False)
+        return found.stdout.strip()
+
+    changed = git("diff", "--name-only", "HEAD", "--", ":(top)", f":(exclude){RESULTS.name}")
+    return git("rev-parse", "--short=7", "HEAD") + "+" * bool(changed)

@@ -5,6 +5,7 @@ import importlib
 import json
 import os
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -88,6 +89,28 @@ def test_ctrl_c_starts_no_other_run(tmp_path, monkeypatch):
     finally:
         signal.signal(signal.SIGINT, before)
     assert begun == ["1"]
+
+
+def test_results_do_not_change_the_commit_but_code_does(tmp_path):
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *words]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+    code, lines = tmp_path / "actor.py", tmp_path / "studies" / "results" / "one.jsonl"
+    lines.parent.mkdir(parents=True)
+    assert not study.commit(lines.parent.parent)
+    git("init", "-q")
+    code.write_text("1\n")
+    lines.write_text("1\n")
+    git("add", ".")
+    git("commit", "-qm", "first")
+    first = git("rev-parse", "--short=7", "HEAD").strip()
+    lines.write_text("1\n2\n")
+    assert study.commit(lines.parent.parent) == first
+    code.write_text("2\n")
+    assert study.commit(lines.parent.parent) == first + "+"
+    git("add", ".")  # as much where it is staged
+    assert study.commit(lines.parent.parent) == first + "+"
 
 
 def test_a_wrong_agent_is_refused():
