@@ -69,7 +69,7 @@ trial_ema_latent := --latent-target ema
 trial_ema_memory := --target-memory ema
 trial_curiosity := --curiosity 0.1 --curiosity-scale std
 trial_shortcut := --head-input hidden+embedding
-trial_raw_observations := --no-normalize-observations
+trial_raw_observations := --no-normalize-observations --no-fill-blanks
 TRIALS := base layer_norm prioritized ema_latent ema_memory curiosity shortcut raw_observations
 
 trial: $(STAMP)

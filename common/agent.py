@@ -43,13 +43,14 @@ class AgentConfig:
     grounding: bool = True
     """The world model also predicts the next observation's change and the reward."""
     blank_flag: bool = False
-    """The memory is told which observations are blank (flickered out), not left to tell them from zeros."""
+    """The memory has one more input, which says whether the observation is blank (flickered out)."""
     fill_blanks: bool = False
-    """The memory is given, in the place of a blank observation, what a network of its own expects there from what was
-    last seen, the memory and the action. The recurrent state then is h and what was last seen."""
+    """A blank observation is replaced, before the memory reads it, by what a small network of its own predicts from the
+    observation before (filled itself if it was blank), the memory and the last action. The stored state then is h and
+    that observation. Needs normalized observations."""
     initial_priority: Literal["max", "actor"] = "max"
-    """Priority that a window enters the replay with: the largest seen, or its TD error by the networks of its actor, to
-    which the critics are then sent, too."""
+    """Priority that a window enters a prioritized replay with: the largest seen, or the TD error that its actor
+    computes, to which the critics are then sent, too."""
 
     def state_size(self, obs_dim: int) -> int:
         """S, numbers that an actor carries from step to step, and stores: h, and what was last seen where it fills."""
@@ -321,7 +322,7 @@ class Agent(nn.Module):
         return self.memory(seen, blank, prev_action, state), seen, after
 
     def policy_weights(self) -> dict[str, Tensor]:
-        """What it takes to act, detached, on the CPU: the world model, too, where it fills blanks."""
+        """What it takes to act, detached, on the CPU: what fills blanks, too, where they are filled."""
         return self._weights(self._acting())
 
     def broadcast_weights(self) -> dict[str, Tensor]:
