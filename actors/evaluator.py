@@ -36,6 +36,14 @@ class EvaluatorConfig:
     """Episodes per evaluation, played side by side with the policy's mean."""
 
 
+def first_start(run_seed: int, final: bool = False) -> int:
+    """Seed of the first episode of an evaluation, those after it count on from there.
+
+    A run's last evaluation, and ``rmc evaluate``, start elsewhere than those that tell which checkpoint is the best.
+    """
+    return int(np.random.SeedSequence([run_seed, final]).generate_state(1)[0]) >> 1  # leaves room for those after it
+
+
 class Player(Protocol):
     """What plays: a ``PolicyRunner``, or another agent that acts like one."""
 
@@ -148,10 +156,10 @@ class Evaluator:
         bus: Bus,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``clock`` times the looks for new policies."""
+        """``seed`` is the run's; ``clock`` times the looks for new policies."""
         if config.episodes < 1:
             raise ConfigError("--episodes", config.episodes, "at least 1")
-        self._seed, self._bus, self._clock = seed, bus, clock
+        self._seed, self._bus, self._clock = first_start(seed), bus, clock
         self._make_env, self._envs = make_env, [make_env() for _ in range(config.episodes)]
         observation, action = self._envs[0].observation_space.shape, self._envs[0].action_space.shape
         assert observation

@@ -270,7 +270,8 @@ def squashed_sample(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tenso
 
 
 class Agent(nn.Module):
-    """All of it. Actors use ``normalizer``, ``memory`` and ``policy``; the learner everything."""
+    """All of it. Actors use ``normalizer``, ``memory`` and ``policy``; ``next_frame`` where blanks are filled, and
+    ``critic`` where they rate their windows; the learner everything."""
 
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
@@ -315,11 +316,19 @@ class Agent(nn.Module):
         self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor
     ) -> tuple[Remembered, Tensor, Tensor]:
         """The memory along a sequence; what it was given, (B, T, O), blanks filled; and the state after, (B, S)."""
-        if not self.config.fill_blanks:
-            remembered: Remembered = self.memory(observation, blank, prev_action, state)
-            return remembered, observation, remembered.hidden[:, -1]
-        seen, after = self.fill(observation, blank, prev_action, state)
-        return self.memory(seen, blank, prev_action, state), seen, after
+        seen = observation
+        if self.fills(blank):
+            seen, after = self.fill(observation, blank, prev_action, state)
+        remembered: Remembered = self.memory(seen, blank, prev_action, state)
+        if seen is observation:
+            last_seen = seen[:, -1, : state.shape[1] - self.config.hidden]
+            after = torch.cat([remembered.hidden[:, -1], last_seen], 1)
+        return remembered, seen, after
+
+    def fills(self, blank: Tensor) -> bool:
+        """Whether there may be anything to fill; a GPU would have to wait to be asked, an export cannot ask."""
+        cannot_ask = blank.device.type != "cpu" or torch.compiler.is_exporting()
+        return self.config.fill_blanks and (cannot_ask or bool(blank.any()))
 
     def policy_weights(self) -> dict[str, Tensor]:
         """What it takes to act, detached, on the CPU: what fills blanks, too, where they are filled."""

@@ -45,7 +45,7 @@ class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
         return self._vector(observation), float(reward), terminated, truncated, info
 
     def _vector(self, observation: Any) -> Floats:
-        vector = np.asarray(observation, np.float32)
+        vector = np.array(observation, np.float32)  # a copy: some environments write into the same one again
         if vector.shape != self._shape:
             raise ValueError(f"its observation has shape {vector.shape}, its space says {self._shape}")
         return vector

@@ -25,16 +25,17 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from actors.evaluator import play_episodes
+from actors.evaluator import first_start, play_episodes
 from common.envs import EnvConfig, first_env, make_env
 from common.errors import ConfigError
 from common.role import StopSignal
 from common.wrappers import Floats
 from deploy.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, transitions_per_update, validate
+from deploy.evaluation import FINAL_EPISODES
 from deploy.run_folder import RunFolder
 
 CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
-FINAL_EPISODES, STOPPED = 10, 130
+STOPPED = 130  # exit status after Ctrl-C, as shells have it
 SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
 RECORD_SECONDS = 5.0
 MODEL, BUFFER, SCALES, PROGRESS = "model.zip", "replay_buffer.pkl", "scales.pkl", "progress.json"
@@ -218,19 +219,19 @@ class _Run(BaseCallback):
 
     # -- evaluation and records -------------------------------------------------------------------------
 
-    def _play(self, episodes: int) -> dict[str, Any]:
-        opponent = Opponent(self._model, _scaled_by(self._vec), episodes)
-        return _returns(play_episodes(opponent, lambda: make_env(self.config.env), episodes, self.config.seed))
+    def _play(self, episodes: int, final: bool) -> dict[str, Any]:
+        opponent, seed = Opponent(self._model, _scaled_by(self._vec), episodes), first_start(self.config.seed, final)
+        return _returns(play_episodes(opponent, lambda: make_env(self.config.env), episodes, seed))
 
     def _first_evaluation(self) -> float:
         """Of what it was before any training, once for the folder."""
         initial = self.folder.path / "initial.json"
         if not initial.exists():
-            initial.write_text(json.dumps(self._play(FINAL_EPISODES)) + "\n")
+            initial.write_text(json.dumps(self._play(FINAL_EPISODES, final=True)) + "\n")
         return float(json.loads(initial.read_bytes())["eval_return_mean"])
 
     def _evaluate(self) -> None:
-        found = self._play(self.config.episodes)
+        found = self._play(self.config.episodes, final=False)
         self._write_progress()
         self._write("evaluator", {**found, "eval_update": self.updates, "eval_env_steps": self.steps})
         mean, deviation = found["eval_return_mean"], found["eval_return_std"]
@@ -255,7 +256,7 @@ class _Run(BaseCallback):
             "seed": self.config.seed,
             "env_steps": self.steps,
             "updates": self.updates,
-            **self._play(FINAL_EPISODES),
+            **self._play(FINAL_EPISODES, final=True),
             "eval_flicker": self.config.env.flicker,
             "initial_return_mean": self._initial,
             "wall_s": self._wall(),
@@ -274,7 +275,8 @@ def evaluate(folder: RunFolder, episodes: int, flicker: float | None = None) -> 
     scales = states[-1] / SCALES
     bare = DummyVecEnv([lambda: make_env(env)])
     scaled = _scaled_by(VecNormalize.load(str(scales), bare) if scales.exists() else bare)
-    returns = play_episodes(Opponent(model, scaled, episodes), lambda: make_env(env), episodes, raw["seed"])
+    seed = first_start(raw["seed"], final=True)
+    returns = play_episodes(Opponent(model, scaled, episodes), lambda: make_env(env), episodes, seed)
     bare.close()
     progress = json.loads((states[-1] / PROGRESS).read_bytes())
     about = {"env": env.id, "preset": raw["name"], "seed": raw["seed"], **progress}

@@ -8,7 +8,7 @@ import numpy as np
 import safetensors.torch
 import torch
 
-from actors.evaluator import play_episodes
+from actors.evaluator import first_start, play_episodes
 from actors.policy_runner import PolicyRunner
 from common.agent import Agent
 from common.checkpoint import CheckpointFolder
@@ -16,8 +16,9 @@ from common.envs import make_env
 from common.errors import CheckpointError, ConfigError
 from deploy.presets import RunConfig
 from deploy.run_folder import RunFolder
+from learner.learner import POLICY, PROGRESS, STATE
 
-STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
+FINAL_EPISODES = 10  # of a run's first and last evaluation
 
 
 def evaluate_blob(config: RunConfig, blob: bytes, episodes: int, flicker: float | None = None) -> dict[str, Any]:
@@ -26,7 +27,7 @@ def evaluate_blob(config: RunConfig, blob: bytes, episodes: int, flicker: float 
     spec = config.window_spec()
     runner = PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, episodes)
     runner.load(blob)
-    returns = play_episodes(runner, lambda: make_env(env), episodes, config.seed)
+    returns = play_episodes(runner, lambda: make_env(env), episodes, first_start(config.seed, final=True))
     return {
         "eval_return_mean": float(np.mean(returns)),
         "eval_return_std": float(np.std(returns)),

@@ -18,10 +18,11 @@ from torch import Tensor
 from actors.evaluator import LONGEST_EPISODE
 from common.agent import Agent, Remembered
 from common.errors import ConfigError
-from deploy.evaluation import STATE, load_state
+from deploy.evaluation import load_state
 from deploy.policy import load_policy
 from deploy.presets import RunConfig
 from deploy.run_folder import RunFolder, check_writable
+from learner.learner import STATE
 from learner.losses import model_error
 from learner.update import share_unexplained
 

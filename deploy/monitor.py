@@ -72,7 +72,11 @@ class Monitor:
     def record(self, record: dict[str, Any]) -> None:
         """Write one record (with its ``role``) and take it into the view."""
         self.board.take(record)
-        self._journal.write(record, self.board.env_steps)
+        at = self.board.checkpoint_steps(record.get("eval_update"))  # an evaluation belongs where its checkpoint was
+        if at is None:
+            self._journal.write(record, self.board.env_steps)
+        else:
+            self._journal.write(record | {"eval_env_steps": at}, at)
         update, score = record.get("eval_update"), record.get("eval_return_mean")
         if (
             record["role"] == "evaluator" and isinstance(update, int) and is_finite(score)

@@ -107,7 +107,7 @@ def robust(env: EnvConfig) -> RunConfig:
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0),
         update=UpdateConfig(scheme=3),
-        learner=LearnerConfig(batch_size=8, importance_exponent=0.0),
+        learner=LearnerConfig(batch_size=8, importance_exponent=0.0, publish_updates=80),
     )
 
 

@@ -22,16 +22,16 @@ from common.errors import ConfigError, RoleDied
 from common.redis_url import shown
 from common.role import StopSignal
 from deploy import attachment, local, lockstep
-from deploy.evaluation import evaluate_blob, evaluate_checkpoint, initial_policy
+from deploy.evaluation import FINAL_EPISODES, evaluate_blob, evaluate_checkpoint, initial_policy
 from deploy.monitor import Monitor
 from deploy.presets import RunConfig, validate
 from deploy.resources import check_ring_fits
 from deploy.roles import check_device, cores
 from deploy.run_folder import IfExists, RunFolder, open_run
 from deploy.supervisor import EXIT_CONFIG
+from learner.learner import PROGRESS
 
 Launcher = Literal["local", "ray", "lockstep", "manual"]
-FINAL_EPISODES = 10  # of the last evaluation
 STOPPED = 130  # exit status after Ctrl-C, as shells have it
 log = logging.getLogger(__name__)
 
@@ -141,7 +141,7 @@ def say_end(folder: RunFolder, console: Console) -> int:
         return _say_result(folder, console)
     if status == STOPPED:
         found = CheckpointFolder(folder.checkpoints).latest()
-        steps = json.loads(found[1]["progress.json"])["env_steps"] if found else 0
+        steps = json.loads(found[1][PROGRESS])["env_steps"] if found else 0
         return _say_stopped(folder, config, steps, console)
     log_file = folder.logs / "launcher.log"
     words = log_file.read_text(errors="replace").strip().splitlines()[-30:] if log_file.exists() else []

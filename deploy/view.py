@@ -48,6 +48,12 @@ class Board:
         steps = self.replay("env_steps", sum) or self.get("learner", "env_steps") or 0
         return int(steps) if 0 <= steps < LARGEST_STEP else 0  # and so not NaN
 
+    def checkpoint_steps(self, update: int | None) -> int | None:
+        """Environment steps at the checkpoint of that update, or None where the learner has said them of another."""
+        steps = self.get("learner", "checkpoint_env_steps")
+        known = update is not None and update == self.get("learner", "checkpoint_update")
+        return int(steps) if known and steps is not None and 0 <= steps < LARGEST_STEP else None
+
     def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:
         """The sum or mean ``over`` all replay servers, or None."""
         found = [record[name] for role, record in self.roles.items() if role.startswith("replay") and name in record]

@@ -16,7 +16,7 @@ from common.window import Rows, WindowSpec
 
 @dataclass(frozen=True)
 class Batch:
-    """What the update reads; everything outside the masks is zero."""
+    """What the update reads, as it was seen; zero outside the masks."""
 
     observation: Tensor  # (B, T + 1, O) raw
     prev_action: Tensor  # (B, T + 1, A), a_{t-1}

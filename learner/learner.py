@@ -89,7 +89,7 @@ class Learner:
     ) -> None:
         self.spec, self.config, self.replay, self.bus, self.checkpoints = spec, config, replay, bus, checkpoints
         self.device = torch.device(device)
-        self.updates = self.env_steps = self.last_checkpoint = 0
+        self.updates = self.env_steps = self.last_checkpoint = self._checkpoint_steps = 0
         self.finished = self._fenced = self._diverged = self._evaluation_due = False
         self._means, self._rate, self._waiting = Means(), Rate(), ""
         self._unexplained: list[float] = []  # of every observation dimension, since the last look at it
@@ -239,7 +239,7 @@ class Learner:
             return False
         self._checkpoint_error = ""
         self._evaluation_due = True
-        self.last_checkpoint = self.updates
+        self.last_checkpoint, self._checkpoint_steps = self.updates, self.env_steps
         self._next_checkpoint = self._after(self.env_steps)
         self._broadcast(evaluate=True)
         return True
@@ -278,6 +278,7 @@ class Learner:
             progress = json.loads(files[PROGRESS])
             self.updates = self.last_checkpoint = int(progress["updates"])
             self.env_steps, epoch = int(progress["env_steps"]), int(progress["epoch"])
+            self._checkpoint_steps = self.env_steps
         except NOT_OURS as error:
             reason = (str(error).strip() or "empty").splitlines()[0]
             raise CheckpointError(f"{self.checkpoints.path(number)}: {STATE} is not this run's ({reason})") from None
@@ -296,6 +297,8 @@ class Learner:
             "env_steps": self.env_steps,
             "beta": self.update.config.beta(self.env_steps),
             "epoch": self.epoch,
+            "checkpoint_update": self.last_checkpoint,
+            "checkpoint_env_steps": self._checkpoint_steps,
             "checkpoint_error": self._checkpoint_error,
             **({"observation_unexplained": unexplained} if unexplained else {}),
             **self._means.take(),

@@ -1,4 +1,4 @@
-"""The joint update: all four losses from the parameters as they stood, one backward, one step.
+"""The joint update: all losses from the parameters as they stood, one backward, one step; or one after the other.
 
 Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, H hidden, S state, Z head input.
 Nothing here waits for the host: no ``.item()``, no branch on a tensor, static shapes.
@@ -322,7 +322,7 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
 
 def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
     """(B, L + 1, O) with blank frames filled where configured, along the states that ``remember`` goes through."""
-    if not agent.config.fill_blanks or (o.device.type == "cpu" and not batch.blank.any()):  # a GPU would have to wait
+    if not agent.fills(batch.blank):
         return o
 
     def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:

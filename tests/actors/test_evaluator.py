@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from safetensors.torch import save
 
-from actors.evaluator import Evaluator, EvaluatorConfig, Match, play_episodes
+from actors.evaluator import Evaluator, EvaluatorConfig, Match, first_start, play_episodes
 from actors.policy_runner import PolicyRunner
 from common.agent import Agent, AgentConfig
 from common.bus import Bus, MemoryBus, Version
@@ -60,6 +60,15 @@ def test_an_episode_without_end_is_judged_by_its_start(monkeypatch: pytest.Monke
     match = Match(runner_for(Agent(3, 1, AGENT), 2), envs, seed=0)
     rounds = next(count for count in itertools.count(1) if not match.step())
     assert (rounds, match.steps) == (30, 60)
+
+
+def test_what_picks_the_best_is_not_what_judges_it() -> None:
+    """Nor do two seeds' evaluations share a start, of up to a thousand episodes."""
+    starts = [first_start(seed, final) for seed in range(100) for final in (False, True)]
+    assert min(np.diff(sorted(starts))) > 1_000
+    assert min(starts) >= 0
+    assert max(starts) < 2**31
+    assert starts == [first_start(seed, final) for seed in range(100) for final in (False, True)]
 
 
 def publish(bus: Bus, update: int, evaluate: bool) -> None:

@@ -93,6 +93,33 @@ def test_a_time_limit_counts_the_environments_steps(repeat: int, limit: int, ste
     env.close()
 
 
+class Reused(gym.Env[Any, Any]):
+    """Counts, in the one array that it ever gives."""
+
+    observation_space, action_space = gym.spaces.Box(-9, 9, (1,)), gym.spaces.Box(-1, 1, (1,))
+
+    def __init__(self) -> None:
+        self._seen = np.zeros(1, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self._seen[:] = 0
+        return self._seen, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._seen += 1
+        return self._seen, 0.0, False, False, {}
+
+
+gym.register("Reused-v0", entry_point=Reused)
+
+
+def test_an_environment_may_write_into_the_array_that_it_gave() -> None:
+    env = make_env(EnvConfig("Reused-v0", frame_stack=3))
+    before, _ = env.reset(seed=0)
+    seen = [env.step(np.zeros(1, np.float32))[0].tolist() for _ in range(3)]
+    assert (before.tolist(), seen) == ([0, 0, 0], [[0, 0, 1], [0, 1, 2], [1, 2, 3]])
+
+
 class Parts(gym.Env[Any, Any]):
     """A Dict of boxes."""
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from common.bus import MemoryBus
 from common.envs import EnvConfig
@@ -109,6 +110,23 @@ def test_each_role_speaks_for_itself_only(monitor: Monitor, tmp_path: Path) -> N
     lines = [json.loads(text) for text in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert {record["role"] for record in lines} == {"actor-0", "launcher"}
     assert monitor.board.get("learner", "updates") is None
+
+
+def test_an_evaluation_stands_where_its_checkpoint_was(monitor: Monitor, tmp_path: Path) -> None:
+    def says(role: str, **said: float) -> None:
+        bus.emit(role, {"time": 1.0, **said})
+        monitor.watch(bus)
+
+    bus = MemoryBus()
+    says("replay", env_steps=1_300)
+    says("evaluator", eval_update=3, eval_return_mean=1.0)  # of a checkpoint that the learner has not spoken of
+    says("learner", checkpoint_update=4, checkpoint_env_steps=1_000)
+    says("evaluator", eval_update=4, eval_return_mean=2.0)
+    monitor.close()
+    lines = [json.loads(text) for text in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert [one.get("eval_env_steps") for one in lines if one["role"] == "evaluator"] == [None, 1_000]
+    events = EventAccumulator(str(tmp_path / "run" / "events")).Reload().Scalars("evaluator/eval_return_mean")
+    assert [(event.step, event.value) for event in events] == [(1_300, 1.0), (1_000, 2.0)]
 
 
 def test_new_names_without_end_are_left_out(monitor: Monitor) -> None:

@@ -48,13 +48,13 @@ def with_state(spec: WindowSpec, config: AgentConfig) -> WindowSpec:
     return dataclasses.replace(spec, state=config.state_size(spec.obs_dim))
 
 
-def play(agent: Agent, spec: WindowSpec) -> tuple[dict[str, np.ndarray], Rows]:
+def play(agent: Agent, spec: WindowSpec, blanks: float = 0.2) -> tuple[dict[str, np.ndarray], Rows]:
     """An episode, and its windows with the states that ``agent`` had."""
     rng = np.random.default_rng(0)
     episode = {
         "observation": rng.normal(size=(STEPS + 1, spec.obs_dim)).astype(np.float32),
         "action": rng.uniform(-1, 1, (STEPS, spec.action_dim)).astype(np.float32),
-        "blank": rng.random(STEPS + 1) < 0.2,
+        "blank": rng.random(STEPS + 1) < blanks,
     }
     states = [np.zeros(spec.state, np.float32)]
     states += [h for h, _ in remembered(agent, episode, states[0], 0, STEPS)]
@@ -73,9 +73,10 @@ def play(agent: Agent, spec: WindowSpec) -> tuple[dict[str, np.ndarray], Rows]:
 
 @pytest.mark.parametrize("config", [AGENT, FILLING], ids=["zeros", "filled"])
 @pytest.mark.parametrize("spec", [SPEC, UNBURNED])
-def test_todays_weights_find_nothing_stale(spec: WindowSpec, config: AgentConfig) -> None:
+@pytest.mark.parametrize("blanks", [0.0, 0.2])
+def test_todays_weights_find_nothing_stale(spec: WindowSpec, config: AgentConfig, blanks: float) -> None:
     agent, spec = make_agent(1, config), with_state(spec, config)
-    _, rows = play(agent, spec)
+    _, rows = play(agent, spec, blanks)
     chosen = np.flatnonzero(measurable(rows, spec))
     assert chosen.tolist() == [1, 2, 3, 4, 5]  # not the first, not the short
     for window in chosen:
