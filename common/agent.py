@@ -330,6 +330,10 @@ class Agent(nn.Module):
         cannot_ask = blank.device.type != "cpu" or torch.compiler.is_exporting()
         return self.config.fill_blanks and (cannot_ask or bool(blank.any()))
 
+    def acting(self) -> dict[str, nn.Parameter]:
+        """The parameters that it takes to act, by name."""
+        return {name: value for name, value in self.named_parameters() if name.startswith(self._acting())}
+
     def policy_weights(self) -> dict[str, Tensor]:
         """What it takes to act, detached, on the CPU: what fills blanks, too, where they are filled."""
         return self._weights(self._acting())

@@ -14,6 +14,7 @@ Every Redis key, R = ``rmc:{run}``:
 | R:weights               | string | learner  | ``epoch update pieces crc32`` of the newest weights      |
 | R:weights:EPOCH:UPDATE:I| string | learner  | piece I (256 KiB) of a policy, safetensors               |
 | R:evaluate              | string | learner  | ``epoch update pieces crc32`` the evaluator should play  |
+| R:evaluate:EPOCH:UPDATE:I| string | learner | piece I of that policy                                   |
 | R:metrics:ROLE          | stream | ROLE     | records, msgpack, about the last 300                     |
 | R:stop                  | string | launcher | why the run should end                                   |
 | R:dead                  | stream | replay   | refused entries: actor, id, reason, first 1 KiB; 1 000   |
@@ -150,10 +151,10 @@ class Bus(Protocol):
         """Where that replay server listens, once it does."""
 
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
-        """Make a policy the newest; ``evaluate`` also asks the evaluator to play it. Raises FencedError."""
+        """Make a policy the newest that acts, or the newest that the evaluator should play. Raises FencedError."""
 
     def latest_version(self, evaluate: bool = False) -> Version | None:
-        """The newest policy's version, or of the newest to evaluate."""
+        """Of the newest policy that acts, or of the newest to evaluate."""
 
     def weights(self, evaluate: bool = False) -> tuple[Version, bytes] | None:
         """The newest policy, or the newest to evaluate. None if there is none or it was just replaced."""
@@ -277,9 +278,7 @@ class MemoryBus:
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
         if version.epoch < self.current_epoch("learner"):
             raise FencedError(f"learner epoch {version.epoch} was replaced")
-        self._weights[False] = (version, blob)
-        if evaluate:
-            self._weights[True] = (version, blob)
+        self._weights[evaluate] = (version, blob)
 
     def latest_version(self, evaluate: bool = False) -> Version | None:
         return self._weights[evaluate][0] if evaluate in self._weights else None

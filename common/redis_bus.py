@@ -18,6 +18,7 @@ from common.redis_url import shown
 
 DEAD_LETTERS_KEPT = 1_000
 INTEGER = re.compile(rb"-?[0-9]{1,18}")
+KINDS = ("weights", "evaluate")  # of policies: what acts, and what is evaluated
 PIECES = 4096  # of a policy, at most: 1 GiB
 UNPUBLISHED_SECONDS = 300  # that a piece is kept whose version has not become the newest: far more than all take
 RECORDS_READ = 1_000  # of a role at a time
@@ -76,8 +77,9 @@ class RedisBus:
     def expire(self, seconds: int | None) -> None:
         """Let all that this run has in Redis vanish after so many seconds; None takes that back."""
         pattern = re.sub(r"([*?\[\]\\])", r"\\\1", self._prefix) + ":*"
-        pieces = self._key("weights", "").encode()
-        named = {key.encode() for version, count in self._heads() for key in self._piece_keys(version, count)}
+        pieces = tuple(self._key(kind, "").encode() for kind in KINDS)
+        heads = ((self._head(evaluate), evaluate) for evaluate in (False, True))
+        named = {key.encode() for head, kind in heads if head for key in self._piece_keys(head[0], head[1], kind)}
         for key in self._call(lambda: list(self._redis.scan_iter(match=pattern, count=1000))):
             if seconds is not None:
                 self._call(self._redis.expire, key, seconds)
@@ -246,12 +248,13 @@ class RedisBus:
 
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
         pieces = split_pieces(blob)
-        keys = self._piece_keys(version, len(pieces))
+        keys = self._piece_keys(version, len(pieces), evaluate)
         for key, piece in zip(keys, pieces, strict=True):  # one call each: a pipeline would make them one blob again
             self._call(self._redis.set, key, piece, UNPUBLISHED_SECONDS)
-        before = self._heads()
+        before = self._head(evaluate)
         self._make_newest(version, f"{version.epoch} {version.update} {len(pieces)} {crc32(blob)}", keys, evaluate)
-        self._drop_pieces(before - self._heads())
+        if before is not None and before[0] != version:  # it expires rather than vanishes: a reader amid it can finish
+            self._at_once("expire", self._piece_keys(before[0], before[1], evaluate), 5)
 
     def _make_newest(self, version: Version, head: str, pieces: list[str], evaluate: bool) -> None:
         """Name the version as the newest, and keep its pieces: those of a learner that did not come so far expire."""
@@ -268,8 +271,7 @@ class RedisBus:
                 pipe.set(epoch_key, version.epoch)
             for key in pieces:
                 pipe.persist(key)
-            for name in ("weights", "evaluate")[: 1 + evaluate]:
-                pipe.set(self._key(name), head)
+            pipe.set(self._key(KINDS[evaluate]), head)
 
         self._call(lambda: self._redis.transaction(transaction, epoch_key))
 
@@ -281,20 +283,15 @@ class RedisBus:
         self.refused["control"] += bool(raw)
         return None
 
-    def _heads(self) -> set[tuple[Version, int]]:
-        """Versions that a head names, with their number of pieces."""
-        found = [self._head(False), self._head(True)]
-        return {(version, pieces) for version, pieces, _ in filter(None, found)}
-
     def _head(self, evaluate: bool) -> tuple[Version, int, int] | None:
-        raw = self._call(lambda: self._redis.get(self._key("evaluate" if evaluate else "weights")))
+        raw = self._call(lambda: self._redis.get(self._key(KINDS[evaluate])))
         found = self._integers(raw, 4)
         if found is None or found[2] > PIECES:
             return None
         return Version(found[0], found[1]), found[2], found[3]
 
-    def _piece_keys(self, version: Version, pieces: int) -> list[str]:
-        return [self._key("weights", version.epoch, version.update, index) for index in range(pieces)]
+    def _piece_keys(self, version: Version, pieces: int, evaluate: bool) -> list[str]:
+        return [self._key(KINDS[evaluate], version.epoch, version.update, index) for index in range(pieces)]
 
     def _at_once(self, command: str, keys: list[str], *words: object) -> list[Any]:
         """The same command for each key in one round trip; the replies stay apart."""
@@ -303,11 +300,6 @@ class RedisBus:
             pipe.execute_command(command, key, *words)
         replies: list[Any] = self._call(pipe.execute)
         return replies
-
-    def _drop_pieces(self, versions: set[tuple[Version, int]]) -> None:
-        """Let replaced versions expire rather than vanish, so that a reader amid them can finish."""
-        for version, pieces in versions:
-            self._at_once("expire", self._piece_keys(version, pieces), 5)
 
     def latest_version(self, evaluate: bool = False) -> Version | None:
         head = self._head(evaluate)
@@ -318,7 +310,7 @@ class RedisBus:
         if head is None:
             return None
         version, count, crc = head
-        pieces = self._at_once("get", self._piece_keys(version, count))
+        pieces = self._at_once("get", self._piece_keys(version, count, evaluate))
         try:
             return version, join_pieces(pieces, crc)
         except MessageError:

@@ -106,7 +106,7 @@ def robust(env: EnvConfig) -> RunConfig:
         agent=AgentConfig(normalize_observations=True, fill_blanks=True),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0),
-        update=UpdateConfig(scheme=3),
+        update=UpdateConfig(scheme=3, policy_average=2_000),
         learner=LearnerConfig(batch_size=8, importance_exponent=0.0, publish_updates=80),
     )
 
@@ -225,6 +225,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "update.scheme": (1, 6),
     "update.n_step": (1, 10_000),
     "update.eta": (0, 1),
+    "update.policy_average": (0, 2**31),
     "learner.batch_size": (1, 65_536),
     "learner.importance_exponent": (0, 1),
     "learner.publish_updates": (1, 2**31),

@@ -24,19 +24,18 @@ EVERYONE = (
     "(+get +incr +incrby ~R:epoch:ROLE)",
     "(+xadd %W~R:metrics:ROLE)",
 )
-READS_WEIGHTS = "(+get %R~R:weights %R~R:weights:*)"
 ACTOR = (
-    READS_WEIGHTS,
+    "(+get %R~R:weights %R~R:weights:*)",
     "(+sadd %W~R:actors)",
     "(+xadd %W~R:windows:INDEX)",
     "(+xinfo|stream %R~R:windows:INDEX)",
     "(+hget %R~R:acks)",
 )
-EVALUATOR = (READS_WEIGHTS, "(+get %R~R:evaluate)")
+EVALUATOR = ("(+get %R~R:evaluate %R~R:evaluate:*)",)
 LEARNER = (
     "+watch +unwatch +multi +exec",
     "(+get +set ~R:weights ~R:evaluate)",
-    "(+set +expire +exists +persist ~R:weights:*)",
+    "(+set +expire +exists +persist ~R:weights:* ~R:evaluate:*)",
     "(+set +watch ~R:epoch:ROLE)",
     "(+hget %R~R:replay)",
 )

@@ -92,6 +92,7 @@ WHEN = {
     "curiosity": "up where rewards are rare, 0 where observations flicker for long",
     "curiosity_scale": "`std` makes beta mean the same in every environment, `raw` is the paper's",
     "curiosity_steps": "as long as exploration should last",
+    "policy_average": "0 to evaluate and save what acts; up where evaluations swing",
     "eta": "rarely; only with prioritized replay",
     "batch_size": "up for steadier updates; more and smaller ones learn [sooner](history.md) at the same replay ratio",
     "publish_updates": "rarely",

@@ -27,7 +27,7 @@ from learner.batch import clear_padding, importance_weights
 from learner.cuda_graph import HostCopy
 from learner.staleness import SLICE, measurable, staleness
 from learner.static_update import StaticUpdate
-from learner.update import UpdateConfig, Updated, make_update
+from learner.update import AVERAGE_UPDATES, UpdateConfig, Updated, make_update
 
 log = logging.getLogger(__name__)
 STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
@@ -122,7 +122,7 @@ class Learner:
 
     def _step(self) -> bool:
         if self._evaluation_due:
-            self._broadcast(evaluate=True)
+            self._ask_for_evaluation()
         sample = self.replay.sample(self.config.batch_size)
         self.env_steps = max(self.env_steps, sample.env_steps)
         if sample.draw is not Draw.BATCH:
@@ -153,6 +153,8 @@ class Learner:
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
         updated = self._updated(raw, torch.from_numpy(weights), self.update.config.beta(self.env_steps))
         self.updates += 1
+        if self.update.config.policy_average and self.updates % AVERAGE_UPDATES == 0:
+            self.update.follow_average(self.updates)
         self._returning.append((rows["serial"].copy(), HostCopy(updated.priorities)))
         self._return_priorities(leave=self._updated.in_flight)
         self._measure(updated)
@@ -189,7 +191,9 @@ class Learner:
     def publish(self) -> None:
         """Broadcast the policy with the newest observation statistics frozen into it. Raises FencedError."""
         self._freeze_statistics()
-        self._broadcast()
+        blob, version = self._sound(self.agent.broadcast_weights()), Version(self.epoch, self.updates)
+        self.bus.publish_weights(version, blob)
+        self._published = version
 
     def _publish_if_forgotten(self) -> None:
         """A Redis that lost data has old weights for a new actor, or none: it would wait for them, and we for it."""
@@ -198,11 +202,10 @@ class Learner:
             if self.bus.latest_version() != self._published:
                 self.publish()
 
-    def _broadcast(self, evaluate: bool = False) -> None:
-        blob, version = self._sound(self.agent.broadcast_weights()), Version(self.epoch, self.updates)
-        self.bus.publish_weights(version, blob, evaluate)
-        self._published = version
-        self._evaluation_due = self._evaluation_due and not evaluate
+    def _ask_for_evaluation(self) -> None:
+        blob = self._sound(self.update.policy_weights())
+        self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate=True)
+        self._evaluation_due = False
 
     def _sound(self, weights: dict[str, Tensor]) -> bytes:
         """Weights as they are sent and saved. Raises RmcError where they are not finite: neither must then happen."""
@@ -241,7 +244,7 @@ class Learner:
         self._evaluation_due = True
         self.last_checkpoint, self._checkpoint_steps = self.updates, self.env_steps
         self._next_checkpoint = self._after(self.env_steps)
-        self._broadcast(evaluate=True)
+        self._ask_for_evaluation()
         return True
 
     def save(self) -> None:
@@ -255,7 +258,7 @@ class Learner:
         progress = {"updates": self.updates, "env_steps": self.env_steps, "epoch": self.epoch, "time": time.time()}
         files = {
             STATE: state.getvalue(),
-            POLICY: self._sound(self.agent.policy_weights()),
+            POLICY: self._sound(self.update.policy_weights()),
             PROGRESS: json.dumps(progress).encode(),
         }
         self.checkpoints.save(self.updates, files)

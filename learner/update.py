@@ -21,6 +21,7 @@ from learner.batch import Batch
 from learner.fused import fuse
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
+AVERAGE_UPDATES = 10  # updates between moves of the policy's average, which reads and writes all that acts
 TRAINS_MEMORY = {  # the paper's table 1
     1: {"model", "value"},
     2: {"value"},
@@ -75,6 +76,10 @@ class UpdateConfig:
     eta: float = 0.9
     """Weight of the largest against the mean absolute TD error in a window's priority."""
 
+    policy_average: int = 0
+    """Updates over which the policy that checkpoints hold, and evaluations play, is averaged, at most a tenth of those
+    made; actors have the newest. 0 does not average."""
+
     def beta(self, env_steps: int) -> float:
         """beta after so many environment steps."""
         return self.curiosity * max(0.0, 1.0 - env_steps / self.curiosity_steps)
@@ -101,6 +106,7 @@ class JointUpdate:
         self.agent, self.burn_in, self.config, self.bf16 = agent, burn_in, config, bf16
         self.target_critic = _target_copy(agent.critic)
         self.target_memory = _target_copy(agent.memory)
+        self.average = {name: value.detach().clone() for name, value in agent.acting().items()}  # theta-bar
         self._has_target_memory = "ema" in (config.latent_target, config.target_memory)
         self.optimizers = self._make_optimizers()
         self.generator = torch.Generator(device).manual_seed(seed)
@@ -235,12 +241,24 @@ class JointUpdate:
     def _polyak(self, target: Iterable[Tensor], source: Iterable[Tensor]) -> None:
         torch._foreach_lerp_(list(target), list(source), 1.0 - self.config.polyak)
 
+    @torch.no_grad()
+    def follow_average(self, updates: int) -> None:
+        """Move theta-bar of algorithm 1 towards what acts; every ``AVERAGE_UPDATES``, the last time at ``updates``."""
+        over = min(self.config.policy_average, updates / 10) / AVERAGE_UPDATES
+        torch._foreach_lerp_(list(self.average.values()), list(self.agent.acting().values()), 1.0 / max(1.0, over))
+
+    def policy_weights(self) -> dict[str, Tensor]:
+        """What checkpoints hold and evaluations play: theta-bar, with what normalises observations now."""
+        averaged = self.average if self.config.policy_average else {}
+        return self.agent.policy_weights() | {name: value.cpu() for name, value in averaged.items()}
+
     def state_dict(self) -> dict[str, Any]:
         """All that an update changes, for a checkpoint."""
         return {
             "agent": self.agent.state_dict(),
             "target_critic": self.target_critic.state_dict(),
             "target_memory": self.target_memory.state_dict(),
+            "average": self.average,
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "curiosity_variance": self.curiosity_variance,
             "generator": self.generator.get_state(),
@@ -251,6 +269,8 @@ class JointUpdate:
         self.agent.load_state_dict(state["agent"])
         self.target_critic.load_state_dict(state["target_critic"])
         self.target_memory.load_state_dict(state["target_memory"])
+        for name, value in self.average.items():
+            value.copy_(state["average"][name])
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
             capturable = optimizer.defaults["capturable"]
             optimizer.load_state_dict(saved)

@@ -10,9 +10,10 @@ WAYS = {
     "longer burn-in": "--burn-in 30",
     "longer windows": "--burn-in 20 --trained-steps 30",
     "observation beside": "--head-input hidden+observation",
-    "no grounding": "--no-grounding --scheme 1 --clip-norm 40",
-    "clipped": "--clip-norm 40",
-    "scheme 1": "--scheme 1 --clip-norm 40",
+    "no grounding": "--no-grounding --scheme 1",
+    "not averaged": "--policy-average 0",
+    "clipped": "--clip-norm 40 --policy-average 0",
+    "scheme 1": "--scheme 1 --clip-norm 40 --policy-average 0",
 }
 STUDY = Study("blanks", {name: f"train ENV --flicker 0.5 {words}" for name, words in WAYS.items()})
 

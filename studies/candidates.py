@@ -1,6 +1,6 @@
 """What one update is worth: one change at a time from 32 windows a batch, at 60 000 steps.
 
-What names no batch has 32. All with scheme 1 and clipped at 40, which were the default then.
+What names no batch has 32. All with scheme 1, clipped at 40 and not averaged, which were the default then.
 """
 
 from studies.study import Scale, Study
@@ -38,7 +38,7 @@ CHANGES = {
 }
 STUDY = Study(
     "candidates",
-    {name: f"train ENV --scheme 1 --clip-norm 40 {words}" for name, words in CHANGES.items()},
+    {name: f"train ENV --scheme 1 --clip-norm 40 --policy-average 0 {words}" for name, words in CHANGES.items()},
     small=Scale(60_000, (1, 2)),
 )
 

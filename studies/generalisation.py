@@ -27,8 +27,9 @@ STUDY = Study(
     {
         "RMC": "train ENV",
         "RMC, not filling": "train ENV --no-fill-blanks",
-        "RMC, clipped": "train ENV --clip-norm 40",
-        "RMC, scheme 1": "train ENV --scheme 1 --clip-norm 40",
+        "RMC, not averaged": "train ENV --policy-average 0",
+        "RMC, clipped": "train ENV --clip-norm 40 --policy-average 0",
+        "RMC, scheme 1": "train ENV --scheme 1 --clip-norm 40 --policy-average 0",
         "SAC": "baseline sac ENV",
     },
     small=Scale(100_000, (1, 2, 3)),

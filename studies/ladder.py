@@ -7,9 +7,9 @@ and learner. Every later one keeps what the one before has, as far as it is not 
 from studies.study import Scale, Study
 
 ALONE = "--head-input observation --hidden 8 --embedding 0"  # the agent without a memory
-BARE = "--no-fill-blanks --no-grounding"
+BARE = "--no-fill-blanks --no-grounding --policy-average 0"
 FLAT = f"--heads 256 256 --no-normalize-observations {BARE} --scheme 2 {ALONE}"
-CLIPPED = "--clip-norm 40"
+CLIPPED = "--clip-norm 40 --policy-average 0"
 ONE = "--envs-per-actor 1 --chunk-windows 1 --burn-in 0 --capacity 1000000"
 EVERY_STEP = "--replay-ratio 256 --batch-size"
 RUNGS = {
@@ -25,7 +25,8 @@ RUNGS = {
     "the model's loss": f"train ENV {CLIPPED} {BARE} --scheme 1",
     "grounding": f"train ENV {CLIPPED} --scheme 1",
     "no value in the memory": f"train ENV {CLIPPED}",
-    "not clipped, robust": "train ENV",
+    "not clipped": "train ENV --policy-average 0",
+    "averaged, robust": "train ENV",
     "curiosity": "train ENV --curiosity 0.1 --curiosity-scale std",
 }
 STUDY = Study("ladder", RUNGS, small=Scale(60_000, (1, 2)))

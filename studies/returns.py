@@ -3,7 +3,11 @@
 from studies.study import Scale, Study
 
 ENVS = ("Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Walker2d-v5", "HumanoidStandup-v5")
-OURS = {"RMC": "train ENV", "RMC paper": "train ENV --preset paper"}
+OURS = {
+    "RMC": "train ENV",
+    "RMC, not averaged": "train ENV --policy-average 0",
+    "RMC paper": "train ENV --preset paper",
+}
 THEIRS = {name: f"baseline {name.lower()} ENV" for name in ("SAC", "TD3", "DDPG", "PPO")}
 TUNED = {f"{name} zoo": f"{words} --settings zoo" for name, words in THEIRS.items()}
 STUDY = Study(

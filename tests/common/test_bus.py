@@ -173,8 +173,10 @@ def test_weights_of_many_pieces(bus):
     assert bus.weights() == (Version(epoch, 5), blob)
     assert bus.latest_version(evaluate=True) is None
     bus.publish_weights(Version(epoch, 6), b"six", evaluate=True)
-    bus.publish_weights(Version(epoch, 7), b"seven")
-    assert (bus.weights(), bus.weights(evaluate=True)) == ((Version(epoch, 7), b"seven"), (Version(epoch, 6), b"six"))
+    assert (bus.weights(), bus.weights(evaluate=True)) == ((Version(epoch, 5), blob), (Version(epoch, 6), b"six"))
+    bus.publish_weights(Version(epoch, 6), b"half a dozen")
+    assert bus.weights() == (Version(epoch, 6), b"half a dozen")
+    assert bus.weights(evaluate=True) == (Version(epoch, 6), b"six")
 
 
 def test_a_replaced_learner_cannot_publish(bus):
@@ -186,10 +188,10 @@ def test_a_replaced_learner_cannot_publish(bus):
     assert bus.latest_version() == Version(new, 1)
 
 
-def piece_lives(bus: RedisBus) -> dict[Version, list[int]]:
+def piece_lives(bus: RedisBus, kind: str = "weights") -> dict[Version, list[int]]:
     """Seconds until each piece there expires, by version; -1 where it does not."""
     found: dict[Version, list[int]] = {}
-    for key in bus._redis.scan_iter(match=bus._key("weights", "*")):
+    for key in bus._redis.scan_iter(match=bus._key(kind, "*")):
         epoch, update, _ = map(int, key.decode().rsplit(":", 3)[1:])
         found.setdefault(Version(epoch, update), []).append(bus._redis.ttl(key))
     return found
@@ -198,20 +200,22 @@ def piece_lives(bus: RedisBus) -> dict[Version, list[int]]:
 def test_what_was_published_stays_and_what_was_fenced_expires(redis_url):
     bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
     old, new, blob = bus.take_epoch("learner"), bus.take_epoch("learner"), os.urandom(PIECE_BYTES + 1)
-    bus.publish_weights(Version(new, 1), blob, evaluate=True)
+    bus.publish_weights(Version(new, 1), blob)
     bus.publish_weights(Version(new, 2), blob)
-    bus.publish_weights(Version(new, 2), blob, evaluate=True)  # the version that is there already, and by both names
+    bus.publish_weights(Version(new, 2), blob, evaluate=True)  # another policy by the same version
     bus.publish_weights(Version(new, 3), blob)
+    bus.publish_weights(Version(new, 3), blob)  # the version that is there already
     with pytest.raises(FencedError):
         bus.publish_weights(Version(old, 9), blob)
     lives = piece_lives(bus)
-    assert lives[Version(new, 2)] == lives[Version(new, 3)] == [-1, -1]
-    assert all(0 < life <= 5 for life in lives[Version(new, 1)])
+    assert lives[Version(new, 3)] == [-1, -1]
+    assert all(0 < life <= 5 for update in (1, 2) for life in lives[Version(new, update)])
+    assert piece_lives(bus, "evaluate") == {Version(new, 2): [-1, -1]}
     assert all(0 < life <= UNPUBLISHED_SECONDS for life in lives[Version(old, 9)])
     assert len(lives[Version(old, 9)]) == 2
     bus.expire(None)  # the run goes on: what nobody published still goes
     lives = piece_lives(bus)
-    assert lives[Version(new, 2)] == lives[Version(new, 3)] == [-1, -1]
+    assert lives[Version(new, 3)] == piece_lives(bus, "evaluate")[Version(new, 2)] == [-1, -1]
     assert all(life > 0 for life in lives[Version(old, 9)])
 
 

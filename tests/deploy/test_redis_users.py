@@ -31,14 +31,14 @@ FORBIDDEN = {  # R for the prefix
     "actor-0": """
         XADD R:windows:1 * p x|XRANGE R:windows:0 - +|DEL R:windows:0|XTRIM R:windows:0 MAXLEN 0
         XREAD STREAMS R:metrics:actor-0 0|SET R:config x|SET R:weights x|SET R:weights:1:1:0 x|SET R:stop x
-        GET R:evaluate|HSET R:acks 0 x|SCAN 0
+        GET R:evaluate|GET R:evaluate:1:1:0|HSET R:acks 0 x|SCAN 0
         HSET R:replay replay x|INCR R:epoch:actor-1|INCR R:epoch:learner
         XADD R:metrics:learner * r x|XADD R:dead * reason x
     """,
     "actor-1": "XADD R:windows:0 * p x|XADD R:windows:10 * p x|INCR R:epoch:actor-0|XINFO STREAM R:windows:0",
     "evaluator": """
         XADD R:windows:0 * p x|SET R:evaluate x|HGET R:acks 0|SCAN 0|INCR R:epoch:learner
-        SET R:weights x|SET R:weights:1:1:0 x|SET R:config x|SET R:stop x
+        SET R:weights x|SET R:weights:1:1:0 x|SET R:evaluate:1:1:0 x|SET R:config x|SET R:stop x
     """,
     "learner": """
         XADD R:windows:0 * p x|SET R:config x|INCR R:epoch:replay|HSET R:replay a b|XREAD STREAMS R:windows:0 0
@@ -95,7 +95,8 @@ def test_every_role_can_do_its_work(server: RedisServer) -> None:
     replay._trim(holder, {0: Ack(EntryId(5, 1), 100)})
     assert learner.replay_address("replay") is not None
     for update in (1, 2, 3):
-        learner.publish_weights(Version(5, update), b"w" * 600_000, evaluate=True)
+        for evaluate in (False, True):
+            learner.publish_weights(Version(5, update), b"w" * 600_000, evaluate)
     assert replay.latest_version() == Version(5, 3)
     assert actor.ack(0) == Ack(EntryId(5, 1), 100)
     for bus, evaluate in ((actor, False), (evaluator, True)):

@@ -13,7 +13,7 @@ from common.checkpoint import CheckpointFolder
 from common.errors import CheckpointError, FencedError, RmcError
 from common.wire import encode_hello, encode_windows
 from learner.learner import Learner, LearnerConfig, is_finite, latent_rank
-from learner.update import UpdateConfig
+from learner.update import AVERAGE_UPDATES, UpdateConfig
 from replay_server.server import ReplayConfig, ReplayServer
 from tests.hostile import hostile_state
 from tests.learner.rows import SPEC, random_rows
@@ -33,9 +33,9 @@ class Setting:
         self.bus.append(0, EntryId(1, 0), encode_hello(SPEC))
         self.learner = self.start()
 
-    def start(self) -> Learner:
-        checkpoints = CheckpointFolder(self.folder / "checkpoints")
-        return Learner(SPEC, AGENT, UpdateConfig(), CONFIG, self.server, self.bus, checkpoints, seed=1)
+    def start(self, policy_average: int = 0) -> Learner:
+        checkpoints, update = CheckpointFolder(self.folder / "checkpoints"), UpdateConfig(policy_average=policy_average)
+        return Learner(SPEC, AGENT, update, CONFIG, self.server, self.bus, checkpoints, seed=1)
 
     def feed(self, windows: int) -> None:
         rows = random_rows(windows, self.seq)
@@ -116,6 +116,29 @@ def test_checkpoint_holds_the_policy_and_resumes(setting):
         assert torch.equal(value, resumed.agent.state_dict()[name]), name
     resumed.finished = True
     resumed.close()
+
+
+@pytest.mark.parametrize("average", [0, 1_000])
+def test_what_is_evaluated_and_saved_is_the_average_where_asked_and_actors_have_the_newest(setting, average):
+    setting.learner.close()
+    learner = setting.learner = setting.start(average)
+    setting.feed(200)
+    while learner.step():
+        pass
+    assert learner.updates % AVERAGE_UPDATES  # so that the newest has moved on since the average did
+    learner.publish()
+    learner.checkpoint()
+    acts, judged = (safetensors.torch.load(setting.bus.weights(evaluate)[1]) for evaluate in (False, True))
+    saved = safetensors.torch.load(learner.checkpoints.latest()[1]["policy.safetensors"])
+    assert acts.keys() == judged.keys() == saved.keys()
+    for name, value in learner.agent.policy_weights().items():
+        assert torch.equal(acts[name], value), name
+        assert torch.equal(judged[name], saved[name]), name
+        assert torch.equal(judged[name], value) == (not average or name.startswith("normalizer")), name
+    learner.close()
+    resumed = setting.learner = setting.start(average)
+    for name, value in resumed.update.policy_weights().items():
+        assert torch.equal(value, judged[name]), name
 
 
 def test_no_valid_checkpoint_is_an_error(setting):

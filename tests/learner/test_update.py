@@ -206,6 +206,28 @@ def test_targets_follow_by_polyak_alone():
     assert all(p.grad is None for p in targets)
 
 
+def test_the_policys_average_is_over_the_last_tenth_and_then_over_so_many():
+    """As a plain loop has it. What does not act has none."""
+    update = make(dataclasses.replace(ROBUST, fill_blanks=True), policy_average=40)
+    names = {name for name, _ in update.agent.named_parameters() if name.startswith(("memory", "policy", "next_frame"))}
+    assert set(update.average) == names
+    expected = {name: value.double() for name, value in update.average.items()}
+    for updates in range(10, 1_001, 10):
+        with torch.no_grad():
+            for value in update.agent.parameters():
+                value.add_(torch.randn_like(value))
+        update.follow_average(updates)
+        share = 1.0 if updates <= 100 else max(0.25, 100 / updates)  # ten updates of those it is over
+        acting = dict(update.agent.named_parameters())
+        expected = {name: (1 - share) * mean + share * acting[name].double() for name, mean in expected.items()}
+    for name, value in update.policy_weights().items():
+        if name in names:
+            torch.testing.assert_close(value.double(), expected[name], rtol=0, atol=1e-5)
+            assert not torch.equal(value, acting[name])
+        else:
+            assert torch.equal(value, update.agent.state_dict()[name])
+
+
 @pytest.mark.parametrize(
     ("option", "moved"), [("latent_target", {"model_loss"}), ("target_memory", {"q_loss"})], ids=["latent", "critics"]
 )

@@ -9,13 +9,14 @@ import subprocess
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import studies
 from common.errors import ConfigError
 from deploy import history, options
 from deploy.presets import validate
-from studies import generalisation, study
+from studies import averaging, generalisation, study
 from studies.study import Scale, Study
 
 NAMES = sorted({path.stem for path in Path(studies.__file__).parent.glob("*.py")} - {"__init__", "study"})
@@ -58,6 +59,10 @@ def test_a_study_runs_once_and_its_lines_can_be_plotted(tmp_path, monkeypatch):
     before = lines.read_bytes()
     tiny.run("smoke", jobs)
     assert lines.read_bytes() == before
+    played = averaging.play(jobs[0], episodes=1)
+    assert played["env_steps"] == sorted(played["env_steps"]) != []
+    assert len(played["averaged"]) == len(played["newest"]) == len(played["env_steps"])
+    assert np.isfinite([played["averaged"], played["newest"]]).all()
 
 
 def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, monkeypatch):
@@ -126,6 +131,15 @@ def test_an_area_is_over_partial_views_only(tmp_path, capsys):
     assert generalisation.area(returns) == 20.0
     generalisation.tell(tmp_path / "lines")
     assert capsys.readouterr().out == "Hopper-v5, RMC: 20 (20, 20)\n"
+
+
+def test_averages_are_judged_by_a_runs_second_half(capsys):
+    both = {"averaged": [9, 2, 4, 6], "newest": [9, 1, 3, 8]}
+    averaging.tell({"env": "Hopper-v5", "seed": 1, "env_steps": [10, 20, 30, 40]} | both)
+    assert capsys.readouterr().out.splitlines() == [
+        "Hopper-v5, seed 1, averaged: mean 5, worst 4, deviation 1 of 2 checkpoints",
+        "Hopper-v5, seed 1, newest: mean 6, worst 3, deviation 2 of 2 checkpoints",
+    ]
 
 
 def test_how_it_was_played_is_drawn(tmp_path):

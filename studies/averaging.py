@@ -1,0 +1,67 @@
+"""The policy as its weights' average over the last updates, or as the newest: the same runs, each checkpoint as both.
+
+After the runs, ``python -m studies.averaging --play`` plays what a checkpoint holds, the average, and what its learner
+state has, the newest, from the same starts, and tells means and worst cases of the second half.
+"""
+
+import json
+import sys
+
+import numpy as np
+import safetensors.torch
+
+from common.checkpoint import CheckpointFolder
+from deploy.evaluation import evaluate_blob, evaluate_checkpoint
+from deploy.inspection import load_agent
+from deploy.run_folder import RunFolder
+from studies.study import Job, Scale, Study
+
+EPISODES = 10
+STUDY = Study(
+    "averaging",
+    {"RMC": "train ENV --keep-checkpoints 1000"},
+    small=Scale(300_000, (1, 2, 3), ("Hopper-v5", "Walker2d-v5", "HalfCheetah-v5")),
+)
+
+
+def play(job: Job, episodes: int = EPISODES) -> dict[str, object]:
+    """A line: returns of a run's checkpoints as both."""
+    folder = RunFolder(job.folder)
+    config, steps, averaged, newest = folder.config(), [], [], []
+    for number in CheckpointFolder(folder.checkpoints).numbers():
+        found = evaluate_checkpoint(folder, config, str(number), episodes)
+        steps.append(found["env_steps"])
+        averaged.append(found["eval_return_mean"])
+        blob = safetensors.torch.save(load_agent(folder, config, str(number)).policy_weights())
+        newest.append(evaluate_blob(config, blob, episodes)["eval_return_mean"])
+    return {"env": job.env, "seed": job.seed, "env_steps": steps, "averaged": averaged, "newest": newest}
+
+
+def tell(line: dict[str, list[float]]) -> None:
+    """One run's second half."""
+    half = np.array(line["env_steps"]) > max(line["env_steps"]) / 2
+    for name in ("averaged", "newest"):
+        found = np.array(line[name])[half]
+        spread = f"mean {found.mean():,.0f}, worst {found.min():,.0f}, deviation {found.std():,.0f}"
+        print(f"{line['env']}, seed {line['seed']}, {name}: {spread} of {len(found)} checkpoints")
+
+
+def main() -> None:
+    """Train, or play what was trained."""
+    if "--play" not in sys.argv:
+        STUDY.main()
+        return
+    target = STUDY.results("small").with_suffix(".played.jsonl")
+    lines = [json.loads(text) for text in target.read_text().splitlines()] if target.exists() else []
+    done = {(line["env"], line["seed"]) for line in lines}
+    for job in STUDY.jobs("small"):
+        if (job.env, job.seed) not in done and RunFolder(job.folder).result():
+            lines.append(play(job))
+            with target.open("a") as file:
+                file.write(json.dumps(lines[-1]) + "\n")
+    for line in lines:
+        tell(line)
+
+
+if __name__ == "__main__":
+    main()
