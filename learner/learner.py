@@ -244,6 +244,7 @@ class Learner:
         self._evaluation_due = True
         self.last_checkpoint, self._checkpoint_steps = self.updates, self.env_steps
         self._next_checkpoint = self._after(self.env_steps)
+        self.publish()  # a run that goes on from here begins with these weights, too
         self._ask_for_evaluation()
         return True
 
