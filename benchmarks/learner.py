@@ -1,12 +1,13 @@
 """Trained transitions a second of the whole learner role, beside its bare update and stable-baselines3's SAC.
 
-    python -m benchmarks.learner [--env ENV] [--batches 32 64 256] [--rounds N] [--seconds S]
+    python -m benchmarks.learner [--env ENV] [--batches 8 32 64 256] [--rounds N] [--seconds S]
 
 A transition is trained when it is in a batch as a trained step: 15 for each window, B for each of SAC's batches. The
 learner has one thread on the first core and draws from a real replay server, which has the last one with Redis; SAC has
 its transitions in memory, one thread on the first core in one row, two on the first and the last in the other.
 """
 
+import dataclasses
 import os
 import tempfile
 from collections.abc import Iterator
@@ -39,7 +40,7 @@ from common.redis_bus import RedisBus
 from common.window import WindowSpec
 from deploy.presets import RunConfig, robust
 from learner.batch import view_batch
-from learner.learner import Learner, LearnerConfig
+from learner.learner import Learner
 from learner.replay_client import ReplayClient
 from learner.update import make_update
 from replay_server.server import ReplayConfig
@@ -65,7 +66,7 @@ def replay_of(run: RunConfig) -> Iterator[RedisBus]:
 def learner_role(run: RunConfig, bus: RedisBus, batch_size: int, precision: Precision) -> Iterator[Learner]:
     spec, address = run.window_spec(), bus.replay_address("replay")
     assert address is not None
-    config = LearnerConfig(batch_size=batch_size, checkpoint_steps=ENDLESS, precision=precision)
+    config = dataclasses.replace(run.learner, batch_size=batch_size, checkpoint_steps=ENDLESS, precision=precision)
     client = ReplayClient(lambda: address.address, SECRET, spec, batch_size)
     with tempfile.TemporaryDirectory() as at:
         role = Learner(spec, run.agent, run.update, config, client, bus, CheckpointFolder(Path(at)), 0)
@@ -127,7 +128,7 @@ def _sac(stack: ExitStack, spec: WindowSpec, threads: int, seconds: float) -> Me
 def main() -> None:
     made = parser(__doc__)
     made.add_argument("--env", default="HalfCheetah-v5")
-    made.add_argument("--batches", type=int, nargs="+", default=[32, 64, 256])
+    made.add_argument("--batches", type=int, nargs="+", default=[8, 32, 64, 256])
     options = made.parse_args()
     run = robust(EnvConfig(options.env))
     torch.set_num_threads(1)
