@@ -6,6 +6,7 @@ state has, the newest, from the same starts, and tells means and worst cases of 
 
 import json
 import sys
+from typing import Any
 
 import numpy as np
 import safetensors.torch
@@ -19,12 +20,16 @@ from studies.study import Job, Scale, Study
 EPISODES = 10
 STUDY = Study(
     "averaging",
-    {"RMC": "train ENV --keep-checkpoints 1000"},
+    {
+        "RMC": "train ENV --keep-checkpoints 1000",
+        "over 500 updates": "train ENV --keep-checkpoints 1000 --policy-average 500",
+        "over 8 000 updates": "train ENV --keep-checkpoints 1000 --policy-average 8000",
+    },
     small=Scale(300_000, (1, 2, 3), ("Hopper-v5", "Walker2d-v5", "HalfCheetah-v5")),
 )
 
 
-def play(job: Job, episodes: int = EPISODES) -> dict[str, object]:
+def play(job: Job, episodes: int = EPISODES) -> dict[str, Any]:
     """A line: returns of a run's checkpoints as both."""
     folder = RunFolder(job.folder)
     config, steps, averaged, newest = folder.config(), [], [], []
@@ -34,16 +39,17 @@ def play(job: Job, episodes: int = EPISODES) -> dict[str, object]:
         averaged.append(found["eval_return_mean"])
         blob = safetensors.torch.save(load_agent(folder, config, str(number)).policy_weights())
         newest.append(evaluate_blob(config, blob, episodes)["eval_return_mean"])
-    return {"env": job.env, "seed": job.seed, "env_steps": steps, "averaged": averaged, "newest": newest}
+    about = {"agent": job.agent, "env": job.env, "seed": job.seed}
+    return about | {"env_steps": steps, "averaged": averaged, "newest": newest}
 
 
-def tell(line: dict[str, list[float]]) -> None:
+def tell(line: dict[str, Any]) -> None:
     """One run's second half."""
     half = np.array(line["env_steps"]) > max(line["env_steps"]) / 2
     for name in ("averaged", "newest"):
         found = np.array(line[name])[half]
         spread = f"mean {found.mean():,.0f}, worst {found.min():,.0f}, deviation {found.std():,.0f}"
-        print(f"{line['env']}, seed {line['seed']}, {name}: {spread} of {len(found)} checkpoints")
+        print(f"{line['agent']}, {line['env']}, seed {line['seed']}, {name}: {spread} of {len(found)} checkpoints")
 
 
 def main() -> None:
@@ -51,16 +57,8 @@ def main() -> None:
     if "--play" not in sys.argv:
         STUDY.main()
         return
-    target = STUDY.results("small").with_suffix(".played.jsonl")
-    lines = [json.loads(text) for text in target.read_text().splitlines()] if target.exists() else []
-    done = {(line["env"], line["seed"]) for line in lines}
-    for job in STUDY.jobs("small"):
-        if (job.env, job.seed) not in done and RunFolder(job.folder).result():
-            lines.append(play(job))
-            with target.open("a") as file:
-                file.write(json.dumps(lines[-1]) + "\n")
-    for line in lines:
-        tell(line)
+    for text in STUDY.played("small", "played", play).read_text().splitlines():
+        tell(json.loads(text))
 
 
 if __name__ == "__main__":

@@ -102,19 +102,7 @@ def main() -> None:
     if options.draw:
         draw(options.draw[0], options.draw[1:])
     else:
-        play_all(options.scale)
-
-
-def play_all(scale: str) -> None:
-    """Every run that has not been played yet."""
-    target = STUDY.results(scale).with_suffix(".flicker.jsonl")
-    lines = [json.loads(line) for line in target.read_text().splitlines()] if target.exists() else []
-    done = {(line["agent"], line["env"], line["seed"]) for line in lines}
-    for job in STUDY.jobs(scale):
-        if job.folder.exists() and (job.agent, job.env, job.seed) not in done:
-            with target.open("a") as file:
-                file.write(json.dumps(play(job)) + "\n")
-    tell(target)
+        tell(STUDY.played(options.scale, "flicker", play))
 
 
 if __name__ == "__main__":

@@ -9,19 +9,22 @@ the cores, each on its own part of them. ``rmc plot studies/results/NAME-SCALE.j
 
 import argparse
 import dataclasses
+import json
 import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import product
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Lock
+from typing import Any
 
 from common.errors import ConfigError
 from deploy import history
+from deploy.run_folder import RunFolder
 
 RESULTS, RUNS = Path(__file__).parent / "results", Path("runs") / "studies"
 TINY = "--checkpoint-steps 300 --episodes 1"  # at the scale smoke
@@ -99,6 +102,18 @@ class Study:
             sys.exit(f"studies.{self.name}: {error}")
         except KeyboardInterrupt:
             sys.exit(f"studies.{self.name}: interrupted; the same command goes on with it")
+
+    def played(self, scale: str, kind: str, play: Callable[[Job], dict[str, Any]]) -> Path:
+        """The file of ``play``'s lines, one for each finished run; plays those that it lacks."""
+        target = self.results(scale).with_suffix(f".{kind}.jsonl")
+        lines = [json.loads(text) for text in target.read_text().splitlines()] if target.exists() else []
+        done = {(line["agent"], line["env"], line["seed"]) for line in lines}
+        for job in self.jobs(scale):
+            if (job.agent, job.env, job.seed) not in done and RunFolder(job.folder).result():
+                line = json.dumps(play(job))
+                with target.open("a") as file:
+                    file.write(line + "\n")
+        return target
 
     def run(self, scale: str, jobs: Sequence[Job], at_once: int = 1) -> None:
         """Those that have no line yet, so many at once. Raises ConfigError for the first that fails, after the rest."""

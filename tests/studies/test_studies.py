@@ -60,6 +60,10 @@ def test_a_study_runs_once_and_its_lines_can_be_plotted(tmp_path, monkeypatch):
     tiny.run("smoke", jobs)
     assert lines.read_bytes() == before
     played = averaging.play(jobs[0], episodes=1)
+    plays = iter([{"agent": one.agent, "env": one.env, "seed": one.seed} for one in jobs])
+    for _ in range(2):  # the second time nothing is left to play
+        told = tiny.played("smoke", "played", lambda _: next(plays)).read_text().splitlines()
+        assert [json.loads(line)["agent"] for line in told] == ["ours", "theirs"]
     assert played["env_steps"] == sorted(played["env_steps"]) != []
     assert len(played["averaged"]) == len(played["newest"]) == len(played["env_steps"])
     assert np.isfinite([played["averaged"], played["newest"]]).all()
@@ -135,10 +139,10 @@ def test_an_area_is_over_partial_views_only(tmp_path, capsys):
 
 def test_averages_are_judged_by_a_runs_second_half(capsys):
     both = {"averaged": [9, 2, 4, 6], "newest": [9, 1, 3, 8]}
-    averaging.tell({"env": "Hopper-v5", "seed": 1, "env_steps": [10, 20, 30, 40]} | both)
+    averaging.tell({"agent": "RMC", "env": "Hopper-v5", "seed": 1, "env_steps": [10, 20, 30, 40]} | both)
     assert capsys.readouterr().out.splitlines() == [
-        "Hopper-v5, seed 1, averaged: mean 5, worst 4, deviation 1 of 2 checkpoints",
-        "Hopper-v5, seed 1, newest: mean 6, worst 3, deviation 2 of 2 checkpoints",
+        "RMC, Hopper-v5, seed 1, averaged: mean 5, worst 4, deviation 1 of 2 checkpoints",
+        "RMC, Hopper-v5, seed 1, newest: mean 6, worst 3, deviation 2 of 2 checkpoints",
     ]
 
 
