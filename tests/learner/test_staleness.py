@@ -85,6 +85,16 @@ def test_todays_weights_find_nothing_stale(spec: WindowSpec, config: AgentConfig
         assert max(found.values()) < 1e-5
 
 
+def test_where_nothing_is_blank_the_state_is_that_of_the_step_by_step_way():
+    agent, state = make_agent(1, FILLING), torch.randn(2, FILLING.state_size(SPEC.obs_dim))
+    o, action = torch.randn(2, 6, SPEC.obs_dim), torch.rand(2, 6, SPEC.action_dim)
+    sequence = (o, torch.zeros(2, 6, dtype=torch.bool), action, state)
+    with torch.no_grad():
+        _, seen, after = agent.remember(*sequence)
+        torch.testing.assert_close(after, agent.fill(*sequence)[1])
+    assert torch.equal(seen, o)
+
+
 @pytest.mark.parametrize("config", [AGENT, FILLING], ids=["zeros", "filled"])
 @pytest.mark.parametrize("window", [1, 4])
 def test_as_a_plain_loop_has_it(window: int, config: AgentConfig) -> None:

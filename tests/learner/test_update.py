@@ -220,9 +220,11 @@ def test_the_policys_average_is_over_the_last_tenth_and_then_over_so_many():
         share = 1.0 if updates <= 100 else max(0.25, 100 / updates)  # ten updates of those it is over
         acting = dict(update.agent.named_parameters())
         expected = {name: (1 - share) * mean + share * acting[name].double() for name, mean in expected.items()}
+        for name, mean in expected.items():
+            torch.testing.assert_close(update.average[name].double(), mean, rtol=0, atol=1e-5)
     for name, value in update.policy_weights().items():
         if name in names:
-            torch.testing.assert_close(value.double(), expected[name], rtol=0, atol=1e-5)
+            assert torch.equal(value, update.average[name])
             assert not torch.equal(value, acting[name])
         else:
             assert torch.equal(value, update.agent.state_dict()[name])
