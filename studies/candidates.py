@@ -1,11 +1,12 @@
-"""What one update is worth: one change at a time from 32 windows a batch, at 60 000 steps.
+"""What one update is worth: one change at a time, at 60 000 steps.
 
-What names no batch has 32. All with scheme 1, clipped at 40 and not averaged, which were the default then.
+BEFORE changes 32 windows a batch, with scheme 1, clipped at 40 and not averaged, which were the default then; what
+names no batch has 32. TODAY changes what is the default now.
 """
 
 from studies.study import Scale, Study
 
-CHANGES = {
+BEFORE = {
     "batch 32": "--batch-size 32",
     "ratio 96": "--batch-size 32 --replay-ratio 96",
     "batch 16": "--batch-size 16",
@@ -36,9 +37,24 @@ CHANGES = {
     "batch 16, critics normalised": "--batch-size 16 --critic-norm",
     "batch 16, observation beside": "--batch-size 16 --head-input hidden+observation",
 }
+TODAY = {
+    "RMC": "",
+    "RMC, n-step 3": "--n-step 3",
+    "RMC, critics normalised": "--critic-norm",
+    "RMC, observation beside": "--head-input hidden+observation",
+    "RMC, memory's rate 0.3": "--memory-learning-scale 0.3",
+    "RMC, first critic": "--policy-q first",
+    "RMC, optimisers apart": "--update-order alternate",
+    "RMC, stride 5": "--stride 5",
+    "RMC, prioritized": "--priority-exponent 0.6 --importance-exponent 0.4",
+    "RMC, learning rate 1e-3": "--learning-rate 1e-3",
+    "RMC, reward scale 5": "--reward-scale 5",
+    "RMC, reward scale 0.2": "--reward-scale 0.2",
+}
 STUDY = Study(
     "candidates",
-    {name: f"train ENV --scheme 1 --clip-norm 40 --policy-average 0 {words}" for name, words in CHANGES.items()},
+    {name: f"train ENV --scheme 1 --clip-norm 40 --policy-average 0 {words}" for name, words in BEFORE.items()}
+    | {name: f"train ENV {words}" for name, words in TODAY.items()},
     small=Scale(60_000, (1, 2)),
 )
 

@@ -1,8 +1,10 @@
 """Runs a study: several agents, several seeds each, a line of results a run; the same command goes on with it.
 
     python -m studies.NAME [--scale smoke|small|full] [--env ENV ...] [--only AGENT ...] [--seeds 1 2 3] [--jobs 2]
+    python -m studies.NAME --steps 300000 …
 
-smoke takes minutes, small two cores and hours, full is for a cluster or a GPU. A run that has its line in
+smoke takes minutes, small two cores and hours, full is for a cluster or a GPU; --steps is small, but of so many
+environment steps, with files of its own (NAME-STEPS.jsonl). A run that has its line in
 studies/results/NAME-SCALE.jsonl is not run again, one that was interrupted goes on in runs/studies/. Several jobs share
 the cores, each on its own part of them. ``rmc plot studies/results/NAME-SCALE.jsonl`` shows what came.
 """
@@ -83,6 +85,11 @@ class Study:
         size = ["--total-steps", str(self.scales[scale].steps), "--seed", str(seed), "--run-dir", str(folder)]
         return Job(agent, env, seed, [*words[:2], *tiny, *words[2:], *size], folder)  # what the study says of it wins
 
+    def of_steps(self, steps: int) -> str:
+        """The name of a scale that is small, but of so many environment steps."""
+        self.scales[str(steps)] = dataclasses.replace(self.scales["small"], steps=steps)
+        return str(steps)
+
     def results(self, scale: str) -> Path:
         """The file of a scale's lines; a smoke test's are no results."""
         return (RUNS if scale == "smoke" else RESULTS) / f"{self.name}-{scale}.jsonl"
@@ -90,14 +97,17 @@ class Study:
     def main(self) -> None:
         """The command line."""
         parser = argparse.ArgumentParser(description=f"The study {self.name}: {', '.join(self.agents)}.")
-        parser.add_argument("--scale", choices=list(self.scales), default="small")
+        length = parser.add_mutually_exclusive_group()
+        length.add_argument("--scale", choices=list(self.scales), default="small")
+        length.add_argument("--steps", type=int, help="as small, but of so many environment steps")
         parser.add_argument("--seeds", type=int, nargs="+")
         parser.add_argument("--env", nargs="+")
         parser.add_argument("--only", nargs="+", help="agents")
         parser.add_argument("--jobs", type=int, default=1, help="runs at once")
         options = parser.parse_args()
+        scale = options.scale if options.steps is None else self.of_steps(options.steps)
         try:
-            self.run(options.scale, self.jobs(options.scale, options.seeds, options.env, options.only), options.jobs)
+            self.run(scale, self.jobs(scale, options.seeds, options.env, options.only), options.jobs)
         except ConfigError as error:
             sys.exit(f"studies.{self.name}: {error}")
         except KeyboardInterrupt:

@@ -69,6 +69,27 @@ def test_a_study_runs_once_and_its_lines_can_be_plotted(tmp_path, monkeypatch):
     assert np.isfinite([played["averaged"], played["newest"]]).all()
 
 
+def test_of_so_many_steps_it_has_runs_and_a_file_of_its_own(tmp_path, monkeypatch):
+    begun = []
+
+    def trained(job, cores):
+        begun.append(job)
+        raise ConfigError(job.agent, "", "ended with 1")
+
+    monkeypatch.setattr(study, "RESULTS", tmp_path)
+    monkeypatch.setattr(study, "_trained", trained)
+    tiny = Study("tiny", {"ours": "train ENV"}, small=Scale(1000, (1, 2), ("InvertedPendulum-v5",)))
+    monkeypatch.setattr("sys.argv", ["tiny", "--steps", "3000", "--seeds", "4"])
+    with pytest.raises(SystemExit, match="ended with 1"):
+        tiny.main()
+    (job,) = begun
+    command = options.parse(job.words)
+    assert (command.total_steps, command.seed, command.env.id) == (3000, 4, "InvertedPendulum-v5")
+    assert job.folder.parent.name == "tiny-3000"
+    assert tiny.results("3000") == tmp_path / "tiny-3000.jsonl"
+    assert all("1000" in one.words for one in tiny.jobs("small"))
+
+
 def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "RUNS", tmp_path)
     agents = {"broken": "train ENV --gamma 7", "sound": "baseline sac ENV"}
