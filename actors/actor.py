@@ -27,6 +27,7 @@ from common.wrappers import Env, Floats
 log = logging.getLogger(__name__)
 POLL_SECONDS = 0.02  # between looks at the bus while there is nothing to do but wait
 RESEND_SECONDS = 5.0  # without a new acknowledgement before everything unacknowledged is sent again
+DOUBT_SECONDS = 10.0  # that an older acknowledgement than the last is not believed; the replay repeats its own sooner
 BROKEN_STARTS = 5  # episodes in a row that an environment breaks in their first step before the actor gives up
 _NOISE = -1  # the place of the policy's noise among the environments' seeds
 
@@ -121,6 +122,7 @@ class Actor:
         epoch = self._bus.take_epoch(self.name, floor=ack.id.epoch if ack else 0)
         self._outbox = Outbox(self._bus, self._index, epoch, self._spec)
         self._ack: Ack | None = None
+        self._older_since = float("inf")
         self._version: Version | None = None
         self._steps = 0
         self._refresh_at = self._config.refresh_steps
@@ -227,8 +229,10 @@ class Actor:
             self._version = found[0]
 
     def _poll_ack(self) -> None:
-        ack, now = self._bus.ack(self._index), self._clock()
+        now = self._clock()
+        ack = self._believed(self._bus.ack(self._index), now)
         if ack is not None and self._is_forgotten_life(ack):
+            log.warning("%s: the replay server does not know epoch %d any more", self.name, self._outbox.epoch)
             self.restart()
             return
         if ack is not None and ack.id.epoch == self._outbox.epoch:
@@ -238,6 +242,15 @@ class Actor:
         if now >= self._resend_at:  # a Redis that came back empty has lost what the replay server never saw
             self._outbox.send_again()
             self._resend_at = now + RESEND_SECONDS
+
+    def _believed(self, ack: Ack | None, now: float) -> Ack | None:
+        """An ack, but for a while none older than the last: a Redis that came back as it was hears of the newest soon.
+
+        One that stays is a ring's that has forgotten the newest.
+        """
+        older = ack is not None and self._ack is not None and ack.id < self._ack.id
+        self._older_since = min(self._older_since, now) if older else float("inf")
+        return None if older and now < self._older_since + DOUBT_SECONDS else ack
 
     def _is_forgotten_life(self, ack: Ack) -> bool:
         """Whether Redis has forgotten a life of this actor that the ring knows, or the ring has forgotten ours.

@@ -196,7 +196,7 @@ def random_rows(spec: WindowSpec, count: int) -> Rows:
     """Full windows of plausible numbers."""
     rng = np.random.default_rng(0)
     rows = np.zeros(count, spec.dtype)
-    rows["last"] = spec.steps
+    rows["last"], rows["episode_step"] = spec.steps, spec.burn_in
     rows["new_steps"] = rows["new_observations"] = spec.train
     for name in ("observation", "action", "prev_action", "reward", "state"):
         rows[name] = rng.uniform(-1.0, 1.0, rows[name].shape)

@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 import redis
@@ -16,6 +17,7 @@ from common.pending_read import PendingRead
 from common.record import decode_record, encode_record
 from common.redis_url import shown
 
+TIMEOUT_SECONDS = 3.0  # that Redis may take for an answer; two of them are less than a learner waits for a batch
 DEAD_LETTERS_KEPT = 1_000
 INTEGER = re.compile(rb"-?[0-9]{1,18}")
 KINDS = ("weights", "evaluate")  # of policies: what acts, and what is evaluated
@@ -29,6 +31,11 @@ if tonumber(redis.call('GET', KEYS[1]) or '0') > tonumber(ARGV[1]) then return -
 for i = 2, #KEYS do redis.call('XTRIM', KEYS[i], 'MINID', ARGV[i]) end
 return 0
 """
+DROP_SCRIPT = """
+if tonumber(redis.call('GET', KEYS[1]) or '0') > tonumber(ARGV[1]) then return -1 end
+redis.call('DEL', KEYS[2])
+return 0
+"""
 T = TypeVar("T")
 
 
@@ -36,14 +43,16 @@ class RedisBus:
     """All roles of one run over one Redis. Not thread-safe: one per thread.
 
     Redis's own retries are short (a lost reply is repeated, which explicit ids make harmless);
-    an outage longer than that raises BusUnavailable and the role's loop waits.
+    an outage longer than that raises BusUnavailable and the role's loop waits. ``around`` is entered for every call.
     """
 
     def __init__(self, url: str, run: str) -> None:
         """``url``: ``unix:///path``, ``redis://host:port`` or ``rediss://…``. Raises ConfigError."""
+        lost = (redis.exceptions.ConnectionError,)  # one that hangs would keep the role once more
+        retry = Retry(ExponentialBackoff(cap=0.1, base=0.01), retries=3, supported_errors=lost)
         try:
             self._redis: Any = redis.Redis.from_url(  # Any: its annotations do not know decode_responses
-                url, retry=Retry(ExponentialBackoff(cap=0.1, base=0.01), retries=3), socket_timeout=10.0
+                url, retry=retry, socket_timeout=TIMEOUT_SECONDS
             )
         except ValueError:  # its words quote parts of the URL, which may be a password's
             fix = "not a Redis URL; give unix:///path, redis://host:port or rediss://…; in a password, %2F is /"
@@ -51,13 +60,15 @@ class RedisBus:
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
         self._pending = PendingRead(self._redis.connection_pool)
+        self.around: Callable[[], AbstractContextManager[None]] = nullcontext
 
     def _key(self, *parts: object) -> str:
         return ":".join([self._prefix, *map(str, parts)])
 
     def _call(self, action: Callable[..., T], *args: Any) -> T:
         try:
-            return action(*args)
+            with self.around():
+                return action(*args)
         except redis.exceptions.OutOfMemoryError as error:
             raise BusFull(str(error)) from None
         except redis.exceptions.ResponseError as error:
@@ -173,10 +184,16 @@ class RedisBus:
             self._commit(holder, acks, progress)
 
     def _trim(self, holder: Holder, acks: Mapping[int, Ack]) -> None:
-        """Trim alone, in a script: a full Redis refuses all commands in a MULTI, XTRIM too; alone it is not fenced."""
-        keys = [self._key("epoch", holder.role), *(self._key("windows", actor) for actor in acks)]
-        words = [str(holder.epoch), *(f"{ack.id.epoch}-{ack.id.seq + 1}" for ack in acks.values())]
-        if self._call(lambda: self._redis.eval(TRIM_SCRIPT, len(keys), *keys, *words)) < 0:
+        """Trim alone: a full Redis has no room for the acks, but for this."""
+        self._run(TRIM_SCRIPT, holder, list(acks), [f"{ack.id.epoch}-{ack.id.seq + 1}" for ack in acks.values()])
+
+    def _run(self, script: str, holder: Holder, actors: list[int], words: list[str]) -> None:
+        """A script on actors' streams: a full Redis refuses all commands in a MULTI; by themselves they are not fenced.
+
+        Raises FencedError where a newer replay server has come.
+        """
+        keys = [self._key("epoch", holder.role), *(self._key("windows", actor) for actor in actors)]
+        if self._call(lambda: self._redis.eval(script, len(keys), *keys, str(holder.epoch), *words)) < 0:
             raise FencedError(f"{holder.role} epoch {holder.epoch} was replaced")
 
     def _commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes) -> None:
@@ -216,12 +233,7 @@ class RedisBus:
         return held
 
     def drop_stream(self, holder: Holder, actor: int) -> None:
-        def transaction(pipe: Any) -> None:
-            self._held(pipe, holder)
-            pipe.multi()
-            pipe.delete(self._key("windows", actor))
-
-        self._call(lambda: self._redis.transaction(transaction, self._key("epoch", holder.role)))
+        self._run(DROP_SCRIPT, holder, [actor], [])
 
     def ack(self, actor: int) -> Ack | None:
         raw = self._call(lambda: self._redis.hget(self._key("acks"), str(actor)))

@@ -2,6 +2,8 @@
 
 import faulthandler
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class Watchdog:
@@ -16,6 +18,18 @@ class Watchdog:
         if now >= self._next:
             self._next = now + self._seconds / 10
             faulthandler.dump_traceback_later(1.1 * self._seconds, exit=True)
+
+    @contextmanager
+    def asleep(self) -> Iterator[None]:
+        """Watch nothing in here; afterwards it begins anew, if it had begun."""
+        begun = self._next > float("-inf")
+        faulthandler.cancel_dump_traceback_later()
+        try:
+            yield
+        finally:
+            self._next = float("-inf")
+            if begun:
+                self.beat()
 
     def close(self) -> None:
         """Watch no more."""

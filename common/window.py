@@ -96,6 +96,8 @@ def first_fault(rows: Rows, spec: WindowSpec) -> str | None:
         return "last is outside (burn_in, T]"
     if not ((rows["new_steps"] >= 0) & (rows["new_steps"] <= last - spec.burn_in)).all():
         return "new_steps exceeds the trained steps"
+    if ((first == 0) & (rows["episode_step"] < spec.burn_in)).any():
+        return "a burn-in before its episode's start"
     new = rows["new_observations"]
     if not ((new >= rows["new_steps"]) & (new <= rows["new_steps"] + 1)).all():
         return "new_observations is neither new_steps nor one more"

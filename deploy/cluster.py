@@ -31,11 +31,10 @@ from common.errors import BusFull, BusUnavailable, ConfigError, RoleDied
 from common.replay import WHOLE
 from common.role import StopSignal
 from deploy import tls
-from deploy.counters import Counters
-from deploy.local import PREFIX, TICK_SECONDS, register, sweep, watch
+from deploy.local import PREFIX, TICK_SECONDS, sweep, watch
 from deploy.monitor import Monitor
 from deploy.nursery import URL_VARIABLE
-from deploy.presets import RunConfig, to_json
+from deploy.presets import RunConfig
 from deploy.ray_host import NAMESPACE, Task, host_name
 from deploy.ray_hosted import Hosted
 from deploy.ray_places import (
@@ -51,6 +50,7 @@ from deploy.ray_places import (
 )
 from deploy.redis_server import Port, RedisServer
 from deploy.redis_users import RedisUsers
+from deploy.registration import Registration
 from deploy.rings import Rings
 from deploy.roles import PATIENCE_VARIABLE, connect
 from deploy.run_folder import RunFolder
@@ -72,7 +72,6 @@ class ClusterRun:
     def __init__(self, config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> None:
         self.config, self._folder, self._device, self._all_cpus = config, folder, device, all_cpus
         self._encrypted, self._rings = encrypted, Rings(folder)
-        self._counters = Counters(folder, config.replay.replay_shards)
         self._leave = ExitStack()
         sweep()
         sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))
@@ -86,8 +85,7 @@ class ClusterRun:
             self._server = RedisServer(sockets, port=port, users=self._users())
             self._leave.enter_context(self._server)
             self.bus = connect(self._server.url(), folder.name)
-            register(self.bus, config)
-            self._counters.restore(self.bus)
+            self._registration = Registration(config, folder, self.bus)
         except BaseException:
             self._leave.close()
             raise
@@ -163,15 +161,13 @@ class ClusterRun:
         if not self._server.alive():
             log.warning("the embedded Redis died; starting it again")
             self._server.start()
-            register(self.bus, self.config)
-            self._counters.restore(self.bus)
+        self._registration.tend()
         for hosted in list(self._hosts.values()):
             hosted.ask(self._folder.logs)
             if hosted.dead:
                 self._mourn(hosted)
             elif hosted.name.startswith("replay") and hosted.running:
                 self._rings.note(hosted.name, hosted.node)
-        self._counters.keep(self.bus)
         if time.monotonic() >= self._look_at:
             self._look_at = time.monotonic() + NODES_SECONDS
             self._look_at_nodes()
@@ -248,7 +244,7 @@ class ClusterRun:
             return
         grown = dataclasses.replace(self.config, actors=fit)
         try:
-            self.bus.set_config(to_json(grown).encode())
+            self._registration.change(grown)
         except (BusUnavailable, BusFull):  # the next look tries again
             return
         self.config = grown
@@ -286,7 +282,7 @@ class ClusterRun:
                 with suppress(RoleDied):
                     hosted.ask(self._folder.logs)
             time.sleep(TICK_SECONDS)
-        self._counters.keep(self.bus, at_once=True)
+        self._registration.keep()
 
     def _kept_elsewhere(self) -> bool:
         """Whether something of the run is on a node alone, where its hosts share a folder."""

@@ -14,12 +14,12 @@ from common.errors import BusFull, BusUnavailable
 from common.redis_bus import RedisBus
 from common.replay import Shard
 from common.role import StopSignal
-from deploy.counters import Counters
 from deploy.monitor import Monitor
 from deploy.nursery import URL_VARIABLE
-from deploy.presets import RunConfig, to_json
+from deploy.presets import RunConfig
 from deploy.redis_server import RedisServer
 from deploy.redis_users import LAUNCHER, RedisUsers
+from deploy.registration import Registration
 from deploy.roles import PATIENCE_VARIABLE, connect
 from deploy.run_folder import RunFolder
 from deploy.supervisor import STOP_SECONDS, RoleCommand, Supervisor
@@ -59,7 +59,6 @@ class LocalRun:
     """A run's processes between ``start`` and ``close``."""
 
     def __init__(self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str) -> None:
-        self._config, self._counters = config, Counters(folder, config.replay.replay_shards)
         self._leave = ExitStack()
         sweep()
         self.sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))  # private, and short: see redis_server
@@ -67,8 +66,7 @@ class LocalRun:
         try:
             self._server = None if redis_url else self._leave.enter_context(_redis(config, folder, self.sockets))
             self.bus = connect(redis_url or self._url(LAUNCHER), folder.name)
-            register(self.bus, config)
-            self._counters.restore(self.bus)
+            self._registration = Registration(config, folder, self.bus)
         except BaseException:
             self._leave.close()
             raise
@@ -87,9 +85,7 @@ class LocalRun:
         if self._server is not None and not self._server.alive():
             log.warning("the embedded Redis died; starting it again")
             self._server.start()
-            self.bus.set_config(to_json(self._config).encode())
-            self._counters.restore(self.bus)
-        self._counters.keep(self.bus)
+        self._registration.tend()
         self.supervisor.tend()
 
     def finished(self) -> bool:
@@ -100,7 +96,7 @@ class LocalRun:
         """End everything; nothing is left but the run's folder."""
         try:
             self.supervisor.stop()
-            self._counters.keep(self.bus, at_once=True)
+            self._registration.keep()
             if self._server is None:
                 _expire(self.bus)
         finally:
@@ -114,13 +110,6 @@ def sweep() -> None:
         with suppress(FileNotFoundError):  # another launcher sweeps, too
             if owner.isdigit() and not psutil.pid_exists(int(owner)) and left.stat().st_uid == os.getuid():
                 shutil.rmtree(left, ignore_errors=True)
-
-
-def register(bus: RedisBus, config: RunConfig) -> None:
-    """Make a run known to its roles, afresh."""
-    bus.expire(None)
-    bus.set_config(to_json(config).encode())
-    bus.clear_stop()
 
 
 def _expire(bus: RedisBus) -> None:
@@ -152,9 +141,10 @@ def train(
 def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monitor, stop: StopSignal) -> bool:
     """Register a run whose roles are started by hand, watch it and end it; whether its total was reached."""
     bus = connect(redis_url, folder.name)
-    register(bus, config)
+    registration = Registration(config, folder, bus)
     monitor.skip_old(bus)
     while not stop.requested and not monitor.learner_finished():
+        registration.tend()
         watch(monitor, bus)
         time.sleep(TICK_SECONDS)
     with suppress(BusUnavailable, BusFull):

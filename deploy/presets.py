@@ -23,6 +23,7 @@ from learner.update import UpdateConfig
 from replay_server.server import ReplayConfig
 
 Preset = Literal["robust", "paper", "debug"]
+LARGEST_WINDOW = 32 << 20  # bytes, half of what our Redis takes as a value
 ConfigT = TypeVar("ConfigT")
 
 
@@ -73,7 +74,13 @@ class RunConfig:
                 )
             train = time_limit
         state = self.agent.state_size(obs_dim)
-        return WindowSpec(obs_dim, action_dim, state, burn_in if strategy == "burn-in" else 0, train)
+        spec = WindowSpec(obs_dim, action_dim, state, burn_in if strategy == "burn-in" else 0, train)
+        if 4 * spec.observations * (obs_dim + action_dim + 1) > LARGEST_WINDOW:
+            name = "--time-limit" if strategy == "episode" else "--trained-steps"
+            raise ConfigError(
+                name, train, f"a window would have more than {LARGEST_WINDOW >> 20} MiB; take fewer steps"
+            )
+        return spec
 
     def shards(self) -> list[Shard]:
         """The replay servers."""

@@ -43,13 +43,13 @@ REPLAY = (
     "+watch +unwatch +multi +exec",
     "(+get %R~R:weights %R~R:epoch:learner)",
     "(+smembers %R~R:actors)",
-    "(+xread +xtrim +del ~R:windows:OWN)",
+    "(+xread +xtrim ~R:windows:OWN)",
     "(+set +watch ~R:epoch:ROLE)",
     "(+hset ~R:acks)",
     "(+hget +hset +hsetnx ~R:progress)",
     "(+hset %W~R:replay)",
     "(+xadd %W~R:dead)",
-    "(+eval +get +xtrim ~R:epoch:ROLE ~R:windows:OWN)",  # a full Redis takes a trim by a script alone
+    "(+eval +get +xtrim +del ~R:epoch:ROLE ~R:windows:OWN)",  # a full Redis takes these by a script alone
 )
 PLAIN = frozenset(string.ascii_letters + string.digits + "._-:")
 OWNER = ("~R:*", "+@all -@dangerous -@admin -@scripting -@pubsub +acl|load")

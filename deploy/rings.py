@@ -1,11 +1,12 @@
 """Where the rings of a run lie on a cluster, so that one that goes on finds them again."""
 
 import json
+from contextlib import suppress
 
 import ray
 from ray.util.placement_group import PlacementGroup, placement_group_table
 
-from deploy.run_folder import RunFolder
+from deploy.run_folder import RunFolder, write_whole
 
 READY_SECONDS = 5.0
 
@@ -15,15 +16,16 @@ class Rings:
 
     def __init__(self, folder: RunFolder) -> None:
         self._path = folder.path / "rings-at"
-        self._at: dict[str, str] = json.loads(self._path.read_text()) if self._path.exists() else {}
+        self._at: dict[str, str] = {}
+        with suppress(OSError, ValueError):  # cut short, or not there yet: Ray places them anywhere
+            self._at.update(json.loads(self._path.read_bytes()))
 
     def note(self, role: str, address: str) -> None:
         """A replay server runs there now."""
         if self._at.get(role) != address:
-            self._at[role] = address
-            temporary = self._path.with_suffix(".new")
-            temporary.write_text(json.dumps(self._at))
-            temporary.rename(self._path)
+            with suppress(OSError):  # the disk is full: until it is not, a later launcher would not find the ring
+                write_whole(self._path, json.dumps({**self._at, role: address}).encode())
+                self._at[role] = address
 
     def node(self, role: str) -> str | None:
         """Ray's id of the node that holds a ring, while that node is alive."""

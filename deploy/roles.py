@@ -23,7 +23,7 @@ from common.outage import Outage
 from common.redis_bus import RedisBus
 from common.redis_url import shown
 from common.replay import Shard
-from common.role import RECONNECT_SLEEP, StopSignal, run_role
+from common.role import RECONNECT_SLEEP, Role, StopSignal, run_role
 from common.watchdog import Watchdog
 from common.wrappers import Env
 from deploy import tls
@@ -166,9 +166,7 @@ def run_actor(place: Place, index: int) -> None:
     torch.set_num_threads(1)
     spec, rater = config.window_spec(), initial_priority(config, index)
     actor = Actor(index, config.seed, process.make_env, spec, config.agent, config.actor, process.bus, rater=rater)
-    watchdog = Watchdog(config.env.env_timeout)
-    run_role(actor, process.bus, process.stop, beat=watchdog.beat)
-    watchdog.close()
+    _run_watched(actor, process)
 
 
 def initial_priority(config: RunConfig, index: int) -> InitialPriority | None:
@@ -186,8 +184,14 @@ def run_evaluator(place: Place) -> None:
     torch.set_num_threads(1)
     os.nice(EVALUATOR_NICENESS)
     evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, process.bus)
-    watchdog = Watchdog(config.env.env_timeout)
-    run_role(evaluator, process.bus, process.stop, beat=watchdog.beat)
+    _run_watched(evaluator, process)
+
+
+def _run_watched(role: Role, process: Process) -> None:
+    """A role that dies where an environment hangs; Redis may hang."""
+    watchdog = Watchdog(process.config.env.env_timeout)
+    process.bus.around = watchdog.asleep
+    run_role(role, process.bus, process.stop, beat=watchdog.beat)
     watchdog.close()
 
 

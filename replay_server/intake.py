@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.bus import Bus, Entry, EntryId
-from common.errors import BusFull, MessageError
+from common.errors import BusFull, BusUnavailable, MessageError
 from common.replay import WHOLE, Shard
 from common.window import Rows, WindowSpec, first_fault
 from common.wire import check_rows, decode_rows, max_entry_bytes
@@ -28,7 +28,7 @@ class Round:
 
     rows: Rows  # (n,) writable, all but the serial as it will stand in the ring
     positions: dict[int, StreamPosition]  # of the streams read from, after this round
-    broken: list[int]  # actors whose stream lacks an entry: nothing past it was taken
+    broken: dict[int, EntryId]  # actors whose stream lacks an entry, and the one before: nothing past it was taken
 
 
 class Intake:
@@ -55,8 +55,14 @@ class Intake:
         self._entry_bytes = max(len(entry.payload) for entry in entries) + 64
         found = self._round(entries, dict(positions))
         if not found.broken:  # of a broken stream the same entries would come again, and then pass for all there is
-            self.bus.expect(self._cursors(found.positions), self._count())
+            with suppress(BusUnavailable):  # what is refused in this round shall not be refused again
+                self.bus.expect(self._cursors(found.positions), self._count())
         return found
+
+    def sends_again(self, actor: int, before: EntryId) -> None:
+        """An actor's stream was dropped, so that it sends again what came after that entry."""
+        self._asked[actor] = before
+        self.gaps += 1
 
     def _cursors(self, positions: Mapping[int, StreamPosition]) -> dict[int, EntryId]:
         return {actor: positions[actor].id if actor in positions else BEFORE_ALL for actor in self._actors}
@@ -79,20 +85,23 @@ class Intake:
             positions[entry.actor] = StreamPosition(entry.id, settled)
         return Round(rows, positions, broken)
 
-    def _in_order(self, entries: list[Entry], positions: Mapping[int, StreamPosition]) -> tuple[list[Entry], list[int]]:
-        """Entries up to the first gap of each stream that can be filled, and the actors of those with one."""
+    def _in_order(
+        self, entries: list[Entry], positions: Mapping[int, StreamPosition]
+    ) -> tuple[list[Entry], dict[int, EntryId]]:
+        """Entries up to the first gap of each stream that can be filled, and of those with one what was before it."""
         last = {actor: position.id for actor, position in positions.items()}
         taken: list[Entry] = []
-        broken: list[int] = []
+        broken: dict[int, EntryId] = {}
         for entry in entries:
+            before = last.get(entry.actor, BEFORE_ALL)
             if entry.actor in broken:
                 continue
             if entry.id.epoch > LARGEST.epoch or entry.id.seq > LARGEST.seq:
                 self._refuse(entry, MessageError("id", f"{entry.id.epoch}-{entry.id.seq}, past all others"))
-                broken.append(entry.actor)
+                broken[entry.actor] = before
                 continue
-            if self._lacks_entries(last.get(entry.actor, BEFORE_ALL), entry):
-                broken.append(entry.actor)
+            if self._lacks_entries(before, entry):
+                broken[entry.actor] = before
                 continue
             last[entry.actor] = entry.id
             taken.append(entry)
@@ -107,11 +116,10 @@ class Intake:
         known = entry.id.epoch == before.epoch
         if entry.id.seq == (before.seq + 1 if known else 0):
             return False
+        if known and self._asked.get(entry.actor) != before:
+            return True
         self.gaps += 1
-        if not known or self._asked.get(entry.actor) == before:
-            return False
-        self._asked[entry.actor] = before
-        return True
+        return False
 
     def _decode(self, entry: Entry) -> Rows | None:
         try:

@@ -5,7 +5,7 @@ from typing import Any
 
 from common.errors import BusFull, BusUnavailable
 from common.memory import keep_freed_memory
-from common.role import RECONNECT_SLEEP
+from common.role import next_try
 from replay_server.server import ReplayServer
 from replay_server.socket_server import SocketServer
 
@@ -16,7 +16,10 @@ ANNOUNCE_PERIOD = 5.0
 
 
 class ReplayProcess:
-    """The role ``replay``, or a shard of it, with its socket. The learner is served on while Redis is away."""
+    """The role ``replay``, or a shard of it, with its socket.
+
+    The learner is served on while Redis is away, and half of the time where it hangs.
+    """
 
     def __init__(self, server: ReplayServer, sockets: SocketServer) -> None:
         keep_freed_memory()
@@ -39,7 +42,7 @@ class ReplayProcess:
                 self.sockets.fence(self.server.bus.current_epoch("learner"))  # an older one may come to us first
                 self.server.bus.announce_replay(self.server.holder, self.sockets.address)
         except (BusUnavailable, BusFull):
-            self._bus_is_away, self._next_intake = True, now + RECONNECT_SLEEP
+            self._bus_is_away, self._next_intake = True, next_try(now)
             return False
         self._wait = 0.0 if took else min(2 * self._wait + FIRST_WAIT, IDLE_WAIT)  # what was asked for ahead is near
         self._bus_is_away, self._next_intake = False, now + self._wait

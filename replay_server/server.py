@@ -100,6 +100,7 @@ class ReplayServer:
         )
         self._published: dict[int, Ack] = {}
         self._republish_at = 0.0
+        self._owes_acks = False  # of what was taken in when Redis went away
         self._buffers = [np.empty(0, spec.dtype)] * 2
         self._waiting_for, self._waiting_since = "", 0.0  # the learner, at the limiter
         self._refused_priorities = 0
@@ -156,11 +157,16 @@ class ReplayServer:
         """Take in one round of entries: ring, commit, acks. False where there was none."""
         taken = self._intake.read(self._store.ring.progress.streams)
         if taken is not None:
+            self._owes_acks = True
             self._insert(taken)
-            for actor in taken.broken:
-                self.bus.drop_stream(self.holder, actor)
-        self._publish(at_once=taken is not None)
-        return taken is not None
+        self._publish(at_once=self._owes_acks)
+        self._owes_acks = False
+        if taken is None:
+            return False
+        for actor, before in taken.broken.items():
+            self.bus.drop_stream(self.holder, actor)
+            self._intake.sends_again(actor, before)
+        return True
 
     def _insert(self, taken: Round) -> None:
         ring, progress, rows = self._store.ring, self._store.ring.progress, taken.rows

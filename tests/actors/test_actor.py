@@ -51,7 +51,7 @@ class Reader:
     """Reads and acknowledges as a replay server does, and keeps what it read."""
 
     def __init__(self, bus: Bus) -> None:
-        self._bus, self._holder = bus, Holder("replay", bus.take_epoch("replay"))
+        self._bus, self.holder = bus, Holder("replay", bus.take_epoch("replay"))
         self._cursors: dict[int, EntryId] = {}
         self.entries: list[Entry] = []
 
@@ -62,7 +62,7 @@ class Reader:
             self.entries.append(entry)
             self._cursors[entry.actor] = entry.id
         acks = {actor: Ack(cursor, granted_steps, final) for actor, cursor in self._cursors.items()}
-        self._bus.commit(self._holder, acks)
+        self._bus.commit(self.holder, acks)
 
     def rows(self) -> Rows:
         return join_rows([decode_rows(entry.payload, SPEC) for entry in self.entries], SPEC)
@@ -425,6 +425,30 @@ def test_a_life_that_the_ring_forgot_is_begun_anew(bus: Bus) -> None:
     play(bus, actor, reader, 300)
     later = reader.rows()[reader.rows()["epoch"] == 2]
     assert_each_step_once(later, 300)
+    actor.close()
+
+
+def test_a_redis_that_is_back_as_it_was_ends_no_life(bus: Bus) -> None:
+    """It has an older ack; the replay server, which forgot nothing, repeats its own soon."""
+    publish(bus, 0)
+    actor, reader = make_actor(bus), Reader(bus)
+    play(bus, actor, reader, 200, final=False)
+    old = bus.ack(0)
+    assert old is not None
+    for granted in (300, 400):
+        reader.read(granted)
+        step_until_blocked(actor)
+    reader.read(400)
+    newest = bus.ack(0)
+    assert newest is not None
+    for said in (old, newest, old):
+        bus.commit(reader.holder, {0: said})
+        actor.step()
+        assert actor.waiting_for() == "credit"
+    assert bus.current_epoch("actor-0") == 1
+    for _ in range(60):  # it stays: the ring has forgotten the newest
+        actor.step()
+    assert bus.current_epoch("actor-0") == 2
     actor.close()
 
 

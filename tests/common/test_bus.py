@@ -333,6 +333,9 @@ def test_a_full_redis_trims_in_no_transaction():
             pipe.execute()
         bus.commit(Holder("replay", 1), {0: Ack(EntryId(1, 18), 5)})
         assert bus._redis.xlen(bus._key("windows", 0)) == 1
+        bus._redis.config_set("maxmemory", 1)
+        bus.drop_stream(Holder("replay", 1), 0)
+        assert not bus._redis.exists(bus._key("windows", 0))
 
 
 def fill(bus: Bus, start: int = 0) -> int:

@@ -129,3 +129,11 @@ def test_values_that_do_not_go_together_are_refused() -> None:
         validate(with_value(with_value(config, "actors", 3), "replay.replay_shards", 2))
     with pytest.raises(ConfigError, match="--heads"):
         validate(with_value(config, "agent.heads", (400, 0)))
+
+
+def test_a_window_that_no_redis_would_take_is_refused() -> None:
+    config = with_value(
+        presets.robust(EnvConfig("InvertedPendulum-v5", time_limit=2**31)), "actor.state_strategy", "episode"
+    )
+    with pytest.raises(ConfigError, match=r"--time-limit=2147483648: .* more than 32 MiB"):
+        config.window_spec()

@@ -37,6 +37,15 @@ def test_a_ring_is_where_it_was_noted_while_that_node_lives(tmp_path: Path) -> N
     assert again.node("replay") is None
 
 
+@pytest.mark.parametrize("cut", [b"", b'{"replay": "10'])
+def test_a_note_that_is_cut_short_is_none(tmp_path: Path, cut: bytes) -> None:
+    (tmp_path / "rings-at").write_bytes(cut)
+    noted = Rings(RunFolder(tmp_path))
+    assert noted.node("replay") is None
+    noted.note("replay", "10.0.0.b")
+    assert Rings(RunFolder(tmp_path)).node("replay") == "b"
+
+
 def test_shards_take_the_bundles_of_their_nodes_and_the_others_what_is_left(tmp_path: Path) -> None:
     noted = Rings(RunFolder(tmp_path))
     assert noted.bundles(Group(), ROLES) == {"replay-0": 0, "replay-1": 1, "replay-2": 2}

@@ -16,11 +16,12 @@ from common.envs import EnvConfig
 from common.errors import ConfigError
 from common.redis_bus import RedisBus
 from common.role import StopSignal
-from deploy.local import register
 from deploy.presets import debug
 from deploy.redis_server import RedisServer
 from deploy.redis_users import RedisUsers
+from deploy.registration import Registration
 from deploy.roles import Patience, Place, Process, connect, wait_for_room
+from deploy.run_folder import RunFolder
 
 
 @pytest.fixture
@@ -54,7 +55,7 @@ def handlers() -> Iterator[None]:
 
 @pytest.mark.usefixtures("handlers")
 def test_a_role_waits_for_its_run(
-    redis_url: str, run_name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    redis_url: str, run_name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RMC_PATIENCE", "0.3")
     place = Place(run_name, redis_url)
@@ -64,7 +65,8 @@ def test_a_role_waits_for_its_run(
     monkeypatch.setenv("RMC_PATIENCE", "60")
     config = debug(EnvConfig("Pendulum-v1"))
     with ThreadPoolExecutor(1) as pool:
-        later = pool.submit(lambda: (time.sleep(0.5), register(RedisBus(redis_url, run_name), config)))
+        bus, folder = RedisBus(redis_url, run_name), RunFolder(tmp_path)
+        later = pool.submit(lambda: (time.sleep(0.5), Registration(config, folder, bus)))
         assert Process(place).config == config
         later.result()
 

@@ -27,6 +27,7 @@ def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC) -> Rows:
     rows = np.zeros(count, spec.dtype)
     rows["serial"] = np.arange(count)
     rows["first"] = rng.choice([0, spec.burn_in], count)
+    rows["episode_step"] = spec.burn_in
     rows["last"] = rng.integers(spec.burn_in + 1, spec.steps + 1, count)
     rows["terminated"] = rng.integers(0, 2, count)
     rows["blank"] = rng.uniform(size=rows["blank"].shape) < 0.3

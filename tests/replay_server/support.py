@@ -18,7 +18,7 @@ def make_rows(count: int, first_mark: int = 0, spec: WindowSpec = SPEC) -> Rows:
     """Full windows that each carry ``train`` new steps; reward[0] is a running mark that names the window."""
     rows = np.zeros(count, spec.dtype)
     marks = np.arange(first_mark, first_mark + count)
-    rows["last"] = spec.steps
+    rows["first"], rows["last"] = spec.burn_in, spec.steps  # each begins an episode
     rows["new_steps"] = rows["new_observations"] = spec.train
     phase = np.arange(spec.observations * spec.obs_dim).reshape(spec.observations, spec.obs_dim)
     rows["observation"] = np.sin(marks[:, None, None] + phase)

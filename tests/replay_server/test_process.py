@@ -1,5 +1,7 @@
 """The replay server as a process's role: both its ends at once, and one end while the other is away."""
 
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 
 from common.errors import BusUnavailable, FencedError
-from common.redis_bus import RedisBus
+from common.redis_bus import TIMEOUT_SECONDS, RedisBus
 from common.replay import Draw
 from common.role import StopSignal, run_role
 from deploy.redis_server import RedisServer
@@ -104,7 +106,7 @@ def test_a_replaced_learner_that_comes_first_is_not_served(
         running.end()
 
 
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(90)
 def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_path: Path) -> None:
     folder = tmp_path / "redis"
     folder.mkdir(mode=0o700)
@@ -127,6 +129,15 @@ def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_
             time.sleep(0.05)
         assert time.monotonic() - started < 10.0
         redis_server.start()  # empty: it keeps no files
+        until(lambda: bus.ack(0) is not None)
+        assert redis_server.process is not None
+        os.kill(redis_server.process.pid, signal.SIGSTOP)  # it does not answer, either
+        began, served = time.monotonic(), 0
+        while (now := time.monotonic()) < began + 2.5 * TIMEOUT_SECONDS:
+            assert client.sample(16).draw is Draw.BATCH
+            served += time.monotonic() - now < 1.0
+        os.kill(redis_server.process.pid, signal.SIGCONT)
+        assert served > 40
         until(lambda: bus.ack(0) is not None)  # acks and address are said again
         until(lambda: bus.replay_address("replay") is not None)
         sender.greet()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -294,7 +295,10 @@ def test_bad_entries_are_put_aside_counted_and_cost_no_credit(make: Make, redis_
     good = encode_windows(make_rows(3), SPEC)
     nan = make_rows(3)
     nan["reward"][1] = np.nan
-    bad = [b"", b"\x00" * 50, good[:-1], good[:-1] + b"\xff", encode_windows(nan, SPEC), b"\xc1" * (2 << 20)]
+    early = make_rows(3)
+    early["first"][1] = 0  # a burn-in from before the episode
+    bad = [b"", b"\x00" * 50, good[:-1], good[:-1] + b"\xff", b"\xc1" * (2 << 20)]
+    bad += [encode_windows(rows, SPEC) for rows in (nan, early)]
     for payload in bad:
         sender.send_raw(payload)
         sender.send(1)
@@ -302,11 +306,11 @@ def test_bad_entries_are_put_aside_counted_and_cost_no_credit(make: Make, redis_
     stats = server.stats()
     assert stats["dead_letters"] == len(bad) == bus._redis.xlen(f"rmc:{run_name}:dead")
     assert stats["dead_letters_crc"] == 1
-    assert stats["dead_letters_window"] == 1
+    assert stats["dead_letters_window"] == 2
     assert stats["dead_letters_too-large"] == 1
-    assert stats["env_steps"] == 6 * SPEC.train
-    assert stored(server)["reward"][:, 0].tolist() == list(range(6))
-    lost = 3 * 3 * SPEC.train  # what the sender counts in the three that were whole in size, at least
+    assert stats["env_steps"] == len(bad) * SPEC.train
+    assert stored(server)["reward"][:, 0].tolist() == list(range(len(bad)))
+    lost = 4 * 3 * SPEC.train  # what the sender counts in the four that were whole in size, at least
     assert sender.granted() >= lost + stats["env_steps"] + 116 - stats["env_steps"]
     assert bus.ack(0) is not None
     assert bus._redis.xlen(f"rmc:{run_name}:windows:0") == 0  # trimmed
@@ -334,6 +338,75 @@ def test_what_a_stream_lacks_is_sent_again(make: Make, kind: str, redis_url: str
     assert stored(server)["reward"][:, 0].tolist() == [0, 1, 2, 3]
     assert server.stats()["entry_gaps"] == 1
     assert sender.granted() > 0
+
+
+class Failing(MemoryBus):
+    """One call of the named methods fails."""
+
+    def __init__(self, *names: str) -> None:
+        super().__init__()
+        for name in names:
+            setattr(self, name, self._once(getattr(self, name)))
+        self.failing = False
+
+    def _once(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        failed = False
+
+        def call(*args: Any) -> Any:
+            nonlocal failed
+            if self.failing and not failed:
+                failed = True
+                raise BusUnavailable("away")
+            return method(*args)
+
+        return call
+
+
+def test_what_a_stream_lacks_is_asked_for_again_where_redis_went_away_amid_asking(make: Make) -> None:
+    bus = Failing("drop_stream")
+    server, sender = make(on=bus), Sender(bus)
+    sender.send(2)
+    drain(server)
+    sender.seq += 1  # entry 2 is what Redis lost
+    sender.send_rows(make_rows(1, 3))
+    bus.failing = True
+    with pytest.raises(BusUnavailable):
+        drain(server)
+    drain(server)
+    assert len(stored(server)) == 2
+    assert server.stats()["entry_gaps"] == 1
+    sender.greet()
+    sender.seq = 1
+    for mark in (2, 3):
+        sender.send_rows(make_rows(1, mark))
+    drain(server)
+    assert stored(server)["reward"][:, 0].tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("away", ["commit", "latest_version"])
+def test_what_redis_did_not_hear_is_said_when_it_is_back(make: Make, away: str) -> None:
+    bus = Failing(away)
+    server, sender = make(on=bus), Sender(bus)
+    drain(server)
+    sender.send(2)
+    bus.failing = True
+    with pytest.raises(BusUnavailable):
+        drain(server)
+    drain(server)  # nothing new came
+    ack = bus.ack(0)
+    assert ack is not None
+    assert ack.id == EntryId(1, 1)
+    assert bus.read({0: EntryId(0, -1)}, 10) == []
+
+
+def test_what_is_refused_is_refused_once_though_redis_goes_away(make: Make) -> None:
+    bus = Failing("expect")
+    server, sender = make(on=bus), Sender(bus)
+    drain(server)
+    sender.send_raw(b"junk")
+    bus.failing = True
+    drain(server)
+    assert server.stats()["dead_letters"] == len(bus.dead_letters) == 1
 
 
 @pytest.mark.parametrize("bad", [EntryId(2**64 - 1, 2**64 - 1), EntryId(1, 2**63), EntryId(2**31, 0)])

@@ -1,0 +1,62 @@
+"""A run stays known in a Redis that forgets."""
+
+from pathlib import Path
+
+import pytest
+import redis
+
+from common.bus import Ack, EntryId, Holder
+from common.envs import EnvConfig
+from common.errors import BusUnavailable
+from common.redis_bus import RedisBus
+from deploy import registration
+from deploy.presets import debug, from_json
+from deploy.registration import Registration
+from deploy.run_folder import RunFolder
+
+CONFIG = debug(EnvConfig("Pendulum-v1"))
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registration, "LOOK_SECONDS", 0.0)
+
+
+def test_a_redis_that_forgot_is_told_again_what_it_must_know(tmp_path: Path, redis_url: str, run_name: str) -> None:
+    bus = RedisBus(redis_url, run_name)
+    registered = Registration(CONFIG, RunFolder(tmp_path), bus)
+    bus.commit(Holder("replay", bus.take_epoch("replay")), {0: Ack(EntryId(1, 0), 0)}, b"counted")
+    registered.keep()
+    _forget(redis_url, run_name)
+    assert bus.config() is None
+    registered.tend()
+    assert from_json(bus.config() or b"") == CONFIG
+    assert bus.progress("replay") == b"counted"
+    bus.request_stop("so it shall be")  # which is no reason to begin afresh
+    registered.tend()
+    assert bus.stop_requested() == "so it shall be"
+
+
+def test_a_redis_that_is_away_is_told_later(
+    tmp_path: Path, redis_url: str, run_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus = RedisBus(redis_url, run_name)
+    registered = Registration(CONFIG, RunFolder(tmp_path), bus)
+    _forget(redis_url, run_name)
+
+    def away(_: bytes) -> None:
+        raise BusUnavailable("gone again")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(bus, "set_config", away)
+        registered.tend()
+    assert bus.config() is None
+    registered.tend()
+    assert bus.config() is not None
+
+
+def _forget(redis_url: str, run_name: str) -> None:
+    server = redis.Redis.from_url(redis_url)
+    for key in server.scan_iter(f"rmc:{run_name}:*"):
+        server.delete(key)
+    server.close()
