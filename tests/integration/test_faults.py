@@ -51,6 +51,7 @@ def test_a_frozen_learner_stops_the_actors_at_their_credit(endless: Training) ->
     try:
         endless.wait_for(lambda: endless.newest("actor-0", "waiting_share") > 0.99)
         endless.wait_for(lambda: endless.newest("actor-0", "waiting_for", "") == "credit")
+        time.sleep(3.0)  # what the replay server says is older
         steps = endless.newest("replay", "env_steps")
         time.sleep(3.0)
         assert endless.newest("replay", "env_steps") == steps
