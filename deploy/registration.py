@@ -21,8 +21,8 @@ class Registration:
         self._counters = Counters(folder, config.replay.replay_shards)
         self._look_at = 0.0
         bus.expire(None)
+        bus.clear_stop()  # before the config, which roles that are started by hand may wait for
         self._tell()
-        bus.clear_stop()
 
     def change(self, config: RunConfig) -> None:
         """From now on roles begin with this config. Raises BusUnavailable, BusFull."""
