@@ -14,9 +14,9 @@ import numpy as np
 from deploy.aggregate import ENOUGH_SEEDS, interquartile_mean, interval
 from deploy.baselines import evaluate
 from deploy.evaluation import evaluate_checkpoint
-from deploy.history import is_baseline
-from deploy.run_folder import RunFolder
-from studies.study import Job, Scale, Study
+from deploy.history import objects
+from deploy.run_folder import RunFolder, check_writable
+from studies.study import Job, Play, Scale, Study
 
 ENVS = ("HalfCheetah-v5", "Walker2d-v5", "Ant-v5")
 PROBABILITIES = tuple(round(0.1 * tenths, 1) for tenths in range(11))
@@ -41,7 +41,7 @@ def play(job: Job, episodes: int = EPISODES) -> dict[str, object]:
     """A line: returns of a run's last checkpoint under each probability."""
     folder, returns = RunFolder(job.folder), []
     for probability in PROBABILITIES:
-        if is_baseline(folder):
+        if folder.is_baseline():
             played = evaluate(folder, episodes, probability)
         else:
             played = evaluate_checkpoint(folder, folder.config(), "latest", episodes, probability)

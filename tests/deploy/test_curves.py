@@ -28,7 +28,8 @@ def shown(tables) -> str:
 
 
 def test_a_line_holds_a_history():
-    assert history._of_line(made().to_line()) == made()
+    line = made().to_line()
+    assert history._of_line(json.loads(line), "file:1").to_line() == line
 
 
 def test_a_run_is_read_from_its_folder(tmp_path):
@@ -57,6 +58,7 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     assert found.evaluations == [Evaluation(500, 50, 5.0, 7.0, 1.0), Evaluation(900, 90, 15.0, 9.0, 1.0)]
     assert found.transitions == 90 * 8 * 15
     result = {"updates": 100, "env_steps": 1000, "wall_s": 21.0, "eval_return_mean": 11.0, "eval_return_std": 2.0}
+    result["eval_episodes"] = 10
     (tmp_path / "result.json").write_text(json.dumps({**result, "initial_return_mean": -1.0}))
     (found,) = history.read(tmp_path)
     assert found.evaluations[-1] == Evaluation(1000, 100, 21.0, 11.0, 2.0)
@@ -66,10 +68,31 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     assert [one.env_steps for one in found.evaluations] == [500, 1000]
 
 
-@pytest.mark.parametrize("text", ["[1, 2]", "{}", "not json"])
-def test_what_is_no_history_is_refused(text, tmp_path):
-    (tmp_path / "file.jsonl").write_text(text)
-    with pytest.raises(ConfigError, match="RUNS"):
+def odd(**fields) -> str:
+    return json.dumps(dataclasses.asdict(made()) | fields)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[1, 2]",
+        "{}",
+        "not json",
+        made().to_line()[:-9],
+        b"\xff",
+        odd(evaluations=[]),
+        odd(evaluations=[dataclasses.asdict(Evaluation(1, 1, 1.0, 1.0, 1.0)) | {"return_mean": None}]),
+        odd(evaluations=[dataclasses.asdict(Evaluation(1, 1, 1.0, 1.0, 1.0)) | {"return_mean": "abc"}]),
+        odd(evaluations=["abc"]),
+        odd(initial_return="abc"),
+        odd(agent=None),
+        odd(other=1),
+    ],
+)
+def test_what_is_no_history_is_refused_where_it_is(text, tmp_path):
+    line = text if isinstance(text, bytes) else text.encode()
+    (tmp_path / "file.jsonl").write_bytes(made().to_line().encode() + b"\n\n" + line)
+    with pytest.raises(ConfigError, match=r"RUNS='.*file\.jsonl:3'"):
         history.read(tmp_path / "file.jsonl")
 
 
