@@ -239,6 +239,7 @@ def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> Ru
         raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
     make(folder)
     folder.lock()
+    folder.reopen(config.total_steps)
     folder.write_config(config)
     folder.secret()
     return folder
