@@ -161,13 +161,26 @@ def plot(command: options.Plot) -> int:
     """Draw curves and print their table."""
     if not command.runs:
         raise ConfigError("RUNS", "", "give folders of runs, or files of JSON lines")
-    groups = curves.grouped([found for path in command.runs for found in history.read(path)])
-    shown = curves.tables(groups, command.reference)
+    groups, console = curves.grouped(_histories(command.runs)), terminal(max(terminal().width, curves.WIDTH))
+    console.print(*curves.tables(groups, command.reference), sep="\n")
     curves.draw(groups, command.by, command.out)
-    console = terminal(max(terminal().width, curves.WIDTH))
-    console.print(*shown, sep="\n")
     console.print(f"{command.out}", soft_wrap=True)
     return 0
+
+
+def _histories(paths: Sequence[Path]) -> list[history.History]:
+    """Of all that can be read; the others are told. Raises ConfigError where that is none."""
+    found = []
+    for path in paths:
+        try:
+            found += history.read(path)
+        except ConfigError as error:
+            if len(paths) == 1:
+                raise
+            log.warning("%s (left out)", error)
+    if not found:
+        raise ConfigError("RUNS", " ".join(map(str, paths)), "no history in there; give runs that were evaluated")
+    return found
 
 
 def stats(command: options.Stats) -> int:
@@ -201,6 +214,9 @@ def stop(command: options.Stop) -> int:
     """End a run in order."""
     folder = RunFolder(command.run)
     attachment.stop(folder)
+    if folder.is_baseline():  # its own terminal says how
+        terminal().print(f"{folder.path} has ended", soft_wrap=True)
+        return 0
     training.say_end(folder, terminal())
     return 0
 
@@ -214,9 +230,6 @@ def cluster(command: options.Cluster) -> int:
     return 0
 
 
-    if folder.is_baseline():  # its own terminal says how
-        terminal().print(f"{folder.path} has ended", soft_wrap=True)
-        return 0
 def launch(command: options.LauncherRole) -> int:
     """Be the launcher of a run on Ray."""
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
