@@ -1,6 +1,5 @@
 """Watching a run from outside its launcher, and ending it: by its folder alone, on the machine that holds that."""
 
-import json
 import os
 import signal
 import socket
@@ -13,7 +12,7 @@ from typing import Any
 from rich.console import Console
 
 from common.errors import ConfigError
-from deploy.run_folder import RunFolder
+from deploy.run_folder import RunFolder, record
 from deploy.view import Board, View
 
 LOOK_SECONDS = 0.2
@@ -34,14 +33,8 @@ class Tail:
             text = file.read()
             whole = text[: text.rfind(b"\n") + 1]
             self._position += len(whole)
-            return [record for line in whole.splitlines() if (record := _record(line)) is not None]
+            return list(filter(None, map(record, whole.splitlines())))
         return []
-
-
-def _record(line: bytes) -> dict[str, Any] | None:
-    with suppress(ValueError):  # torn by a crash
-        return dict(json.loads(line))
-    return None
 
 
 def watch(folder: RunFolder, console: Console, gone: Callable[[], bool]) -> int | None:
@@ -51,13 +44,13 @@ def watch(folder: RunFolder, console: Console, gone: Callable[[], bool]) -> int 
     tail, view = Tail(folder.metrics), View(board, console)
     try:
         while folder.ended() is None and not gone():
-            for record in tail.take():
-                board.take(record)
+            for found in tail.take():
+                board.take(found)
             view.refresh()
             time.sleep(LOOK_SECONDS)
     finally:
-        for record in tail.take():
-            board.take(record)
+        for found in tail.take():
+            board.take(found)
         view.close()
     return folder.ended()
 
@@ -80,8 +73,8 @@ def trained_now(folder: RunFolder) -> int:
     deadline = time.monotonic() + AWAY_SECONDS * comes_back
     while (trainer := folder.trainer()) is None:
         if time.monotonic() >= deadline:
-            folder.config()
-            fix = "nobody trains it now; rmc train with its --run-dir goes on with it"
+            folder.settings()
+            fix = "nobody trains it now; the command that began it goes on with it, given its --run-dir"
             raise ConfigError("RUN", str(folder.path), fix)
         time.sleep(LOOK_SECONDS)
     return trainer

@@ -3,11 +3,12 @@
 The zoo's numbers are those of hyperparams/*.yml at its commit 00128b5, for MuJoCo's v3 environments.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from common.envs import EnvConfig
 from common.errors import ConfigError
+from deploy.run_folder import RunFolder
 
 Algorithm = Literal["sac", "td3", "ddpg", "ppo", "recurrent-ppo"]
 Settings = Literal["paper", "zoo", "default"]
@@ -60,6 +61,19 @@ class BaselineConfig:
         """What plots call it."""
         kind = "RecurrentPPO" if self.algorithm == "recurrent-ppo" else self.algorithm.upper()
         return {"paper": f"{kind} 400-300", "zoo": f"{kind} zoo", "default": kind}[self.settings]
+
+
+def read(folder: RunFolder) -> BaselineConfig:
+    """A baseline's config from its folder. Raises ConfigError."""
+    raw = folder.settings()
+    try:
+        env = EnvConfig(**raw["env"])
+        config = BaselineConfig(**{item.name: raw[item.name] for item in fields(BaselineConfig)} | {"env": env})
+        validate(config)
+    except (KeyError, TypeError) as error:
+        fix = f"its config.json is no baseline's of this version ({error}); restore it, or train another run"
+        raise ConfigError("RUN", str(folder.path), fix) from None
+    return config
 
 
 def validate(config: BaselineConfig) -> None:

@@ -8,8 +8,8 @@ import dataclasses
 import json
 import shutil
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,19 +20,20 @@ from numpy.typing import NDArray
 from rich.console import Console
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from actors.evaluator import first_start, play_episodes
-from common.envs import EnvConfig, first_env, make_env
+from common.envs import first_env, make_env
 from common.errors import ConfigError
 from common.role import StopSignal
 from common.wrappers import Floats
-from deploy.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, transitions_per_update, validate
+from deploy.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, read, validate
 from deploy.evaluation import FINAL_EPISODES
-from deploy.run_folder import RunFolder
+from deploy.run_folder import RunFolder, make, read_object, write_whole
 
 CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
 STOPPED = 130  # exit status after Ctrl-C, as shells have it
@@ -46,14 +47,18 @@ def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: 
     validate(config)
     first_env(config.env).close()
     folder = _open_folder(config, run_dir)
-    torch.set_num_threads(config.threads)
-    torch.set_flush_denormal(True)  # as our learner does
-    console.print(f"run folder {folder.path}", soft_wrap=True)
-    folder.lock()
     try:
+        _set_torch(config)
+        console.print(f"run folder {folder.path}", soft_wrap=True)
         return _conduct(config, folder, console, stop)
     finally:
         folder.unlock()
+
+
+def _set_torch(config: BaselineConfig) -> None:
+    """What an action's last bits depend on, the same to train and to evaluate."""
+    torch.set_num_threads(config.threads)
+    torch.set_flush_denormal(True)  # as our learner does
 
 
 def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: StopSignal) -> int:
@@ -71,27 +76,55 @@ def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: 
 
 
 def _open_folder(config: BaselineConfig, run_dir: Path | None) -> RunFolder:
+    """Make or take up a run's folder, locked, as ``open_run``. Raises ConfigError."""
     env = config.env.id.replace(":", "_").replace("/", "_")
     name = f"{env}__{config.algorithm}-{config.settings}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
     folder = RunFolder(run_dir or Path("runs") / name)
     about, now = folder.path / "config.json", json.loads(json.dumps(asdict(config)))
-    if about.exists():
-        was = json.loads(about.read_bytes())
+    if about.exists() and folder.is_baseline():
+        was = folder.settings()
         for key in now:
             if key not in ("total_steps", "threads") and was.get(key) != now[key]:
                 fix = f"the run in {folder.path} has {was.get(key)!r}; use that, or another --run-dir"
                 raise ConfigError(f"--{key.replace('_', '-')}", now[key], fix)
     elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no baseline's; give another one")
-    folder.checkpoints.mkdir(parents=True, exist_ok=True)
-    per_update = transitions_per_update(config)
-    about.write_text(json.dumps(now | {"name": config.name, "transitions_per_update": per_update}, indent=2) + "\n")
+    make(folder)
+    folder.lock()
+    folder.reopen(config.total_steps)
+    write_whole(about, f"{json.dumps(now, indent=2)}\n".encode())
+    for left in set(folder.checkpoints.glob("[0-9]*")) - set(_states(folder)):  # by a crash amid a save
+        shutil.rmtree(left)
     return folder
 
 
 def _states(folder: RunFolder) -> list[Path]:
     """What can be gone on with, whole, oldest first."""
     return [path.parent for path in sorted(folder.checkpoints.glob(f"*/{PROGRESS}"))]
+
+
+@contextmanager
+def _reading(state: Path) -> Iterator[None]:
+    """Raises ConfigError where a state is not as it was saved."""
+    try:
+        yield
+    except Exception as error:  # zipfile, pickle and torch raise several unrelated classes
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ConfigError("RUN", str(state), f"cannot be read ({reason}); restore it, or train another run") from None
+
+
+def _grow(buffer: ReplayBuffer, size: int) -> None:
+    """Room for so many steps, where it has less; what is in it stays."""
+    if size <= buffer.buffer_size:
+        return
+    if buffer.full:
+        buffer.pos, buffer.full = buffer.buffer_size, False
+    for name, array in list(vars(buffer).items()):
+        if isinstance(array, np.ndarray):
+            more = np.zeros((size, *array.shape[1:]), array.dtype)
+            more[: len(array)] = array
+            setattr(buffer, name, more)
+    buffer.buffer_size = size
 
 
 class Opponent:
@@ -130,8 +163,8 @@ class _Run(BaseCallback):
         self._began, self._wall_before = time.monotonic(), folder.wall_seconds()
         self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, 0.0
         self._next_evaluation = self._after(self.steps)
-        self._metrics = folder.metrics.open("a", buffering=1)
         self._initial = self._first_evaluation()
+        self._metrics = folder.metrics.open("a", buffering=1)
 
     @property
     def steps(self) -> int:
@@ -149,22 +182,29 @@ class _Run(BaseCallback):
         """As it was saved last, or new."""
         config, at, kind = self.config, _states(self.folder)[-1:], CLASSES[self.config.algorithm]
         vec: VecEnv = DummyVecEnv([lambda: Monitor(make_env(config.env))])
-        if choice.normalize:
-            gamma = float(choice.arguments.get("gamma", 0.99))
-            vec = VecNormalize.load(str(at[0] / SCALES), vec) if at else VecNormalize(vec, gamma=gamma)
         if at:
-            model = kind.load(at[0] / MODEL, env=vec, device="cpu")
-            if config.algorithm in OFF_POLICY:
-                model.load_replay_buffer(at[0] / BUFFER)
+            with _reading(at[0]):
+                vec = VecNormalize.load(str(at[0] / SCALES), vec) if choice.normalize else vec
+                model = kind.load(at[0] / MODEL, env=vec, device="cpu")
+                if config.algorithm in OFF_POLICY:
+                    with (at[0] / BUFFER).open("rb") as file:
+                        model.load_replay_buffer(file)
+                    _grow(model.replay_buffer, self._buffer_size)
             vec.seed(config.seed + model.num_timesteps)  # not the episodes that it has had
             return vec, model
+        if choice.normalize:
+            vec = VecNormalize(vec, gamma=float(choice.arguments.get("gamma", 0.99)))
         return vec, kind(_policy(config), vec, **self._arguments(choice, vec), seed=config.seed, device="cpu")
+
+    @property
+    def _buffer_size(self) -> int:
+        return min(1_000_000, self.config.total_steps)  # as large as it can ever be of use
 
     def _arguments(self, choice: Choice, vec: VecEnv) -> dict[str, Any]:
         network = dict(choice.network) | ({"activation_fn": torch.nn.ReLU} if choice.relu else {})
         found = dict(choice.arguments) | ({"policy_kwargs": network} if network else {})
         if self.config.algorithm in OFF_POLICY:
-            found["buffer_size"] = min(1_000_000, self.config.total_steps)  # as large as it can ever be of use
+            found["buffer_size"] = self._buffer_size
         if choice.noise:
             size = vec.action_space.shape or (1,)
             found["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, choice.noise))
@@ -181,7 +221,7 @@ class _Run(BaseCallback):
             self._model.save_replay_buffer(at / BUFFER)
         if isinstance(self._vec, VecNormalize):
             self._vec.save(str(at / SCALES))
-        (at / PROGRESS).write_text(json.dumps({"env_steps": self.steps, "updates": self.updates}) + "\n")
+        write_whole(at / PROGRESS, json.dumps({"env_steps": self.steps, "updates": self.updates}).encode())
         for old in before:
             shutil.rmtree(old)
         self._save_at = time.monotonic() + SAVE_SECONDS
@@ -227,8 +267,8 @@ class _Run(BaseCallback):
         """Of what it was before any training, once for the folder."""
         initial = self.folder.path / "initial.json"
         if not initial.exists():
-            initial.write_text(json.dumps(self._play(FINAL_EPISODES, final=True)) + "\n")
-        return float(json.loads(initial.read_bytes())["eval_return_mean"])
+            write_whole(initial, json.dumps(self._play(FINAL_EPISODES, final=True)).encode())
+        return float(read_object(initial, "eval_return_mean")["eval_return_mean"])
 
     def _evaluate(self) -> None:
         found = self._play(self.config.episodes, final=False)
@@ -265,21 +305,21 @@ class _Run(BaseCallback):
 
 def evaluate(folder: RunFolder, episodes: int, flicker: float | None = None) -> dict[str, Any]:
     """Deterministic episodes of what a baseline's run saved last, as ``evaluate_checkpoint``. Raises ConfigError."""
-    raw = json.loads((folder.path / "config.json").read_bytes())
-    states = _states(folder)
+    config, states = read(folder), _states(folder)
     if not states:
         raise ConfigError("RUN", str(folder.path), "it has no checkpoint yet; train it for longer")
-    env = EnvConfig(**raw["env"])
-    env = env if flicker is None else dataclasses.replace(env, flicker=flicker)
-    model = CLASSES[raw["algorithm"]].load(states[-1] / MODEL, device="cpu")
+    _set_torch(config)
+    progress = read_object(states[-1] / PROGRESS, "env_steps", "updates")
+    env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
+    bare: VecEnv = DummyVecEnv([lambda: make_env(env)])
     scales = states[-1] / SCALES
-    bare = DummyVecEnv([lambda: make_env(env)])
-    scaled = _scaled_by(VecNormalize.load(str(scales), bare) if scales.exists() else bare)
-    seed = first_start(raw["seed"], final=True)
+    with _reading(states[-1]):
+        model = CLASSES[config.algorithm].load(states[-1] / MODEL, device="cpu")
+        scaled = _scaled_by(VecNormalize.load(str(scales), bare) if scales.exists() else bare)
+    seed = first_start(config.seed, final=True)
     returns = play_episodes(Opponent(model, scaled, episodes), lambda: make_env(env), episodes, seed)
     bare.close()
-    progress = json.loads((states[-1] / PROGRESS).read_bytes())
-    about = {"env": env.id, "preset": raw["name"], "seed": raw["seed"], **progress}
+    about = {"env": env.id, "preset": config.name, "seed": config.seed, **progress}
     return about | _returns(returns) | {"eval_flicker": env.flicker}
 
 

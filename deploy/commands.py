@@ -7,8 +7,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +81,8 @@ def evaluate(command: options.Evaluate) -> int:
         if not 0.0 <= flicker <= 1.0:
             raise ConfigError("--flicker", flicker, "take probabilities from 0 to 1")
     folder, console = RunFolder(command.run), terminal()
+    if command.video is not None and folder.is_baseline():
+        raise ConfigError("--video", str(command.video), "only runs of rmc train are filmed; leave it")
     for probability in command.flicker or (None,):
         played = _played(folder, command, probability)
         text = json.dumps(played) if command.json else _said(played)
@@ -96,7 +97,7 @@ def evaluate(command: options.Evaluate) -> int:
 
 
 def _played(folder: RunFolder, command: options.Evaluate, flicker: float | None) -> dict[str, Any]:
-    if not history.is_baseline(folder):
+    if not folder.is_baseline():
         return evaluate_checkpoint(folder, folder.config(), command.checkpoint, command.episodes, flicker)
     if command.checkpoint != "latest":
         raise ConfigError("--checkpoint", command.checkpoint, "a baseline keeps its last state only; use latest")
@@ -160,26 +161,38 @@ def plot(command: options.Plot) -> int:
     """Draw curves and print their table."""
     if not command.runs:
         raise ConfigError("RUNS", "", "give folders of runs, or files of JSON lines")
-    groups = curves.grouped([found for path in command.runs for found in history.read(path)])
-    shown = curves.tables(groups, command.reference)
+    groups, console = curves.grouped(_histories(command.runs)), terminal(max(terminal().width, curves.WIDTH))
+    console.print(*curves.tables(groups, command.reference), sep="\n")
     curves.draw(groups, command.by, command.out)
-    console = terminal(max(terminal().width, curves.WIDTH))
-    console.print(*shown, sep="\n")
     console.print(f"{command.out}", soft_wrap=True)
     return 0
+
+
+def _histories(paths: Sequence[Path]) -> list[history.History]:
+    """Of all that can be read; the others are told. Raises ConfigError where that is none."""
+    found = []
+    for path in paths:
+        try:
+            found += history.read(path)
+        except ConfigError as error:
+            if len(paths) == 1:
+                raise
+            log.warning("%s (left out)", error)
+    if not found:
+        raise ConfigError("RUNS", " ".join(map(str, paths)), "no history in there; give runs that were evaluated")
+    return found
 
 
 def stats(command: options.Stats) -> int:
     """Print the newest metrics of a run, and its result if it has one."""
     folder = RunFolder(command.run)
-    config, console = folder.config(), terminal()
+    config, result, console = folder.config(), folder.result(), terminal()
     board = Board(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
-    for record in _records(folder.metrics):
+    for record in folder.records():
         board.take(record)
     if not board.roles:
         raise ConfigError("RUN", str(folder.path), "it has no metrics yet; train it first")
     console.print(table(board))
-    result = folder.result()
     if result is not None:
         console.print_json(data=result)
     return 0
@@ -201,6 +214,9 @@ def stop(command: options.Stop) -> int:
     """End a run in order."""
     folder = RunFolder(command.run)
     attachment.stop(folder)
+    if folder.is_baseline():  # its own terminal says how
+        terminal().print(f"{folder.path} has ended", soft_wrap=True)
+        return 0
     training.say_end(folder, terminal())
     return 0
 
@@ -225,14 +241,6 @@ def launch(command: options.LauncherRole) -> int:
         folder.path, "resume", "ray", command.device, None, command.ray_address, command.all_cpus, command.tls
     )
     return training.conduct(config, folder, placement, terminal(400))
-
-
-def _records(path: Path) -> list[dict[str, object]]:
-    records = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        with suppress(ValueError):  # torn by a crash
-            records.append(json.loads(line))
-    return records
 
 
 ACTIONS: dict[type, Callable[[Any], int]] = {  # of all that are no roles

@@ -32,10 +32,12 @@ Groups = dict[str, dict[str, list[History]]]  # environment -> agent -> its runs
 
 
 def grouped(histories: Sequence[History]) -> Groups:
-    """By environment, then agent, each in the order in which it came; seeds in order."""
+    """By environment, then agent, each in the order in which it came; seeds in order. A run given twice counts once."""
     groups: Groups = {}
     for one in histories:
-        groups.setdefault(one.env, {}).setdefault(one.agent, []).append(one)
+        runs = groups.setdefault(one.env, {}).setdefault(one.agent, [])
+        if one not in runs:
+            runs.append(one)
     for agents in groups.values():
         for runs in agents.values():
             runs.sort(key=lambda run: run.seed)
@@ -82,7 +84,7 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
 
 def _draw_agent(panel: Any, runs: list[History], by: Axis, color: str) -> Any:
     curves = [curve(run, by) for run in runs]
-    if len(curves) < ENOUGH_SEEDS:
+    if _seeds(runs) < ENOUGH_SEEDS:
         lines = [panel.plot(*one, color=color, linewidth=1.2, alpha=0.8)[0] for one in curves]
         return lines[0]
     places = np.linspace(max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves), POINTS)
@@ -93,8 +95,13 @@ def _draw_agent(panel: Any, runs: list[History], by: Axis, color: str) -> Any:
     return line
 
 
+def _seeds(runs: list[History]) -> int:
+    """Of one seed there may be several runs, which say no more of others than one."""
+    return len({run.seed for run in runs})
+
+
 def _named(agent: str, groups: Groups) -> str:
-    counts = [len(found[agent]) for found in groups.values() if agent in found]
+    counts = [_seeds(found[agent]) for found in groups.values() if agent in found]
     fewest, most = min(counts), max(counts)
     how = "interquartile mean, 95 %" if fewest >= ENOUGH_SEEDS else "each a line"
     seeds = f"{fewest}" if fewest == most else f"{fewest} to {most}"
@@ -125,14 +132,18 @@ def _table(env: str, found: dict[str, list[History]], reference: str | None) -> 
 
 
 def _cells(runs: list[History]) -> list[str]:
-    counts = [np.median([getattr(run, name) for run in runs]) for name in ("env_steps", "updates", "wall_s")]
+    seeds, unfinished = f"{_seeds(runs)}", sum(not run.finished for run in runs)
+    seeds += f", {unfinished} unfinished" if unfinished else ""
+    ends = [run.env_steps for run in runs]
+    steps = f"{min(ends):,}" + (f" to {max(ends):,}" if min(ends) < max(ends) else "")
+    counts = [np.median([getattr(run, name) for run in runs]) for name in ("updates", "wall_s")]
     worst = min(one.return_mean for run in runs for one in run.evaluations[-LAST:])
-    return [str(len(runs)), _returns(runs), f"{worst:,.0f}", *(f"{count:,.0f}" for count in counts)]
+    return [seeds, _returns(runs), f"{worst:,.0f}", steps, *(f"{count:,.0f}" for count in counts)]
 
 
 def _returns(runs: list[History]) -> str:
     scores = last_returns(runs)
-    if len(runs) >= ENOUGH_SEEDS:
+    if _seeds(runs) >= ENOUGH_SEEDS:
         low, high = interval(interquartile_mean, scores)
         return f"{interquartile_mean(scores):,.0f} [{low:,.0f}, {high:,.0f}]"
     return f"{scores.mean():,.0f} ({', '.join(f'{score:,.0f}' for score in scores[:, 0])})"

@@ -13,7 +13,7 @@ from actors.policy_runner import PolicyRunner
 from common.agent import Agent
 from common.checkpoint import CheckpointFolder
 from common.envs import make_env
-from common.errors import CheckpointError, ConfigError
+from common.errors import CheckpointError, ConfigError, MessageError
 from deploy.presets import RunConfig
 from deploy.run_folder import RunFolder
 from learner.learner import POLICY, PROGRESS, STATE
@@ -40,7 +40,7 @@ def evaluate_checkpoint(
     folder: RunFolder, config: RunConfig, checkpoint: str, episodes: int, flicker: float | None = None
 ) -> dict[str, Any]:
     """Deterministic episodes of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
-    progress, blob = load_checkpoint(folder, checkpoint)
+    progress, blob = load_checkpoint(folder, config, checkpoint)
     return {
         "env": config.env.id,
         "preset": config.preset,
@@ -51,9 +51,17 @@ def evaluate_checkpoint(
     }
 
 
-def load_checkpoint(folder: RunFolder, checkpoint: str) -> tuple[dict[str, Any], bytes]:
-    """Progress and policy of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
-    files = _load(folder, checkpoint)
+def load_checkpoint(folder: RunFolder, config: RunConfig, checkpoint: str) -> tuple[dict[str, Any], bytes]:
+    """Progress and policy of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError, also where the
+    policy is not this config's.
+
+    The best is of those that were evaluated while it trained, which the last one need not be.
+    """
+    files, spec = _load(folder, checkpoint), config.window_spec()
+    try:
+        PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, envs=1).load(files[POLICY])
+    except MessageError as error:
+        raise ConfigError("--checkpoint", checkpoint, f"{error}; use another") from None
     return json.loads(files[PROGRESS]), files[POLICY]
 
 
@@ -84,7 +92,7 @@ def _number(checkpoints: CheckpointFolder, which: str) -> int:
         if best is None or best not in numbers:
             raise ConfigError("--checkpoint", which, "none was evaluated yet; use latest")
         return best
-    if which.isdigit() and int(which) in numbers:
+    if which.isdecimal() and int(which) in numbers:
         return int(which)
     raise ConfigError("--checkpoint", which, f"use latest, best or one of {numbers}")
 

@@ -49,8 +49,8 @@ def export(folder: RunFolder, checkpoint: str, out: Path) -> None:
         if importlib.util.find_spec(name) is None:
             raise ConfigError("--out", str(out), f"{name} is missing; pip install 'rmc[onnx]'")
     check_writable("--out", out, (".onnx",))
-    config, (_, blob) = folder.config(), load_checkpoint(folder, checkpoint)
-    spec = config.window_spec()
+    config = folder.config()
+    (_, blob), spec = load_checkpoint(folder, config, checkpoint), config.window_spec()
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
     agent.load_state_dict(safetensors.torch.load(blob), strict=False)
     two = [torch.zeros(2, size) for size in (spec.obs_dim, spec.action_dim, spec.state)]

@@ -6,7 +6,7 @@ A file of JSON lines holds many, one a line, so that results can be kept without
 import dataclasses
 import json
 import math
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 from common.envs import EnvConfig
 from common.errors import ConfigError
 from common.record import is_finite
+from deploy import baseline_settings
 from deploy.presets import RunConfig, option, preset
 from deploy.run_folder import MAY_CHANGE, RunFolder, flat
 
@@ -47,7 +48,7 @@ class History:
     initial_return: float | None
     evaluations: list[Evaluation] = field(default_factory=list)
     finished: bool = False  # then the last evaluation is the result's
-    commit: str = ""
+    commit: str = field(default="", compare=False)
 
     def to_line(self) -> str:
         """As one line of JSON."""
@@ -58,27 +59,50 @@ def read(path: Path) -> list[History]:
     """The histories in a run's folder, or in a file of lines. Raises ConfigError."""
     if path.is_dir():
         return [of_run(RunFolder(path))]
+    return [_of_line(line, place) for place, line in objects(path, "evaluations").items()]
+
+
+def objects(path: Path, *names: str) -> dict[str, dict[str, Any]]:
+    """What a file of JSON lines holds, by PATH:LINE, each with these ``names``. Raises ConfigError."""
     try:
-        return [_of_line(line) for line in path.read_text().splitlines() if line.strip()]
+        lines = path.read_bytes().splitlines()
     except OSError as error:
         raise ConfigError("RUNS", str(path), f"{error.strerror}; give runs' folders or files of JSON lines") from None
-    except (ValueError, TypeError, KeyError) as error:
-        raise ConfigError("RUNS", str(path), f"not a file of histories ({error}); give runs' folders") from None
+    return {f"{path}:{i}": _object(line, f"{path}:{i}", names) for i, line in enumerate(lines, 1) if line.strip()}
 
 
-def _of_line(line: str) -> History:
-    raw = json.loads(line)
-    return History(**{**raw, "evaluations": [Evaluation(**one) for one in raw["evaluations"]]})
+def _object(line: bytes, place: str, names: Sequence[str]) -> dict[str, Any]:
+    try:
+        found = json.loads(line)
+    except ValueError as error:
+        raise ConfigError("RUNS", place, f"not JSON ({error}); mend the line, or remove it") from None
+    if not isinstance(found, dict) or not found.keys() >= set(names):
+        raise ConfigError("RUNS", place, f"must be an object with {', '.join(names)}; mend the line, or remove it")
+    return found
+
+
+def _of_line(raw: dict[str, Any], place: str) -> History:
+    try:
+        found = History(**{**raw, "evaluations": [Evaluation(**one) for one in raw["evaluations"]]})
+    except TypeError as error:
+        raise ConfigError("RUNS", place, f"not a history ({error}); mend the line, or remove it") from None
+    numbers: list[Any] = [found.seed, found.env_steps, found.updates, found.transitions, found.wall_s]
+    numbers += [] if found.initial_return is None else [found.initial_return]
+    numbers += [value for one in found.evaluations for value in dataclasses.astuple(one)]
+    texts = found.agent, found.env, found.commit
+    if not (found.evaluations and all(map(is_finite, numbers)) and all(isinstance(text, str) for text in texts)):
+        fix = "not a history (its evaluations, numbers and names); mend the line, or remove it"
+        raise ConfigError("RUNS", place, fix)
+    return found
 
 
 def of_run(folder: RunFolder) -> History:
     """A run's, finished or not. Raises ConfigError where it is none, or was not evaluated yet."""
     about = describe(folder.path)
-    records = _records(folder.metrics)
-    evaluations = _evaluations(records)
+    evaluations = _evaluations(list(folder.records()))
     result = folder.result() or {}
     if result:
-        ours = not is_baseline(folder)  # of its last checkpoint's own evaluation only the update is known
+        ours = not folder.is_baseline()  # of its last checkpoint's own evaluation only the update is known
         below = result["env_steps"], result["updates"] if ours else math.inf
         evaluations = [one for one in evaluations if one.env_steps < below[0] and one.updates < below[1]]
         mean, std = result["eval_return_mean"], result["eval_return_std"]
@@ -110,20 +134,13 @@ class About:
     transitions_per_update: int
 
 
-def is_baseline(folder: RunFolder) -> bool:
-    """Whether ``rmc baseline`` made it."""
-    with suppress(OSError, ValueError):
-        return "algorithm" in json.loads((folder.path / "config.json").read_bytes())
-    return False
-
-
 def describe(path: Path) -> About:
     """Of a run of RMC, or of a baseline. Raises ConfigError."""
     folder = RunFolder(path)
-    if is_baseline(folder):
-        raw = json.loads((folder.path / "config.json").read_bytes())
-        env = EnvConfig(**raw["env"])
-        return About(_with(raw["name"], _stack(env)), _seen(env), raw["seed"], raw["transitions_per_update"])
+    if folder.is_baseline():
+        theirs = baseline_settings.read(folder)
+        per_update = baseline_settings.transitions_per_update(theirs)
+        return About(_with(theirs.name, _stack(theirs.env)), _seen(theirs.env), theirs.seed, per_update)
     config = folder.config()
     name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
     transitions = config.learner.batch_size * config.window.trained_steps
@@ -156,14 +173,6 @@ def _seen(env: EnvConfig) -> str:
     names = [item.name for item in dataclasses.fields(env) if item.name not in ("frame_stack", "env_timeout")]
     odd = [name for name in names if getattr(env, name) != getattr(plain, name)]
     return ", ".join([env.id, *(f"{name.replace('_', ' ')} {getattr(env, name)}" for name in odd)])
-
-
-def _records(path: Path) -> list[dict[str, Any]]:
-    found = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        with suppress(ValueError):  # torn by a crash
-            found.append(json.loads(line))
-    return found
 
 
 def _evaluations(records: list[dict[str, Any]]) -> list[Evaluation]:

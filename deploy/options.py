@@ -106,7 +106,7 @@ class Evaluate:
     flicker: tuple[float, ...] = ()
     """Probabilities of a blank observation, each of which is played; by default the run's own."""
     checkpoint: str = "latest"
-    """latest, best, or the number of a checkpoint."""
+    """latest, best of those evaluated while it trained, or the number of a checkpoint."""
     video: Path | None = None
     """Also write an episode to this file, like episode.mp4, with the first of the flicker probabilities."""
     json: bool = False
@@ -122,7 +122,7 @@ class Export:
     out: Path = Path("policy.onnx")
     """The file to write."""
     checkpoint: str = "latest"
-    """latest, best, or the number of a checkpoint."""
+    """latest, best of those evaluated while it trained, or the number of a checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Inspect:
     out: Path = Path("inspect.png")
     """The picture to write."""
     checkpoint: str = "latest"
-    """latest, best, or the number of a checkpoint."""
+    """latest, best of those evaluated while it trained, or the number of a checkpoint."""
 
 
 @dataclass(frozen=True)

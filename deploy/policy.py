@@ -26,7 +26,7 @@ def load_policy(run: str | Path, checkpoint: str = "latest") -> "Policy":
     """The policy of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
     folder = RunFolder(Path(run))
     config = folder.config()
-    _, blob = load_checkpoint(folder, checkpoint)
+    _, blob = load_checkpoint(folder, config, checkpoint)
     return Policy(config, blob)
 
 

@@ -12,17 +12,28 @@ import secrets
 import socket
 import tempfile
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
 from common.checkpoint import CheckpointFolder
 from common.errors import CheckpointError, ConfigError
+from common.record import is_finite
 from deploy.presets import RunConfig, from_json, option, to_json
 
 SECRET_LENGTH = 64  # hexadecimal characters
 LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
 IfExists = Literal["resume", "fail", "new"]
+RESULT = (
+    "env_steps",
+    "updates",
+    "wall_s",
+    "eval_return_mean",
+    "eval_return_std",
+    "eval_episodes",
+    "initial_return_mean",
+)
 MAY_CHANGE = {
     "total_steps",
     "actors",
@@ -48,27 +59,52 @@ class RunFolder:
         """The run's name in Redis: the folder's, and what tells it from others of that name."""
         return f"{self.path.name}-{hashlib.sha256(self.secret()).hexdigest()[:8]}"
 
-    def config(self) -> RunConfig:
-        """The run's config. Raises ConfigError where this is no run's folder."""
+    def settings(self) -> dict[str, Any]:
+        """What ``config.json`` says, also that of a baseline. Raises ConfigError where this is no run's folder."""
         try:
-            return from_json((self.path / "config.json").read_bytes())
+            return read_object(self.path / "config.json")
         except OSError:
             raise ConfigError("RUN", str(self.path), "no config.json there; give the folder of a run") from None
+
+    def is_baseline(self) -> bool:
+        """Whether ``rmc baseline`` made it. Raises ConfigError where this is no run's folder."""
+        return "algorithm" in self.settings()
+
+    def config(self) -> RunConfig:
+        """The run's config. Raises ConfigError, which names the folder, where it cannot be read or is a baseline's."""
+        if self.is_baseline():
+            fix = "is a baseline's run; rmc baseline goes on with it, and rmc evaluate, plot and stop take it"
+            raise ConfigError("RUN", str(self.path), fix)
+        try:
+            return from_json((self.path / "config.json").read_bytes())
+        except ConfigError as error:
+            raise ConfigError("RUN", str(self.path), str(error)) from None
 
     def write_config(self, config: RunConfig) -> None:
         """Write ``config.json``, whole or not at all."""
         write_whole(self.path / "config.json", f"{to_json(config)}\n".encode())
 
     def result(self) -> dict[str, Any] | None:
-        """What ``result.json`` says, once the run has ended."""
+        """What ``result.json`` says, once the run has ended. Raises ConfigError where it is not as it was written."""
         try:
-            return dict(json.loads(self.result_file.read_bytes()))
-        except OSError:
+            return read_object(self.result_file, *RESULT)
+        except FileNotFoundError:
             return None
 
     def write_result(self, result: dict[str, Any]) -> None:
         """Write ``result.json``, whole or not at all."""
         write_whole(self.result_file, f"{json.dumps(result, indent=2)}\n".encode())
+
+    def reopen(self, total_steps: int) -> None:
+        """Drop the result where steps are missing: what it says is no longer the end. Raises ConfigError."""
+        result = self.result()
+        if result is not None and result["env_steps"] < total_steps:
+            self.result_file.unlink()
+
+    def records(self) -> Iterator[dict[str, Any]]:
+        """Those of ``metrics.jsonl`` that are whole, each with its role."""
+        with suppress(FileNotFoundError), self.metrics.open("rb") as lines:
+            yield from filter(None, map(record, lines))
 
     def secret(self) -> bytes:
         """The run's secret, made at first use. Only the owner may read it: where others could, they no longer can.
@@ -101,14 +137,8 @@ class RunFolder:
 
     def wall_seconds(self) -> float:
         """How long the run was trained before, over all its starts."""
-        if not self.metrics.exists():
-            return 0.0
-        last = 0.0
-        with self.metrics.open() as lines:
-            for line in lines:
-                if '"launcher"' in line:
-                    last = max(last, _wall(line))
-        return last
+        said = (found.get("wall_s") for found in self.records() if found["role"] == "launcher")
+        return max(filter(is_finite, said), default=0.0)
 
     def lock(self) -> None:
         """Be the one launcher of this run. Raises ConfigError where another one is."""
@@ -175,12 +205,25 @@ def _locked(handle: int, kind: int) -> bool:
     return True
 
 
-def _wall(line: str) -> float:
+def read_object(path: Path, *numbers: str) -> dict[str, Any]:
+    """What a small file of JSON says, with these ``numbers``. Raises ConfigError naming it, OSError."""
     try:
-        record = json.loads(line)
-        return float(record.get("wall_s", 0.0)) if record.get("role") == "launcher" else 0.0
-    except ValueError:  # a line torn by a crash
-        return 0.0
+        found = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise ConfigError(path.name, str(path), f"not JSON ({error}); restore it, or take another run") from None
+    if not isinstance(found, dict) or not all(is_finite(found.get(name)) for name in numbers):
+        wanted = f"an object with the numbers {', '.join(numbers)}" if numbers else "an object"
+        raise ConfigError(path.name, str(path), f"must be {wanted}; restore it, or take another run")
+    return found
+
+
+def record(line: bytes) -> dict[str, Any] | None:
+    """A line of ``metrics.jsonl``; None where it is torn by a crash, or is no role's."""
+    with suppress(ValueError):
+        found = json.loads(line)
+        if isinstance(found, dict) and isinstance(found.get("role"), str):
+            return found
+    return None
 
 
 def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> RunFolder:
@@ -194,8 +237,9 @@ def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> Ru
         _check_resumable(folder, config)
     elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
-    _make(folder)
+    make(folder)
     folder.lock()
+    folder.reopen(config.total_steps)
     folder.write_config(config)
     folder.secret()
     return folder
@@ -214,7 +258,8 @@ def _unused(folder: RunFolder) -> RunFolder:
     return candidate
 
 
-def _make(folder: RunFolder) -> None:
+def make(folder: RunFolder) -> None:
+    """Its folders, its owner's alone. Raises ConfigError."""
     try:
         folder.path.mkdir(parents=True, exist_ok=True)
         if not (folder.path / "config.json").exists():
@@ -250,13 +295,20 @@ def check_checkpoints(folder: RunFolder) -> None:
 
 
 def check_writable(name: str, path: Path, suffixes: tuple[str, ...]) -> None:
-    """Raises ConfigError where a file of one of these kinds cannot be written there."""
+    """Raises ConfigError where a file of one of these kinds cannot be written there; tries, and changes nothing."""
     if not path.parent.is_dir():
         raise ConfigError(name, str(path), "its folder is not there; make it, or give another")
     if path.is_dir():
         raise ConfigError(name, str(path), f"is a folder; give a file in it, like {path / f'out{suffixes[0]}'}")
     if path.suffix.lower() not in suffixes:
         raise ConfigError(name, str(path), f"give a name that ends in {' or '.join(suffixes)}")
+    there = path.exists()
+    try:
+        path.open("ab").close()
+        if not there:
+            path.unlink()
+    except OSError as error:
+        raise ConfigError(name, str(path), f"cannot be written ({error.strerror}); give another") from None
 
 
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:

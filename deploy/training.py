@@ -76,7 +76,6 @@ def conduct(config: RunConfig, folder: RunFolder, placement: Placement, console:
             status = STOPPED
             return _say_stopped(folder, config, monitor.board.env_steps, console)
         result = _result(config, folder, monitor, before)
-        CheckpointFolder(folder.checkpoints).mark_best(result["updates"], result["eval_return_mean"])
         folder.write_result(result)
         status = 0
     except ConfigError:

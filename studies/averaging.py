@@ -4,8 +4,7 @@ After the runs, ``python -m studies.averaging --play`` plays what a checkpoint h
 state has, the newest, from the same starts, and tells means and worst cases of the second half.
 """
 
-import json
-import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,10 @@ import safetensors.torch
 
 from common.checkpoint import CheckpointFolder
 from deploy.evaluation import evaluate_blob, evaluate_checkpoint
+from deploy.history import objects
 from deploy.inspection import load_agent
 from deploy.run_folder import RunFolder
-from studies.study import Job, Scale, Study
+from studies.study import Job, Play, Scale, Study
 
 EPISODES = 10
 STUDY = Study(
@@ -43,8 +43,13 @@ def play(job: Job, episodes: int = EPISODES) -> dict[str, Any]:
     return about | {"env_steps": steps, "averaged": averaged, "newest": newest}
 
 
-def tell(line: dict[str, Any]) -> None:
-    """One run's second half."""
+def tell(path: Path) -> None:
+    """The second half of each run."""
+    for line in objects(path, "agent", "env", "seed", "env_steps", "averaged", "newest").values():
+        _tell_run(line)
+
+
+def _tell_run(line: dict[str, Any]) -> None:
     half = np.array(line["env_steps"]) > max(line["env_steps"]) / 2
     for name in ("averaged", "newest"):
         found = np.array(line[name])[half]
@@ -52,14 +57,5 @@ def tell(line: dict[str, Any]) -> None:
         print(f"{line['agent']}, {line['env']}, seed {line['seed']}, {name}: {spread} of {len(found)} checkpoints")
 
 
-def main() -> None:
-    """Train, or play what was trained."""
-    if "--play" not in sys.argv:
-        STUDY.main()
-        return
-    for text in STUDY.played("small", "played", play).read_text().splitlines():
-        tell(json.loads(text))
-
-
 if __name__ == "__main__":
-    main()
+    STUDY.main(Play("played", play, tell))

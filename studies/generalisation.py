@@ -1,22 +1,23 @@
 """Generalisation (a) of the paper: trained where everything is seen, played with more and more frames blank.
 
-After the runs, ``python -m studies.generalisation --scale SCALE --play`` plays each with p = 0 … 1 and tells the areas;
+After the runs, the same command with ``--play`` plays each with p = 0 … 1 and tells the areas;
 ``--draw PICTURE FILE …`` draws the lines of such files, a panel an environment.
 """
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
 import numpy as np
 
+from common.errors import ConfigError
 from deploy.aggregate import ENOUGH_SEEDS, interquartile_mean, interval
 from deploy.baselines import evaluate
+from deploy.curves import PICTURES
 from deploy.evaluation import evaluate_checkpoint
-from deploy.history import is_baseline
-from deploy.run_folder import RunFolder
-from studies.study import Job, Scale, Study
+from deploy.history import objects
+from deploy.run_folder import RunFolder, check_writable
+from studies.study import Job, Play, Scale, Study
 
 ENVS = ("HalfCheetah-v5", "Walker2d-v5", "Ant-v5")
 PROBABILITIES = tuple(round(0.1 * tenths, 1) for tenths in range(11))
@@ -41,7 +42,7 @@ def play(job: Job, episodes: int = EPISODES) -> dict[str, object]:
     """A line: returns of a run's last checkpoint under each probability."""
     folder, returns = RunFolder(job.folder), []
     for probability in PROBABILITIES:
-        if is_baseline(folder):
+        if folder.is_baseline():
             played = evaluate(folder, episodes, probability)
         else:
             played = evaluate_checkpoint(folder, folder.config(), "latest", episodes, probability)
@@ -58,7 +59,7 @@ def area(returns: list[float]) -> float:
 def tell(path: Path) -> None:
     """The areas by environment and agent, with an interval where there are seeds enough."""
     found: dict[tuple[str, str], list[float]] = {}
-    for line in map(json.loads, path.read_text().splitlines()):
+    for line in objects(path, "agent", "env", "returns").values():
         found.setdefault((line["env"], line["agent"]), []).append(area(line["returns"]))
     for (env, agent), areas in found.items():
         scores = np.array(areas)[:, None]
@@ -73,7 +74,9 @@ def draw(out: Path, paths: list[Path]) -> None:
     """Returns over p: a panel an environment, a line a run."""
     from matplotlib.figure import Figure  # an extra
 
-    lines = [json.loads(line) for path in paths for line in path.read_text().splitlines()]
+    check_writable("--draw", out, PICTURES)
+    names = "agent", "env", "seed", "env_steps", "flicker", "returns"
+    lines = [line for path in paths for line in objects(path, *names).values()]
     envs = list(dict.fromkeys(line["env"] for line in lines))
     figure = Figure(figsize=(6.0 * len(envs), 4.2), layout="constrained")
     for panel, env in zip(figure.subplots(1, len(envs), squeeze=False).flat, envs, strict=True):
@@ -89,20 +92,18 @@ def draw(out: Path, paths: list[Path]) -> None:
 
 def main() -> None:
     """Train, or play what was trained, or draw how it played."""
-    if not {"--play", "--draw"} & set(sys.argv):
-        STUDY.main()
+    if "--draw" not in sys.argv:
+        STUDY.main(Play("flicker", play, tell))
         return
     parser = argparse.ArgumentParser()
-    parser.add_argument("--play", action="store_true")
     parser.add_argument("--draw", type=Path, nargs="+", metavar=("PICTURE", "FILE"))
-    parser.add_argument("--scale", default="small")
-    options = parser.parse_args()
-    if options.draw and len(options.draw) < 2:
-        parser.error(f"--draw={options.draw[0]}: name the files of lines after the picture")
-    if options.draw:
-        draw(options.draw[0], options.draw[1:])
-    else:
-        tell(STUDY.played(options.scale, "flicker", play))
+    out, *paths = parser.parse_args().draw
+    if not paths:
+        parser.error(f"--draw={out}: name the files of lines after the picture")
+    try:
+        draw(out, paths)
+    except ConfigError as error:
+        sys.exit(f"studies.{STUDY.name}: {error}")
 
 
 if __name__ == "__main__":

@@ -2,11 +2,13 @@
 
     python -m studies.NAME [--scale smoke|small|full] [--env ENV ...] [--only AGENT ...] [--seeds 1 2 3] [--jobs 2]
     python -m studies.NAME --steps 300000 …
+    python -m studies.NAME … --play
 
 smoke takes minutes, small two cores and hours, full is for a cluster or a GPU; --steps is small, but of so many
 environment steps, with files of its own (NAME-STEPS.jsonl). A run that has its line in
 studies/results/NAME-SCALE.jsonl is not run again, one that was interrupted goes on in runs/studies/. Several jobs share
-the cores, each on its own part of them. ``rmc plot studies/results/NAME-SCALE.jsonl`` shows what came.
+the cores, each on its own part of them. ``rmc plot studies/results/NAME-SCALE.jsonl`` shows what came. Some studies
+play, with ``--play``, what the same command has trained.
 """
 
 import argparse
@@ -56,6 +58,15 @@ class Job:
     folder: Path
 
 
+@dataclasses.dataclass(frozen=True)
+class Play:
+    """What is done with finished runs: a line a run, in NAME-SCALE.KIND.jsonl, and how that file is told."""
+
+    kind: str
+    play: Callable[[Job], dict[str, Any]]
+    tell: Callable[[Path], None]
+
+
 class Study:
     """Agents by their names in the results, each as words of ``rmc`` with ENV for the environment."""
 
@@ -94,8 +105,8 @@ class Study:
         """The file of a scale's lines; a smoke test's are no results."""
         return (RUNS if scale == "smoke" else RESULTS) / f"{self.name}-{scale}.jsonl"
 
-    def main(self) -> None:
-        """The command line."""
+    def main(self, after: Play | None = None) -> None:
+        """The command line; ``after`` is what ``--play`` does."""
         parser = argparse.ArgumentParser(description=f"The study {self.name}: {', '.join(self.agents)}.")
         length = parser.add_mutually_exclusive_group()
         length.add_argument("--scale", choices=list(self.scales), default="small")
@@ -104,25 +115,35 @@ class Study:
         parser.add_argument("--env", nargs="+")
         parser.add_argument("--only", nargs="+", help="agents")
         parser.add_argument("--jobs", type=int, default=1, help="runs at once")
+        if after is not None:
+            parser.add_argument("--play", action="store_true", help="play what was trained")
         options = parser.parse_args()
+        if options.jobs < 1:
+            parser.error(f"--jobs={options.jobs}: take at least 1")
         scale = options.scale if options.steps is None else self.of_steps(options.steps)
         try:
-            self.run(scale, self.jobs(scale, options.seeds, options.env, options.only), options.jobs)
+            jobs = self.jobs(scale, options.seeds, options.env, options.only)
+            if after is not None and options.play:
+                after.tell(self.played(scale, jobs, after))
+            else:
+                self.run(scale, jobs, options.jobs)
         except ConfigError as error:
             sys.exit(f"studies.{self.name}: {error}")
         except KeyboardInterrupt:
             sys.exit(f"studies.{self.name}: interrupted; the same command goes on with it")
 
-    def played(self, scale: str, kind: str, play: Callable[[Job], dict[str, Any]]) -> Path:
-        """The file of ``play``'s lines, one for each finished run; plays those that it lacks."""
-        target = self.results(scale).with_suffix(f".{kind}.jsonl")
-        lines = [json.loads(text) for text in target.read_text().splitlines()] if target.exists() else []
+    def played(self, scale: str, jobs: Sequence[Job], after: Play) -> Path:
+        """The file of its lines, one for each finished run; plays those that it lacks. Raises ConfigError."""
+        target = self.results(scale).with_suffix(f".{after.kind}.jsonl")
+        lines = history.objects(target, "agent", "env", "seed").values() if target.exists() else []
         done = {(line["agent"], line["env"], line["seed"]) for line in lines}
-        for job in self.jobs(scale):
+        for job in jobs:
             if (job.agent, job.env, job.seed) not in done and RunFolder(job.folder).result():
-                line = json.dumps(play(job))
+                line = json.dumps(after.play(job))
                 with target.open("a") as file:
                     file.write(line + "\n")
+        if not target.exists():
+            raise ConfigError("--play", str(target), "no such run has ended; the same command without it trains them")
         return target
 
     def run(self, scale: str, jobs: Sequence[Job], at_once: int = 1) -> None:

@@ -3,16 +3,20 @@
 import dataclasses
 import json
 import pickle
+import subprocess
+import sys
+from pathlib import Path
 from typing import get_args
 
 import pytest
+import torch
 from rich.console import Console
 
 from common.envs import EnvConfig
 from common.errors import ConfigError
 from common.role import StopSignal
 from deploy.baseline_settings import Algorithm, BaselineConfig, Settings, choose
-from deploy.baselines import train
+from deploy.baselines import evaluate, train
 from deploy.cli import run as rmc
 from deploy.history import of_run
 from deploy.run_folder import RunFolder
@@ -40,7 +44,15 @@ def test_every_one_trains_stops_and_goes_on(algorithm, tmp_path):
     assert first.env_steps >= 300
     assert [one.env_steps // 100 for one in first.evaluations][:2] == [1, 2]
     more = first.env_steps + 200  # a PPO's rollout may have gone past its end
+    stop = StopSignal()
+    stop.requested = True
+    assert run(config(algorithm, total_steps=more), folder, stop) == 130
+    assert not of_run(RunFolder(folder)).finished
     assert run(config(algorithm, total_steps=more), folder) == 0
+    for path in (folder / "checkpoints").glob("*/replay_buffer.pkl"):
+        buffer = pickle.loads(path.read_bytes())
+        assert (buffer.size(), len(buffer.rewards)) == (more - 1, more)  # all but the step that the signal ended
+        assert buffer.observations[: more - 1].any(axis=(1, 2)).all()
     second = of_run(RunFolder(folder))
     assert second.env_steps >= more
     assert second.evaluations[: len(first.evaluations) - 1] == first.evaluations[:-1]
@@ -51,10 +63,12 @@ def test_every_one_trains_stops_and_goes_on(algorithm, tmp_path):
 
 def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):
     run(config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=600), tmp_path / "run")
+    torch.set_num_threads(2)  # as a process has it that has trained nothing
     assert rmc(["evaluate", str(tmp_path / "run"), "--episodes", "10", "--flicker", "0", "1", "--json"]) == 0
+    assert torch.get_num_threads() == 1
     seen, blind = (json.loads(line) for line in capsys.readouterr().out.splitlines())
     result = RunFolder(tmp_path / "run").result()
-    assert seen["eval_return_mean"] == pytest.approx(result["eval_return_mean"])
+    assert seen["eval_return_mean"] == result["eval_return_mean"]
     assert (blind["eval_flicker"], blind["env_steps"]) == (1.0, result["env_steps"])
     assert rmc(["evaluate", str(tmp_path / "run"), "--checkpoint", "best"]) == 2
 
@@ -69,6 +83,7 @@ def test_a_stop_signal_is_heard_and_nothing_is_lost(tmp_path):
     (folder / "checkpoints" / "999999").mkdir()  # one that a crash left without its progress
     assert run(config(), folder) == 0
     assert of_run(RunFolder(folder)).env_steps == 300
+    assert [path.name for path in (folder / "checkpoints").iterdir()] == ["000000000300"]
 
 
 def test_another_agent_is_not_gone_on_with(tmp_path):
@@ -82,6 +97,8 @@ def test_another_agent_is_not_gone_on_with(tmp_path):
     (tmp_path / "other" / "file").write_text("mine")
     with pytest.raises(ConfigError, match="no baseline's"):
         run(config(), tmp_path / "other")
+    with pytest.raises(ConfigError, match="cannot be made"):
+        run(config(), Path("/etc/passwd/x"))
 
 
 def test_a_stack_of_frames_belongs_to_the_agent(tmp_path):
@@ -110,3 +127,39 @@ def test_the_zoos_ppo_trains_and_keeps_its_scales(tmp_path):
         with scales.open("rb") as file:
             count = pickle.load(file).obs_rms.count
         assert count == pytest.approx(of_run(RunFolder(tmp_path / "run")).env_steps, rel=0.02)
+
+
+def test_one_in_use_is_left_as_it_is_and_can_be_stopped(tmp_path, capsys):
+    words = ["baseline", "sac", ENV.id, "--total-steps", "1000000", "--checkpoint-steps", "100", "--run-dir"]
+    command = [sys.executable, "-m", "deploy.cli", *words, str(tmp_path / "run")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        while "environment step" not in (said := process.stdout.readline()):
+            assert said
+        before = (tmp_path / "run" / "config.json").read_bytes()
+        with pytest.raises(ConfigError, match="stop it first"):
+            run(config(total_steps=2_000_000), tmp_path / "run")
+        assert (tmp_path / "run" / "config.json").read_bytes() == before
+        assert rmc(["stop", str(tmp_path / "run")]) == 0
+    assert process.returncode == 130
+    said = capsys.readouterr()
+    assert (said.out, said.err) == (f"{tmp_path / 'run'} has ended\n", "")
+
+
+def test_files_that_are_cut_are_named(tmp_path):
+    folder = tmp_path / "run"
+    assert run(config(total_steps=100), folder) == 0
+    (state,) = (folder / "checkpoints").iterdir()
+    cuts = {folder / "initial.json": "JSON", folder / "config.json": "JSON", state / "progress.json": "JSON"}
+    cuts |= dict.fromkeys((state / "replay_buffer.pkl", state / "model.zip"), "cannot be read")
+    for path, fault in cuts.items():
+        whole = path.read_bytes()
+        for cut in (b"", whole[: len(whole) // 2]):
+            path.write_bytes(cut)
+            if path.name != "progress.json":
+                with pytest.raises(ConfigError, match=rf"{folder}.*{fault}"):
+                    run(config(total_steps=200), folder)
+            if path.name in ("progress.json", "model.zip", "config.json"):
+                with pytest.raises(ConfigError, match=rf"{folder}.*{fault}"):
+                    evaluate(RunFolder(folder), 1)
+        path.write_bytes(whole)

@@ -28,7 +28,8 @@ def shown(tables) -> str:
 
 
 def test_a_line_holds_a_history():
-    assert history._of_line(made().to_line()) == made()
+    line = made().to_line()
+    assert history._of_line(json.loads(line), "file:1").to_line() == line
 
 
 def test_a_run_is_read_from_its_folder(tmp_path):
@@ -57,6 +58,7 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     assert found.evaluations == [Evaluation(500, 50, 5.0, 7.0, 1.0), Evaluation(900, 90, 15.0, 9.0, 1.0)]
     assert found.transitions == 90 * 8 * 15
     result = {"updates": 100, "env_steps": 1000, "wall_s": 21.0, "eval_return_mean": 11.0, "eval_return_std": 2.0}
+    result["eval_episodes"] = 10
     (tmp_path / "result.json").write_text(json.dumps({**result, "initial_return_mean": -1.0}))
     (found,) = history.read(tmp_path)
     assert found.evaluations[-1] == Evaluation(1000, 100, 21.0, 11.0, 2.0)
@@ -66,11 +68,71 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     assert [one.env_steps for one in found.evaluations] == [500, 1000]
 
 
-@pytest.mark.parametrize("text", ["[1, 2]", "{}", "not json"])
-def test_what_is_no_history_is_refused(text, tmp_path):
-    (tmp_path / "file.jsonl").write_text(text)
-    with pytest.raises(ConfigError, match="RUNS"):
+def odd(**fields) -> str:
+    return json.dumps(dataclasses.asdict(made()) | fields)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[1, 2]",
+        "{}",
+        "not json",
+        made().to_line()[:-9],
+        b"\xff",
+        odd(evaluations=[]),
+        odd(evaluations=[dataclasses.asdict(Evaluation(1, 1, 1.0, 1.0, 1.0)) | {"return_mean": None}]),
+        odd(evaluations=[dataclasses.asdict(Evaluation(1, 1, 1.0, 1.0, 1.0)) | {"return_mean": "abc"}]),
+        odd(evaluations=["abc"]),
+        odd(initial_return="abc"),
+        odd(agent=None),
+        odd(other=1),
+    ],
+)
+def test_what_is_no_history_is_refused_where_it_is(text, tmp_path):
+    line = text if isinstance(text, bytes) else text.encode()
+    (tmp_path / "file.jsonl").write_bytes(made().to_line().encode() + b"\n\n" + line)
+    with pytest.raises(ConfigError, match=r"RUNS='.*file\.jsonl:3'"):
         history.read(tmp_path / "file.jsonl")
+
+
+def test_a_run_that_cannot_be_read_is_told_and_left_out(tmp_path, capsys):
+    for name, text in {"foreign": "5", "new": to_json(robust(EnvConfig("Hopper-v5")))}.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text(text)
+    (tmp_path / "lines").write_text(made().to_line())
+    (tmp_path / "empty").touch()
+    paths = {name: str(tmp_path / name) for name in ("foreign", "new", "empty", "lines")}
+    assert run(["plot", *paths.values(), "--out", str(tmp_path / "out.png")]) == 0
+    assert "100 (100)" in capsys.readouterr().out
+    for names, fault in {("foreign",): "an object", ("foreign", "new"): "no history", ("empty",): "no history"}.items():
+        assert run(["plot", *map(paths.get, names), "--out", str(tmp_path / "out.png")]) == 2
+        assert fault in capsys.readouterr().err
+    with pytest.raises(ConfigError, match=str(tmp_path / "foreign")):
+        history.read(tmp_path / "foreign")
+    assert run(["plot", paths["lines"], "--out", "/proc/out.png"]) == 2
+    said = capsys.readouterr()
+    assert "100 (100)" in said.out
+    assert "--out='/proc/out.png': cannot be written" in said.err
+
+
+def test_a_run_counts_once_and_a_seed_once(tmp_path):
+    """Unfinished ones are said to be so."""
+    runs = [made(seed=seed) for seed in (1, 2, 3, 4)]
+    others = [dataclasses.replace(made(seed=1, last=400.0), finished=False, env_steps=1000)] * 2
+    twice = [dataclasses.replace(run, commit="def") for run in runs]
+    groups = curves.grouped([*runs, *twice, *others])
+    assert len(groups["HalfCheetah-v5"]["RMC"]) == 5
+    line = shown(curves.tables(groups, None)).splitlines()[-1]
+    assert "4, 1 unfinished" in line
+    assert "(100, 400, 100, 100, 100)" in line
+    assert "1,000 to 3,000" in line
+    assert curves._named("RMC", groups) == "RMC (4 seeds, each a line)"
+    from matplotlib.figure import Figure
+
+    panel = Figure().subplots()
+    curves._draw_agent(panel, groups["HalfCheetah-v5"]["RMC"], "env_steps", "C0")
+    assert (len(panel.lines), len(panel.collections)) == (5, 0)
 
 
 def test_a_run_without_an_evaluation_is_refused(tmp_path):

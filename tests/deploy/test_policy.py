@@ -8,7 +8,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from safetensors.torch import save
+from safetensors.torch import load, save
 
 from actors.evaluator import first_start
 from common.agent import Agent, AgentConfig
@@ -105,6 +105,24 @@ def test_export_says_what_is_wrong_in_one_line(
     assert "is a folder" in capsys.readouterr().err
     assert cli.run(["export", str(run.path), "--checkpoint", "best"]) == 2
     assert "none was evaluated yet" in capsys.readouterr().err
+    assert cli.run(["export", str(run.path), "--checkpoint", "²"]) == 2
+    assert "use latest, best or one of [7]" in capsys.readouterr().err
+    assert cli.run(["export", str(run.path), "--out", "/proc/policy.onnx"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
     monkeypatch.setattr("deploy.export.NEEDED", ("no_such_package",))
     assert cli.run(["export", str(run.path)]) == 2
     assert "pip install 'rmc[onnx]'" in capsys.readouterr().err
+
+
+def test_another_environments_policy_is_refused(run: RunFolder, tmp_path: Path, capsys) -> None:
+    """Its parts have other shapes; or there are fewer, which torch would leave at random."""
+    file, other = tmp_path / "policy.onnx", make_run(tmp_path / "other", run.config().agent, "InvertedPendulum-v5")
+    fewer = load(CheckpointFolder(run.checkpoints).load(7)["policy.safetensors"])
+    del fewer["policy.net.4.bias"]
+    theirs = CheckpointFolder(other.checkpoints).load(7)
+    for blob in (theirs["policy.safetensors"], save(fewer)):
+        CheckpointFolder(run.checkpoints).save(8, theirs | {"policy.safetensors": blob})
+        for words in (["export", str(run.path), "--out", str(file)], ["evaluate", str(run.path), "--episodes", "1"]):
+            assert cli.run(words) == 2
+            assert "--checkpoint='latest': weights: not a policy of this run" in capsys.readouterr().err
+    assert not file.exists()

@@ -1,6 +1,8 @@
-"""A run's secret is whole or absent, its owner's alone, and the same for all who ask at once."""
+"""A run's small files: the secret, its owner's alone and the same for all who ask at once; what is odd is said."""
 
+import dataclasses
 import errno
+import json
 import os
 import resource
 import stat
@@ -10,8 +12,12 @@ from threading import Barrier
 
 import pytest
 
+from common.envs import EnvConfig
 from common.errors import ConfigError
-from deploy.run_folder import RunFolder
+from deploy.cli import run
+from deploy.history import of_run
+from deploy.presets import debug, to_json
+from deploy.run_folder import RESULT, RunFolder, open_run
 
 
 def test_a_secret_is_made_once(tmp_path: Path) -> None:
@@ -75,3 +81,63 @@ def test_one_that_others_could_read_is_closed_to_them(tmp_path: Path, mode: int)
     (tmp_path / "secret").chmod(mode)
     assert RunFolder(tmp_path).secret() == first
     assert stat.S_IMODE((tmp_path / "secret").stat().st_mode) == 0o600
+
+
+def test_a_run_that_is_made_longer_has_no_result_until_it_ends(tmp_path: Path) -> None:
+    config = debug(EnvConfig("InvertedPendulum-v5"))
+    folder = open_run(config, tmp_path / "run", "fail")
+    folder.write_result(dict.fromkeys(RESULT, config.total_steps))
+    folder.unlock()
+    for more, there in ((0, True), (1, False)):
+        open_run(dataclasses.replace(config, total_steps=config.total_steps + more), folder.path, "resume").unlock()
+        assert (folder.result() is not None) == there
+
+
+def test_odd_lines_of_metrics_are_passed_over(tmp_path: Path) -> None:
+    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    folder.unlock()
+    evaluation = {"role": "evaluator", "eval_update": 50, "eval_return_mean": 7.0, "eval_return_std": 1.0}
+    records = [{"role": "launcher", "time": 1.0, "wall_s": 3.0}, evaluation | {"time": 1.0}]
+    odd = [b"5", b'{"a": 1}', b'{"role": 1}', b'{"role": "launcher", "wall_s": "abc"}', b"\xff", b'{"role": "launch']
+    folder.metrics.write_bytes(b"\n".join([odd[-2], *(json.dumps(one).encode() for one in records), *odd]))
+    assert folder.wall_seconds() == 3.0
+    assert [one.return_mean for one in of_run(folder).evaluations] == [7.0]
+    assert run(["stats", str(folder.path)]) == 0
+
+
+BASELINE = json.dumps({"algorithm": "sac"})
+OURS = to_json(debug(EnvConfig("InvertedPendulum-v5")))
+TRAIN = ["train", "InvertedPendulum-v5", "--run-dir"]
+
+
+@pytest.mark.parametrize(
+    ("files", "fault", "commands"),
+    [
+        ({"config.json": "5"}, "must be an object", [["stats"], ["attach"], ["stop"], ["plot"], ["evaluate"], TRAIN]),
+        ({"config.json": "{"}, "not JSON", [["stats"], ["stop"], ["plot"], ["evaluate"], ["export"], TRAIN]),
+        ({"config.json": "{}"}, "is missing", [["stats"], ["plot"], ["evaluate"]]),
+        ({"config.json": BASELINE}, "is a baseline's run", [["stats"], ["export"], ["inspect"], TRAIN]),
+        ({"config.json": BASELINE}, "nobody trains it now", [["stop"], ["attach"]]),
+        ({"config.json": BASELINE}, "no baseline's of this version ('env')", [["plot"], ["evaluate"]]),
+        ({"config.json": OURS, "result.json": '{"a": 1}'}, "result.json", [["plot"], ["stats"]]),
+        ({"config.json": OURS, "result.json": '{"env_st'}, "result.json", [["plot"], ["stats"]]),
+    ],
+)
+def test_odd_files_are_named_in_one_line(
+    files: dict[str, str], fault: str, commands: list[list[str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = {"role": "evaluator", "time": 1.0, "eval_update": 5, "eval_return_mean": 7.0, "eval_return_std": 1.0}
+    for name, text in (files | {"metrics.jsonl": json.dumps(record)}).items():
+        (tmp_path / name).write_text(text)
+    for command in commands:
+        assert run([*command, str(tmp_path)]) == 2
+        said = capsys.readouterr()
+        assert (said.out, said.err.count("\n")) == ("", 1)
+        assert fault in said.err
+        assert str(tmp_path) in said.err
+
+
+def test_a_baseline_is_not_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "config.json").write_text(BASELINE)
+    assert run(["evaluate", str(tmp_path), "--video", "x.mp4"]) == 2
+    assert "--video='x.mp4': only runs of rmc train are filmed" in capsys.readouterr().err

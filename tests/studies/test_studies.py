@@ -16,8 +16,9 @@ import studies
 from common.errors import ConfigError
 from deploy import history, options
 from deploy.presets import validate
+from deploy.run_folder import RESULT, RunFolder
 from studies import averaging, generalisation, study
-from studies.study import Scale, Study
+from studies.study import Play, Scale, Study
 
 NAMES = sorted({path.stem for path in Path(studies.__file__).parent.glob("*.py")} - {"__init__", "study"})
 
@@ -62,7 +63,7 @@ def test_a_study_runs_once_and_its_lines_can_be_plotted(tmp_path, monkeypatch):
     played = averaging.play(jobs[0], episodes=1)
     plays = iter([{"agent": one.agent, "env": one.env, "seed": one.seed} for one in jobs])
     for _ in range(2):  # the second time nothing is left to play
-        told = tiny.played("smoke", "played", lambda _: next(plays)).read_text().splitlines()
+        told = tiny.played("smoke", jobs, Play("played", lambda _: next(plays), print)).read_text().splitlines()
         assert [json.loads(line)["agent"] for line in told] == ["ours", "theirs"]
     assert played["env_steps"] == sorted(played["env_steps"]) != []
     assert len(played["averaged"]) == len(played["newest"]) == len(played["env_steps"])
@@ -88,6 +89,49 @@ def test_of_so_many_steps_it_has_runs_and_a_file_of_its_own(tmp_path, monkeypatc
     assert job.folder.parent.name == "tiny-3000"
     assert tiny.results("3000") == tmp_path / "tiny-3000.jsonl"
     assert all("1000" in one.words for one in tiny.jobs("small"))
+
+
+def test_what_is_played_is_of_the_length_that_was_trained(tmp_path, monkeypatch, capsys):
+    """Only finished runs; where there are none, or a file of lines is torn, that is one line."""
+    monkeypatch.setattr(study, "RESULTS", tmp_path)
+    monkeypatch.setattr(study, "RUNS", tmp_path)
+    tiny = Study("tiny", {"ours": "train ENV"}, small=Scale(1000, (1, 2), ("InvertedPendulum-v5",)))
+    after = Play("seen", lambda job: {"agent": job.agent, "env": job.env, "seed": job.seed}, lambda path: print(path))
+    monkeypatch.setattr("sys.argv", ["tiny", "--steps", "3000", "--seeds", "2", "3", "--play"])
+    with pytest.raises(SystemExit, match="no such run has ended"):
+        tiny.main(after)
+    tiny.of_steps(3000)
+    for job in tiny.jobs("3000", [1, 2]):
+        job.folder.mkdir(parents=True)
+        RunFolder(job.folder).write_result(dict.fromkeys(RESULT, 3000))
+    tiny.main(after)
+    lines = tmp_path / "tiny-3000.seen.jsonl"
+    assert capsys.readouterr().out.strip() == str(lines)
+    assert [json.loads(line)["seed"] for line in lines.read_text().splitlines()] == [2]
+    lines.write_text("{")
+    with pytest.raises(SystemExit, match=r"tiny-3000\.seen\.jsonl:1"):
+        tiny.main(after)
+    (tmp_path / "tiny-small.jsonl").write_text("{")
+    monkeypatch.setattr("sys.argv", ["tiny"])
+    with pytest.raises(SystemExit, match=r"tiny-small\.jsonl:1"):
+        tiny.main()
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (["--jobs", "0"], "--jobs=0: take at least 1"),
+        (["--play", "--scale", "300000"], "invalid choice"),
+        (["--draw", "x.png"], "name the files"),
+        (["--draw", "x.png", "nofile"], "nofile"),
+        (["--draw", "/proc/x.png", "nofile"], "cannot be written"),
+    ],
+)
+def test_what_a_study_cannot_do_is_said(words, fault, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["generalisation", *words])
+    with pytest.raises(SystemExit) as ending:
+        generalisation.main()
+    assert fault in f"{ending.value} {capsys.readouterr().err}"
 
 
 def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, monkeypatch):
@@ -158,9 +202,11 @@ def test_an_area_is_over_partial_views_only(tmp_path, capsys):
     assert capsys.readouterr().out == "Hopper-v5, RMC: 20 (20, 20)\n"
 
 
-def test_averages_are_judged_by_a_runs_second_half(capsys):
+def test_averages_are_judged_by_a_runs_second_half(tmp_path, capsys):
     both = {"averaged": [9, 2, 4, 6], "newest": [9, 1, 3, 8]}
-    averaging.tell({"agent": "RMC", "env": "Hopper-v5", "seed": 1, "env_steps": [10, 20, 30, 40]} | both)
+    line = {"agent": "RMC", "env": "Hopper-v5", "seed": 1, "env_steps": [10, 20, 30, 40]} | both
+    (tmp_path / "lines").write_text(json.dumps(line))
+    averaging.tell(tmp_path / "lines")
     assert capsys.readouterr().out.splitlines() == [
         "RMC, Hopper-v5, seed 1, averaged: mean 5, worst 4, deviation 1 of 2 checkpoints",
         "RMC, Hopper-v5, seed 1, newest: mean 6, worst 3, deviation 2 of 2 checkpoints",

@@ -1,0 +1,21 @@
+"""What rmc train does around the roles."""
+
+import json
+
+from rich.console import Console
+
+from common.checkpoint import CheckpointFolder
+from deploy import training
+from deploy.training import Placement, conduct
+from tests.deploy.test_policy import AGENTS, make_run
+
+
+def test_the_last_evaluation_judges_and_does_not_choose(tmp_path, monkeypatch):
+    """The best is of those that were evaluated from other starts."""
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+    monkeypatch.setattr(training, "_launch", lambda *_: True)
+    placement = Placement(folder.path, "resume", "local", "cpu", None)
+    folder.lock()
+    assert conduct(folder.config(), folder, placement, Console(quiet=True)) == 0
+    assert json.loads(folder.result_file.read_bytes())["updates"] == 7
+    assert CheckpointFolder(folder.checkpoints).best() is None
