@@ -386,7 +386,7 @@ def test_what_a_stream_lacks_is_asked_for_again_where_redis_went_away_amid_askin
 @pytest.mark.parametrize("away", ["commit", "latest_version"])
 def test_what_redis_did_not_hear_is_said_when_it_is_back(make: Make, away: str) -> None:
     bus = Failing(away)
-    server, sender = make(on=bus), Sender(bus)
+    server, sender = make(on=bus, slack=1000), Sender(bus)  # so much that two windows' credit alone would wait
     drain(server)
     sender.send(2)
     bus.failing = True
