@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -27,13 +29,25 @@ def evaluate_blob(config: RunConfig, blob: bytes, episodes: int, flicker: float 
     spec = config.window_spec()
     runner = PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, episodes)
     runner.load(blob)
-    returns = play_episodes(runner, lambda: make_env(env), episodes, first_start(config.seed, final=True))
+    with _one_thread():
+        returns = play_episodes(runner, lambda: make_env(env), episodes, first_start(config.seed, final=True))
     return {
         "eval_return_mean": float(np.mean(returns)),
         "eval_return_std": float(np.std(returns)),
         "eval_episodes": len(returns),
         "eval_flicker": env.flicker,
     }
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """A product's last bits depend on its threads, and an episode on them: so they must not on the machine's cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def evaluate_checkpoint(

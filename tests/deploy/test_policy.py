@@ -71,6 +71,19 @@ def test_a_loop_of_ones_own_gives_what_an_evaluation_gives(run: RunFolder) -> No
     assert np.mean(returns) == pytest.approx(found["eval_return_mean"], rel=1e-4)
 
 
+def test_an_evaluation_is_the_same_with_any_number_of_threads(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", AgentConfig(normalize_observations=True, fill_blanks=True), "HalfCheetah-v5", 0.5)
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(evaluate_checkpoint(run, run.config(), "latest", episodes=10))
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert found[0] == found[1]
+
+
 def test_exploring_actions_vary_and_are_seeded(run: RunFolder) -> None:
     observation = np.ones(3, np.float32)
     found = [[load_policy(run.path).act(observation, explore=explore) for _ in range(2)] for explore in (False, True)]
