@@ -143,8 +143,14 @@ def describe(path: Path) -> About:
         return About(_with(theirs.name, _stack(theirs.env)), _seen(theirs.env), theirs.seed, per_update)
     config = folder.config()
     name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
-    transitions = config.learner.batch_size * config.window.trained_steps
-    return About(_with(name, [*_changes(config), *_stack(config.env)]), _seen(config.env), config.seed, transitions)
+    agent = _with(name, [*_changes(config), *_stack(config.env)])
+    return About(agent, _seen(config.env), config.seed, config.learner.batch_size * _trained_steps(config))
+
+
+def _trained_steps(config: RunConfig) -> int:
+    """Of a window. Only for whole episodes an environment is made, which a machine that plots may lack."""
+    whole = config.actor.state_strategy == "episode"
+    return config.window_spec().train if whole else config.window.trained_steps
 
 
 def _with(name: str, words: list[str]) -> str:

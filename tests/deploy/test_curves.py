@@ -68,6 +68,13 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     assert [one.env_steps for one in found.evaluations] == [500, 1000]
 
 
+def test_a_window_that_is_an_episode_counts_with_its_length(tmp_path):
+    config = robust(EnvConfig("HalfCheetah-v5"))
+    actor = dataclasses.replace(config.actor, state_strategy="episode")
+    (tmp_path / "config.json").write_text(to_json(dataclasses.replace(config, actor=actor)))
+    assert history.describe(tmp_path).transitions_per_update == 8 * 1000
+
+
 def odd(**fields) -> str:
     return json.dumps(dataclasses.asdict(made()) | fields)
 
