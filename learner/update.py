@@ -14,8 +14,9 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
+from torch.nn import functional
 
-from common.agent import Agent, Memory, Remembered, squashed_sample
+from common.agent import NORMALIZED_CLIP, Agent, Memory, Remembered, squashed_sample
 from learner import losses
 from learner.batch import Batch
 from learner.fused import fuse
@@ -113,7 +114,19 @@ class JointUpdate:
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
-        return [_adam(self.agent, self.config, "memory", "world_model", "next_frame", "critic", "policy", "log_alpha")]
+        return [
+            _adam(
+                self.agent,
+                self.config,
+                "memory",
+                "world_model",
+                "next_frame",
+                "hindsight",
+                "critic",
+                "policy",
+                "log_alpha",
+            )
+        ]
 
     def __call__(self, batch: Batch, beta: Tensor) -> Updated:
         """One update from a Batch; ``beta`` is a scalar tensor."""
@@ -133,7 +146,8 @@ class JointUpdate:
             o = agent.normalizer(batch.observation, batch.blank)
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
-            o = filled(agent, o, batch, self.burn_in)
+            o, expected = filled(agent, o, batch, self.burn_in)
+            o, hindsight_loss = self._in_hindsight(o, expected, batch)
             memory = remember(agent.memory, o, batch, self.burn_in)
             z = self._low(agent.features(memory))
             trains = TRAINS_MEMORY[c.scheme]
@@ -175,6 +189,8 @@ class JointUpdate:
             with self._autocast():
                 expected = agent.next_frame(self._low(memory.hidden.detach()[:, :-1]), now, a)
             parts["fill_loss"] = losses.fill_loss(expected, after, seen_after, m)
+        if agent.hindsight is not None:
+            parts["hindsight_loss"] = hindsight_loss
         if agent.config.grounding:
             predicted = now + prediction.observation_change.float()
             seen = seen_after if agent.config.fill_blanks else seen_after * seen_now
@@ -203,6 +219,20 @@ class JointUpdate:
         """What all heads read, rounded once for all where their products are in bfloat16."""
         return z.bfloat16() if self.bf16 else z
 
+    def _in_hindsight(self, o: Tensor, expected: Tensor | None, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Blanks filled with what the next frame seen tells of them, where configured; and the loss of what tells it.
+
+        That one learns from frames that are seen, told as if they were not.
+        """
+        if self.agent.hindsight is None or expected is None:
+            return o, o.new_zeros(())
+        seen = _seen(batch) > 0
+        told, tellable = self.agent.hindsight(o, expected, seen, batch.prev_action)
+        tellable = tellable & functional.pad(batch.observation_valid, (1, -1))
+        loss = losses.fill_loss(told, o, seen.float(), tellable.float())
+        told = told.detach().clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+        return torch.where((tellable & batch.blank).unsqueeze(-1), told, o), loss
+
     @torch.no_grad()
     def _remember_target(self, o: Tensor, batch: Batch) -> Remembered:
         return remember(self.target_memory, o, batch, self.burn_in)
@@ -222,7 +252,8 @@ class JointUpdate:
     def _step(self, optimizer: torch.optim.Adam, parts: Iterable[Tensor]) -> Tensor:
         """Backward from the losses' sum, clip, Adam; returns the gradient's norm before clipping."""
         self.agent.zero_grad(set_to_none=True)
-        sum(parts, torch.zeros_like(self.agent.log_alpha)).backward()  # type: ignore[no-untyped-call]
+        nothing = 0.0 * self.agent.log_alpha  # has a gradient where no part has: hindsight's where all is seen
+        sum(parts, nothing).backward()  # type: ignore[no-untyped-call]
         gradients = [value.grad for value in self.agent.parameters() if value.grad is not None]
         norm = nn.utils.get_total_norm(gradients)
         if self.config.clip_norm:
@@ -296,6 +327,7 @@ class AlternateUpdate(JointUpdate):
     _STAGES = (
         ("world_model", ("model_loss", "grounding_loss")),
         ("next_frame", ("fill_loss",)),
+        ("hindsight", ("hindsight_loss",)),
         ("critic", ("q_loss",)),
         ("policy", ("policy_loss",)),
         ("log_alpha", ("temperature_loss",)),
@@ -340,17 +372,21 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
     return torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
 
 
-def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
-    """(B, L + 1, O) with blank frames filled where configured, along the states that ``remember`` goes through."""
-    if not agent.fills(batch.blank):
-        return o
+def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> tuple[Tensor, Tensor | None]:
+    """(B, L + 1, O) with blank frames filled where configured, along the states that ``remember`` goes through.
 
-    def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:
+    Beside it what was expected at every step, (B, L + 1, O), where something was filled.
+    """
+    if not agent.fills(batch.blank):
+        return o, None
+
+    def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return agent.fill(o[:, steps], batch.blank[:, steps], batch.prev_action[:, steps], state)
 
-    past, state = part(slice(burn_in), batch.state)
+    past, past_expected, state = part(slice(burn_in), batch.state)
     state = torch.where(batch.burned_in.unsqueeze(1), state, batch.state)
-    return torch.cat([past, part(slice(burn_in, None), state)[0]], 1)
+    now, now_expected, _ = part(slice(burn_in, None), state)
+    return torch.cat([past, now], 1), torch.cat([past_expected, now_expected], 1)
 
 
 def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:
