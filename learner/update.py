@@ -109,24 +109,15 @@ class JointUpdate:
         self.target_memory = _target_copy(agent.memory)
         self.average = {name: value.detach().clone() for name, value in agent.acting().items()}  # theta-bar
         self._has_target_memory = "ema" in (config.latent_target, config.target_memory)
+        self.fast = {n: copy.deepcopy(getattr(agent, n)) for n in ("next_frame", "hindsight") if getattr(agent, n) is not None}
         self.optimizers = self._make_optimizers()
         self.generator = torch.Generator(device).manual_seed(seed)
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
-        return [
-            _adam(
-                self.agent,
-                self.config,
-                "memory",
-                "world_model",
-                "next_frame",
-                "hindsight",
-                "critic",
-                "policy",
-                "log_alpha",
-            )
-        ]
+        o = _adam(self.agent, self.config, "memory", "world_model", "critic", "policy", "log_alpha")
+        o.add_param_group({"params": [p for f in self.fast.values() for p in f.parameters()], "lr": 3e-3})
+        return [o]
 
     def __call__(self, batch: Batch, beta: Tensor) -> Updated:
         """One update from a Batch; ``beta`` is a scalar tensor."""
@@ -187,7 +178,7 @@ class JointUpdate:
         seen_now, seen_after = _seen(batch)[:, steps][:, :-1], _seen(batch)[:, steps][:, 1:]
         if agent.next_frame is not None:
             with self._autocast():
-                expected = agent.next_frame(self._low(memory.hidden.detach()[:, :-1]), now, a)
+                expected = self.fast["next_frame"](self._low(memory.hidden.detach()[:, :-1]), now, a)
             parts["fill_loss"] = losses.fill_loss(expected, after, seen_after, m)
         if agent.hindsight is not None:
             parts["hindsight_loss"] = hindsight_loss
@@ -227,9 +218,11 @@ class JointUpdate:
         if self.agent.hindsight is None or expected is None:
             return o, o.new_zeros(())
         seen = _seen(batch) > 0
-        told, tellable = self.agent.hindsight(o, expected, seen, batch.prev_action)
+        trained, _ = self.fast["hindsight"](o, expected, seen, batch.prev_action)
+        with torch.no_grad():
+            told, tellable = self.agent.hindsight(o, expected, seen, batch.prev_action)
         tellable = tellable & functional.pad(batch.observation_valid, (1, -1))
-        loss = losses.fill_loss(told, o, seen.float(), tellable.float())
+        loss = losses.fill_loss(trained, o, seen.float(), tellable.float())
         told = told.detach().clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
         return torch.where((tellable & batch.blank).unsqueeze(-1), told, o), loss
 
@@ -252,6 +245,7 @@ class JointUpdate:
     def _step(self, optimizer: torch.optim.Adam, parts: Iterable[Tensor]) -> Tensor:
         """Backward from the losses' sum, clip, Adam; returns the gradient's norm before clipping."""
         self.agent.zero_grad(set_to_none=True)
+        for f in self.fast.values(): f.zero_grad(set_to_none=True)
         nothing = 0.0 * self.agent.log_alpha  # has a gradient where no part has: hindsight's where all is seen
         sum(parts, nothing).backward()  # type: ignore[no-untyped-call]
         gradients = [value.grad for value in self.agent.parameters() if value.grad is not None]
@@ -264,6 +258,8 @@ class JointUpdate:
     def _follow(self, updated: Updated) -> None:
         """What follows the step: targets by Polyak, and the running variance."""
         self._polyak(self.target_critic.parameters(), self.agent.critic.parameters())
+        for n, fast in self.fast.items():
+            self._polyak(getattr(self.agent, n).parameters(), fast.parameters())
         if self._has_target_memory:
             self._polyak(self.target_memory.parameters(), self.agent.memory.parameters())
         self.curiosity_variance.copy_(updated.curiosity_variance)
