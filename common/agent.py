@@ -14,7 +14,6 @@ from torch.nn import functional as F
 
 LOG_STD_RANGE = (-20.0, 2.0)  # of the policy's Gaussian before the tanh
 NORMALIZED_CLIP = 10.0  # standard deviations
-HINDSIGHT = 4  # steps ahead in which a frame is looked for that tells what a blank one was
 STD_FLOOR = 1e-2  # a constant dimension is not blown up
 HeadInput = Literal["hidden", "hidden+embedding", "hidden+observation", "observation"]
 POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what it takes to act
@@ -49,9 +48,6 @@ class AgentConfig:
     """A blank observation is replaced, before the memory reads it, by what a small network of its own predicts from the
     observation before (filled itself if it was blank), the memory and the last action. The stored state then is h and
     that observation. Needs normalized observations."""
-    hindsight: bool = False
-    """The learner fills a blank with what a second small network makes of that prediction and of the next frame that
-    is seen, up to ``HINDSIGHT`` steps later. Needs ``fill_blanks``."""
     initial_priority: Literal["max", "actor"] = "max"
     """Priority that a window enters a prioritized replay with: the largest seen, or the TD error that its actor
     computes, to which the critics are then sent, too."""
@@ -211,40 +207,6 @@ class NextFrame(nn.Module):
         return observation + change.float()
 
 
-class Hindsight(nn.Module):
-    """What o_t was, from what was expected of it and from the next frame that is seen, o_{t+k}, k <= ``HINDSIGHT``.
-
-    It reads o_{t-1}, a_{t-1}, the expected o_t, o_{t+k}, k and a_t ... a_{t+k-1}, and trains nothing but itself.
-    """
-
-    def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
-        super().__init__()
-        inputs = 3 * obs_dim + 1 + (1 + HINDSIGHT) * action_dim
-        self.net = _mlp(inputs, config.heads, nn.Linear(config.heads[1], obs_dim))
-
-    def forward(
-        self, observation: Tensor, expected: Tensor, seen: Tensor, prev_action: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """(B, T, O) normalised and filled, (B, T, O) the expected o_t, (B, T) bool, (B, T, A).
-
-        Gives o_0 ... o_{T-1} in hindsight, (B, T, O), and where there was a later frame to tell it by, (B, T) bool.
-        """
-        steps = expected.shape[1]
-
-        def later(x: Tensor, k: int) -> Tensor:
-            return F.pad(x, (0, 0, 0, k))[:, k : k + steps]
-
-        after, ahead = torch.zeros_like(observation), torch.zeros_like(observation[..., :1])
-        for k in range(HINDSIGHT, 0, -1):
-            there = later(seen.unsqueeze(-1), k)
-            after, ahead = torch.where(there, later(observation, k), after), ahead.masked_fill(there, k)
-        between = [later(prev_action, k) * (ahead >= k) for k in range(1, HINDSIGHT + 1)]
-        before = F.pad(observation, (0, 0, 1, 0))[:, :steps]
-        inputs = torch.cat([before, prev_action, expected, after, ahead / HINDSIGHT, *between], -1)
-        change: Tensor = self.net(inputs)
-        return expected + change.float(), ahead[..., 0] > 0
-
-
 class StackedLinear(nn.Module):
     """Two Linear layers side by side as one batched product: x (2, N, in) -> (2, N, out)."""
 
@@ -322,7 +284,6 @@ class Agent(nn.Module):
         self.policy = Policy(features, action_dim, config)
         self.log_alpha = nn.Parameter(torch.zeros(()))
         self.next_frame = NextFrame(obs_dim, action_dim, config) if config.fill_blanks else None
-        self.hindsight = Hindsight(obs_dim, action_dim, config) if config.hindsight else None
 
     def features(self, remembered: Remembered) -> Tensor:
         """What the heads read: h_t, what is beside it, or both."""
@@ -334,25 +295,22 @@ class Agent(nn.Module):
         return torch.cat(remembered, dim=-1)
 
     @torch.no_grad()
-    def fill(
-        self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """A blank o_t becomes what is expected from (h_{t-1}, o_{t-1}, a_{t-1}), o_{t-1} filled itself.
 
-        (B, T, O) normalised, (B, T) bool, (B, T, A), (B, S) the state before the first step -> (B, T, O), what was
-        expected at every step, (B, T, O), and the state after the last. No gradient.
+        (B, T, O) normalised, (B, T) bool, (B, T, A), (B, S) the state before the first step -> (B, T, O) and the state
+        after the last. No gradient.
         """
         assert self.next_frame is not None
         hidden, seen = state[:, : self.config.hidden], state[:, self.config.hidden :]
-        frames, all_expected = [observation[:, :0]], [observation[:, :0]]
+        frames = [observation[:, :0]]
         with torch.autocast(observation.device.type, enabled=False):  # at a step at a time the casts outweigh the rest
             for o, was_blank, a in zip(observation.unbind(1), blank.unbind(1), prev_action.unbind(1), strict=True):
                 expected = self.next_frame(hidden, seen, a).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
                 seen = torch.where(was_blank.unsqueeze(1), expected, o)
                 hidden = self.memory.step(seen, was_blank, a, hidden)
                 frames.append(seen.unsqueeze(1))
-                all_expected.append(expected.unsqueeze(1))
-        return torch.cat(frames, 1), torch.cat(all_expected, 1), torch.cat([hidden, seen], 1)
+        return torch.cat(frames, 1), torch.cat([hidden, seen], 1)
 
     def remember(
         self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor
@@ -360,7 +318,7 @@ class Agent(nn.Module):
         """The memory along a sequence; what it was given, (B, T, O), blanks filled; and the state after, (B, S)."""
         seen = observation
         if self.fills(blank):
-            seen, _, after = self.fill(observation, blank, prev_action, state)
+            seen, after = self.fill(observation, blank, prev_action, state)
         remembered: Remembered = self.memory(seen, blank, prev_action, state)
         if seen is observation:
             last_seen = seen[:, -1, : state.shape[1] - self.config.hidden]

@@ -276,8 +276,6 @@ def validate(config: RunConfig) -> None:
     if config.agent.fill_blanks and not config.agent.normalize_observations:
         fix = "it takes --normalize-observations; or leave blanks as they are: --no-fill-blanks"
         raise ConfigError("--fill-blanks", True, fix)
-    if config.agent.hindsight and not config.agent.fill_blanks:
-        raise ConfigError("--hindsight", True, "it corrects what --fill-blanks fills; take both, or --no-hindsight")
     if not config.update.policy_through_q and config.update.scheme < 4:
         raise ConfigError("--policy-through-q", False, "schemes 1 to 3 have no such way; take --scheme 4, 5 or 6")
     if config.total_steps <= config.replay.warmup_steps:

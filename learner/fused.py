@@ -27,8 +27,6 @@ def fuse(agent: Agent) -> None:
     agent.world_model.net = _as(FusedHead, agent.world_model.net)
     if agent.next_frame is not None:
         agent.next_frame.net = _as(FusedHead, agent.next_frame.net)
-    if agent.hindsight is not None:
-        agent.hindsight.net = _as(FusedHead, agent.hindsight.net)
     agent.policy.net = _as(FusedHead, agent.policy.net)
     agent.critic = _as(FusedTwinQ, agent.critic)
 
@@ -48,9 +46,7 @@ class FusedAgent(Agent):
     """Fills blanks with every weight rounded once for all steps, not once a step."""
 
     @torch.no_grad()
-    def fill(
-        self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """As ``Agent.fill``, which it is without a memory, or where the embedding has no plain layer."""
         c = self.config
         if not (c.embedding and _applies(observation)) or c.layer_norm or c.head_input == "observation":
@@ -114,8 +110,8 @@ def _bits(x: Tensor) -> NDArray[np.uint16]:
 
 def _fill(
     agent: Agent, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(B, T, O), (B, T), (B, T, A), (B, S) -> (B, T, O), (B, T, O), (B, S)."""
+) -> tuple[Tensor, Tensor]:
+    """(B, T, O), (B, T), (B, T, A), (B, S) -> (B, T, O), (B, S)."""
     assert agent.next_frame is not None
     gru, size = agent.memory.gru, agent.config.hidden
     nets = agent.next_frame.net, agent.memory.embed
@@ -129,18 +125,17 @@ def _fill(
         state[:, :size].to(LOW),
         np.empty((len(state), 4 * size), np.float32),
     )
-    seen, all_expected, before = observation.clone(), torch.empty_like(observation), state[:, size:]
-    by_step = (x.transpose(0, 1) for x in (seen, all_expected, blank.unsqueeze(2), prev_action.to(LOW), inputs))
-    for o, expected, was_blank, a, x in zip(*by_step, strict=True):
+    seen, before = observation.clone(), state[:, size:]
+    by_step = (x.transpose(0, 1) for x in (seen, blank.unsqueeze(2), prev_action.to(LOW), inputs))
+    for o, was_blank, a, x in zip(*by_step, strict=True):
         second = _layer(_layer(torch.cat([low, before.to(LOW), a], 1), w1, b1), w2, b2)
-        change = torch.mm(second, w3).float().add_(b3)
-        torch.add(change, before, out=expected).clamp_(-NORMALIZED_CLIP, NORMALIZED_CLIP)
-        torch.where(was_blank, expected, o, out=o)
+        expected = torch.mm(second, w3).float().add_(b3).add_(before)
+        torch.where(was_blank, expected.clamp_(-NORMALIZED_CLIP, NORMALIZED_CLIP), o, out=o)
         x[:, : agent.obs_dim] = o
         gi, gh = torch.mm(_layer(x.contiguous(), w_embed, b_embed), wi), torch.mm(low, wh)
         kernels.gru_step(_bits(gi), _bits(gh), bi, bh, h, kept, h, _bits(low))
         before = o
-    return seen, all_expected, torch.cat([torch.from_numpy(h), before], 1)
+    return seen, torch.cat([torch.from_numpy(h), before], 1)
 
 
 class _GRU(torch.autograd.Function):

@@ -41,7 +41,7 @@ class InitialPriority:
         batch = view_batch(raw, torch.ones(len(rows)), self._spec)
         m = batch.step_valid[:, steps].float()
         o = agent.normalizer(batch.observation, batch.blank)
-        o, _ = filled(agent, o, batch, self._spec.burn_in)
+        o = filled(agent, o, batch, self._spec.burn_in)
         z = agent.features(remember(agent.memory, o, batch, self._spec.burn_in))
         mean, log_std = agent.policy(z)
         pi, log_pi = squashed_sample(mean, log_std, torch.randn(mean.shape, generator=self._generator))

@@ -14,9 +14,8 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
-from torch.nn import functional
 
-from common.agent import NORMALIZED_CLIP, Agent, Memory, Remembered, squashed_sample
+from common.agent import Agent, Memory, Remembered, squashed_sample
 from learner import losses
 from learner.batch import Batch
 from learner.fused import fuse
@@ -109,15 +108,12 @@ class JointUpdate:
         self.target_memory = _target_copy(agent.memory)
         self.average = {name: value.detach().clone() for name, value in agent.acting().items()}  # theta-bar
         self._has_target_memory = "ema" in (config.latent_target, config.target_memory)
-        self.fast = {n: copy.deepcopy(getattr(agent, n)) for n in ("next_frame", "hindsight") if getattr(agent, n) is not None}
         self.optimizers = self._make_optimizers()
         self.generator = torch.Generator(device).manual_seed(seed)
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
-        o = _adam(self.agent, self.config, "memory", "world_model", "critic", "policy", "log_alpha")
-        o.add_param_group({"params": [p for f in self.fast.values() for p in f.parameters()], "lr": 3e-3})
-        return [o]
+        return [_adam(self.agent, self.config, "memory", "world_model", "next_frame", "critic", "policy", "log_alpha")]
 
     def __call__(self, batch: Batch, beta: Tensor) -> Updated:
         """One update from a Batch; ``beta`` is a scalar tensor."""
@@ -137,8 +133,7 @@ class JointUpdate:
             o = agent.normalizer(batch.observation, batch.blank)
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
-            o, expected = filled(agent, o, batch, self.burn_in)
-            o, hindsight_loss = self._in_hindsight(o, expected, batch)
+            o = filled(agent, o, batch, self.burn_in)
             memory = remember(agent.memory, o, batch, self.burn_in)
             z = self._low(agent.features(memory))
             trains = TRAINS_MEMORY[c.scheme]
@@ -178,10 +173,8 @@ class JointUpdate:
         seen_now, seen_after = _seen(batch)[:, steps][:, :-1], _seen(batch)[:, steps][:, 1:]
         if agent.next_frame is not None:
             with self._autocast():
-                expected = self.fast["next_frame"](self._low(memory.hidden.detach()[:, :-1]), now, a)
+                expected = agent.next_frame(self._low(memory.hidden.detach()[:, :-1]), now, a)
             parts["fill_loss"] = losses.fill_loss(expected, after, seen_after, m)
-        if agent.hindsight is not None:
-            parts["hindsight_loss"] = hindsight_loss
         if agent.config.grounding:
             predicted = now + prediction.observation_change.float()
             seen = seen_after if agent.config.fill_blanks else seen_after * seen_now
@@ -210,22 +203,6 @@ class JointUpdate:
         """What all heads read, rounded once for all where their products are in bfloat16."""
         return z.bfloat16() if self.bf16 else z
 
-    def _in_hindsight(self, o: Tensor, expected: Tensor | None, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Blanks filled with what the next frame seen tells of them, where configured; and the loss of what tells it.
-
-        That one learns from frames that are seen, told as if they were not.
-        """
-        if self.agent.hindsight is None or expected is None:
-            return o, o.new_zeros(())
-        seen = _seen(batch) > 0
-        trained, _ = self.fast["hindsight"](o, expected, seen, batch.prev_action)
-        with torch.no_grad():
-            told, tellable = self.agent.hindsight(o, expected, seen, batch.prev_action)
-        tellable = tellable & functional.pad(batch.observation_valid, (1, -1))
-        loss = losses.fill_loss(trained, o, seen.float(), tellable.float())
-        told = told.detach().clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
-        return torch.where((tellable & batch.blank).unsqueeze(-1), told, o), loss
-
     @torch.no_grad()
     def _remember_target(self, o: Tensor, batch: Batch) -> Remembered:
         return remember(self.target_memory, o, batch, self.burn_in)
@@ -245,9 +222,7 @@ class JointUpdate:
     def _step(self, optimizer: torch.optim.Adam, parts: Iterable[Tensor]) -> Tensor:
         """Backward from the losses' sum, clip, Adam; returns the gradient's norm before clipping."""
         self.agent.zero_grad(set_to_none=True)
-        for f in self.fast.values(): f.zero_grad(set_to_none=True)
-        nothing = 0.0 * self.agent.log_alpha  # has a gradient where no part has: hindsight's where all is seen
-        sum(parts, nothing).backward()  # type: ignore[no-untyped-call]
+        sum(parts, torch.zeros_like(self.agent.log_alpha)).backward()  # type: ignore[no-untyped-call]
         gradients = [value.grad for value in self.agent.parameters() if value.grad is not None]
         norm = nn.utils.get_total_norm(gradients)
         if self.config.clip_norm:
@@ -258,8 +233,6 @@ class JointUpdate:
     def _follow(self, updated: Updated) -> None:
         """What follows the step: targets by Polyak, and the running variance."""
         self._polyak(self.target_critic.parameters(), self.agent.critic.parameters())
-        for n, fast in self.fast.items():
-            self._polyak(getattr(self.agent, n).parameters(), fast.parameters())
         if self._has_target_memory:
             self._polyak(self.target_memory.parameters(), self.agent.memory.parameters())
         self.curiosity_variance.copy_(updated.curiosity_variance)
@@ -323,7 +296,6 @@ class AlternateUpdate(JointUpdate):
     _STAGES = (
         ("world_model", ("model_loss", "grounding_loss")),
         ("next_frame", ("fill_loss",)),
-        ("hindsight", ("hindsight_loss",)),
         ("critic", ("q_loss",)),
         ("policy", ("policy_loss",)),
         ("log_alpha", ("temperature_loss",)),
@@ -368,21 +340,17 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
     return torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
 
 
-def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> tuple[Tensor, Tensor | None]:
-    """(B, L + 1, O) with blank frames filled where configured, along the states that ``remember`` goes through.
-
-    Beside it what was expected at every step, (B, L + 1, O), where something was filled.
-    """
+def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
+    """(B, L + 1, O) with blank frames filled where configured, along the states that ``remember`` goes through."""
     if not agent.fills(batch.blank):
-        return o, None
+        return o
 
-    def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:
         return agent.fill(o[:, steps], batch.blank[:, steps], batch.prev_action[:, steps], state)
 
-    past, past_expected, state = part(slice(burn_in), batch.state)
+    past, state = part(slice(burn_in), batch.state)
     state = torch.where(batch.burned_in.unsqueeze(1), state, batch.state)
-    now, now_expected, _ = part(slice(burn_in, None), state)
-    return torch.cat([past, now], 1), torch.cat([past_expected, now_expected], 1)
+    return torch.cat([past, part(slice(burn_in, None), state)[0]], 1)
 
 
 def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:

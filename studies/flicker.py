@@ -10,7 +10,6 @@ STUDY = Study(
     "flicker",
     {
         "RMC": "train ENV --flicker 0.5",
-        "RMC, in hindsight": "train ENV --flicker 0.5 --hindsight",
         "SAC, 4 frames": "baseline sac ENV --flicker 0.5 --frame-stack 4",
         "RecurrentPPO": "baseline recurrent-ppo ENV --flicker 0.5",
         "RecurrentPPO zoo": "baseline recurrent-ppo ENV --flicker 0.5 --settings zoo",

@@ -75,7 +75,7 @@ def relearned(agent_name: str, rows: Rows, spec: WindowSpec) -> tuple[Batch, tor
     agent = AGENTS[agent_name]
     raw = torch.from_numpy(rows.view(np.uint8).reshape(len(rows), -1))
     batch = view_batch(raw, torch.ones(len(rows)), spec)
-    o, _ = filled(agent, agent.normalizer(batch.observation, batch.blank), batch, spec.burn_in)
+    o = filled(agent, agent.normalizer(batch.observation, batch.blank), batch, spec.burn_in)
     return batch, remember(agent.memory, o, batch, spec.burn_in).hidden
 
 

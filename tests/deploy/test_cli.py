@@ -27,7 +27,7 @@ TRAIN_FLAGS = """
     --ray-address --all-cpus --tls
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
-    --blank-flag --fill-blanks --hindsight --initial-priority
+    --blank-flag --fill-blanks --initial-priority
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
     --capacity --replay-shards --replay-ratio --warmup-steps --priority-exponent --importance-exponent
     --learning-rate --memory-learning-scale

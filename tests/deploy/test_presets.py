@@ -121,8 +121,6 @@ def test_values_that_do_not_go_together_are_refused() -> None:
         validate(with_value(with_value(config, "agent.blank_flag", True), "env.frame_stack", 2))
     with pytest.raises(ConfigError, match=r"--fill-blanks=True: .*--normalize-observations; .*--no-fill-blanks"):
         validate(with_value(config, "agent.normalize_observations", False))
-    with pytest.raises(ConfigError, match=r"--hindsight=True: .*--fill-blanks.*--no-hindsight"):
-        validate(with_value(with_value(config, "agent.hindsight", True), "agent.fill_blanks", False))
     with pytest.raises(ConfigError, match="--policy-through-q"):
         validate(with_value(config, "update.policy_through_q", False))
     with pytest.raises(ConfigError, match=r"--replay-shards=2: .*--actors=1"):

@@ -61,7 +61,6 @@ VARIANTS: list[dict[str, Any]] = [
     {"flicker": 0.5, "blank_flag": True, "normalize_observations": True},
     {"flicker": 0.5, "fill_blanks": True, "normalize_observations": True},
     {"flicker": 0.5, "fill_blanks": True, "normalize_observations": True, "initial_priority": "actor"},
-    {"flicker": 0.5, "fill_blanks": True, "normalize_observations": True, "hindsight": True},
     {"hide": "velocities"},
     {"hide": "positions"},
     {"noise": 0.1},

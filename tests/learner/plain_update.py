@@ -12,18 +12,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from common.agent import HINDSIGHT, Agent, Memory
+from common.agent import Agent, Memory
 from learner.update import UpdateConfig
 
 REACHES_MEMORY = {1: "MV", 2: "V", 3: "M", 4: "MVP", 5: "MP", 6: "VP"}  # model, value, policy: table 1 of the paper
-ALTERNATE = (
-    ("MG", "world_model"),
-    ("F", "next_frame"),
-    ("H", "hindsight"),
-    ("V", "critic"),
-    ("P", "policy"),
-    ("T", None),
-)
+ALTERNATE = (("MG", "world_model"), ("F", "next_frame"), ("V", "critic"), ("P", "policy"), ("T", None))
 
 
 class Known(NamedTuple):
@@ -35,15 +28,15 @@ class Known(NamedTuple):
 
 
 class PlainUpdate:
-    """Losses by name: M model, G grounding, F fill, H hindsight, V value, P policy, T temperature."""
+    """Losses by name: M model, G grounding, F fill, V value, P policy, T temperature."""
 
     def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int) -> None:
         self.agent, self.burn_in, self.c = agent, burn_in, config
         self.target_critic, self.target_memory = copy.deepcopy(agent.critic), copy.deepcopy(agent.memory)
         self.generator = torch.Generator().manual_seed(seed)
         self.variance_sum = self.variance_weight = 0.0
-        everything = ["world_model", "next_frame", "hindsight", "critic", "policy", None]
-        self.stages = [names for names, part in ALTERNATE if part is None or getattr(agent, part) is not None]
+        everything = ["world_model", "next_frame", "critic", "policy", None]
+        self.stages = [names for names, part in ALTERNATE if part != "next_frame" or agent.config.fill_blanks]
         groups = (
             [everything]
             if config.update_order == "joint"
@@ -65,7 +58,7 @@ class PlainUpdate:
 
     def __call__(self, rows: np.ndarray, importance: np.ndarray, beta: float) -> tuple[dict[str, float], list[float]]:
         """One update; the losses as they were before it, and the windows' priorities."""
-        wholes = ["MGFHVPT"] if self.c.update_order == "joint" else self.stages
+        wholes = ["MGFVPT"] if self.c.update_order == "joint" else self.stages
         found: dict[str, float] = {}
         priorities: list[float] = []
         for names, optimizer in zip(wholes, self.optimizers, strict=True):
@@ -88,7 +81,7 @@ class PlainUpdate:
 
     def unroll(self, memory: Memory, row: np.void) -> dict[int, Known]:
         """By observation, from the first trained one on; the burn-in without gradient."""
-        h, known, filled = torch.tensor(row["state"])[: memory.gru.hidden_size], {}, self.in_hindsight(row)[0]
+        h, known, filled = torch.tensor(row["state"])[: memory.gru.hidden_size], {}, self.filled(row)
         for t in range(int(row["first"]), int(row["last"]) + 1):
             if t == self.burn_in:
                 h = h.detach()
@@ -103,41 +96,19 @@ class PlainUpdate:
         return memory.embed(torch.cat([o, previous, *flag]))
 
     @torch.no_grad()
-    def filled(self, row: np.void) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
-        """By observation, what the memory is given, for a blank one what is expected, where asked; and the expected."""
-        memory, found, expected = self.agent.memory, {}, {}
+    def filled(self, row: np.void) -> dict[int, Tensor]:
+        """By observation, what the memory is given: for a blank one what the model expects, where it is asked."""
+        memory, found = self.agent.memory, {}
         h, last = torch.tensor(row["state"]).tensor_split([self.agent.config.hidden])
         for t in range(int(row["first"]), int(row["last"]) + 1):
             previous = torch.tensor(row["prev_action"] if t == row["first"] else row["action"][t - 1])
             found[t] = self.seen(row, t)
-            if self.agent.config.fill_blanks:
-                expected[t] = self.agent.next_frame(h, last, previous).clamp(-10, 10)
-                found[t] = expected[t] if row["blank"][t] else found[t]
+            if self.agent.config.fill_blanks and row["blank"][t]:
+                found[t] = self.agent.next_frame(h, last, previous).clamp(-10, 10)
             last = found[t]
             without = self.agent.config.head_input == "observation"
             h = 0 * h if without else gru(memory, self.embedded(memory, row, t, found[t], previous), h)
-        return found, expected
-
-    def in_hindsight(self, row: np.void) -> tuple[dict[int, Tensor], list[Tensor]]:
-        """The same, where asked corrected by the next frame that is seen; and the errors of that where one is."""
-        found, expected = self.filled(row)
-        corrected, errors = dict(found), []
-        if self.agent.config.hindsight:
-            for t in range(int(row["first"]) + 1, int(row["last"]) + 1):
-                ahead = [k for k in range(1, HINDSIGHT + 1) if t + k <= row["last"] and not row["blank"][t + k]]
-                if ahead:
-                    told = self.told(row, t, ahead[0], found, expected[t])
-                    corrected[t] = told.detach().clamp(-10, 10) if row["blank"][t] else found[t]
-                    errors += [] if row["blank"][t] else [(told - found[t]).abs().mean()]
-        return corrected, errors
-
-    def told(self, row: np.void, t: int, k: int, found: dict[int, Tensor], expected: Tensor) -> Tensor:
-        between = [torch.tensor(row["action"][t + j]) * (j < k) for j in range(min(HINDSIGHT, len(row["action"]) - t))]
-        between += [torch.zeros(self.agent.action_dim)] * (HINDSIGHT - len(between))
-        before = [found[t - 1], torch.tensor(row["action"][t - 1])]
-        return expected + self.agent.hindsight.net(
-            torch.cat([*before, expected, found[t + k], torch.tensor([k / HINDSIGHT]), *between])
-        )
+        return found
 
     def seen(self, row: np.void, t: int) -> Tensor:
         """The observation as the networks see it."""
@@ -166,12 +137,11 @@ class PlainUpdate:
         noise = torch.randn(
             (len(rows), rows["action"].shape[1] - self.burn_in + 1, agent.action_dim), generator=self.generator
         )
-        sums: dict[str, list[Tensor]] = {name: [] for name in ("M", "observation", "reward", "F", "H", "V", "P", "T")}
+        sums: dict[str, list[Tensor]] = {name: [] for name in ("M", "observation", "reward", "F", "V", "P", "T")}
         errors = []  # of every window, by step
         for b, row in enumerate(rows):
             online, target = self.unroll(agent.memory, row), self.unroll(self.target_memory, row)
             latent = target if c.latent_target == "ema" else online
-            sums["H"] += self.in_hindsight(row)[1]
             window = {}
             for t in range(self.burn_in, int(row["last"])):
                 z = self.z(online[t])

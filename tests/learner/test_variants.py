@@ -22,7 +22,7 @@ ROBUST = AgentConfig(
     blank_flag=True,
 )
 NAMES = {
-    "M": "model_loss", "G": "grounding_loss", "F": "fill_loss", "H": "hindsight_loss",
+    "M": "model_loss", "G": "grounding_loss", "F": "fill_loss",
     "V": "q_loss", "P": "policy_loss", "T": "temperature_loss",
 }  # fmt: skip
 BETA = 0.5
@@ -56,7 +56,6 @@ AGENTS = [
     dataclasses.replace(ROBUST, head_input="hidden", fill_blanks=True),
     dataclasses.replace(ROBUST, fill_blanks=True),
     dataclasses.replace(ROBUST, head_input="observation", fill_blanks=True),
-    dataclasses.replace(ROBUST, head_input="hidden", fill_blanks=True, hindsight=True),
 ]
 
 
