@@ -130,10 +130,9 @@ class JointUpdate:
         m = batch.step_valid[:, steps].float()
         alpha = agent.log_alpha.exp().detach()
         with torch.no_grad():
-            o = agent.normalizer(batch.observation, batch.blank)
+            o = agent.normalizer(batch.observation, torch.zeros_like(batch.blank))
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
-            o = filled(agent, o, batch, self.burn_in)
             memory = remember(agent.memory, o, batch, self.burn_in)
             z = self._low(agent.features(memory))
             trains = TRAINS_MEMORY[c.scheme]
