@@ -117,7 +117,7 @@ class Flicker(Disturbed):
 
     def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
         info["blank"] = bool(self._rng.random() < self._probability)
-        return observation
+        return np.zeros_like(observation) if info["blank"] else observation
 
 
 class FrameStack(gym.Wrapper[Floats, Floats, Floats, Floats]):

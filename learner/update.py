@@ -130,9 +130,10 @@ class JointUpdate:
         m = batch.step_valid[:, steps].float()
         alpha = agent.log_alpha.exp().detach()
         with torch.no_grad():
-            o = agent.normalizer(batch.observation, torch.zeros_like(batch.blank))
+            o = agent.normalizer(batch.observation, batch.blank)
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
+            o = filled(agent, o, batch, self.burn_in)
             memory = remember(agent.memory, o, batch, self.burn_in)
             z = self._low(agent.features(memory))
             trains = TRAINS_MEMORY[c.scheme]
@@ -161,11 +162,14 @@ class JointUpdate:
             q_pi = q_pi[0] if c.policy_q == "first" else q_pi.min(0).values
 
         log_pi = log_pi[:, :-1]
+        was_seen = _seen(batch)[:, steps]
+        clean = m * was_seen[:, :-1]
+        pair = clean * torch.maximum(was_seen[:, 1:], d)
         parts = {
             "model_loss": losses.model_loss(error, d, m),
-            "q_loss": losses.q_loss(q, y, batch.importance, m),
-            "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, m),
-            "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
+            "q_loss": losses.q_loss(q, y, batch.importance, pair),
+            "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, clean),
+            "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), clean),
         }
         unexplained = o.new_zeros(0)
         now, after = o[:, steps][:, :-1], o[:, steps][:, 1:]
