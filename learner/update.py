@@ -162,14 +162,11 @@ class JointUpdate:
             q_pi = q_pi[0] if c.policy_q == "first" else q_pi.min(0).values
 
         log_pi = log_pi[:, :-1]
-        was_seen = _seen(batch)[:, steps]
-        clean = m * was_seen[:, :-1]
-        pair = clean * torch.maximum(was_seen[:, 1:], d)
         parts = {
             "model_loss": losses.model_loss(error, d, m),
-            "q_loss": losses.q_loss(q, y, batch.importance, pair),
-            "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, clean),
-            "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), clean),
+            "q_loss": losses.q_loss(q, y, batch.importance, m),
+            "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, m),
+            "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
         unexplained = o.new_zeros(0)
         now, after = o[:, steps][:, :-1], o[:, steps][:, 1:]
