@@ -38,10 +38,6 @@ class AgentConfig:
     an agent without a memory."""
     critic_norm: bool = False
     """LayerNorm before the ReLUs of the critics."""
-    critic_batch_norm: bool = False
-    """Batch norm before every layer of the critics, which then have no target networks (CrossQ)."""
-    project_critic: bool = False
-    """After every update the hidden layers of the critics have the size that they began with."""
     normalize_observations: bool = False
     """Observations are normalised by the replay server's running statistics."""
     grounding: bool = True
@@ -224,30 +220,6 @@ class StackedLinear(nn.Module):
         return torch.baddbmm(self.bias, x, self.weight)
 
 
-class StackedBatchNorm(nn.Module):
-    """Two BatchNorm layers side by side, (2, N, F); in evaluation mode by the running statistics."""
-
-    mean: Tensor
-    variance: Tensor
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(2, 1, width))
-        self.bias = nn.Parameter(torch.zeros(2, 1, width))
-        self.register_buffer("mean", torch.zeros(2, 1, width))
-        self.register_buffer("variance", torch.ones(2, 1, width))
-
-    def forward(self, x: Tensor) -> Tensor:
-        with torch.autocast(x.device.type, enabled=False):
-            y = x.float()
-            mean, variance = self.mean, self.variance
-            if self.training:
-                mean, variance = y.mean(1, keepdim=True), y.var(1, correction=0, keepdim=True)
-                self.mean.lerp_(mean.detach(), 0.01)
-                self.variance.lerp_(variance.detach(), 0.01)
-            return ((y - mean) * (variance + 1e-3).rsqrt() * self.weight + self.bias).to(x.dtype)
-
-
 class TwinQ(nn.Module):
     """Eq. 9: Q_1(h, a) and Q_2(h, a), stacked. Where asked, a LayerNorm without weights before each ReLU."""
 
@@ -255,8 +227,6 @@ class TwinQ(nn.Module):
         super().__init__()
         first, second = config.heads
         self.norm = config.critic_norm
-        widths = (inputs + action_dim, first, second) if config.critic_batch_norm else ()
-        self.batch_norms = nn.ModuleList([StackedBatchNorm(width) for width in widths])
         self.layers = nn.ModuleList(
             [StackedLinear(inputs + action_dim, first), StackedLinear(first, second), StackedLinear(second, 1)]
         )
@@ -266,10 +236,9 @@ class TwinQ(nn.Module):
         x = torch.cat([features, action.to(features.dtype)], dim=-1)
         shape = x.shape[:-1]
         x = x.reshape(1, -1, x.shape[-1]).expand(2, -1, -1)
-        for number, layer in enumerate(self.layers[:-1]):
-            x = layer(self.batch_norms[number](x) if self.batch_norms else x)
+        for layer in self.layers[:-1]:
+            x = layer(x)
             x = F.relu(F.layer_norm(x, x.shape[-1:]) if self.norm else x)
-        x = self.batch_norms[-1](x) if self.batch_norms else x
         with torch.autocast(x.device.type, enabled=False):  # bfloat16 would give a Q of 300 in steps of 2
             q: Tensor = self.layers[-1](x.float())
         return q.reshape(2, *shape)

@@ -88,7 +88,7 @@ class FusedTwinQ(TwinQ):
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """(B, T, Z), (B, T, A) -> (2, B, T) in float32."""
-        if self.norm or self.batch_norms or not _applies(features):
+        if self.norm or not _applies(features):
             return super().forward(features, action)
         stacks = [layer for layer in self.layers if isinstance(layer, StackedLinear)]
         parameters = [part for one in stacks for part in (one.weight, one.bias[:, 0])]

@@ -105,7 +105,6 @@ class JointUpdate:
             fuse(agent)
         self.agent, self.burn_in, self.config, self.bf16 = agent, burn_in, config, bf16
         self.target_critic = _target_copy(agent.critic)
-        self._sizes = [layer.weight.detach().norm(dim=(1, 2), keepdim=True) for layer in agent.critic.layers[:-1]]
         self.target_memory = _target_copy(agent.memory)
         self.average = {name: value.detach().clone() for name, value in agent.acting().items()}  # theta-bar
         self._has_target_memory = "ema" in (config.latent_target, config.target_memory)
@@ -153,19 +152,13 @@ class JointUpdate:
             pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean))
             with torch.no_grad():
                 next_z = (self._low(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:]
-            if agent.config.critic_batch_norm:  # one batch of both: the statistics are those of either
-                both = agent.critic(torch.cat([z_value[:, :-1], next_z]), torch.cat([a, pi[:, 1:].detach()]))
-                q, next_q = both.chunk(2, dim=1)
-            else:
-                q, next_q = agent.critic(z_value[:, :-1], a), self.target_critic(next_z, pi[:, 1:])
-            with torch.no_grad():
+                next_q = self.target_critic(next_z, pi[:, 1:])
                 next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:])
                 y = losses.td_target(r + beta * i, c.gamma, d, next_value, m, c.n_step)
+            q = agent.critic(z_value[:, :-1], a)
             frozen = {name: value.detach() for name, value in agent.critic.named_parameters()}
             z_climbed = z_policy if c.policy_through_q else z.detach()
-            agent.critic.eval()
             q_pi = functional_call(agent.critic, frozen, (z_climbed[:, :-1], pi[:, :-1]))
-            agent.critic.train()
             q_pi = q_pi[0] if c.policy_q == "first" else q_pi.min(0).values
 
         log_pi = log_pi[:, :-1]
@@ -235,14 +228,7 @@ class JointUpdate:
         if self.config.clip_norm:
             nn.utils.clip_grads_with_norm_(self.agent.parameters(), self.config.clip_norm, norm)
         optimizer.step()
-        if self.agent.config.project_critic:
-            self._project()
         return norm.detach()
-
-    @torch.no_grad()
-    def _project(self) -> None:
-        for layer, size in zip(self.agent.critic.layers[:-1], self._sizes, strict=True):
-            layer.weight.mul_(size / layer.weight.norm(dim=(1, 2), keepdim=True))
 
     def _follow(self, updated: Updated) -> None:
         """What follows the step: targets by Polyak, and the running variance."""

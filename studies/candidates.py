@@ -47,8 +47,6 @@ TODAY = {
     "RMC, optimisers apart": "--update-order alternate",
     "RMC, stride 5": "--stride 5",
     "RMC, prioritized": "--priority-exponent 0.6 --importance-exponent 0.4",
-    "RMC, batch norm": "--critic-batch-norm",
-    "RMC, critics normalised and projected": "--critic-norm --project-critic",
     "RMC, learning rate 1e-3": "--learning-rate 1e-3",
     "RMC, reward scale 5": "--reward-scale 5",
     "RMC, reward scale 0.2": "--reward-scale 0.2",
