@@ -181,7 +181,14 @@ def _value(kind: Any, value: Any, path: str) -> Any:
             return tuple(_value(part, item, path) for part, item in zip(parts, value, strict=True))
     elif _matches(kind, value):
         return float(value) if kind is float else value
-    raise ConfigError(f"config.json {path}", value, f"must be {getattr(kind, '__name__', kind)}")
+    raise ConfigError(f"config.json {path}", value, f"must be {_told(kind)}")
+
+
+def _told(kind: Any) -> str:
+    """What is asked for, in words."""
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(map(repr, get_args(kind)))}"
+    return kind.__name__ if isinstance(kind, type) else str(kind)
 
 
 def _matches(kind: Any, value: Any) -> bool:
