@@ -13,7 +13,6 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from actors.colored_noise import ColoredNoise
 from actors.outbox import Outbox
 from actors.policy_runner import PolicyRunner
 from actors.window_builder import WindowBuilder
@@ -48,8 +47,6 @@ class ActorConfig:
     """Rewards are multiplied by this to learn from; returns are told as the environment gives them."""
     refresh_steps: int = 400
     """Environment steps of an actor between two looks at the newest weights."""
-    noise_color: float = 0.0
-    """How alike the policy's noise is from step to step: its power falls as 1 / f^color, 0 is white, 1 is pink."""
     chunk_windows: int = 16
     """Windows sent in one entry."""
     chunk_seconds: float = 0.5
@@ -137,8 +134,6 @@ class Actor:
         stride = self._config.stride or self._spec.train
         self._builder = WindowBuilder(self._spec, stride, n, capacity, store_states=strategy in ("stored", "burn-in"))
         self._rng = np.random.default_rng(environment_seed(self._seed, self._index, epoch, _NOISE))
-        color = self._config.noise_color
-        self._colored = ColoredNoise(n, self._spec.action_dim, color, self._rng) if color else None
         self._returns = np.zeros(n)
         self._lengths = np.zeros(n, np.int64)
         for env in range(n):
@@ -275,7 +270,7 @@ class Actor:
     def _step_environments(self) -> None:
         assert self._version is not None
         now, n = self._builder.now(), len(self._envs)
-        noise = self._colored() if self._colored else self._rng.standard_normal((n, self._spec.action_dim), np.float32)
+        noise = self._rng.standard_normal((n, self._spec.action_dim), np.float32)
         action, state = self._runner.act(*now, noise)
         if self._version.update == 0:  # the policy has learnt nothing yet
             action = self._rng.uniform(-1.0, 1.0, action.shape).astype(np.float32)
@@ -298,8 +293,6 @@ class Actor:
         self._lengths += 1
         for env_index in np.flatnonzero(ended).tolist():
             self._end_episode(env_index)
-            if self._colored:
-                self._colored.restart(env_index)
         while self._faults:
             self._replace_environment(*self._faults.popitem())
 

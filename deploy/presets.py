@@ -219,7 +219,6 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "agent.embedding": (0, 65_536),
     "actor.envs_per_actor": (1, 4096),
     "actor.reward_scale": (1e-12, 1e12),
-    "actor.noise_color": (0, 2),
     "actor.refresh_steps": (1, 2**31),
     "actor.chunk_windows": (1, 65_536),
     "actor.chunk_seconds": (1e-3, 3600),

@@ -52,8 +52,8 @@ class UpdateConfig:
     """Which memory gives the change that the world model predicts."""
     target_memory: Literal["online", "ema"] = "online"
     """Which memory the target critics read."""
-    policy_q: Literal["first", "min", "mean"] = "min"
-    """Which critic the policy climbs: Q_1 (the paper), the smaller of both, or their mean, which then is the target's, too."""
+    policy_q: Literal["first", "min"] = "min"
+    """Which critic the policy climbs: Q_1 (the paper) or the smaller of both."""
     curiosity: float = 0.0
     """beta_0, weight of the curiosity reward at the start; 0 switches it off."""
     curiosity_scale: Literal["raw", "std"] = "raw"
@@ -153,14 +153,13 @@ class JointUpdate:
             with torch.no_grad():
                 next_z = (self._low(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:]
                 next_q = self.target_critic(next_z, pi[:, 1:])
-                next_q = next_q.mean(0, keepdim=True) if c.policy_q == "mean" else next_q
                 next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:])
                 y = losses.td_target(r + beta * i, c.gamma, d, next_value, m, c.n_step)
             q = agent.critic(z_value[:, :-1], a)
             frozen = {name: value.detach() for name, value in agent.critic.named_parameters()}
             z_climbed = z_policy if c.policy_through_q else z.detach()
             q_pi = functional_call(agent.critic, frozen, (z_climbed[:, :-1], pi[:, :-1]))
-            q_pi = {"first": q_pi[0], "min": q_pi.min(0).values, "mean": q_pi.mean(0)}[c.policy_q]
+            q_pi = q_pi[0] if c.policy_q == "first" else q_pi.min(0).values
 
         log_pi = log_pi[:, :-1]
         parts = {
