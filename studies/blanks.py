@@ -10,6 +10,7 @@ WAYS = {
     "longer burn-in": "--burn-in 30",
     "longer windows": "--burn-in 20 --trained-steps 30",
     "observation beside": "--head-input hidden+observation",
+    "no memory": "--head-input observation --hidden 8 --embedding 0 --no-grounding --scheme 2",
     "no grounding": "--no-grounding --scheme 1",
     "not averaged": "--policy-average 0",
     "clipped": "--clip-norm 40 --policy-average 0",

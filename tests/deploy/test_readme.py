@@ -106,7 +106,7 @@ def test_the_docs_name_options_that_exist() -> None:
     others |= {"--no-restart", "--node-ip-address", "--generate"}  # Ray's own
     others |= {"--folder", "--index", "--shard", "--secret-file"}  # the roles'
     others |= {"--alone"}  # of benchmarks
-    others |= {"--settings", "--reference", "--by", "--scale", "--only", "--env"}  # of studies and plots
+    others |= {"--settings", "--reference", "--by", "--scale", "--seeds", "--only", "--env"}  # of studies and plots
     others |= {"--play", "--draw"}  # of a study
     there = set(re.findall(r"--[a-z][a-z-]*[a-z]", made.stdout)) | others | {"--logdir", "--video"}
     for text in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
