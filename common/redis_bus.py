@@ -188,7 +188,7 @@ class RedisBus:
         self._run(TRIM_SCRIPT, holder, list(acks), [f"{ack.id.epoch}-{ack.id.seq + 1}" for ack in acks.values()])
 
     def _run(self, script: str, holder: Holder, actors: list[int], words: list[str]) -> None:
-        """A script on actors' streams: a full Redis refuses all commands in a MULTI; by themselves they are not fenced.
+        """A script on actors' streams: a full Redis 7.0 refuses all in a MULTI; by themselves commands are not fenced.
 
         Raises FencedError where a newer replay server has come.
         """
