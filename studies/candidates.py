@@ -50,6 +50,10 @@ TODAY = {
     "RMC, learning rate 1e-3": "--learning-rate 1e-3",
     "RMC, reward scale 5": "--reward-scale 5",
     "RMC, reward scale 0.2": "--reward-scale 0.2",
+    "RMC, ratio 24": "--replay-ratio 24",
+    "RMC, ratio 96": "--replay-ratio 96",
+    "RMC, batch 4, ratio 24": "--batch-size 4 --replay-ratio 24",
+    "RMC, batch 16, ratio 96": "--batch-size 16 --replay-ratio 96",
 }
 STUDY = Study(
     "candidates",
