@@ -45,6 +45,7 @@ TODAY = {
     "RMC, memory's rate 0.3": "--memory-learning-scale 0.3",
     "RMC, first critic": "--policy-q first",
     "RMC, optimisers apart": "--update-order alternate",
+    "RMC, clipped by part": "--update-order alternate --clip-norm 40",
     "RMC, stride 5": "--stride 5",
     "RMC, prioritized": "--priority-exponent 0.6 --importance-exponent 0.4",
     "RMC, learning rate 1e-3": "--learning-rate 1e-3",
