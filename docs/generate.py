@@ -55,8 +55,8 @@ WHEN = {
     "heads": "rarely",
     "layer_norm": "rarely: it cost return in the [trial](history.md)",
     "head_input": "`observation`, with `--scheme 2 --no-grounding --hidden 8 --embedding 0`, where all is seen and "
-    "time counts: [level by 60 000 steps](results.md), not tried further; the embedding beside it cost return in the "
-    "[trial](history.md)",
+    "time counts: [level by 60 000 steps, far behind by 300 000](results.md); the embedding beside it cost return in "
+    "the [trial](history.md)",
     "critic_norm": "rarely: it cost return in the [trial](history.md)",
     "normalize_observations": "off, with `--no-fill-blanks`, where they are scaled and their statistics keep moving",
     "grounding": "off for the paper's model, with `--scheme 1`; with scheme 3 it keeps the memory from collapsing",
