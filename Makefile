@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo test test-faults test-cluster test-dm-control lint results trial comparisons docs bench peers clean
+.PHONY: env demo wheel site test test-faults test-cluster test-dm-control lint results trial comparisons docs bench peers clean
 
 env: $(STAMP)
 
@@ -49,11 +49,24 @@ test-dm-control:
 	$(VENV)-dm-control/bin/python -m pip install --quiet -e '.[dm-control,dev]' -c $(VENV)-dm-control/constraints.txt
 	$(VENV)-dm-control/bin/python -m pytest tests/common/test_dm_control.py
 
+# mypy and import-linter read the packages as rmc.…: a tree of links that looks as an installed rmc does.
+TREE := build/tree/rmc
+
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	rm -rf $(TREE) && mkdir -p $(TREE) && ln -s $(CURDIR)/rmc/* $(addprefix $(CURDIR)/,actors analysis common deploy learner replay_server) $(TREE)
 	$(BIN)/mypy
-	$(BIN)/lint-imports
+	cd build/tree && PYTHONPATH=. $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml
+
+# A wheel and a source archive in dist/.
+wheel: $(STAMP)
+	rm -rf build/lib build/bdist.* dist
+	$(BIN)/python -m build --no-isolation
+
+# The documents as a site in build/site; every link is checked.
+site: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 # Hours. Interrupt it as you like: the same command goes on from there.
 results: $(STAMP)

@@ -8,21 +8,21 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from actors.outbox import Outbox
-from actors.policy_runner import PolicyRunner
-from actors.window_builder import WindowBuilder
-from common.agent import AgentConfig
-from common.bus import Ack, Bus, Version
-from common.envs import rebuilt, sound_reset
-from common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
-from common.metrics import Means, Rate
-from common.window import Rows, WindowSpec
-from common.wrappers import Env, Floats
+from rmc.actors.config import ActorConfig
+from rmc.actors.outbox import Outbox
+from rmc.actors.policy_runner import PolicyRunner
+from rmc.actors.window_builder import WindowBuilder
+from rmc.common.agent_config import AgentConfig
+from rmc.common.bus.protocol import Ack, Bus, Version
+from rmc.common.env.make import rebuilt, sound_reset
+from rmc.common.env.wrappers import Env, Floats
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
+from rmc.common.metrics import Means, Rate
+from rmc.common.window import Rows, WindowSpec
 
 log = logging.getLogger(__name__)
 POLL_SECONDS = 0.02  # between looks at the bus while there is nothing to do but wait
@@ -30,29 +30,6 @@ RESEND_SECONDS = 5.0  # without a new acknowledgement before everything unacknow
 DOUBT_SECONDS = 10.0  # that an older acknowledgement than the last is not believed; the replay repeats its own sooner
 BROKEN_STARTS = 5  # episodes in a row that an environment breaks in their first step before the actor gives up
 _NOISE = -1  # the place of the policy's noise among the environments' seeds
-
-
-@dataclass(frozen=True)
-class ActorConfig:
-    """How an actor collects."""
-
-    envs_per_actor: int = 4
-    """N, environments of one actor; more of them share one forward pass."""
-    stride: int = 0
-    """Steps between the starts of two windows; fewer than are trained let them overlap; 0 is as many, no overlap."""
-    state_strategy: Literal["zero", "stored", "burn-in", "episode"] = "burn-in"
-    """What a window's memory starts from: zeros; the state that the actor stored; that state, then burned in; or
-    zeros at the start of the episode, all of which is the window, as long as the time limit allows."""
-    reward_scale: float = 1.0
-    """Rewards are multiplied by this to learn from; returns are told as the environment gives them."""
-    refresh_steps: int = 400
-    """Environment steps of an actor between two looks at the newest weights."""
-    chunk_windows: int = 16
-    """Windows sent in one entry."""
-    chunk_seconds: float = 0.5
-    """A chunk that is not full is sent after so long."""
-    unacked_bytes: int = 64 << 20
-    """Most bytes kept to be sent again; the actor waits when they are reached."""
 
 
 class Rater(Protocol):

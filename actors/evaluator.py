@@ -10,30 +10,22 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.policy_runner import PolicyRunner
-from common.agent import AgentConfig
-from common.bus import Bus, Version
-from common.envs import rebuilt, sound_reset
-from common.errors import BusFull, BusUnavailable, ConfigError, MessageError, RmcError
-from common.wrappers import Env, Floats
+from rmc.actors.config import EvaluatorConfig
+from rmc.actors.policy_runner import PolicyRunner
+from rmc.common.agent_config import AgentConfig
+from rmc.common.bus.protocol import Bus, Version
+from rmc.common.env.make import rebuilt, sound_reset
+from rmc.common.env.wrappers import Env, Floats
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError, MessageError, RmcError
 
 log = logging.getLogger(__name__)
 POLL_SECONDS = 0.1  # between looks for a policy to play
 LONGEST_EPISODE = 10_000  # steps, where the environment has no time limit: an episode need not end by itself
-
-
-@dataclass(frozen=True)
-class EvaluatorConfig:
-    """How a policy is judged."""
-
-    episodes: int = 5
-    """Episodes per evaluation, played side by side with the policy's mean."""
 
 
 def first_start(run_seed: int, final: bool = False) -> int:

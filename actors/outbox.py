@@ -3,10 +3,10 @@
 from collections import deque
 from typing import NamedTuple
 
-from common.bus import Ack, Bus, EntryId
-from common.errors import BusUnavailable
-from common.window import Rows, WindowSpec
-from common.wire import MAX_ENTRY_BYTES, encode_hello, encode_windows
+from rmc.common.bus.protocol import Ack, Bus, EntryId
+from rmc.common.errors import BusUnavailable
+from rmc.common.window import Rows, WindowSpec
+from rmc.common.wire import MAX_ENTRY_BYTES, encode_hello, encode_windows
 
 
 class _Kept(NamedTuple):

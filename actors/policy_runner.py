@@ -1,7 +1,7 @@
 """The policy on the CPU, fast at small batches: every product and every result in a buffer of its own.
 
 Shapes: N environments, O observation, A action, E embedding, H hidden, S state. Float32 throughout; agrees with
-``common.agent`` (its modules are the reference) to 1e-5.
+``rmc.common.agent`` (its modules are the reference) to 1e-5.
 """
 
 import math
@@ -16,9 +16,9 @@ from safetensors.torch import load
 from torch import Tensor
 from torch.nn import functional as F
 
-from common.agent import CRITIC_PARTS, LOG_STD_RANGE, NORMALIZED_CLIP, AgentConfig
-from common.errors import MessageError
-from common.window import BoolArray
+from rmc.common.agent_config import CRITIC_PARTS, LOG_STD_RANGE, NORMALIZED_CLIP, AgentConfig
+from rmc.common.errors import MessageError
+from rmc.common.window import BoolArray
 
 Floats = NDArray[np.float32]
 

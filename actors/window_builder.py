@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from common.window import BoolArray, Rows, WindowSpec
+from rmc.common.window import BoolArray, Rows, WindowSpec
 
 Floats = NDArray[np.float32]
 

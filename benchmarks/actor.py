@@ -16,15 +16,17 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
-from actors.actor import Actor, ActorConfig
 from benchmarks import harness
 from benchmarks.harness import ENDLESS, Measure, Peer, Row, compare, peer_python, replay_process, speed
-from common.agent import Agent
-from common.bus import Version
-from common.envs import EnvConfig, make_env
-from common.window import WindowSpec
-from deploy.presets import robust
-from replay_server.server import ReplayConfig
+from rmc.actors.actor import Actor
+from rmc.actors.config import ActorConfig
+from rmc.common.agent import Agent
+from rmc.common.bus.protocol import Version
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import make_env
+from rmc.common.window import WindowSpec
+from rmc.deploy.run.presets import robust
+from rmc.replay_server.config import ReplayConfig
 
 DEFAULT_ENVS = 8  # of an actor; what peers are compared with
 WARM_SECONDS = 1.0

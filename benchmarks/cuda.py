@@ -8,14 +8,15 @@ Batches lie ready in pinned memory; both take priorities back to the host. Ends 
 import torch
 
 from benchmarks.harness import Row, compare, parser, random_rows, save, speed
-from common.agent import Agent
-from common.envs import EnvConfig
-from deploy.presets import RunConfig, robust
-from learner.batch import view_batch
-from learner.cuda_graph import HostCopy
-from learner.learner import bf16_is_native
-from learner.static_update import StaticUpdate
-from learner.update import JointUpdate, make_update
+from rmc.common.agent import Agent
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.presets import robust
+from rmc.learner.batch import view_batch
+from rmc.learner.cuda_graph import HostCopy
+from rmc.learner.learner import bf16_is_native
+from rmc.learner.static_update import StaticUpdate
+from rmc.learner.update import JointUpdate, make_update
 
 CHUNK = 10  # updates between looks at the clock
 

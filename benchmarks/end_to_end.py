@@ -38,7 +38,7 @@ def ours(env: str, seed: int, every: int) -> Iterator[Point]:
     with tempfile.TemporaryDirectory() as folder:
         run, began = Path(folder) / "run", time.time()
         words = ["train", env, "--seed", str(seed), "--total-steps", "1000000", "--run-dir", str(run)]
-        process = _started([sys.executable, "-m", "deploy.cli", *words, "--checkpoint-steps", str(every)])
+        process = _started([sys.executable, "-m", "rmc.cli.main", *words, "--checkpoint-steps", str(every)])
         try:
             for line in _lines(run / "metrics.jsonl", process):
                 found = json.loads(line)

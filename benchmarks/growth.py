@@ -20,10 +20,11 @@ from benchmarks import harness
 from benchmarks.harness import Row, compare, random_rows, speed
 from benchmarks.learner import learner_role, replay_of
 from benchmarks.scaling import measure
-from common.envs import EnvConfig
-from common.window import WindowSpec
-from deploy.presets import RunConfig, robust
-from replay_server.recovery import open_store
+from rmc.common.env.config import EnvConfig
+from rmc.common.window import WindowSpec
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.presets import robust
+from rmc.replay_server.recovery import open_store
 
 ENV = EnvConfig("HalfCheetah-v5")
 SMALL = WindowSpec(obs_dim=4, action_dim=1, state=8, burn_in=2, train=3)  # a million of them fit the memory

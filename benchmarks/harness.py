@@ -20,12 +20,13 @@ from types import TracebackType
 import numpy as np
 
 from benchmarks import PEER_ENVIRONMENT
-from common.redis_bus import RedisBus
-from common.window import Rows, WindowSpec
-from deploy.redis_server import RedisServer
-from replay_server.process import ReplayProcess
-from replay_server.server import ReplayConfig, ReplayServer
-from replay_server.socket_server import SocketServer
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.window import Rows, WindowSpec
+from rmc.deploy.redis.server import RedisServer
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.process import ReplayProcess
+from rmc.replay_server.server import ReplayServer
+from rmc.replay_server.socket_server import SocketServer
 
 HERE = Path(__file__).parent
 SECRET = b"benchmark"

@@ -28,9 +28,10 @@ from benchmarks.harness import (
     speed,
 )
 from benchmarks.sender import CHUNK, Sender
-from common.envs import EnvConfig, env_spaces
-from common.window import WindowSpec
-from replay_server.server import ReplayConfig
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import env_spaces
+from rmc.common.window import WindowSpec
+from rmc.replay_server.config import ReplayConfig
 
 WINDOWS = {"HalfCheetah-v5": 20_000, "Humanoid-v5": 4_000}  # in the ring
 HIDDEN = 256

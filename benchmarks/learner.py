@@ -33,17 +33,18 @@ from benchmarks.harness import (
     speed,
 )
 from benchmarks.sender import CHUNK, Sender
-from common.agent import Agent
-from common.checkpoint import CheckpointFolder
-from common.envs import EnvConfig
-from common.redis_bus import RedisBus
-from common.window import WindowSpec
-from deploy.presets import RunConfig, robust
-from learner.batch import view_batch
-from learner.learner import Learner
-from learner.replay_client import ReplayClient
-from learner.update import make_update
-from replay_server.server import ReplayConfig
+from rmc.common.agent import Agent
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.env.config import EnvConfig
+from rmc.common.window import WindowSpec
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.presets import robust
+from rmc.learner.batch import view_batch
+from rmc.learner.learner import Learner
+from rmc.learner.replay_client import ReplayClient
+from rmc.learner.update import make_update
+from rmc.replay_server.config import ReplayConfig
 
 Precision = Literal["auto", "bf16", "fp32"]
 PRECISIONS: tuple[Precision, ...] = ("bf16", "fp32")

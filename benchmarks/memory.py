@@ -16,11 +16,11 @@ import psutil
 
 from benchmarks import harness
 from benchmarks.harness import Row, compare, random_rows
-from common.envs import EnvConfig
-from common.window import WindowSpec
-from common.wire import encode_windows
-from deploy.presets import robust
-from replay_server.ring import Ring
+from rmc.common.env.config import EnvConfig
+from rmc.common.window import WindowSpec
+from rmc.common.wire import encode_windows
+from rmc.deploy.run.presets import robust
+from rmc.replay_server.ring import Ring
 
 ROWS = 10_000  # of the ring that is measured
 CHUNK = 16  # windows an entry
@@ -61,7 +61,7 @@ def resident(env_id: str, preset: str, total_steps: int) -> list[Row]:
     """The most that each role of a real run held; of several actors, the largest."""
     with tempfile.TemporaryDirectory() as folder:
         words = ["train", env_id, "--preset", preset, "--total-steps", str(total_steps), "--run-dir", f"{folder}/run"]
-        process = subprocess.Popen([sys.executable, "-m", "deploy.cli", *words], stdout=subprocess.DEVNULL)
+        process = subprocess.Popen([sys.executable, "-m", "rmc.cli.main", *words], stdout=subprocess.DEVNULL)
         seen: dict[str, list[float]] = defaultdict(list)
         while process.poll() is None:
             _look(psutil.Process(process.pid), seen)

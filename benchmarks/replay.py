@@ -33,14 +33,15 @@ from benchmarks.harness import (
 )
 from benchmarks.peers.turns import send_at
 from benchmarks.sender import CHUNK, Sender
-from common.envs import EnvConfig, env_spaces
-from common.redis_bus import RedisBus
-from common.replay import Draw
-from common.window import WindowSpec
-from learner.batch import Batch, clear_padding, importance_weights, view_batch
-from learner.learner import LearnerConfig
-from learner.replay_client import ReplayClient
-from replay_server.server import ReplayConfig
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import env_spaces
+from rmc.common.replay import Draw
+from rmc.common.window import WindowSpec
+from rmc.learner.batch import Batch, clear_padding, importance_weights, view_batch
+from rmc.learner.config import LearnerConfig
+from rmc.learner.replay_client import ReplayClient
+from rmc.replay_server.config import ReplayConfig
 
 BATCH = 256
 RATE = 500  # windows a second that come in

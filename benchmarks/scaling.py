@@ -22,15 +22,17 @@ from pathlib import Path
 import psutil
 
 from benchmarks.harness import ENDLESS, RUN, random_rows
-from common.bus import EntryId
-from common.envs import EnvConfig, env_spaces
-from common.redis_bus import RedisBus
-from common.replay import Shard
-from common.window import WindowSpec
-from common.wire import encode_hello, encode_windows
-from deploy.presets import robust
-from deploy.redis_server import RedisServer
-from replay_server.server import ReplayConfig, ReplayServer
+from rmc.common.bus.protocol import EntryId
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import env_spaces
+from rmc.common.shard import Shard
+from rmc.common.window import WindowSpec
+from rmc.common.wire import encode_hello, encode_windows
+from rmc.deploy.redis.server import RedisServer
+from rmc.deploy.run.presets import robust
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.server import ReplayServer
 
 CHUNK = 16  # windows an entry
 BEHIND = 1024  # entries that a simulated actor sends ahead of what is acknowledged

@@ -3,10 +3,10 @@
 import time
 
 from benchmarks.harness import random_rows
-from common.bus import EntryId
-from common.redis_bus import RedisBus
-from common.window import WindowSpec
-from common.wire import encode_hello, encode_windows
+from rmc.common.bus.protocol import EntryId
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.window import WindowSpec
+from rmc.common.wire import encode_hello, encode_windows
 
 CHUNK = 16  # windows an entry
 

@@ -19,14 +19,15 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
-from actors.actor import POLL_SECONDS
-from actors.policy_runner import PolicyRunner
 from benchmarks import harness
 from benchmarks.harness import RUN, compare
-from common.agent import Agent, AgentConfig
-from common.bus import Version
-from common.redis_bus import RedisBus
-from deploy.redis_server import RedisServer
+from rmc.actors.actor import POLL_SECONDS
+from rmc.actors.policy_runner import PolicyRunner
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.common.bus.protocol import Version
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.deploy.redis.server import RedisServer
 
 OBS_DIM, ACTION_DIM = 17, 6
 AGENT = AgentConfig(hidden=384, embedding=384, heads=(500, 350))  # 5 MB

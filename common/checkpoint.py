@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from common.errors import CheckpointError, ConfigError
+from rmc.common.errors import CheckpointError, ConfigError
 
 log = logging.getLogger(__name__)
 MANIFEST = "manifest.json"
@@ -171,3 +171,6 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.checksum import crc32
-from common.errors import MessageError
-from common.window import Rows, WindowSpec
+from rmc.common.checksum import crc32
+from rmc.common.errors import MessageError
+from rmc.common.window import Rows, WindowSpec
 
 TURNS = 3
 

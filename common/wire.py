@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import msgpack
 import numpy as np
 
-from common.checksum import crc32
-from common.errors import MessageError
-from common.window import Rows, WindowSpec, first_fault
+from rmc.common.checksum import crc32
+from rmc.common.errors import MessageError
+from rmc.common.window import Rows, WindowSpec, first_fault
 
 VERSION = 1
 MAGIC = b"RMC1"

@@ -8,10 +8,11 @@ import itertools
 from pathlib import Path
 from typing import Any
 
-from common.envs import EnvConfig
-from deploy.options import Train
-from deploy.presets import option, paper, robust
-from deploy.run_folder import MAY_CHANGE
+from rmc.cli.options import Train
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.run.config import option
+from rmc.deploy.run.folder import MAY_CHANGE
+from rmc.deploy.run.presets import paper, robust
 
 PAGE = Path(__file__).parent / "configuration.md"
 TITLES = {

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.window import Rows, WindowSpec
+from rmc.common.window import Rows, WindowSpec
 
 
 @dataclass(frozen=True)

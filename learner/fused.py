@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from common.agent import NORMALIZED_CLIP, Agent, Float32Linear, StackedLinear, TwinQ
-from learner import kernels
+from rmc.common.agent import Agent, Float32Linear, StackedLinear, TwinQ
+from rmc.common.agent_config import NORMALIZED_CLIP
+from rmc.learner import kernels
 
 LOW = torch.bfloat16
 ModuleT = TypeVar("ModuleT", bound=nn.Module)

@@ -9,12 +9,14 @@ import safetensors.torch
 import torch
 from numpy.typing import NDArray
 
-from common.agent import Agent, AgentConfig, squashed_sample
-from common.errors import MessageError
-from common.window import Rows, WindowSpec
-from learner import losses
-from learner.batch import view_batch
-from learner.update import UpdateConfig, filled, remember
+from rmc.common.agent import Agent, squashed_sample
+from rmc.common.agent_config import AgentConfig
+from rmc.common.errors import MessageError
+from rmc.common.window import Rows, WindowSpec
+from rmc.learner import losses
+from rmc.learner.batch import view_batch
+from rmc.learner.config import UpdateConfig
+from rmc.learner.unroll import filled, remember
 
 
 class InitialPriority:

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from common.compiled import compiled
+from rmc.common.compiled import compiled
 
 Bits = NDArray[np.uint16]  # bfloat16
 Floats = NDArray[np.float32]

@@ -7,8 +7,7 @@ import pickle
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import safetensors.torch
@@ -16,47 +15,27 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.agent import Agent, AgentConfig
-from common.bus import Bus, Version
-from common.checkpoint import CheckpointFolder
-from common.errors import CheckpointError, FencedError, RmcError
-from common.metrics import Means, Rate
-from common.replay import Draw, Replay, Sample
-from common.window import Rows, WindowSpec
-from learner.batch import clear_padding, importance_weights
-from learner.cuda_graph import HostCopy
-from learner.staleness import SLICE, measurable, staleness
-from learner.static_update import StaticUpdate
-from learner.update import AVERAGE_UPDATES, UpdateConfig, Updated, make_update
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.common.bus.protocol import Bus, Version
+from rmc.common.checkpoint import POLICY, PROGRESS, STATE, CheckpointFolder
+from rmc.common.errors import CheckpointError, FencedError, RmcError
+from rmc.common.metrics import Means, Rate
+from rmc.common.replay import Draw, Replay, Sample
+from rmc.common.window import Rows, WindowSpec
+from rmc.learner.batch import clear_padding, importance_weights
+from rmc.learner.config import LearnerConfig, UpdateConfig
+from rmc.learner.cuda_graph import HostCopy
+from rmc.learner.staleness import SLICE, measurable, staleness
+from rmc.learner.static_update import StaticUpdate
+from rmc.learner.update import AVERAGE_UPDATES, Updated, make_update
 
 log = logging.getLogger(__name__)
-STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
 NOT_OURS = (pickle.UnpicklingError, EOFError, RuntimeError, LookupError, ValueError, TypeError, AttributeError)
 METRICS_UPDATES = 20  # updates between looks at the update's metrics: each look waits for the device
 SAVE_AGAIN_SECONDS = 10.0  # after a checkpoint that could not be written
 LOOK_SECONDS = 5.0  # between looks, while waiting, whether Redis still has the weights
 INSIGHT_UPDATES = 500  # updates between looks at what takes longer: the latent's rank and the states' staleness
-
-
-@dataclass(frozen=True)
-class LearnerConfig:
-    """How the learner runs; what it computes is in UpdateConfig."""
-
-    batch_size: int = 64
-    """B, windows in a batch."""
-    importance_exponent: float = 0.4
-    """How far importance weights undo prioritized sampling; 1 is wholly."""
-    publish_updates: int = 20
-    """Updates between broadcasts of the policy."""
-    checkpoint_steps: int = 10_000
-    """Environment steps between checkpoints, each of which the evaluator plays."""
-    keep_checkpoints: int = 3
-    """Newest checkpoints kept, beside the best."""
-    precision: Literal["auto", "bf16", "fp32"] = "auto"
-    """Matrix products in bfloat16 (auto: where this CPU or GPU has instructions for it) or float32."""
-    threads: int = 0
-    """CPU threads of the learner; 0 takes all cores but one, which is left to the other roles; on Ray and in lockstep
-    it takes one."""
 
 
 def bf16_is_native(device: torch.device) -> bool:

@@ -22,11 +22,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from common.errors import AuthenticationError, FencedError, MessageError, RmcError
-from common.replay import EPISODE_BYTES, NOTHING_YET, Draw, ObservationStatistics, Sample
-from common.shared_batches import SharedBatches
-from common.window import Rows, WindowSpec
-from common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame, proof
+from rmc.common.errors import AuthenticationError, FencedError, MessageError, RmcError
+from rmc.common.replay import EPISODE_BYTES, NOTHING_YET, Draw, ObservationStatistics, Sample
+from rmc.common.shared_batches import SharedBatches
+from rmc.common.window import Rows, WindowSpec
+from rmc.common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame, proof
 
 log = logging.getLogger(__name__)
 AHEAD = 2  # draws in flight, so that the server gathers while the learner computes

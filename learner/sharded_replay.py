@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from common.replay import NOTHING_YET, Draw, ObservationStatistics, Replay, Sample
-from common.window import Rows, WindowSpec
+from rmc.common.replay import NOTHING_YET, Draw, ObservationStatistics, Replay, Sample
+from rmc.common.window import Rows, WindowSpec
 
 
 class _Stock:

@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.agent import Agent
-from common.window import BoolArray, Rows, WindowSpec
+from rmc.common.agent import Agent
+from rmc.common.window import BoolArray, Rows, WindowSpec
 
 Floats = NDArray[np.float32]
 SLICE = 4  # windows of a batch that are looked at

@@ -6,10 +6,10 @@ That is what a CUDA graph asks for; a CPU takes the same way, without a graph. S
 import torch
 from torch import Tensor
 
-from common.window import WindowSpec
-from learner.batch import view_batch
-from learner.cuda_graph import CopiesAhead, CudaGraph
-from learner.update import JointUpdate, Updated
+from rmc.common.window import WindowSpec
+from rmc.learner.batch import view_batch
+from rmc.learner.cuda_graph import CopiesAhead, CudaGraph
+from rmc.learner.update import JointUpdate, Updated
 
 
 class StaticUpdate:

@@ -8,17 +8,18 @@ import copy
 import zlib
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from common.agent import Agent, Memory, Remembered, squashed_sample
-from learner import losses
-from learner.batch import Batch
-from learner.fused import fuse
+from rmc.common.agent import Agent, Remembered, squashed_sample
+from rmc.learner import losses
+from rmc.learner.batch import Batch
+from rmc.learner.config import UpdateConfig
+from rmc.learner.fused import fuse
+from rmc.learner.unroll import filled, remember
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 AVERAGE_UPDATES = 10  # updates between moves of the policy's average, which reads and writes all that acts
@@ -30,59 +31,6 @@ TRAINS_MEMORY = {  # the paper's table 1
     5: {"model", "policy"},
     6: {"value", "policy"},
 }
-
-
-@dataclass(frozen=True)
-class UpdateConfig:
-    """The algorithm's constants; equations in ``learner/losses.py``."""
-
-    learning_rate: float = 3e-4
-    """Adam's step size for every network."""
-    memory_learning_scale: float = 1.0
-    """The memory's step size, as a multiple of the others'."""
-    alpha_learning_rate: float = 3e-4
-    """Adam's step size for the temperature."""
-    gamma: float = 0.99
-    """Discount per step of the agent."""
-    polyak: float = 0.995
-    """Share of itself that a target network keeps at every update."""
-    clip_norm: float = 0.0
-    """Largest global gradient norm; 0 does not clip."""
-    latent_target: Literal["online", "ema"] = "online"
-    """Which memory gives the change that the world model predicts."""
-    target_memory: Literal["online", "ema"] = "online"
-    """Which memory the target critics read."""
-    policy_q: Literal["first", "min"] = "min"
-    """Which critic the policy climbs: Q_1 (the paper) or the smaller of both."""
-    curiosity: float = 0.0
-    """beta_0, weight of the curiosity reward at the start; 0 switches it off."""
-    curiosity_scale: Literal["raw", "std"] = "raw"
-    """Curiosity as it is (the paper), or divided by its running standard deviation."""
-    curiosity_steps: int = 100_000
-    """Environment steps after which beta has decayed to 0, linearly."""
-    scheme: Literal[1, 2, 3, 4, 5, 6] = 1
-    """Whose losses train the memory: 1 model and value, 2 value, 3 model, 4 all, 5 model and policy, 6 value and
-    policy (table 1 of the paper)."""
-    policy_through_q: bool = True
-    """In schemes 4 to 6: the policy's loss also reaches the memory by the state that Q reads, not by the policy's
-    own input alone."""
-    update_order: Literal["joint", "alternate"] = "joint"
-    """All losses from the parameters as they stood, in one step; or one after the other, each from what the one
-    before left, with optimisers of their own (algorithm 1 as printed)."""
-    model_norm: Literal["l1", "l2"] = "l1"
-    """How the world model's error is measured, as loss and as curiosity."""
-    n_step: int = 1
-    """Steps of reward in a target before it bootstraps; 1 is the paper."""
-    eta: float = 0.9
-    """Weight of the largest against the mean absolute TD error in a window's priority."""
-
-    policy_average: int = 0
-    """Updates over which the policy that checkpoints hold, and evaluations play, is averaged, at most a tenth of those
-    made; actors have the newest. 0 does not average."""
-
-    def beta(self, env_steps: int) -> float:
-        """beta after so many environment steps."""
-        return self.curiosity * max(0.0, 1.0 - env_steps / self.curiosity_steps)
 
 
 class Updated(NamedTuple):
@@ -320,37 +268,6 @@ class AlternateUpdate(JointUpdate):
                 updated = found
         self._follow(updated)
         return updated._replace(metrics=updated.metrics | metrics | {"grad_norm": torch.stack(norms).norm()})
-
-
-def remember(memory: Memory, o: Tensor, batch: Batch, burn_in: int) -> Remembered:
-    """(B, L_t + 1, ·) from the stored state, which starts the trained part itself where the burn-in is padding."""
-    n, hidden = burn_in, _burned_in(memory, o, batch, burn_in)
-    remembered: Remembered = memory(o[:, n:], batch.blank[:, n:], batch.prev_action[:, n:], hidden)
-    return remembered
-
-
-@torch.no_grad()
-def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
-    """(B, H), the state before the first trained step."""
-    if not n:
-        return batch.state
-    hidden = batch.state[:, : memory.gru.hidden_size]
-    burned = memory(o[:, :n], batch.blank[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
-    torch.clear_autocast_cache()  # older torch would go on with these casts, which carry no gradient
-    return torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
-
-
-def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
-    """(B, L + 1, O) with blank frames filled where configured, along the states that ``remember`` goes through."""
-    if not agent.fills(batch.blank):
-        return o
-
-    def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:
-        return agent.fill(o[:, steps], batch.blank[:, steps], batch.prev_action[:, steps], state)
-
-    past, state = part(slice(burn_in), batch.state)
-    state = torch.where(batch.burned_in.unsqueeze(1), state, batch.state)
-    return torch.cat([past, part(slice(burn_in, None), state)[0]], 1)
 
 
 def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:

@@ -7,9 +7,9 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from common.errors import MessageError
-from common.shared_batches import SharedBatches
-from common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame
+from rmc.common.errors import MessageError
+from rmc.common.shared_batches import SharedBatches
+from rmc.common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame
 
 RECEIVE_BYTES = 64 << 10
 STRANGER_META_BYTES = 1024  # all that someone who has not proved anything may make us hold

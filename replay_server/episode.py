@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from replay_server.ring import Ring, Slots
+from rmc.replay_server.ring import Ring, Slots
 
 CHUNK = 1024  # serials looked through at once
 FARTHEST = 65_536  # serials looked through at most: the learner waits for its next batch meanwhile

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bus import Bus, Entry, EntryId
-from common.errors import BusFull, BusUnavailable, MessageError
-from common.replay import WHOLE, Shard
-from common.window import Rows, WindowSpec, first_fault
-from common.wire import check_rows, decode_rows, max_entry_bytes
-from replay_server.record import StreamPosition
+from rmc.common.bus.protocol import Bus, Entry, EntryId
+from rmc.common.errors import BusFull, BusUnavailable, MessageError
+from rmc.common.shard import WHOLE, Shard
+from rmc.common.window import Rows, WindowSpec, first_fault
+from rmc.common.wire import check_rows, decode_rows, max_entry_bytes
+from rmc.replay_server.record import StreamPosition
 
 ROUND_BYTES = 4 << 20  # read at most about this much in a round, so that the learner is served in between
 MAX_ENTRIES = 256  # of one actor in a round

@@ -6,9 +6,9 @@ Shapes: n rows, T + 1 observations, O observation, F floats of a row.
 import numpy as np
 from numpy.typing import NDArray
 
-from common.compiled import compiled
-from common.replay import ObservationStatistics
-from common.window import Rows, WindowSpec
+from rmc.common.compiled import compiled
+from rmc.common.replay import ObservationStatistics
+from rmc.common.window import Rows, WindowSpec
 
 
 @compiled

@@ -3,11 +3,11 @@
 import time
 from typing import Any
 
-from common.errors import BusFull, BusUnavailable
-from common.memory import keep_freed_memory
-from common.role import next_try
-from replay_server.server import ReplayServer
-from replay_server.socket_server import SocketServer
+from rmc.common.errors import BusFull, BusUnavailable
+from rmc.common.process.malloc import keep_freed_memory
+from rmc.common.process.role import next_try
+from rmc.replay_server.server import ReplayServer
+from rmc.replay_server.socket_server import SocketServer
 
 IDLE_WAIT = 0.005  # seconds between looks at the bus while nothing comes in
 FIRST_WAIT = 0.0005  # until the first look after something came

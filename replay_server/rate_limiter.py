@@ -11,7 +11,7 @@ waits for the other for ever where the slack covers the steps that actors may ho
 
 from dataclasses import dataclass
 
-from common.replay import Draw
+from rmc.common.replay import Draw
 
 
 @dataclass(frozen=True)

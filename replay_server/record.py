@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bus import EntryId
-from common.errors import ConfigError
+from rmc.common.bus.protocol import EntryId
+from rmc.common.errors import ConfigError
 
 MAX_STREAMS = 4096
 _HEADER = struct.Struct("<QII")

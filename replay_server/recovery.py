@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import ConfigError
-from common.window import WindowSpec
-from replay_server.ring import Ring, reserve
-from replay_server.sum_tree import SumTree, Values
+from rmc.common.errors import ConfigError
+from rmc.common.window import WindowSpec
+from rmc.replay_server.ring import Ring, reserve
+from rmc.replay_server.sum_tree import SumTree, Values
 
 log = logging.getLogger(__name__)
 

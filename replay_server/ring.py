@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import ConfigError
-from common.window import Rows, WindowSpec
-from replay_server.record import Progress, RecordPair, record_bytes
+from rmc.common.errors import ConfigError
+from rmc.common.window import Rows, WindowSpec
+from rmc.replay_server.record import Progress, RecordPair, record_bytes
 
 _IDENTITY = struct.Struct("<8s16sQQ")  # magic, fingerprint, capacity, row bytes; then its CRC
 _IDENTITY_BYTES = 4096

@@ -5,55 +5,29 @@ Shapes: B batch, O observation. One thread does it all; ``step`` takes in one bo
 
 import logging
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bus import Ack, Bus, Holder, Version
-from common.errors import ConfigError
-from common.metrics import Means, Rate
-from common.replay import EPISODE_BYTES, WHOLE, Draw, ObservationStatistics, Sample, Shard
-from common.window import Rows, WindowSpec
-from replay_server.episode import find_episode
-from replay_server.intake import Intake, Round
-from replay_server.observation_sums import observation_sums
-from replay_server.rate_limiter import RateLimiter
-from replay_server.record import Progress, decode_published
-from replay_server.recovery import open_store, valid_leaves
+from rmc.common.bus.protocol import Ack, Bus, Holder, Version
+from rmc.common.metrics import Means, Rate
+from rmc.common.replay import EPISODE_BYTES, Draw, ObservationStatistics, Sample
+from rmc.common.shard import WHOLE, Shard
+from rmc.common.window import Rows, WindowSpec
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.episode import find_episode
+from rmc.replay_server.intake import Intake, Round
+from rmc.replay_server.observation_sums import observation_sums
+from rmc.replay_server.rate_limiter import RateLimiter
+from rmc.replay_server.record import Progress, decode_published
+from rmc.replay_server.recovery import open_store, valid_leaves
 
 log = logging.getLogger(__name__)
 PRIORITY_FLOOR = 1e-6  # so that every window keeps a chance
 LOOK_SECONDS = 0.1  # between looks at which weights are the newest: each waits for Redis
 REPUBLISH_PERIOD = 5.0  # seconds between repeats of all acks, in case Redis lost its data
-
-
-@dataclass(frozen=True)
-class ReplayConfig:
-    """The replay server's options."""
-
-    capacity: int = 70_000
-    """Windows kept; the oldest make room."""
-    replay_ratio: float = 128.0
-    """Trained steps drawn per new environment step, from the end of the warm-up on."""
-    warmup_steps: int = 5_000
-    """Environment steps before the first draw."""
-    priority_exponent: float = 0.6
-    """How strongly priorities steer sampling; 0 is uniform."""
-    replay_shards: int = 1
-    """Replay servers, each with a share of the actors and of the capacity."""
-
-    def __post_init__(self) -> None:
-        if self.capacity < 1:
-            raise ConfigError("--capacity", self.capacity, "take at least 1 window")
-        if not 0.0 < self.replay_ratio < float("inf"):
-            raise ConfigError("--replay-ratio", self.replay_ratio, "take a positive number, like 128")
-        if self.warmup_steps < 0:
-            raise ConfigError("--warmup-steps", self.warmup_steps, "take 0 or more")
-        if not 0.0 <= self.priority_exponent <= 4.0:
-            raise ConfigError("--priority-exponent", self.priority_exponent, "take 0 (uniform) to 4")
 
 
 class ReplayServer:

@@ -27,13 +27,13 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import AuthenticationError, ConfigError, FencedError, MessageError
-from common.replay import Draw
-from common.shared_batches import SharedBatches, reserve_memory, shared_bytes
-from common.window import WindowSpec
-from common.wire import Kind, proof
-from replay_server.connection import Connection, Frame
-from replay_server.server import ReplayServer
+from rmc.common.errors import AuthenticationError, ConfigError, FencedError, MessageError
+from rmc.common.replay import Draw
+from rmc.common.shared_batches import SharedBatches, reserve_memory, shared_bytes
+from rmc.common.window import WindowSpec
+from rmc.common.wire import Kind, proof
+from rmc.replay_server.connection import Connection, Frame
+from rmc.replay_server.server import ReplayServer
 
 log = logging.getLogger(__name__)
 NONCE_BYTES = 32

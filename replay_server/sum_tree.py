@@ -8,7 +8,7 @@ tree rebuilt from the same leaves has the same bits.
 import numpy as np
 from numpy.typing import NDArray
 
-from common.compiled import compiled
+from rmc.common.compiled import compiled
 
 Values = NDArray[np.float64]
 Slots = NDArray[np.int64]

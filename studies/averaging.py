@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import safetensors.torch
 
-from common.checkpoint import CheckpointFolder
-from deploy.evaluation import evaluate_blob, evaluate_checkpoint
-from deploy.history import objects
-from deploy.inspection import load_agent
-from deploy.run_folder import RunFolder
+from rmc.analysis.evaluation import evaluate_blob, evaluate_checkpoint
+from rmc.analysis.history import objects
+from rmc.analysis.world_model_picture import load_agent
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.deploy.run.folder import RunFolder
 from studies.study import Job, Play, Scale, Study
 
 EPISODES = 10

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from common.errors import ConfigError
-from deploy.aggregate import ENOUGH_SEEDS, interquartile_mean, interval
-from deploy.baselines import evaluate
-from deploy.curves import PICTURES
-from deploy.evaluation import evaluate_checkpoint
-from deploy.history import objects
-from deploy.run_folder import RunFolder, check_writable
+from rmc.analysis.baselines import evaluate
+from rmc.analysis.curves import PICTURES
+from rmc.analysis.evaluation import evaluate_checkpoint
+from rmc.analysis.history import objects
+from rmc.analysis.statistics import ENOUGH_SEEDS, interquartile_mean, interval
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.folder import RunFolder, check_writable
 from studies.study import Job, Play, Scale, Study
 
 ENVS = ("HalfCheetah-v5", "Walker2d-v5", "Ant-v5")

@@ -26,9 +26,9 @@ from queue import SimpleQueue
 from threading import Lock
 from typing import Any
 
-from common.errors import ConfigError
-from deploy import history
-from deploy.run_folder import RunFolder
+from rmc.analysis import history
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.folder import RunFolder
 
 RESULTS, RUNS = Path(__file__).parent / "results", Path("runs") / "studies"
 TINY = "--checkpoint-steps 300 --episodes 1"  # at the scale smoke
@@ -190,7 +190,7 @@ def _trained(job: Job, cores: set[int]) -> history.History:
     log = job.folder.with_suffix(".log")
     with log.open("a") as said:
         process = subprocess.Popen(
-            [sys.executable, "-m", "deploy.cli", *job.words], stdin=subprocess.DEVNULL, stdout=said, stderr=said
+            [sys.executable, "-m", "rmc.cli.main", *job.words], stdin=subprocess.DEVNULL, stdout=said, stderr=said
         )
         os.sched_setaffinity(process.pid, cores)
         status = process.wait()

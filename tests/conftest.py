@@ -27,7 +27,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch starts its threads
 TEMPORARY = tempfile.mkdtemp(prefix="rmct-")  # so that what other runs on this machine leave is not taken for ours
 os.environ["TMPDIR"] = tempfile.tempdir = TEMPORARY
 
-from deploy.redis_server import RedisServer  # noqa: E402
+from rmc.deploy.redis.server import RedisServer  # noqa: E402
 
 hypothesis.settings.register_profile("unhurried", deadline=None)  # a core is shared
 hypothesis.settings.load_profile("unhurried")

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from common.window import Rows, WindowSpec
+from rmc.common.window import Rows, WindowSpec
 
 LONGEST = 40
 OBS_DIM, ACTION_DIM = 4, 2

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from common.window import Rows, WindowSpec
+from rmc.common.window import Rows, WindowSpec
 
 
 def join_rows(parts: Sequence[Rows], spec: WindowSpec) -> Rows:

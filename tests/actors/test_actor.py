@@ -11,14 +11,18 @@ import pytest
 import redis
 from safetensors.torch import save
 
-from actors.actor import Actor, ActorConfig, environment_seed
-from common.agent import Agent, AgentConfig
-from common.bus import Ack, Bus, Entry, EntryId, Holder, MemoryBus, Version
-from common.envs import EnvConfig, make_env
-from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
-from common.redis_bus import RedisBus
-from common.window import Rows, WindowSpec
-from common.wire import decode_rows
+from rmc.actors.actor import Actor, environment_seed
+from rmc.actors.config import ActorConfig
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.protocol import Ack, Bus, Entry, EntryId, Holder, Version
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import make_env
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
+from rmc.common.window import Rows, WindowSpec
+from rmc.common.wire import decode_rows
 from tests.actors.support import join_rows
 from tests.broken_env import FAULTS
 from tests.counting_env import ACTION_DIM, OBS_DIM, Step, audit

@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 from safetensors.torch import save
 
-from actors.evaluator import Evaluator, EvaluatorConfig, Match, first_start, play_episodes
-from actors.policy_runner import PolicyRunner
-from common.agent import Agent, AgentConfig
-from common.bus import Bus, MemoryBus, Version
-from common.envs import EnvConfig, make_env
-from common.errors import ConfigError, RmcError
-from common.wrappers import Env, Standardised
+from rmc.actors.config import EvaluatorConfig
+from rmc.actors.evaluator import Evaluator, Match, first_start, play_episodes
+from rmc.actors.policy_runner import PolicyRunner
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.protocol import Bus, Version
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import make_env
+from rmc.common.env.wrappers import Env, Standardised
+from rmc.common.errors import ConfigError, RmcError
 from tests.counting_env import ACTION_DIM, OBS_DIM
 
 AGENT = AgentConfig(hidden=8, embedding=8, heads=(8, 8))
@@ -55,7 +59,7 @@ def test_an_episode_without_end_is_judged_by_its_start(monkeypatch: pytest.Monke
         pendulum.spec = None
         return Standardised(pendulum)
 
-    monkeypatch.setattr("actors.evaluator.LONGEST_EPISODE", 30)
+    monkeypatch.setattr("rmc.actors.evaluator.LONGEST_EPISODE", 30)
     envs = [endless() for _ in range(2)]
     match = Match(runner_for(Agent(3, 1, AGENT), 2), envs, seed=0)
     rounds = next(count for count in itertools.count(1) if not match.step())

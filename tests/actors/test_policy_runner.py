@@ -11,9 +11,10 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from actors.policy_runner import PolicyRunner
-from common.agent import Agent, AgentConfig, HeadInput, squashed_sample
-from common.errors import MessageError
+from rmc.actors.policy_runner import PolicyRunner
+from rmc.common.agent import Agent, squashed_sample
+from rmc.common.agent_config import AgentConfig, HeadInput
+from rmc.common.errors import MessageError
 from tests.hostile import Touch, hostile_state
 
 OBS_DIM, ACTION_DIM, ENVS = 5, 3, 4

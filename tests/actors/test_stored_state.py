@@ -7,11 +7,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.window_builder import WindowBuilder
-from common.agent import AgentConfig
-from common.window import Rows, WindowSpec
-from learner.batch import Batch, view_batch
-from learner.update import filled, remember
+from rmc.actors.window_builder import WindowBuilder
+from rmc.common.agent_config import AgentConfig
+from rmc.common.window import Rows, WindowSpec
+from rmc.learner.batch import Batch, view_batch
+from rmc.learner.unroll import filled, remember
 from tests.actors.support import join_rows
 from tests.actors.test_policy_runner import ACTION_DIM, OBS_DIM, make_agent, make_runner
 

@@ -7,8 +7,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.window_builder import WindowBuilder
-from common.window import Rows, WindowSpec, first_fault
+from rmc.actors.window_builder import WindowBuilder
+from rmc.common.window import Rows, WindowSpec, first_fault
 from tests.actors.support import join_rows
 
 OBS_DIM, ACTION_DIM, HIDDEN = 3, 3, 3

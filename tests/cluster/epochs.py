@@ -8,11 +8,11 @@ import json
 import sys
 from pathlib import Path
 
-from common.bus import EntryId
-from common.errors import FencedError
-from common.redis_bus import RedisBus
-from deploy.redis_users import LAUNCHER, RedisUsers
-from deploy.run_folder import RunFolder
+from rmc.common.bus.protocol import EntryId
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.errors import FencedError
+from rmc.deploy.redis.users import LAUNCHER, RedisUsers
+from rmc.deploy.run.folder import RunFolder
 
 
 def is_refused(bus: RedisBus, actor: int, epoch: int) -> bool:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
-import deploy
+from rmc import deploy
 from tests.cluster import machines
 from tests.cluster.machines import Machine, Machines
 from tests.integration.test_learning import DATA, FAST, SMALL
@@ -27,7 +27,7 @@ CUTS = [int(word) for word in os.environ.get("RMC_CUTS", "5 30 90").split()]  # 
 BACK_SECONDS = 10.0  # after a network is back
 ANEW_SECONDS = 60.0  # after a node that was given up is back: every role on it begins anew, all on two cores
 SHOWN = os.environ.get("RMC_CLUSTER_RESULTS")  # a file for the figures
-RMC = f"cd {PROJECT} && {PYTHON}/python -P -m deploy.cli"
+RMC = f"cd {PROJECT} && {PYTHON}/python -P -m rmc.cli.main"
 RAY = "RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0"
 ON_A_WORKER = 3  # actors, where the learner is not
 # As Ray is told: the learner's group takes two of one worker's.
@@ -225,7 +225,7 @@ def test_a_run_learns_is_stopped_and_goes_on(site: Site) -> None:
     steps = run.newest("replay", "env_steps")
     assert "to go on, give the same options" in run.stop()
     for machine in site.machines.machines:
-        assert not machine.processes("deploy.cli"), machine.name
+        assert not machine.processes("rmc.cli.main"), machine.name
     stopped = time.time()
     again = Run(site, "learning", *LEARNING, "--actors", "2")
     again.wait_for(
@@ -323,7 +323,7 @@ def test_the_run_ends_and_nothing_is_left(endless: Run) -> None:
     site = endless.site
     endless.stop()
     for machine in site.machines.machines:
-        assert not machine.processes("deploy.cli"), machine.name
+        assert not machine.processes("rmc.cli.main"), machine.name
     began = time.monotonic()
     site.head.run(f"{RMC} cluster down {site.config}", seconds=180)
     note(test="down", seconds=time.monotonic() - began)

@@ -15,7 +15,7 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from deploy.run_folder import RunFolder
+from rmc.deploy.run.folder import RunFolder
 from tests.cluster import machines
 from tests.deploy.test_tls import lacks_tls
 from tests.integration.running import ENVIRONMENT, Training
@@ -43,7 +43,7 @@ def _left() -> list[str]:
         if (
             "raylet/raylet" in words
             or "gcs_server" in words
-            or ("deploy.cli" in words and tempfile.gettempdir() in words)
+            or ("rmc.cli.main" in words and tempfile.gettempdir() in words)
         ):
             found.append(f"{process.pid} {words[:150]}")
     return found
@@ -111,7 +111,7 @@ def test_checkpoints_that_do_not_reach_the_head_are_said_and_brought_later(tmp_p
 
 
 def test_more_than_the_cluster_holds_is_refused(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "deploy.cli", "train", "InvertedPendulum-v5", "--launcher", "ray"]
+    words = [sys.executable, "-m", "rmc.cli.main", "train", "InvertedPendulum-v5", "--launcher", "ray"]
     done = subprocess.run(
         [*words, "--run-dir", str(tmp_path / "run")], env=ENVIRONMENT, capture_output=True, text=True, timeout=120
     )
@@ -161,7 +161,7 @@ def test_a_node_is_lost_and_another_comes(nodes: Cluster, tmp_path: Path) -> Non
         trainer = RunFolder(folder).trainer()
         assert trainer is not None
         done = subprocess.run(
-            [sys.executable, "-m", "deploy.cli", "stop", str(folder)], env=ENVIRONMENT, capture_output=True, text=True
+            [sys.executable, "-m", "rmc.cli.main", "stop", str(folder)], env=ENVIRONMENT, capture_output=True, text=True
         )
         assert done.returncode == 0, done.stderr
         assert "to go on, give the same options" in done.stdout

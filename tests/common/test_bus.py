@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 import redis
 
-from common.bus import METRICS_KEPT, PIECE_BYTES, Ack, Bus, Entry, EntryId, Holder, MemoryBus, ReplayAddress, Version
-from common.errors import BusFull, BusUnavailable, ConfigError, FencedError
-from common.redis_bus import RECORDS_READ, UNPUBLISHED_SECONDS, RedisBus
-from deploy.redis_server import RedisServer
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.protocol import METRICS_KEPT, PIECE_BYTES, Ack, Bus, Entry, EntryId, Holder, ReplayAddress, Version
+from rmc.common.bus.redis_bus import RECORDS_READ, UNPUBLISHED_SECONDS, RedisBus
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
+from rmc.deploy.redis.server import RedisServer
 
 
 @pytest.fixture(params=["memory", "redis"])

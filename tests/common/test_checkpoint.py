@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from common.checkpoint import CheckpointFolder
-from common.errors import CheckpointError, ConfigError
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import CheckpointError, ConfigError
 
 FILES = {"state": b"\x00" * 100, "progress.json": b"{}"}
 OUTSIDE = [

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.envs import EnvConfig, env_spaces, make_env
-from common.errors import ConfigError
-from deploy import cli
+from rmc.cli import main
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import env_spaces, make_env
+from rmc.common.errors import ConfigError
 
 INSTALLED = importlib.util.find_spec("dm_control") is not None
 needs_dm_control = pytest.mark.skipif(not INSTALLED, reason="dm_control is not installed: make test-dm-control")
@@ -49,10 +50,10 @@ def test_an_unknown_task_is_one_line() -> None:
 
 @needs_dm_control
 def test_check_train_and_evaluate(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["check-env", WALKER]) == 0
+    assert main.run(["check-env", WALKER]) == 0
     run = ["--preset", "debug", "--total-steps", "1200", "--launcher", "lockstep", "--checkpoint-steps", "1100"]
-    assert cli.run(["train", WALKER, *run, "--run-dir", str(tmp_path / "run")]) == 0
-    assert cli.run(["evaluate", str(tmp_path / "run"), "--episodes", "1"]) == 0
+    assert main.run(["train", WALKER, *run, "--run-dir", str(tmp_path / "run")]) == 0
+    assert main.run(["evaluate", str(tmp_path / "run"), "--episodes", "1"]) == 0
     said = capfd.readouterr()
     assert "it can be trained on" in said.out
     assert "GLFW" not in said.err

@@ -10,8 +10,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from common.envs import EnvConfig, env_spaces, make_env
-from common.errors import ConfigError
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import env_spaces, make_env
+from rmc.common.errors import ConfigError
 from tests.memory_env import ANSWER_STEPS
 
 REPOSITORY = Path(__file__).parents[2]
@@ -151,9 +152,12 @@ def test_refused_in_one_line(config: EnvConfig, says: str) -> None:
 )
 def test_a_users_broken_module_is_one_line_with_its_place(source: str, says: str, tmp_path: Path) -> None:
     (tmp_path / "broken.py").write_text(source)
-    run = _python(tmp_path, "from common.envs import *; env_spaces(EnvConfig('broken:Broken-v0'))")
+    run = _python(
+        tmp_path,
+        "from rmc.common.env.make import *; env_spaces(EnvConfig('broken:Broken-v0'))",
+    )
     assert says in run.stderr.splitlines()[-1]
-    assert run.stderr.splitlines()[-1].startswith("common.errors.ConfigError: ENV='broken:Broken-v0': ")
+    assert run.stderr.splitlines()[-1].startswith("rmc.common.errors.ConfigError: ENV='broken:Broken-v0': ")
 
 
 def test_a_users_module_in_the_working_folder_does_not_shadow_ours(tmp_path: Path) -> None:
@@ -163,13 +167,19 @@ def test_a_users_module_in_the_working_folder_does_not_shadow_ours(tmp_path: Pat
         "from gymnasium.envs.classic_control import PendulumEnv\n"
         "gymnasium.register('Mine-v0', entry_point=PendulumEnv, max_episode_steps=7)\n"
     )
-    run = _python(tmp_path, "from common.envs import *; print(env_spaces(EnvConfig('mine:Mine-v0')))")
+    run = _python(
+        tmp_path,
+        "from rmc.common.env.make import *; print(env_spaces(EnvConfig('mine:Mine-v0')))",
+    )
     assert (run.returncode, run.stdout.strip()) == (0, "(3, 1, 7)"), run.stderr
 
 
 @pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Humanoid-v5"])
 def test_mujoco_prints_nothing_and_leaves_no_file(tmp_path: Path, env_id: str) -> None:
-    run = _python(tmp_path, f"from common.envs import *; make_env(EnvConfig({env_id!r})).reset(seed=0); print('made')")
+    run = _python(
+        tmp_path,
+        f"from rmc.common.env.make import *; make_env(EnvConfig({env_id!r})).reset(seed=0); print('made')",
+    )
     assert (run.stdout, run.stderr) == ("made\n", "")
     assert list(tmp_path.iterdir()) == []
 

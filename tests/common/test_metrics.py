@@ -2,8 +2,8 @@
 
 import pytest
 
-from common import metrics
-from common.metrics import Rate
+from rmc.common import metrics
+from rmc.common.metrics import Rate
 
 
 def test_a_rate_is_over_ten_seconds_and_so_does_not_jump_with_bursts(monkeypatch: pytest.MonkeyPatch) -> None:

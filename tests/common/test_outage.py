@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from common.outage import Outage
+from rmc.common.process.outage import Outage
 
 
 def test_once_each(caplog: pytest.LogCaptureFixture) -> None:

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.errors import MessageError
-from common.record import MAX_BYTES, decode_record, encode_record
+from rmc.common.bus.metrics_record import MAX_BYTES, decode_record, encode_record
+from rmc.common.errors import MessageError
 
 RECORD = {"time": 1.5, "updates": 7, "q_loss": 0.25, "waiting_for": "credit", "observation_unexplained": [0.5, 1]}
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from common.errors import ConfigError
-from common.redis_bus import RedisBus
-from common.redis_url import has_password, shown, without_passwords
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.bus.redis_url import has_password, shown, without_passwords
+from rmc.common.errors import ConfigError
 
 SHOWN = {
     "redis://host:6379": "redis://host:6379",

@@ -2,9 +2,9 @@
 
 import pytest
 
-from common.bus import MemoryBus
-from common.errors import BusFull, BusUnavailable
-from common.role import StopSignal, run_role
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.errors import BusFull, BusUnavailable
+from rmc.common.process.role import StopSignal, run_role
 
 
 class Away(MemoryBus):
@@ -43,7 +43,7 @@ class Counting:
 
 @pytest.mark.parametrize("error", [BusUnavailable, BusFull])
 def test_steps_go_on_while_redis_is_away(monkeypatch, error):
-    monkeypatch.setattr("common.role.RECONNECT_SLEEP", 0.01)
+    monkeypatch.setattr("rmc.common.process.role.RECONNECT_SLEEP", 0.01)
     stop = StopSignal()
     role = Counting(stop, 45, error)
     run_role(role, Away(), stop)

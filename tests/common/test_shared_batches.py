@@ -5,9 +5,9 @@ import os
 import numpy as np
 import pytest
 
-from common.errors import MessageError
-from common.shared_batches import TURNS, SharedBatches, reserve_memory, shared_bytes
-from common.window import WindowSpec
+from rmc.common.errors import MessageError
+from rmc.common.shared_batches import TURNS, SharedBatches, reserve_memory, shared_bytes
+from rmc.common.window import WindowSpec
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, state=4, burn_in=2, train=4)
 BATCH = 8

@@ -4,7 +4,7 @@ import subprocess
 import sys
 import time
 
-IMPORTS = "import time\nfrom common.watchdog import Watchdog\n"
+IMPORTS = "import time\nfrom rmc.common.process.watchdog import Watchdog\n"
 
 
 def run(code: str) -> tuple[int, str, float]:

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common import wire
-from common.errors import MessageError
+from rmc.common import wire
+from rmc.common.errors import MessageError
 from tests.learner.rows import SPEC, random_rows
 
 

@@ -6,7 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from common.envs import EnvConfig, env_spaces, make_env
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import env_spaces, make_env
 
 CHEETAH, ACTION = "HalfCheetah-v5", np.linspace(-1, 1, 6, dtype=np.float32)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from deploy.aggregate import interquartile_mean, interval, normalised, probability_of_improvement
+from rmc.analysis.statistics import interquartile_mean, interval, normalised, probability_of_improvement
 
 
 @pytest.mark.parametrize("count", [1, 3, 4, 5, 8, 30])

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from common.envs import EnvConfig
-from common.errors import ConfigError
-from deploy.attachment import Tail, stop, trained_now
-from deploy.presets import debug
-from deploy.run_folder import RunFolder, open_run
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.monitor.attach import Tail, stop, trained_now
+from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.presets import debug
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from deploy.run_folder import RunFolder
+from rmc.deploy.run.folder import RunFolder
 folder = RunFolder(Path(sys.argv[1]))
 folder.lock()
 print("locked", flush=True)

@@ -12,14 +12,14 @@ import pytest
 import torch
 from rich.console import Console
 
-from common.envs import EnvConfig
-from common.errors import ConfigError
-from common.role import StopSignal
-from deploy.baseline_settings import Algorithm, BaselineConfig, Settings, choose
-from deploy.baselines import evaluate, train
-from deploy.cli import run as rmc
-from deploy.history import of_run
-from deploy.run_folder import RunFolder
+from rmc.analysis.baseline_settings import Algorithm, BaselineConfig, Settings, choose
+from rmc.analysis.baselines import evaluate, train
+from rmc.analysis.history import of_run
+from rmc.cli.main import run as rmc
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.common.process.role import StopSignal
+from rmc.deploy.run.folder import RunFolder
 
 ENV = EnvConfig("InvertedPendulum-v5")
 ALGORITHMS = get_args(Algorithm)
@@ -131,7 +131,7 @@ def test_the_zoos_ppo_trains_and_keeps_its_scales(tmp_path):
 
 def test_one_in_use_is_left_as_it_is_and_can_be_stopped(tmp_path, capsys):
     words = ["baseline", "sac", ENV.id, "--total-steps", "1000000", "--checkpoint-steps", "100", "--run-dir"]
-    command = [sys.executable, "-m", "deploy.cli", *words, str(tmp_path / "run")]
+    command = [sys.executable, "-m", "rmc.cli.main", *words, str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         while "environment step" not in (said := process.stdout.readline()):

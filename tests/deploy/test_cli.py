@@ -10,12 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from common.envs import EnvConfig
-from common.errors import ConfigError
-from deploy import cli, options, presets
-from deploy.presets import to_json
-from deploy.run_folder import RunFolder, open_run
-from deploy.training import Placement, prepare
+from rmc.cli import main, options
+from rmc.cli.training import prepare
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import to_json
+from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.launch_options import Placement
+from rmc.deploy.run.presets import debug, paper
 
 PENDULUM = "InvertedPendulum-v5"
 DEBUG = ["train", PENDULUM, "--preset", "debug"]
@@ -61,7 +63,7 @@ OTHER_FLAGS = {
 
 
 def flags(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
-    assert cli.run([command, "--help"]) == 0
+    assert main.run([command, "--help"]) == 0
     found = re.findall(r"--[a-z][a-z-]*[a-z]", capsys.readouterr().out)
     return set(found) - {"--help"}
 
@@ -74,7 +76,7 @@ def test_the_flags_are_these(command: str, expected: list[str], capsys: pytest.C
 
 def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """The one line of a command that must end with status 2 and say nothing else."""
-    assert cli.run(words) == 2
+    assert main.run(words) == 2
     said = capsys.readouterr()
     assert said.out == ""
     lines = said.err.splitlines()
@@ -138,7 +140,7 @@ def test_errors_are_one_line(
 @pytest.mark.parametrize("login", ["", ":hush@"])
 def test_a_password_on_the_command_line_is_warned_of_once(words: list[str], login: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "deploy.cli", *words, "--redis-url", f"redis://{login}localhost:1"],
+        [sys.executable, "-m", "rmc.cli.main", *words, "--redis-url", f"redis://{login}localhost:1"],
         capture_output=True, text=True, env=os.environ | {"RMC_PATIENCE": "0"},
     )  # fmt: skip
     *warnings, error = done.stderr.splitlines()
@@ -151,7 +153,7 @@ def test_a_redis_beside_ray_is_refused_without_its_password() -> None:
     """Where the check is made: to get there from the command line takes a cluster."""
     placement = Placement(None, "fail", "ray", "cpu", "redis://user:hush@localhost:1")
     with pytest.raises(ConfigError, match="--redis-url='redis://localhost:1': a run on Ray"):
-        prepare(presets.debug(EnvConfig(PENDULUM)), placement)
+        prepare(debug(EnvConfig(PENDULUM)), placement)
 
 
 def test_a_full_disk_is_one_line(
@@ -161,13 +163,13 @@ def test_a_full_disk_is_one_line(
         with open("/dev/full", "wb", buffering=0) as file:
             return file.write(b"x")
 
-    monkeypatch.setattr(cli, "_parse_and_run", full)
-    assert cli.run(["train"]) == 1
+    monkeypatch.setattr(main, "_parse_and_run", full)
+    assert main.run(["train"]) == 1
     assert capsys.readouterr().err == "rmc: disk: No space left on device; make room and try again\n"
 
 
 def made_run(folder: Path) -> RunFolder:
-    run = open_run(presets.debug(EnvConfig(PENDULUM)), folder, "fail")
+    run = open_run(debug(EnvConfig(PENDULUM)), folder, "fail")
     run.unlock()
     return run
 
@@ -195,7 +197,7 @@ def test_a_folder_that_is_no_runs_is_refused(capsys: pytest.CaptureFixture[str],
 
 
 def test_a_folder_in_use_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    run = open_run(presets.debug(EnvConfig(PENDULUM)), tmp_path / "run", "fail")
+    run = open_run(debug(EnvConfig(PENDULUM)), tmp_path / "run", "fail")
     assert "stop it first" in complaint([*DEBUG, "--run-dir", str(tmp_path / "run")], capsys)
     run.unlock()
 
@@ -233,7 +235,7 @@ def test_a_role_needs_its_runs_secret(
 
 
 def test_new_takes_a_folder_beside(tmp_path: Path) -> None:
-    config = presets.debug(EnvConfig(PENDULUM))
+    config = debug(EnvConfig(PENDULUM))
     made_run(tmp_path / "run")
     beside = open_run(config, tmp_path / "run", "new")
     beside.unlock()
@@ -241,7 +243,7 @@ def test_new_takes_a_folder_beside(tmp_path: Path) -> None:
 
 
 def test_a_run_may_be_made_longer(tmp_path: Path) -> None:
-    config = presets.debug(EnvConfig(PENDULUM))
+    config = debug(EnvConfig(PENDULUM))
     made_run(tmp_path / "run")
     longer = dataclasses.replace(config, total_steps=2 * config.total_steps)
     run = open_run(longer, tmp_path / "run", "resume")
@@ -263,7 +265,7 @@ def test_options_become_the_config() -> None:
     command = options.parse([*words, "--replay-ratio", "64", "--flicker", "0.5", "--head-input", "hidden+embedding"])
     assert isinstance(command, options.Train)
     config = command.config()
-    expected = presets.paper(EnvConfig(PENDULUM, 0.5))
+    expected = paper(EnvConfig(PENDULUM, 0.5))
     assert (config.seed, config.actor.envs_per_actor, config.agent.heads) == (4, 3, (64, 32))
     assert (config.replay.replay_ratio, config.agent.head_input, config.env.flicker) == (64.0, "hidden+embedding", 0.5)
     assert config.update == expected.update

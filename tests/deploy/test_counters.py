@@ -6,9 +6,10 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from common.bus import Ack, EntryId, Holder, MemoryBus
-from deploy.counters import Counters
-from deploy.run_folder import RunFolder
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.protocol import Ack, EntryId, Holder
+from rmc.deploy.redis.progress_backup import Counters
+from rmc.deploy.run.folder import RunFolder
 
 WHOLE = msgpack.packb({"replay": b"counted"})
 OTHERS = ([1], {"replay": 5}, {"replay": {}}, {"another": b"x"}, {None: b"x"})

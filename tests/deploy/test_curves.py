@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from common.envs import EnvConfig
-from common.errors import ConfigError
-from deploy import curves, history
-from deploy.cli import run
-from deploy.history import Evaluation, History
-from deploy.presets import robust, to_json
+from rmc.analysis import curves, history
+from rmc.analysis.history import Evaluation, History
+from rmc.cli.main import run
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import to_json
+from rmc.deploy.run.presets import robust
 
 
 def made(agent="RMC", env="HalfCheetah-v5", seed=0, last=100.0, initial: float | None = 0.0) -> History:

@@ -7,11 +7,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from deploy import cli
+from rmc.cli import main
 
 
 def said(env: str, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, str]:
-    status = cli.run(["check-env", env, *options])
+    status = main.run(["check-env", env, *options])
     return status, capsys.readouterr().out
 
 
@@ -79,6 +79,6 @@ def test_faults_are_named(fault, words, capsys):
 
 
 def test_what_cannot_be_made_is_one_line(capsys):
-    assert cli.run(["check-env", "CartPole-v1"]) == 2
+    assert main.run(["check-env", "CartPole-v1"]) == 2
     assert "actions are Discrete" in capsys.readouterr().err
-    assert cli.run(["check-env", "HalfCheetah-v5", "--steps", "0"]) == 2
+    assert main.run(["check-env", "HalfCheetah-v5", "--steps", "0"]) == 2

@@ -10,14 +10,16 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from common.agent import Agent
-from common.checkpoint import CheckpointFolder
-from common.envs import EnvConfig
-from common.errors import ConfigError
-from deploy import cli, inspection
-from deploy.inspection import HORIZONS, Episode, load_agent, look, play
-from deploy.presets import RunConfig, debug
-from deploy.run_folder import RunFolder, open_run
+from rmc.analysis import world_model_picture
+from rmc.analysis.world_model_picture import HORIZONS, Episode, load_agent, look, play
+from rmc.cli import main
+from rmc.common.agent import Agent
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.presets import debug
 from tests.deploy.test_policy import AGENTS
 from tests.hostile import hostile_state
 
@@ -86,22 +88,22 @@ def test_the_command_writes_a_picture_and_says_it_in_numbers(
     config: RunConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = make_run(tmp_path / "run", config)
-    assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 0
+    assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 0
     assert (tmp_path / "seen.png").read_bytes().startswith(b"\x89PNG")
     said = capsys.readouterr().out
     assert "% 1 ahead" in said
     assert "% 15 ahead (100% is a guess of no change)" in said
     assert "worst dimensions" in said
-    assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "no" / "seen.png")]) == 2
+    assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "no" / "seen.png")]) == 2
     assert "its folder is not there" in capsys.readouterr().err
-    assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.xyz")]) == 2
+    assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.xyz")]) == 2
     assert "ends in .png" in capsys.readouterr().err
 
 
 def test_an_episode_that_never_ends_is_looked_at_for_a_while(
     config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(inspection, "LONGEST_EPISODE", 25)
+    monkeypatch.setattr(world_model_picture, "LONGEST_EPISODE", 25)
     scaled = dataclasses.replace(config, actor=dataclasses.replace(config.actor, reward_scale=0.5))
     folder = make_run(tmp_path / "run", scaled)
     agent = load_agent(folder, scaled, "latest")
@@ -113,7 +115,7 @@ def test_an_episode_that_never_ends_is_looked_at_for_a_while(
 def test_a_model_without_grounding_has_nothing_to_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = RunConfig(env=EnvConfig("Pendulum-v1"), preset="debug", agent=AGENTS["paper"])
     folder = make_run(tmp_path / "run", run)
-    assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 2
+    assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 2
     assert "--grounding" in capsys.readouterr().err
 
 
@@ -123,7 +125,7 @@ def test_a_checkpoint_never_executes_code(
     folder, mark = make_run(tmp_path / "run", config), tmp_path / "owned"
     checkpoints = CheckpointFolder(folder.checkpoints)
     checkpoints.save(4, {**checkpoints.load(3), "learner.pt": hostile_state(mark)})
-    assert cli.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 2
+    assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 2
     assert "--checkpoint='latest': its learner.pt is not this run's" in capsys.readouterr().err
     assert not mark.exists()
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from common.envs import EnvConfig
-from deploy import journal
-from deploy.journal import Journal
-from deploy.presets import debug
-from deploy.run_folder import RunFolder, open_run
-from deploy.view import Board, View
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.monitor import metrics_log
+from rmc.deploy.monitor.metrics_log import Journal
+from rmc.deploy.monitor.view import Board, View
+from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.presets import debug
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def lines(folder: RunFolder) -> list[int]:
 def test_a_full_disk_is_told_once_and_over_once(
     folder: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(journal, "RETRY_SECONDS", 0.0)
+    monkeypatch.setattr(metrics_log, "RETRY_SECONDS", 0.0)
     kept = Journal(folder)
     kept.write({"role": "learner", "x": 1}, 0)
     there = kept._lines
@@ -50,14 +50,14 @@ def test_a_full_disk_is_told_once_and_over_once(
 
 
 def test_no_half_of_a_line_is_left(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept, write = Journal(folder), journal.os.write
+    kept, write = Journal(folder), metrics_log.os.write
     kept.write({"role": "learner", "x": 1}, 0)
 
     def short(file: int, line: bytes) -> int:
         return write(file, line[:5])
 
     with monkeypatch.context() as patch:
-        patch.setattr(journal.os, "write", short)
+        patch.setattr(metrics_log.os, "write", short)
         kept.write({"role": "learner", "x": 2}, 0)
     assert lines(folder) == [1]
     kept.close()

@@ -8,9 +8,9 @@ import jsonschema
 import pytest
 import ray.autoscaler
 
-import deploy
-from common.errors import ConfigError
-from deploy import machines
+from rmc import deploy
+from rmc.common.errors import ConfigError
+from rmc.deploy.ray import machines
 
 FOLDER = Path(deploy.__file__).parent / "cluster"
 FILES = sorted(FOLDER.glob("*.yaml"))

@@ -10,15 +10,16 @@ import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from common.bus import MemoryBus
-from common.envs import EnvConfig
-from common.errors import ConfigError
-from common.record import decode_record, encode_record
-from deploy import history
-from deploy.monitor import Monitor
-from deploy.presets import RunConfig, debug
-from deploy.run_folder import RunFolder, open_run
-from deploy.view import MOST_NAMES, Board, _evaluation, line, table, terminal
+from rmc.analysis import history
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.metrics_record import decode_record, encode_record
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.monitor.monitor import Monitor
+from rmc.deploy.monitor.view import MOST_NAMES, Board, _evaluation, line, table, terminal
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.presets import debug
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from common.errors import RoleDied
-from deploy import nursery
-from deploy.nursery import Forked, Nursery
+from rmc.cli import fork_server
+from rmc.common.errors import RoleDied
+from rmc.deploy.local.fork_server import FAILED_STATUS, IMPORT_SECONDS, Forked, Nursery
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")
 
@@ -63,7 +63,7 @@ def test_it_leads_a_group_has_its_title_and_dies_of_a_signal(shared: Nursery, tm
     assert role.poll() is None
     with pytest.raises(subprocess.TimeoutExpired):
         role.wait(0.2)
-    assert " ".join(psutil.Process(role.pid).cmdline()).endswith("-P -m deploy.cli actor --run x --index 7")
+    assert " ".join(psutil.Process(role.pid).cmdline()).endswith("-P -m rmc.cli.main actor --run x --index 7")
     os.killpg(role.pid, signal.SIGKILL)
     assert role.wait(5) == -signal.SIGKILL
 
@@ -86,7 +86,7 @@ def test_one_that_does_not_start_says_where_to_look(tmp_path: Path, monkeypatch:
     broken = tmp_path / "python"
     broken.write_text("#!/bin/sh\necho no torch here\nexit 1\n")
     broken.chmod(0o700)
-    monkeypatch.setattr(nursery.sys, "executable", str(broken))
+    monkeypatch.setattr(fork_server.sys, "executable", str(broken))
     one = Nursery(tmp_path / "nursery.log")
     with pytest.raises(RoleDied, match=r"does not start; its log is .*nursery\.log"):
         fork(one, tmp_path / "log", "actor")
@@ -97,7 +97,7 @@ def test_one_that_does_not_start_says_where_to_look(tmp_path: Path, monkeypatch:
 def test_one_that_hangs_is_given_up_for_another(
     shared: Nursery, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(nursery, "REPLY_SECONDS", 0.3)
+    monkeypatch.setattr(fork_server, "REPLY_SECONDS", 0.3)
     words = ("actor", "--run", "x", "--index", "0")
     role = fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99")
     process, hung = psutil.Process(role.pid), shared._program
@@ -105,7 +105,7 @@ def test_one_that_hangs_is_given_up_for_another(
     hung.send_signal(signal.SIGSTOP)
     began = time.monotonic()
     assert role.wait(5) == -signal.SIGKILL  # it cannot be asked
-    assert time.monotonic() - began < nursery.IMPORT_SECONDS / 2  # which it may take at its start alone
+    assert time.monotonic() - began < IMPORT_SECONDS / 2  # which it may take at its start alone
     process.wait(5)
     assert hung.returncode == -signal.SIGKILL
     monkeypatch.undo()
@@ -116,13 +116,13 @@ def test_a_system_without_room_for_a_process_is_said(tmp_path: Path, monkeypatch
     def no_room() -> int:
         raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
 
-    monkeypatch.setattr(nursery.os, "fork", no_room)
+    monkeypatch.setattr(fork_server.os, "fork", no_room)
     ours, theirs = socket.socketpair()
     with ours, theirs, (tmp_path / "log").open("ab") as log:
-        assert nursery._forked(theirs, {"words": [], "environment": {}}, log.fileno()) == 0
+        assert fork_server._forked(theirs, {"words": [], "environment": {}}, log.fileno()) == 0
     assert (tmp_path / "log").read_text() == "no process can be forked: Resource temporarily unavailable\n"
-    ended = Forked(Nursery(tmp_path / "nursery.log"), 0, 0, nursery.FAILED_STATUS)
-    assert ended.poll() == nursery.FAILED_STATUS
+    ended = Forked(Nursery(tmp_path / "nursery.log"), 0, 0, FAILED_STATUS)
+    assert ended.poll() == FAILED_STATUS
 
 
 FORKS_THAT_DRAW = """
@@ -132,10 +132,10 @@ import deploy
 from deploy import nursery
 
 np.random.seed(0)
-deploy.cli = sys.modules["deploy.cli"] = types.ModuleType("deploy.cli")
+deploy.cli = sys.modules["rmc.cli.main"] = types.ModuleType("rmc.cli.main")
 deploy.cli.main = lambda: print(np.random.random(), flush=True)
 for _ in range(2):
-    pid = nursery._forked(socket.socket(), {"words": [], "environment": {}}, os.dup(1))
+    pid = fork_server._forked(socket.socket(), {"words": [], "environment": {}}, os.dup(1))
     os.waitpid(pid, 0)
 """
 

@@ -10,15 +10,16 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
-from actors.evaluator import first_start
-from common.agent import Agent, AgentConfig
-from common.checkpoint import CheckpointFolder
-from common.envs import EnvConfig
-from deploy import cli
-from deploy.evaluation import evaluate_checkpoint
-from deploy.policy import load_policy
-from deploy.presets import debug
-from deploy.run_folder import RunFolder, open_run
+from rmc.actors.evaluator import first_start
+from rmc.analysis.evaluation import evaluate_checkpoint
+from rmc.analysis.policy import load_policy
+from rmc.cli import main
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.presets import debug
 
 AGENTS = {
     "robust": AgentConfig(
@@ -94,7 +95,7 @@ def test_exploring_actions_vary_and_are_seeded(run: RunFolder) -> None:
 
 def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "policy.onnx"
-    assert cli.run(["export", str(run.path), "--out", str(file)]) == 0
+    assert main.run(["export", str(run.path), "--out", str(file)]) == 0
     assert "inputs observation, previous_action, blank, state" in capsys.readouterr().out
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     rng, policy = np.random.default_rng(0), load_policy(run.path)
@@ -112,18 +113,18 @@ def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureF
 def test_export_says_what_is_wrong_in_one_line(
     run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert cli.run(["export", str(run.path), "--out", str(tmp_path / "no" / "policy.onnx")]) == 2
+    assert main.run(["export", str(run.path), "--out", str(tmp_path / "no" / "policy.onnx")]) == 2
     assert "its folder is not there" in capsys.readouterr().err
-    assert cli.run(["export", str(run.path), "--out", str(tmp_path)]) == 2
+    assert main.run(["export", str(run.path), "--out", str(tmp_path)]) == 2
     assert "is a folder" in capsys.readouterr().err
-    assert cli.run(["export", str(run.path), "--checkpoint", "best"]) == 2
+    assert main.run(["export", str(run.path), "--checkpoint", "best"]) == 2
     assert "none was evaluated yet" in capsys.readouterr().err
-    assert cli.run(["export", str(run.path), "--checkpoint", "²"]) == 2
+    assert main.run(["export", str(run.path), "--checkpoint", "²"]) == 2
     assert "use latest, best or one of [7]" in capsys.readouterr().err
-    assert cli.run(["export", str(run.path), "--out", "/proc/policy.onnx"]) == 2
+    assert main.run(["export", str(run.path), "--out", "/proc/policy.onnx"]) == 2
     assert "cannot be written" in capsys.readouterr().err
-    monkeypatch.setattr("deploy.export.NEEDED", ("no_such_package",))
-    assert cli.run(["export", str(run.path)]) == 2
+    monkeypatch.setattr("rmc.analysis.export.NEEDED", ("no_such_package",))
+    assert main.run(["export", str(run.path)]) == 2
     assert "pip install 'rmc[onnx]'" in capsys.readouterr().err
 
 
@@ -136,6 +137,6 @@ def test_another_environments_policy_is_refused(run: RunFolder, tmp_path: Path, 
     for blob in (theirs["policy.safetensors"], save(fewer)):
         CheckpointFolder(run.checkpoints).save(8, theirs | {"policy.safetensors": blob})
         for words in (["export", str(run.path), "--out", str(file)], ["evaluate", str(run.path), "--episodes", "1"]):
-            assert cli.run(words) == 2
+            assert main.run(words) == 2
             assert "--checkpoint='latest': weights: not a policy of this run" in capsys.readouterr().err
     assert not file.exists()

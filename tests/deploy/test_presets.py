@@ -9,27 +9,29 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.agent import HeadInput
-from common.envs import EnvConfig
-from common.errors import ConfigError
-from deploy import presets
-from deploy.presets import RunConfig, from_json, to_json, validate
-from deploy.run_folder import flat
+from rmc.common.agent_config import HeadInput
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run import config
+from rmc.deploy.run.config import RunConfig, from_json, to_json
+from rmc.deploy.run.folder import flat
+from rmc.deploy.run.presets import paper, preset, robust
+from rmc.deploy.run.validation import validate
 
 ENV = EnvConfig("InvertedPendulum-v5")
-NAMES: list[presets.Preset] = ["robust", "paper", "debug"]
+NAMES: list[config.Preset] = ["robust", "paper", "debug"]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_presets_are_valid_and_come_back_from_json(name: presets.Preset) -> None:
-    config = presets.preset(name, ENV)
+def test_presets_are_valid_and_come_back_from_json(name: config.Preset) -> None:
+    config = preset(name, ENV)
     validate(config)
-    assert config.preset == name
+    assert preset == name
     assert from_json(to_json(config)) == config
 
 
 def test_the_paper_preset_is_the_papers() -> None:
-    config = presets.paper(ENV)
+    config = paper(ENV)
     assert (config.agent.embedding, config.agent.heads, config.agent.grounding) == (0, (400, 300), False)
     assert (config.update.learning_rate, config.update.alpha_learning_rate) == (1e-4, 1e-5)
     assert (config.update.curiosity, config.update.curiosity_scale) == (0.5, "raw")
@@ -44,7 +46,7 @@ def test_the_paper_preset_is_the_papers() -> None:
     st.sampled_from(["online", "ema"]),
 )
 def test_json_keeps_every_value(rate: float, steps: int, head_input: Any, memory: Any) -> None:
-    config = presets.robust(ENV)
+    config = robust(ENV)
     config = dataclasses.replace(
         config,
         total_steps=steps,
@@ -70,7 +72,7 @@ def test_json_keeps_every_value(rate: float, steps: int, head_input: Any, memory
     ],
 )
 def test_strange_json_is_refused(path: str, value: Any, said: str) -> None:
-    raw = json.loads(to_json(presets.robust(ENV)))
+    raw = json.loads(to_json(robust(ENV)))
     parent, _, name = path.rpartition(".")
     (raw[parent] if parent else raw)[name] = value
     with pytest.raises(ConfigError, match=said) as caught:
@@ -79,7 +81,7 @@ def test_strange_json_is_refused(path: str, value: Any, said: str) -> None:
 
 
 def test_missing_values_and_broken_files_are_refused() -> None:
-    raw = json.loads(to_json(presets.robust(ENV)))
+    raw = json.loads(to_json(robust(ENV)))
     del raw["replay"]["capacity"]
     with pytest.raises(ConfigError, match=r"replay\.capacity"):
         from_json(json.dumps(raw))
@@ -88,7 +90,7 @@ def test_missing_values_and_broken_files_are_refused() -> None:
 
 
 def numeric_paths() -> list[str]:
-    values = flat(presets.robust(ENV))
+    values = flat(robust(ENV))
     return [path for path, value in values.items() if isinstance(value, int | float) and not isinstance(value, bool)]
 
 
@@ -104,13 +106,13 @@ def with_value(config: RunConfig, path: str, value: Any) -> RunConfig:
 @pytest.mark.parametrize("path", numeric_paths())
 def test_every_number_is_judged(path: str, value: float) -> None:
     with pytest.raises(ConfigError) as caught:
-        validate(with_value(presets.robust(ENV), path, value))
+        validate(with_value(robust(ENV), path, value))
     assert path.rpartition(".")[2].replace("_", "-") in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_values_that_do_not_go_together_are_refused() -> None:
-    config = presets.robust(ENV)
+    config = robust(ENV)
     with pytest.raises(ConfigError, match="--stride=16"):
         validate(with_value(config, "actor.stride", 16))
     with pytest.raises(ConfigError, match="--total-steps"):
@@ -132,8 +134,6 @@ def test_values_that_do_not_go_together_are_refused() -> None:
 
 
 def test_a_window_that_no_redis_would_take_is_refused() -> None:
-    config = with_value(
-        presets.robust(EnvConfig("InvertedPendulum-v5", time_limit=2**31)), "actor.state_strategy", "episode"
-    )
+    config = with_value(robust(EnvConfig("InvertedPendulum-v5", time_limit=2**31)), "actor.state_strategy", "episode")
     with pytest.raises(ConfigError, match=r"--time-limit=2147483648: .* more than 32 MiB"):
         config.window_spec()

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from common import agent, wrappers
 from docs import fault_table
 from docs.generate import page
-from learner import losses, staleness, update
+from rmc.common import agent
+from rmc.common.env import wrappers
+from rmc.learner import losses, staleness, update
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -71,7 +72,7 @@ def test_its_commands_run(tmp_path: Path) -> None:
     commands = re.findall(r"```sh\n(rmc .*)\n```", README)
     assert [command.split()[1] for command in commands] == ["train", "evaluate", "stats"]
     for command in commands:
-        words = [sys.executable, "-m", "deploy.cli", *command.split()[1:]]
+        words = [sys.executable, "-m", "rmc.cli.main", *command.split()[1:]]
         done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=280)
         assert done.returncode == 0, done.stdout + done.stderr
         assert done.stderr == ""
@@ -91,7 +92,7 @@ def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Pat
     said = []
     for command in commands:
         shorter = ["--preset", "debug", "--total-steps", "1500"] * command.startswith("rmc train")
-        words = [sys.executable, "-m", "deploy.cli", *command.split()[1:], *shorter]
+        words = [sys.executable, "-m", "rmc.cli.main", *command.split()[1:], *shorter]
         done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=280)
         assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
         said.append(done.stdout)
@@ -101,7 +102,7 @@ def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Pat
 
 
 def test_the_docs_name_options_that_exist() -> None:
-    made = subprocess.run([sys.executable, "-m", "deploy.cli", "train", "--help"], capture_output=True, text=True)
+    made = subprocess.run([sys.executable, "-m", "rmc.cli.main", "train", "--help"], capture_output=True, text=True)
     others = {"--listen", "--run", "--seconds", "--episodes", "--json", "--checkpoint", "--steps", "--out"}
     others |= {"--no-restart", "--node-ip-address", "--generate"}  # Ray's own
     others |= {"--folder", "--index", "--shard", "--secret-file"}  # the roles'

@@ -11,13 +11,13 @@ import psutil
 import pytest
 import redis
 
-from common.errors import ConfigError
-from deploy.redis_server import MAX_VALUE, RedisServer
+from rmc.common.errors import ConfigError
+from rmc.deploy.redis.server import MAX_VALUE, RedisServer
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from deploy.redis_server import RedisServer
+from rmc.deploy.redis.server import RedisServer
 server = RedisServer(Path(sys.argv[1]))
 server.start()
 print(server.process.pid, flush=True)

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 import redis
 
-from common.bus import Ack, EntryId, Holder, Version
-from common.errors import BusUnavailable, ConfigError
-from common.redis_bus import RedisBus
-from common.replay import Shard
-from deploy.redis_server import Port, RedisServer
-from deploy.redis_users import LAUNCHER, RedisUsers, actor_patterns
-from deploy.roles import connect
+from rmc.common.bus.protocol import Ack, EntryId, Holder, Version
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.errors import BusUnavailable, ConfigError
+from rmc.common.shard import Shard
+from rmc.deploy.redis.connect import connect
+from rmc.deploy.redis.server import Port, RedisServer
+from rmc.deploy.redis.users import LAUNCHER, RedisUsers, actor_patterns
 
 SECRET = b"of the run"
 USERS = RedisUsers("odd name*[1]é", SECRET, ("learner", "evaluator", "replay", "actor-0", "actor-1"))

@@ -5,14 +5,15 @@ from pathlib import Path
 import pytest
 import redis
 
-from common.bus import Ack, EntryId, Holder
-from common.envs import EnvConfig
-from common.errors import BusUnavailable
-from common.redis_bus import RedisBus
-from deploy import registration
-from deploy.presets import debug, from_json
-from deploy.registration import Registration
-from deploy.run_folder import RunFolder
+from rmc.common.bus.protocol import Ack, EntryId, Holder
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import BusUnavailable
+from rmc.deploy.redis import registration
+from rmc.deploy.redis.registration import Registration
+from rmc.deploy.run.config import from_json
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.presets import debug
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from deploy import rings
-from deploy.rings import Rings
-from deploy.run_folder import RunFolder
+from rmc.deploy.ray import ring_nodes
+from rmc.deploy.ray.ring_nodes import Rings
+from rmc.deploy.run.folder import RunFolder
 
 ROLES = ["replay-0", "replay-1", "replay-2"]
 
@@ -24,9 +24,9 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> None:
     alive = {"a": True, "b": True, "c": False}
     nodes = [{"NodeID": name, "Alive": up, "NodeManagerAddress": f"10.0.0.{name}"} for name, up in alive.items()]
     table: dict[str, Any] = {"bundles_to_node_id": {0: "a", 1: "d", 2: "b"}}
-    monkeypatch.setattr(rings.ray, "nodes", lambda: nodes)
-    monkeypatch.setattr(rings.ray, "wait", lambda *_, **__: None)
-    monkeypatch.setattr(rings, "placement_group_table", lambda _: table)
+    monkeypatch.setattr(ring_nodes.ray, "nodes", lambda: nodes)
+    monkeypatch.setattr(ring_nodes.ray, "wait", lambda *_, **__: None)
+    monkeypatch.setattr(ring_nodes, "placement_group_table", lambda _: table)
 
 
 def test_a_ring_is_where_it_was_noted_while_that_node_lives(tmp_path: Path) -> None:

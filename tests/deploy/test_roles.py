@@ -12,16 +12,17 @@ from pathlib import Path
 import pytest
 import redis
 
-from common.envs import EnvConfig
-from common.errors import ConfigError
-from common.redis_bus import RedisBus
-from common.role import StopSignal
-from deploy.presets import debug
-from deploy.redis_server import RedisServer
-from deploy.redis_users import RedisUsers
-from deploy.registration import Registration
-from deploy.roles import Patience, Place, Process, connect, wait_for_room
-from deploy.run_folder import RunFolder
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.common.process.role import StopSignal
+from rmc.deploy.local.roles import Place, Process, wait_for_room
+from rmc.deploy.redis.connect import Patience, connect
+from rmc.deploy.redis.registration import Registration
+from rmc.deploy.redis.server import RedisServer
+from rmc.deploy.redis.users import RedisUsers
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.presets import debug
 
 
 @pytest.fixture
@@ -130,5 +131,5 @@ def test_one_that_answers_that_it_is_full_is_there(short: Path) -> None:
 
         bus._redis.ping = full
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("deploy.roles.RedisBus", lambda url, run: bus)
+            patch.setattr("rmc.deploy.local.roles.RedisBus", lambda url, run: bus)
             assert connect(server.url(), "run") is bus

@@ -12,12 +12,13 @@ from threading import Barrier
 
 import pytest
 
-from common.envs import EnvConfig
-from common.errors import ConfigError
-from deploy.cli import run
-from deploy.history import of_run
-from deploy.presets import debug, to_json
-from deploy.run_folder import RESULT, RunFolder, open_run
+from rmc.analysis.history import of_run
+from rmc.cli.main import run
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import to_json
+from rmc.deploy.run.folder import RESULT, RunFolder, open_run
+from rmc.deploy.run.presets import debug
 
 
 def test_a_secret_is_made_once(tmp_path: Path) -> None:

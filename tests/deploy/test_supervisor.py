@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import RoleDied
-from deploy import supervisor
-from deploy.supervisor import RoleCommand, RoleProcess
+from rmc.common.errors import RoleDied
+from rmc.deploy.local import supervisor
+from rmc.deploy.local.supervisor import RoleCommand, RoleProcess
 
 
 @pytest.fixture

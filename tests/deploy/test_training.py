@@ -4,9 +4,10 @@ import json
 
 from rich.console import Console
 
-from common.checkpoint import CheckpointFolder
-from deploy import training
-from deploy.training import Placement, conduct
+from rmc.cli import training
+from rmc.cli.training import conduct
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.deploy.run.launch_options import Placement
 from tests.deploy.test_policy import AGENTS, make_run
 
 

@@ -7,15 +7,16 @@ from pathlib import Path
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
 
-from common.envs import EnvConfig, make_env
-from deploy import cli
-from deploy.video import _follow
+from rmc.analysis.video import _follow
+from rmc.cli import main
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import make_env
 from tests.deploy.test_policy import AGENTS, make_run
 
 
 def evaluate(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """In a process of its own: rendering leaves traces in one."""
-    command = [sys.executable, "-m", "deploy.cli", "evaluate", str(folder), "--episodes", "1", *words]
+    command = [sys.executable, "-m", "rmc.cli.main", "evaluate", str(folder), "--episodes", "1", *words]
     return subprocess.run(command, capture_output=True, text=True, timeout=170, check=False)
 
 
@@ -45,14 +46,14 @@ def test_the_camera_follows() -> None:
 def test_what_stands_in_the_way_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
     folder = str(make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5").path)
     words = ["evaluate", folder, "--episodes", "1", "--video"]
-    assert cli.run([*words, str(tmp_path / "no" / "episode.mp4")]) == 2
+    assert main.run([*words, str(tmp_path / "no" / "episode.mp4")]) == 2
     assert "its folder is not there" in capsys.readouterr().err
-    assert cli.run([*words, str(tmp_path)]) == 2
+    assert main.run([*words, str(tmp_path)]) == 2
     assert "is a folder" in capsys.readouterr().err
-    assert cli.run([*words, str(tmp_path / "episode.txt")]) == 2
+    assert main.run([*words, str(tmp_path / "episode.txt")]) == 2
     assert "ends in .mp4" in capsys.readouterr().err
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
-    assert cli.run([*words, str(tmp_path / "episode.mp4")]) == 2
+    assert main.run([*words, str(tmp_path / "episode.mp4")]) == 2
     said = capsys.readouterr().err
     assert "nothing here can render (nonsense: " in said
     assert "libegl1 or libosmesa6" in said
@@ -61,11 +62,11 @@ def test_what_stands_in_the_way_is_one_line(tmp_path: Path, capsys: pytest.Captu
 
 def test_a_grid_of_flicker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = str(make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5").path)
-    assert cli.run(["evaluate", folder, "--episodes", "2", "--flicker", "0", "0.5", "1"]) == 0
+    assert main.run(["evaluate", folder, "--episodes", "2", "--flicker", "0", "0.5", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 3
     assert "blank" not in lines[0]
     assert "with 50% of the frames blank: return" in lines[1]
     assert "with 100% of the frames blank: return" in lines[2]
-    assert cli.run(["evaluate", folder, "--flicker", "0", "2"]) == 2
+    assert main.run(["evaluate", folder, "--flicker", "0", "2"]) == 2
     assert "--flicker=2.0" in capsys.readouterr().err

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import msgpack
 
-from common.bus import MemoryBus
-from common.checksum import crc32
-from common.errors import MessageError
-from common.wire import HEADER, MAGIC, VERSION, Kind
-from common.wire import proof as proof_of
-from replay_server.server import ReplayConfig, ReplayServer
-from replay_server.socket_server import SocketServer
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.checksum import crc32
+from rmc.common.errors import MessageError
+from rmc.common.wire import HEADER, MAGIC, VERSION, Kind
+from rmc.common.wire import proof as proof_of
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.server import ReplayServer
+from rmc.replay_server.socket_server import SocketServer
 from tests.replay_server.support import SPEC, Sender
 
 SECRET, NONCE = b"of this run", b"n" * 32

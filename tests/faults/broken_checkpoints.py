@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from common.checkpoint import CheckpointFolder
+from rmc.common.checkpoint import CheckpointFolder
 from tests.faults.row import Row, at_length
 from tests.integration.running import Training
 
@@ -23,7 +23,7 @@ def break_checkpoints(tries: int, folder: Path) -> Iterator[Row]:
 def spoil_each(tries: int, place: CheckpointFolder, copy: Path) -> Row:
     """The newest of those, which lies in ``copy`` meanwhile."""
     chance, said = random.Random(0), Said()
-    logging.getLogger("common.checkpoint").addHandler(said)
+    logging.getLogger("rmc.common.checkpoint").addHandler(said)
     older, newest = place.numbers()[-2:]
     found = {"flipped": 0, "cut": 0, "older_used": 0, "said": 0}
     shutil.copytree(place.path(newest), copy)
@@ -38,7 +38,7 @@ def spoil_each(tries: int, place: CheckpointFolder, copy: Path) -> Row:
         found["said"] += len(said.lines) > lines
         shutil.rmtree(place.path(newest))
         shutil.copytree(copy, place.path(newest))
-    logging.getLogger("common.checkpoint").removeHandler(said)
+    logging.getLogger("rmc.common.checkpoint").removeHandler(said)
     whole = place.latest()
     passed = set(found.values()) == {tries, cuts, tries + cuts} and whole is not None and whole[0] == newest
     return Row("checkpoints with a flipped bit, or cut short", tries + cuts, passed, found={**found})

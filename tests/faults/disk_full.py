@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from common.checkpoint import CheckpointFolder
-from common.errors import CheckpointError
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import CheckpointError
 from tests.faults.kill_redis import LoggedRedis, logged_redis
 from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.row import Row, at_length

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 
-from deploy.nursery import URL_VARIABLE
+from rmc.deploy.local.role_environment import URL_VARIABLE
 from tests.faults.loaded import ROOMY, Loaded, went_back
 from tests.faults.row import Row, at_length
 from tests.integration.running import alive
@@ -79,7 +79,7 @@ def _runs(process: psutil.Process) -> bool:
 @contextmanager
 def _in_its_place(run: Loaded, role: str) -> Iterator[None]:
     """The same role once more; ends of itself when it is replaced in turn."""
-    words = [sys.executable, "-m", "deploy.cli", *_words(run, role)]
+    words = [sys.executable, "-m", "rmc.cli.main", *_words(run, role)]
     environment = {**os.environ, URL_VARIABLE: run.url_of(role)}
     with (run.folder.parent / f"other-{role}.log").open("ab") as log:
         other = subprocess.Popen(words, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log)

@@ -17,16 +17,27 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
-from actors.policy_runner import PolicyRunner
-from common.agent import Agent, AgentConfig
-from common.bus import join_pieces
-from common.checksum import crc32
-from common.envs import EnvConfig
-from common.errors import ConfigError, MessageError
-from common.record import decode_record, encode_record
-from common.wire import HEADER, Kind, check_rows, decode_header, decode_meta, decode_rows, encode_frame, encode_windows
-from deploy.presets import from_json, robust, to_json
-from replay_server.record import Progress, decode_published
+from rmc.actors.policy_runner import PolicyRunner
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.common.bus.metrics_record import decode_record, encode_record
+from rmc.common.bus.protocol import join_pieces
+from rmc.common.checksum import crc32
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError, MessageError
+from rmc.common.wire import (
+    HEADER,
+    Kind,
+    check_rows,
+    decode_header,
+    decode_meta,
+    decode_rows,
+    encode_frame,
+    encode_windows,
+)
+from rmc.deploy.run.config import from_json, to_json
+from rmc.deploy.run.presets import robust
+from rmc.replay_server.record import Progress, decode_published
 from tests.faults.asked import LAWFUL_PROOF, Asked
 from tests.faults.row import Row, at_length
 from tests.replay_server.support import SPEC, make_rows

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from common.bus import EntryId
-from common.window import Rows
-from deploy.run_folder import RunFolder
-from replay_server.recovery import open_store
+from rmc.common.bus.protocol import EntryId
+from rmc.common.window import Rows
+from rmc.deploy.run.folder import RunFolder
+from rmc.replay_server.recovery import open_store
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.run_folder import RunFolder
-from replay_server.recovery import open_store
+from rmc.deploy.run.folder import RunFolder
+from rmc.replay_server.recovery import open_store
 from tests.faults.loaded import ACTORS, Loaded
 from tests.faults.row import Row, at_length
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from common.checkpoint import CheckpointFolder
-from deploy.run_folder import RunFolder
-from replay_server.recovery import open_store
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.deploy.run.folder import RunFolder
+from rmc.replay_server.recovery import open_store
 from tests.faults.judge import judge
 from tests.faults.loaded import ROOMY, Acks, Loaded, went_back
 from tests.faults.row import Row, at_length

@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from common.checkpoint import CheckpointFolder
+from rmc.common.checkpoint import CheckpointFolder
 from tests.faults.loaded import ROOMY, Loaded, went_back
 from tests.faults.row import Row, at_length
 

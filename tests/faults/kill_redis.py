@@ -10,7 +10,7 @@ from pathlib import Path
 
 import redis
 
-from deploy.redis_server import server_binary
+from rmc.deploy.redis.server import server_binary
 from tests.faults.loaded import Loaded, went_back
 from tests.faults.row import Row, at_length
 

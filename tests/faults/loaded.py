@@ -14,12 +14,12 @@ from typing import Any
 
 import psutil
 
-from common.bus import EntryId, Version
-from common.errors import BusUnavailable
-from common.redis_bus import RedisBus
-from deploy.presets import from_json
-from deploy.redis_users import LAUNCHER, RedisUsers
-from deploy.run_folder import RunFolder
+from rmc.common.bus.protocol import EntryId, Version
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.errors import BusUnavailable
+from rmc.deploy.redis.users import LAUNCHER, RedisUsers
+from rmc.deploy.run.config import from_json
+from rmc.deploy.run.folder import RunFolder
 from tests.faults.judge import Judgement, judge, newest
 from tests.integration.running import START_SECONDS, Training
 

@@ -7,9 +7,8 @@ from typing import Any
 
 import torch
 
-from common.checkpoint import CheckpointFolder
-from deploy.supervisor import QUICK_DEATHS
-from learner.learner import STATE
+from rmc.common.checkpoint import STATE, CheckpointFolder
+from rmc.deploy.local.supervisor import QUICK_DEATHS
 from tests.faults.judge import judge
 from tests.faults.loaded import ROOMY, Loaded, went_back
 from tests.faults.row import Row, at_length

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import mode
 
-from common.bus import METRICS_KEPT
+from rmc.common.bus.protocol import METRICS_KEPT
 from tests.faults.loaded import ACTORS, Loaded
 from tests.faults.row import Row, at_length
 from tests.faults.soak import MOST_GROWTH, memory_growth, watch

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from common.window import Rows
+from rmc.common.window import Rows
 from tests.faults.judge import _doubled, _lost, _older
 from tests.replay_server.support import SPEC, make_rows
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from common.checkpoint import CheckpointFolder
+from rmc.common.checkpoint import CheckpointFolder
 from tests.faults.broken_checkpoints import spoil_each
 from tests.faults.clock import HOURS, hours_away, other_clock, set_clock
 from tests.faults.disk_full import cannot_log, filled, goes_on_unsaved, small_disk

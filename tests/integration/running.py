@@ -35,7 +35,7 @@ class Training:
         words = [
             sys.executable,
             "-m",
-            "deploy.cli",
+            "rmc.cli.main",
             "train",
             env,
             "--preset",

@@ -22,7 +22,7 @@ RESULT_KEYS = {
 
 
 def rmc(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "deploy.cli", *words], capture_output=True, text=True, timeout=100)
+    return subprocess.run([sys.executable, "-m", "rmc.cli.main", *words], capture_output=True, text=True, timeout=100)
 
 
 def test_train_evaluate_stats_and_resume(tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_roles_by_hand_over_tcp(told: str, redis_url: str, run_name: str, tmp_pa
             for word, place in places.items():
                 words = words.replace(word, place)
             log = stack.enter_context((tmp_path / f"{words.split()[0]}.log").open("wb"))
-            line = [sys.executable, "-m", "deploy.cli", *words.split()]
+            line = [sys.executable, "-m", "rmc.cli.main", *words.split()]
             roles.append(subprocess.Popen(line, env=environment, stdout=subprocess.DEVNULL, stderr=log))
         for role in roles:
             stack.callback(role.wait)

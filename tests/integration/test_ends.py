@@ -60,7 +60,7 @@ gymnasium.register("Broken-v0", Broken, max_episode_steps=100)
 def test_a_run_is_watched_and_stopped_from_another_terminal(tmp_path: Path) -> None:
     with Training(tmp_path / "run", "--total-steps", "10000000") as training:
         training.wait_for_updates()
-        words = [sys.executable, "-m", "deploy.cli"]
+        words = [sys.executable, "-m", "rmc.cli.main"]
         with subprocess.Popen([*words, "attach", str(tmp_path / "run")], stdout=subprocess.PIPE, text=True) as watcher:
             assert watcher.stdout is not None
             assert watcher.stdout.readline().startswith("steps ")

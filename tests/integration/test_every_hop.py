@@ -14,15 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.actor import ActorConfig
-from common.bus import Version
-from common.envs import EnvConfig
-from common.redis_bus import RedisBus
-from common.replay import Draw
-from deploy.evaluation import initial_policy
-from deploy.presets import debug, to_json
-from learner.replay_client import ReplayClient
-from replay_server.server import ReplayConfig
+from rmc.actors.config import ActorConfig
+from rmc.analysis.evaluation import initial_policy
+from rmc.common.bus.protocol import Version
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.env.config import EnvConfig
+from rmc.common.replay import Draw
+from rmc.deploy.run.config import to_json
+from rmc.deploy.run.presets import debug
+from rmc.learner.replay_client import ReplayClient
+from rmc.replay_server.config import ReplayConfig
 from tests.counting_env import Step, audit
 
 SECONDS = 90.0
@@ -59,7 +60,7 @@ def client(bus: RedisBus, redis_url: str, run_name: str, tmp_path: Path) -> Iter
         str(tmp_path / "secret"),
     ]
     roles = [["replay", *place, *listen], *(["actor", *place, "--index", str(index)] for index in range(CONFIG.actors))]
-    processes = [subprocess.Popen([sys.executable, "-m", "deploy.cli", *words], env=os.environ) for words in roles]
+    processes = [subprocess.Popen([sys.executable, "-m", "rmc.cli.main", *words], env=os.environ) for words in roles]
     found = ReplayClient(lambda: f"unix:{tmp_path}/s", b"every hop", CONFIG.window_spec(), BATCH)
     found.introduce(bus.current_epoch("learner"))  # only the newest learner is served
     yield found

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from deploy.evaluation import evaluate_checkpoint
-from deploy.run_folder import RunFolder
+from rmc.analysis.evaluation import evaluate_checkpoint
+from rmc.deploy.run.folder import RunFolder
 from tests.integration.running import Training
 from tests.memory_env import SOLVED_RETURN
 

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from common.envs import EnvConfig
-from deploy.lockstep import Lockstep
-from deploy.presets import RunConfig, debug
-from learner.learner import LearnerConfig
-from replay_server.server import ReplayConfig
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.local.lockstep import Lockstep
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.presets import debug
+from rmc.learner.config import LearnerConfig
+from rmc.replay_server.config import ReplayConfig
 
 CONFIG = dataclasses.replace(
     debug(EnvConfig("InvertedPendulum-v5")),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import psutil
 
-from deploy.redis_server import RedisServer
+from rmc.deploy.redis.server import RedisServer
 from tests.integration.running import Training
 
 ENV_TIMEOUT = 2.0

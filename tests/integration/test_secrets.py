@@ -9,9 +9,9 @@ from pathlib import Path
 
 import psutil
 
-from deploy.redis_server import server_binary
-from deploy.redis_users import LAUNCHER, RedisUsers
-from deploy.run_folder import RunFolder
+from rmc.deploy.redis.server import server_binary
+from rmc.deploy.redis.users import LAUNCHER, RedisUsers
+from rmc.deploy.run.folder import RunFolder
 from tests.integration.running import Training
 from tests.integration.telling_env import TELLS
 

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from common.bus import MemoryBus
-from common.replay import Draw, Shard
-from learner.batch import importance_weights
-from learner.sharded_replay import ShardedReplay
-from replay_server.server import ReplayConfig, ReplayServer
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.replay import Draw
+from rmc.common.shard import Shard
+from rmc.learner.batch import importance_weights
+from rmc.learner.sharded_replay import ShardedReplay
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.server import ReplayServer
 from tests.integration.running import Training
 from tests.replay_server.support import SPEC, Sender
 

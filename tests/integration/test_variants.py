@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 
-from common.envs import EnvConfig
-from common.errors import ConfigError
-from deploy.lockstep import Lockstep
-from deploy.presets import RunConfig, debug, validate
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.local.lockstep import Lockstep
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.presets import debug
+from rmc.deploy.run.validation import validate
 
 STEPS, WARMUP = 500, 200
 

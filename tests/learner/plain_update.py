@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from common.agent import Agent, Memory
-from learner.update import UpdateConfig
+from rmc.common.agent import Agent, Memory
+from rmc.learner.config import UpdateConfig
 
 REACHES_MEMORY = {1: "MV", 2: "V", 3: "M", 4: "MVP", 5: "MP", 6: "VP"}  # model, value, policy: table 1 of the paper
 ALTERNATE = (("MG", "world_model"), ("F", "next_frame"), ("V", "critic"), ("P", "policy"), ("T", None))

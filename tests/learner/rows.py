@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from common.window import Rows, WindowSpec
-from learner.batch import Batch, clear_padding, view_batch
+from rmc.common.window import Rows, WindowSpec
+from rmc.learner.batch import Batch, clear_padding, view_batch
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=5)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from learner.batch import clear_padding, importance_weights
+from rmc.learner.batch import clear_padding, importance_weights
 from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
 
 
@@ -38,7 +38,7 @@ def test_previous_action_of_the_first_real_step_is_the_stored_one():
 
 
 def test_row_is_a_multiple_of_a_cache_line_and_the_fingerprint_follows_the_sizes():
-    from common.window import WindowSpec
+    from rmc.common.window import WindowSpec
 
     assert SPEC.dtype.itemsize % 64 == 0
     others = [WindowSpec(4, 2, 8, 4, 5), WindowSpec(3, 2, 8, 3, 6)]

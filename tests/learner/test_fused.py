@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from common.agent import Agent, AgentConfig
-from learner import kernels
-from learner.fused import FusedGRU, FusedHead, FusedTwinQ, fuse
-from learner.update import UpdateConfig, make_update
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.learner import kernels
+from rmc.learner.config import UpdateConfig
+from rmc.learner.fused import FusedGRU, FusedHead, FusedTwinQ, fuse
+from rmc.learner.update import make_update
 from tests.learner.rows import SPEC, random_rows, to_batch
 
 B, T = 6, 5

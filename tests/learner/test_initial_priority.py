@@ -8,10 +8,12 @@ import pytest
 import safetensors.torch
 import torch
 
-from common.agent import Agent, AgentConfig, HeadInput
-from common.errors import MessageError
-from learner.initial_priority import InitialPriority
-from learner.update import UpdateConfig, make_update
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig, HeadInput
+from rmc.common.errors import MessageError
+from rmc.learner.config import UpdateConfig
+from rmc.learner.initial_priority import InitialPriority
+from rmc.learner.update import make_update
 from tests.hostile import hostile_state
 from tests.learner.rows import SPEC, random_rows, to_batch
 

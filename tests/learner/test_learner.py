@@ -7,14 +7,17 @@ import pytest
 import safetensors.torch
 import torch
 
-from common.agent import AgentConfig
-from common.bus import EntryId, MemoryBus
-from common.checkpoint import CheckpointFolder
-from common.errors import CheckpointError, FencedError, RmcError
-from common.wire import encode_hello, encode_windows
-from learner.learner import Learner, LearnerConfig, is_finite, latent_rank
-from learner.update import AVERAGE_UPDATES, UpdateConfig
-from replay_server.server import ReplayConfig, ReplayServer
+from rmc.common.agent_config import AgentConfig
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.protocol import EntryId
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import CheckpointError, FencedError, RmcError
+from rmc.common.wire import encode_hello, encode_windows
+from rmc.learner.config import LearnerConfig, UpdateConfig
+from rmc.learner.learner import Learner, is_finite, latent_rank
+from rmc.learner.update import AVERAGE_UPDATES
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.server import ReplayServer
 from tests.hostile import hostile_state
 from tests.learner.rows import SPEC, random_rows
 

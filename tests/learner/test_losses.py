@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from common.agent import squashed_sample
-from learner import losses
+from rmc.common.agent import squashed_sample
+from rmc.learner import losses
 
 B, T, H, OBS, A = 4, 5, 6, 3, 2
 

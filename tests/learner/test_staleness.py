@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from common.agent import Agent, AgentConfig
-from common.window import Rows, WindowSpec
-from learner.staleness import measurable, staleness
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.common.window import Rows, WindowSpec
+from rmc.learner.staleness import measurable, staleness
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=5)
 UNBURNED = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=0, train=5)

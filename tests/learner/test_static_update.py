@@ -12,11 +12,13 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from common.agent import Agent, AgentConfig
-from learner.batch import clear_padding, view_batch
-from learner.cuda_graph import WARM_UP, CopiesAhead, CudaGraph, HostCopy
-from learner.static_update import StaticUpdate
-from learner.update import JointUpdate, UpdateConfig, make_update
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.learner.batch import clear_padding, view_batch
+from rmc.learner.config import UpdateConfig
+from rmc.learner.cuda_graph import WARM_UP, CopiesAhead, CudaGraph, HostCopy
+from rmc.learner.static_update import StaticUpdate
+from rmc.learner.update import JointUpdate, make_update
 from tests.learner.rows import SPEC, random_rows
 
 EVERYTHING = AgentConfig(

@@ -9,9 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from common.agent import Agent, AgentConfig
-from learner import losses
-from learner.update import TRAINS_MEMORY, JointUpdate, UpdateConfig, make_update, remember
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.learner import losses
+from rmc.learner.config import UpdateConfig
+from rmc.learner.unroll import remember
+from rmc.learner.update import TRAINS_MEMORY, JointUpdate, make_update
 from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
 
 ROBUST = AgentConfig(

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from common.agent import Agent, AgentConfig
-from learner.update import UpdateConfig, make_update
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.learner.config import UpdateConfig
+from rmc.learner.update import make_update
 from tests.learner.plain_update import PlainUpdate
 from tests.learner.rows import SPEC, random_rows, to_batch
 

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from common.bus import Bus, MemoryBus
-from replay_server.server import ReplayConfig, ReplayServer
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.protocol import Bus
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.server import ReplayServer
 from tests.replay_server.support import OPEN, SPEC, Make, close
 
 

@@ -3,12 +3,13 @@
 import sys
 from pathlib import Path
 
-from common.redis_bus import RedisBus
-from common.role import StopSignal, run_role
-from replay_server import intake
-from replay_server.process import ReplayProcess
-from replay_server.server import ReplayConfig, ReplayServer
-from replay_server.socket_server import SocketServer
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.process.role import StopSignal, run_role
+from rmc.replay_server import intake
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.process import ReplayProcess
+from rmc.replay_server.server import ReplayServer
+from rmc.replay_server.socket_server import SocketServer
 from tests.replay_server.support import SPEC
 
 SECRET = b"the run's secret"

@@ -4,10 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from common.bus import Bus, EntryId
-from common.window import Rows, WindowSpec
-from common.wire import encode_hello, encode_windows
-from replay_server.server import ReplayConfig, ReplayServer
+from rmc.common.bus.protocol import Bus, EntryId
+from rmc.common.window import Rows, WindowSpec
+from rmc.common.wire import encode_hello, encode_windows
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.server import ReplayServer
 
 Make = Callable[..., ReplayServer]
 OPEN = ReplayConfig(capacity=100, replay_ratio=1e6, warmup_steps=0)  # the limiter never holds anything back

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.window import Rows
-from replay_server import episode
-from replay_server.episode import find_episode
-from replay_server.ring import Ring
+from rmc.common.window import Rows
+from rmc.replay_server import episode
+from rmc.replay_server.episode import find_episode
+from rmc.replay_server.ring import Ring
 from tests.replay_server.support import SPEC, make_rows
 
 ENVS = [(0, 1, 0), (0, 1, 1), (1, 1, 0), (0, 2, 0)]  # actor, epoch, env

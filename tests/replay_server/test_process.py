@@ -10,16 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.errors import BusUnavailable, FencedError
-from common.redis_bus import TIMEOUT_SECONDS, RedisBus
-from common.replay import Draw
-from common.role import StopSignal, run_role
-from deploy.redis_server import RedisServer
-from learner.replay_client import ReplayClient
-from replay_server import process
-from replay_server.process import ReplayProcess
-from replay_server.server import ReplayConfig, ReplayServer
-from replay_server.socket_server import SocketServer
+from rmc.common.bus.redis_bus import TIMEOUT_SECONDS, RedisBus
+from rmc.common.errors import BusUnavailable, FencedError
+from rmc.common.process.role import StopSignal, run_role
+from rmc.common.replay import Draw
+from rmc.deploy.redis.server import RedisServer
+from rmc.learner.replay_client import ReplayClient
+from rmc.replay_server import process
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.process import ReplayProcess
+from rmc.replay_server.server import ReplayServer
+from rmc.replay_server.socket_server import SocketServer
 from tests.replay_server.support import SPEC, Sender
 
 SECRET = b"the run's secret"

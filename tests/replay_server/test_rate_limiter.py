@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.replay import Draw
-from replay_server.rate_limiter import RateLimiter
+from rmc.common.replay import Draw
+from rmc.replay_server.rate_limiter import RateLimiter
 
 TRAIN = 5
 

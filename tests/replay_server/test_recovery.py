@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.errors import ConfigError
-from common.redis_bus import RedisBus
-from common.replay import Draw
-from learner.replay_client import ReplayClient
-from replay_server.recovery import ReplayStore, open_store, valid_leaves
-from replay_server.sum_tree import SumTree
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.errors import ConfigError
+from rmc.common.replay import Draw
+from rmc.learner.replay_client import ReplayClient
+from rmc.replay_server.recovery import ReplayStore, open_store, valid_leaves
+from rmc.replay_server.sum_tree import SumTree
 from tests.replay_server.replay_child import ACTORS, SECRET
 from tests.replay_server.support import SPEC, Sender, make_rows
 

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.bus import EntryId
-from common.errors import ConfigError
-from common.window import WindowSpec
-from replay_server.record import Progress, StreamPosition, decode_progress, record_bytes
-from replay_server.ring import Ring
+from rmc.common.bus.protocol import EntryId
+from rmc.common.errors import ConfigError
+from rmc.common.window import WindowSpec
+from rmc.replay_server.record import Progress, StreamPosition, decode_progress, record_bytes
+from rmc.replay_server.ring import Ring
 from tests.replay_server.support import SPEC, make_rows
 
 RECORDS_START = 4096

@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common.bus import Bus, EntryId, MemoryBus, Version
-from common.errors import BusUnavailable, ConfigError, FencedError
-from common.redis_bus import RedisBus
-from common.replay import Draw
-from common.wire import encode_windows
-from replay_server.observation_sums import observation_sums
-from replay_server.server import ReplayConfig, ReplayServer
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.protocol import Bus, EntryId, Version
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.errors import BusUnavailable, ConfigError, FencedError
+from rmc.common.replay import Draw
+from rmc.common.wire import encode_windows
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.observation_sums import observation_sums
+from rmc.replay_server.server import ReplayServer
 from tests.learner.rows import observation_valid
 from tests.replay_server.support import SPEC, Make, Sender, close, drain, make_rows, stored
 

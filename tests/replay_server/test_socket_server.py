@@ -16,15 +16,16 @@ import numpy as np
 import psutil
 import pytest
 
-from common.bus import MemoryBus
-from common.errors import AuthenticationError, ConfigError, FencedError, MessageError, RmcError
-from common.replay import Draw, Sample
-from common.shared_batches import TURNS
-from common.wire import HEADER, MAGIC, VERSION, Kind, decode_header, decode_meta, encode_frame, proof
-from learner.replay_client import Connection, ReplayClient
-from replay_server import socket_server
-from replay_server.server import ReplayConfig, ReplayServer
-from replay_server.socket_server import SocketServer
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.errors import AuthenticationError, ConfigError, FencedError, MessageError, RmcError
+from rmc.common.replay import Draw, Sample
+from rmc.common.shared_batches import TURNS
+from rmc.common.wire import HEADER, MAGIC, VERSION, Kind, decode_header, decode_meta, encode_frame, proof
+from rmc.learner.replay_client import Connection, ReplayClient
+from rmc.replay_server import socket_server
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.server import ReplayServer
+from rmc.replay_server.socket_server import SocketServer
 from tests.replay_server.support import SPEC, Sender, make_rows
 
 SECRET = b"a secret of the run"

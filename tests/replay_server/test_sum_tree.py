@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from replay_server.sum_tree import SumTree
+from rmc.replay_server.sum_tree import SumTree
 
 
 @settings(max_examples=60, deadline=None)

@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.bus import Bus, EntryId, MemoryBus
-from common.errors import ConfigError, FencedError
-from common.redis_bus import RedisBus
-from common.replay import Draw
-from replay_server.recovery import valid_leaves
-from replay_server.server import ReplayConfig
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.protocol import Bus, EntryId
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.errors import ConfigError, FencedError
+from rmc.common.replay import Draw
+from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.recovery import valid_leaves
 from tests.replay_server.support import Make, Sender, close, drain, make_rows, stored
 
 

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 import studies
-from common.errors import ConfigError
-from deploy import history, options
-from deploy.presets import validate
-from deploy.run_folder import RESULT, RunFolder
+from rmc.analysis import history
+from rmc.cli import options
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.folder import RESULT, RunFolder
+from rmc.deploy.run.validation import validate
 from studies import averaging, generalisation, study
 from studies.study import Play, Scale, Study
 

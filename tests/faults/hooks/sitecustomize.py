@@ -57,13 +57,13 @@ def after(owner: Any, method: str, fault: str) -> None:
 
 def replay_server() -> None:
     """Every point between a read and its ack."""
-    from common.redis_bus import RedisBus
-    from replay_server.intake import Intake
-    from replay_server.record import _HEADER, RecordPair
-    from replay_server.recovery import ReplayStore, valid_leaves
-    from replay_server.ring import Ring
-    from replay_server.server import ReplayServer
-    from replay_server.sum_tree import SumTree
+    from rmc.common.bus.redis_bus import RedisBus
+    from rmc.replay_server.intake import Intake
+    from rmc.replay_server.record import _HEADER, RecordPair
+    from rmc.replay_server.recovery import ReplayStore, valid_leaves
+    from rmc.replay_server.ring import Ring
+    from rmc.replay_server.server import ReplayServer
+    from rmc.replay_server.sum_tree import SumTree
 
     write, commit, record = Ring.write, Ring.commit, RecordPair.write
     step, read = ReplayServer.step, Intake.read
@@ -125,9 +125,10 @@ def learner() -> None:
     """Amid saving; what it resumes from; a loss that is no number; slow updates."""
     import torch
 
-    from common import checkpoint
-    from learner.learner import STATE, Learner
-    from learner.static_update import StaticUpdate
+    from rmc.common import checkpoint
+    from rmc.common.checkpoint import STATE
+    from rmc.learner.learner import Learner
+    from rmc.learner.static_update import StaticUpdate
 
     write, resume, update = checkpoint._write, Learner._resume, StaticUpdate.__call__
 
@@ -174,7 +175,7 @@ def _same(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
-if "deploy.nursery" in sys.orig_argv:
+if "rmc.cli.fork_server" in sys.orig_argv:
     replay_server()
 elif "learner" in sys.orig_argv:
     learner()

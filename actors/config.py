@@ -1,0 +1,35 @@
+"""How actors and the evaluator are configured."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class EvaluatorConfig:
+    """How a policy is judged."""
+
+    episodes: int = 5
+    """Episodes per evaluation, played side by side with the policy's mean."""
+
+
+@dataclass(frozen=True)
+class ActorConfig:
+    """How an actor collects."""
+
+    envs_per_actor: int = 4
+    """N, environments of one actor; more of them share one forward pass."""
+    stride: int = 0
+    """Steps between the starts of two windows; fewer than are trained let them overlap; 0 is as many, no overlap."""
+    state_strategy: Literal["zero", "stored", "burn-in", "episode"] = "burn-in"
+    """What a window's memory starts from: zeros; the state that the actor stored; that state, then burned in; or
+    zeros at the start of the episode, all of which is the window, as long as the time limit allows."""
+    reward_scale: float = 1.0
+    """Rewards are multiplied by this to learn from; returns are told as the environment gives them."""
+    refresh_steps: int = 400
+    """Environment steps of an actor between two looks at the newest weights."""
+    chunk_windows: int = 16
+    """Windows sent in one entry."""
+    chunk_seconds: float = 0.5
+    """A chunk that is not full is sent after so long."""
+    unacked_bytes: int = 64 << 20
+    """Most bytes kept to be sent again; the actor waits when they are reached."""

@@ -1,0 +1,339 @@
+"""``rmc baseline``: stable-baselines3's agents, trained on our environments and judged by our evaluator.
+
+The run's folder looks like that of ``rmc train``, so that ``rmc plot`` reads both. Imported only where the extra
+``baselines`` is installed. Shapes: N environments, O observation, A action.
+"""
+
+import dataclasses
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+
+from rmc.actors.evaluator import first_start, play_episodes
+from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, read, validate
+from rmc.analysis.evaluation import FINAL_EPISODES
+from rmc.common.env.make import first_env, make_env
+from rmc.common.env.wrappers import Floats
+from rmc.common.errors import ConfigError
+from rmc.common.process.role import StopSignal
+from rmc.deploy.run.folder import RunFolder, make, read_object, write_whole
+
+CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
+STOPPED = 130  # exit status after Ctrl-C, as shells have it
+SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
+RECORD_SECONDS = 5.0
+MODEL, BUFFER, SCALES, PROGRESS = "model.zip", "replay_buffer.pkl", "scales.pkl", "progress.json"
+
+
+def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: StopSignal) -> int:
+    """Train to the end, or to a stop signal; the exit status. Raises ConfigError before anything is written."""
+    validate(config)
+    first_env(config.env).close()
+    folder = _open_folder(config, run_dir)
+    try:
+        _set_torch(config)
+        console.print(f"run folder {folder.path}", soft_wrap=True)
+        return _conduct(config, folder, console, stop)
+    finally:
+        folder.unlock()
+
+
+def _set_torch(config: BaselineConfig) -> None:
+    """What an action's last bits depend on, the same to train and to evaluate."""
+    torch.set_num_threads(config.threads)
+    torch.set_flush_denormal(True)  # as our learner does
+
+
+def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: StopSignal) -> int:
+    with closing(_Run(config, folder, console)) as run:
+        run.train(stop)
+        if stop.requested:
+            words = f"the same command with --run-dir {folder.path} goes on"
+            console.print(f"stopped at environment step {run.steps:,}; {words}", soft_wrap=True)
+            return STOPPED
+        result = run.result()
+    folder.write_result(result)
+    mean, deviation = result["eval_return_mean"], result["eval_return_std"]
+    console.print(f"after training: return {mean:,.1f} ± {deviation:,.1f}; {folder.result_file}")
+    return 0
+
+
+def _open_folder(config: BaselineConfig, run_dir: Path | None) -> RunFolder:
+    """Make or take up a run's folder, locked, as ``open_run``. Raises ConfigError."""
+    env = config.env.id.replace(":", "_").replace("/", "_")
+    name = f"{env}__{config.algorithm}-{config.settings}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+    folder = RunFolder(run_dir or Path("runs") / name)
+    about, now = folder.path / "config.json", json.loads(json.dumps(asdict(config)))
+    if about.exists() and folder.is_baseline():
+        was = folder.settings()
+        for key in now:
+            if key not in ("total_steps", "threads") and was.get(key) != now[key]:
+                fix = f"the run in {folder.path} has {was.get(key)!r}; use that, or another --run-dir"
+                raise ConfigError(f"--{key.replace('_', '-')}", now[key], fix)
+    elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
+        raise ConfigError("--run-dir", str(folder.path), "is there and is no baseline's; give another one")
+    make(folder)
+    folder.lock()
+    folder.reopen(config.total_steps)
+    write_whole(about, f"{json.dumps(now, indent=2)}\n".encode())
+    for left in set(folder.checkpoints.glob("[0-9]*")) - set(_states(folder)):  # by a crash amid a save
+        shutil.rmtree(left)
+    return folder
+
+
+def _states(folder: RunFolder) -> list[Path]:
+    """What can be gone on with, whole, oldest first."""
+    return [path.parent for path in sorted(folder.checkpoints.glob(f"*/{PROGRESS}"))]
+
+
+@contextmanager
+def _reading(state: Path) -> Iterator[None]:
+    """Raises ConfigError where a state is not as it was saved."""
+    try:
+        yield
+    except Exception as error:  # zipfile, pickle and torch raise several unrelated classes
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ConfigError("RUN", str(state), f"cannot be read ({reason}); restore it, or train another run") from None
+
+
+def _grow(buffer: ReplayBuffer, size: int) -> None:
+    """Room for so many steps, where it has less; what is in it stays."""
+    if size <= buffer.buffer_size:
+        return
+    if buffer.full:
+        buffer.pos, buffer.full = buffer.buffer_size, False
+    for name, array in list(vars(buffer).items()):
+        if isinstance(array, np.ndarray):
+            more = np.zeros((size, *array.shape[1:]), array.dtype)
+            more[: len(array)] = array
+            setattr(buffer, name, more)
+    buffer.buffer_size = size
+
+
+class Opponent:
+    """A model as our evaluator plays an agent; its memory, if it has one, is kept in here."""
+
+    def __init__(self, model: Any, scaled: Callable[[Floats], Floats], envs: int) -> None:
+        self._model, self._scaled, self._envs = model, scaled, envs
+        self._state: Any = None
+        self._begins = np.ones(envs, np.bool_)
+
+    def start(self) -> tuple[Floats, Floats]:
+        """Previous actions (N, A), and in place of a state (N, 0), at the start of episodes."""
+        self._state, self._begins = None, np.ones(self._envs, np.bool_)
+        sizes = (*self._model.action_space.shape, 0)
+        actions, nothing = (np.zeros((self._envs, size), np.float32) for size in sizes)
+        return actions, nothing
+
+    def act(
+        self, observation: Floats, _prev_action: Floats, _blank: NDArray[np.bool_], state: Floats, _: Floats | None
+    ) -> tuple[Floats, Floats]:
+        """(N, O) -> (N, A), as ``PolicyRunner.act``; of the rest nothing is used."""
+        seen = self._scaled(observation)
+        action, self._state = self._model.predict(seen, self._state, self._begins, deterministic=True)
+        self._begins = np.zeros(self._envs, np.bool_)
+        return action.astype(np.float32), state
+
+
+class _Run(BaseCallback):
+    """A model between its environment and its folder: evaluates, records, saves, stops."""
+
+    def __init__(self, config: BaselineConfig, folder: RunFolder, console: Console) -> None:
+        super().__init__()
+        self.config, self.folder, self._console = config, folder, console
+        choice = choose(config.algorithm, config.settings, config.env.id)
+        self._vec, self._model = self._load(choice)
+        self._began, self._wall_before = time.monotonic(), folder.wall_seconds()
+        self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, 0.0
+        self._next_evaluation = self._after(self.steps)
+        self._initial = self._first_evaluation()
+        self._metrics = folder.metrics.open("a", buffering=1)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return int(self._model.num_timesteps)
+
+    @property
+    def updates(self) -> int:
+        """Gradient steps so far."""
+        return int(self._model._n_updates)
+
+    # -- the model --------------------------------------------------------------------------------------
+
+    def _load(self, choice: Choice) -> tuple[VecEnv, Any]:
+        """As it was saved last, or new."""
+        config, at, kind = self.config, _states(self.folder)[-1:], CLASSES[self.config.algorithm]
+        vec: VecEnv = DummyVecEnv([lambda: Monitor(make_env(config.env))])
+        if at:
+            with _reading(at[0]):
+                vec = VecNormalize.load(str(at[0] / SCALES), vec) if choice.normalize else vec
+                model = kind.load(at[0] / MODEL, env=vec, device="cpu")
+                if config.algorithm in OFF_POLICY:
+                    with (at[0] / BUFFER).open("rb") as file:
+                        model.load_replay_buffer(file)
+                    _grow(model.replay_buffer, self._buffer_size)
+            vec.seed(config.seed + model.num_timesteps)  # not the episodes that it has had
+            return vec, model
+        if choice.normalize:
+            vec = VecNormalize(vec, gamma=float(choice.arguments.get("gamma", 0.99)))
+        return vec, kind(_policy(config), vec, **self._arguments(choice, vec), seed=config.seed, device="cpu")
+
+    @property
+    def _buffer_size(self) -> int:
+        return min(1_000_000, self.config.total_steps)  # as large as it can ever be of use
+
+    def _arguments(self, choice: Choice, vec: VecEnv) -> dict[str, Any]:
+        network = dict(choice.network) | ({"activation_fn": torch.nn.ReLU} if choice.relu else {})
+        found = dict(choice.arguments) | ({"policy_kwargs": network} if network else {})
+        if self.config.algorithm in OFF_POLICY:
+            found["buffer_size"] = self._buffer_size
+        if choice.noise:
+            size = vec.action_space.shape or (1,)
+            found["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, choice.noise))
+        return found
+
+    def _save(self) -> None:
+        """Beside the last one, which goes once this is whole; its progress, written last, says that."""
+        at, before = self.folder.checkpoints / f"{self.steps:012d}", _states(self.folder)
+        if before[-1:] == [at]:
+            return
+        at.mkdir(exist_ok=True)
+        self._model.save(at / MODEL)
+        if self.config.algorithm in OFF_POLICY:
+            self._model.save_replay_buffer(at / BUFFER)
+        if isinstance(self._vec, VecNormalize):
+            self._vec.save(str(at / SCALES))
+        write_whole(at / PROGRESS, json.dumps({"env_steps": self.steps, "updates": self.updates}).encode())
+        for old in before:
+            shutil.rmtree(old)
+        self._save_at = time.monotonic() + SAVE_SECONDS
+
+    # -- training ---------------------------------------------------------------------------------------
+
+    def train(self, stop: StopSignal) -> None:
+        """To the end or the signal; what is not saved then is saved."""
+        self._stop = stop
+        missing = self.config.total_steps - self.steps
+        if missing > 0:
+            self._model.learn(missing, self, reset_num_timesteps=False, log_interval=None)
+        self._save()
+        self._write_progress()
+
+    def close(self) -> None:
+        """Close files and environments."""
+        self._metrics.close()
+        self._vec.close()
+
+    def _on_step(self) -> bool:
+        now = time.monotonic()
+        if now >= self._record_at:
+            self._record_at = now + RECORD_SECONDS
+            self._write_progress()
+        if self.num_timesteps >= self._next_evaluation:
+            self._next_evaluation = self._after(self.num_timesteps)
+            self._evaluate()
+            if now >= self._save_at:
+                self._save()
+        return not self._stop.requested
+
+    def _after(self, steps: int) -> int:
+        return (steps // self.config.checkpoint_steps + 1) * self.config.checkpoint_steps
+
+    # -- evaluation and records -------------------------------------------------------------------------
+
+    def _play(self, episodes: int, final: bool) -> dict[str, Any]:
+        opponent, seed = Opponent(self._model, _scaled_by(self._vec), episodes), first_start(self.config.seed, final)
+        return _returns(play_episodes(opponent, lambda: make_env(self.config.env), episodes, seed))
+
+    def _first_evaluation(self) -> float:
+        """Of what it was before any training, once for the folder."""
+        initial = self.folder.path / "initial.json"
+        if not initial.exists():
+            write_whole(initial, json.dumps(self._play(FINAL_EPISODES, final=True)).encode())
+        return float(read_object(initial, "eval_return_mean")["eval_return_mean"])
+
+    def _evaluate(self) -> None:
+        found = self._play(self.config.episodes, final=False)
+        self._write_progress()
+        self._write("evaluator", {**found, "eval_update": self.updates, "eval_env_steps": self.steps})
+        mean, deviation = found["eval_return_mean"], found["eval_return_std"]
+        said = f"environment step {self.steps:,}: return {mean:,.1f} ± {deviation:,.1f}, {self._wall():,.0f} s"
+        self._console.print(said)
+
+    def _write_progress(self) -> None:
+        self._write("launcher", {"wall_s": self._wall()})
+        self._write("learner", {"env_steps": self.steps, "updates": self.updates})
+
+    def _write(self, role: str, record: dict[str, Any]) -> None:
+        self._metrics.write(json.dumps({"role": role, "time": time.time(), **record}) + "\n")
+
+    def _wall(self) -> float:
+        return self._wall_before + time.monotonic() - self._began
+
+    def result(self) -> dict[str, Any]:
+        """As that of ``rmc train``."""
+        return {
+            "env": self.config.env.id,
+            "preset": self.config.name,
+            "seed": self.config.seed,
+            "env_steps": self.steps,
+            "updates": self.updates,
+            **self._play(FINAL_EPISODES, final=True),
+            "eval_flicker": self.config.env.flicker,
+            "initial_return_mean": self._initial,
+            "wall_s": self._wall(),
+        }
+
+
+def evaluate(folder: RunFolder, episodes: int, flicker: float | None = None) -> dict[str, Any]:
+    """Deterministic episodes of what a baseline's run saved last, as ``evaluate_checkpoint``. Raises ConfigError."""
+    config, states = read(folder), _states(folder)
+    if not states:
+        raise ConfigError("RUN", str(folder.path), "it has no checkpoint yet; train it for longer")
+    _set_torch(config)
+    progress = read_object(states[-1] / PROGRESS, "env_steps", "updates")
+    env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
+    bare: VecEnv = DummyVecEnv([lambda: make_env(env)])
+    scales = states[-1] / SCALES
+    with _reading(states[-1]):
+        model = CLASSES[config.algorithm].load(states[-1] / MODEL, device="cpu")
+        scaled = _scaled_by(VecNormalize.load(str(scales), bare) if scales.exists() else bare)
+    seed = first_start(config.seed, final=True)
+    returns = play_episodes(Opponent(model, scaled, episodes), lambda: make_env(env), episodes, seed)
+    bare.close()
+    about = {"env": env.id, "preset": config.name, "seed": config.seed, **progress}
+    return about | _returns(returns) | {"eval_flicker": env.flicker}
+
+
+def _returns(returns: list[float]) -> dict[str, Any]:
+    mean, std = float(np.mean(returns)), float(np.std(returns))
+    return {"eval_return_mean": mean, "eval_return_std": std, "eval_episodes": len(returns)}
+
+
+def _scaled_by(vec: VecEnv) -> Callable[[Floats], Floats]:
+    """Observations as a model sees them that was trained in this environment."""
+    if isinstance(vec, VecNormalize):
+        return lambda observation: np.asarray(vec.normalize_obs(observation), np.float32)
+    return lambda observation: observation
+
+
+def _policy(config: BaselineConfig) -> str:
+    return "MlpLstmPolicy" if config.algorithm == "recurrent-ppo" else "MlpPolicy"

@@ -1,0 +1,159 @@
+"""``rmc plot``: returns of many runs as curves and as a table, by agent and environment.
+
+From five seeds on, the interquartile mean and its bootstrap interval; with fewer, every seed is a line of its own.
+"""
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+
+from rmc.analysis.history import History
+from rmc.analysis.statistics import (
+    ENOUGH_SEEDS,
+    Scores,
+    interquartile_mean,
+    interval,
+    normalised,
+    probability_of_improvement,
+)
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.folder import check_writable
+
+PICTURES = (".png", ".pdf", ".svg", ".jpg")
+Axis = Literal["env_steps", "updates", "wall_s"]
+LABELS = {"env_steps": "environment steps", "updates": "updates", "wall_s": "wall time (s)"}
+POINTS, CURVE_RESAMPLES, COLUMNS, LAST, WIDTH = 100, 300, 3, 5, 120
+Groups = dict[str, dict[str, list[History]]]  # environment -> agent -> its runs
+
+
+def grouped(histories: Sequence[History]) -> Groups:
+    """By environment, then agent, each in the order in which it came; seeds in order. A run given twice counts once."""
+    groups: Groups = {}
+    for one in histories:
+        runs = groups.setdefault(one.env, {}).setdefault(one.agent, [])
+        if one not in runs:
+            runs.append(one)
+    for agents in groups.values():
+        for runs in agents.values():
+            runs.sort(key=lambda run: run.seed)
+    return groups
+
+
+def curve(run: History, by: Axis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where it was evaluated, and the returns there; it starts with what it had before training."""
+    places = [float(getattr(one, by)) for one in run.evaluations]
+    returns = [one.return_mean for one in run.evaluations]
+    if run.initial_return is not None:
+        places, returns = [0.0, *places], [run.initial_return, *returns]
+    return np.array(places), np.array(returns)
+
+
+def draw(groups: Groups, by: Axis, out: Path) -> None:
+    """A panel an environment, a colour an agent. Raises ConfigError where it cannot be written."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ConfigError("--out", str(out), "matplotlib is missing; pip install 'rmc[plot]'")
+    check_writable("--out", out, PICTURES)
+    from matplotlib.figure import Figure  # an extra
+
+    columns = min(COLUMNS, len(groups))
+    rows = -(-len(groups) // columns)
+    figure = Figure(figsize=(1.0 + 5.0 * columns, 0.6 + 3.6 * rows), layout="constrained")
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    agents = list(dict.fromkeys(agent for found in groups.values() for agent in found))
+    handles: dict[str, Any] = {}
+    for panel, (env, found) in zip(panels, groups.items(), strict=False):
+        for agent, runs in found.items():
+            handles.setdefault(agent, _draw_agent(panel, runs, by, f"C{agents.index(agent) % 10}"))
+        panel.set_title(env)
+        panel.set_xlabel(LABELS[by])
+        panel.locator_params(axis="x", nbins=5)  # more would run into each other
+        panel.set_ylabel("return")
+        panel.grid(alpha=0.3)
+    for panel in panels[len(groups) :]:
+        panel.set_axis_off()
+    figure.legend(
+        handles.values(), [_named(agent, groups) for agent in handles], loc="outside lower center", ncols=columns
+    )
+    figure.savefig(out, dpi=110)
+
+
+def _draw_agent(panel: Any, runs: list[History], by: Axis, color: str) -> Any:
+    curves = [curve(run, by) for run in runs]
+    if _seeds(runs) < ENOUGH_SEEDS:
+        lines = [panel.plot(*one, color=color, linewidth=1.2, alpha=0.8)[0] for one in curves]
+        return lines[0]
+    places = np.linspace(max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves), POINTS)
+    returns = np.stack([np.interp(places, *one) for one in curves])  # (R, POINTS)
+    line = panel.plot(places, [interquartile_mean(at) for at in returns.T], color=color)[0]
+    bands = [interval(interquartile_mean, at[:, None], resamples=CURVE_RESAMPLES) for at in returns.T]
+    panel.fill_between(places, *np.transpose(bands), color=color, alpha=0.2, linewidth=0)
+    return line
+
+
+def _seeds(runs: list[History]) -> int:
+    """Of one seed there may be several runs, which say no more of others than one."""
+    return len({run.seed for run in runs})
+
+
+def _named(agent: str, groups: Groups) -> str:
+    counts = [_seeds(found[agent]) for found in groups.values() if agent in found]
+    fewest, most = min(counts), max(counts)
+    how = "interquartile mean, 95 %" if fewest >= ENOUGH_SEEDS else "each a line"
+    seeds = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+    return f"{agent} ({seeds} seed{'s' * (most > 1)}, {how})"
+
+
+def last_returns(runs: list[History]) -> Scores:
+    """(R, 1): of every run's last evaluation."""
+    return np.array([[run.evaluations[-1].return_mean] for run in runs])
+
+
+def tables(groups: Groups, reference: str | None) -> list[Table]:
+    """One an environment, a line an agent; beside ``reference``, an agent, where there is one. Raises ConfigError."""
+    agents = {agent for found in groups.values() for agent in found}
+    if reference is not None and reference not in agents:
+        raise ConfigError("--reference", reference, f"use one of {', '.join(map(repr, sorted(agents)))}")
+    return [_table(env, found, reference) for env, found in groups.items()]
+
+
+def _table(env: str, found: dict[str, list[History]], reference: str | None) -> Table:
+    made = Table(title=env, title_justify="left", box=None, pad_edge=False)
+    columns = ["agent", "seeds", "return", f"worst of last {LAST}", "steps", "updates", "wall s"]
+    for name in [*columns, *(["scaled", "P(better)"] if reference else [])]:
+        made.add_column(name, justify="left" if name == "agent" else "right", no_wrap=True)
+    for agent, runs in found.items():
+        made.add_row(agent, *_cells(runs), *(_beside(runs, found.get(reference, [])) if reference else []))
+    return made
+
+
+def _cells(runs: list[History]) -> list[str]:
+    seeds, unfinished = f"{_seeds(runs)}", sum(not run.finished for run in runs)
+    seeds += f", {unfinished} unfinished" if unfinished else ""
+    ends = [run.env_steps for run in runs]
+    steps = f"{min(ends):,}" + (f" to {max(ends):,}" if min(ends) < max(ends) else "")
+    counts = [np.median([getattr(run, name) for run in runs]) for name in ("updates", "wall_s")]
+    worst = min(one.return_mean for run in runs for one in run.evaluations[-LAST:])
+    return [seeds, _returns(runs), f"{worst:,.0f}", steps, *(f"{count:,.0f}" for count in counts)]
+
+
+def _returns(runs: list[History]) -> str:
+    scores = last_returns(runs)
+    if _seeds(runs) >= ENOUGH_SEEDS:
+        low, high = interval(interquartile_mean, scores)
+        return f"{interquartile_mean(scores):,.0f} [{low:,.0f}, {high:,.0f}]"
+    return f"{scores.mean():,.0f} ({', '.join(f'{score:,.0f}' for score in scores[:, 0])})"
+
+
+def _beside(runs: list[History], reference: list[History]) -> list[str]:
+    """The mean return scaled so that the reference's is 1 and an untrained agent's 0; the chance to beat it."""
+    initial = [run.initial_return for run in [*runs, *reference] if run.initial_return is not None]
+    if not reference or not initial:
+        return ["", ""]
+    low, high = np.array([np.mean(initial)]), last_returns(reference).mean(0)
+    share = normalised(last_returns(runs), low, high).mean()
+    return [f"{share:.2f}", f"{probability_of_improvement(last_returns(runs), last_returns(reference)):.2f}"]

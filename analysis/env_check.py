@@ -1,0 +1,154 @@
+"""``rmc check-env``: plays an environment at random and says what the agent will make of it, and what to mend."""
+
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils.env_checker import check_env as gymnasiums_checks
+from numpy.typing import NDArray
+from rich.console import Console
+
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import first_env
+from rmc.common.env.wrappers import Env, Floats
+
+BESIDE_THE_POINT = ("is -infinity", "is infinity", "symmetric and normalized")  # of vectors and stretched actions
+REPEATED_STEPS = 50  # played twice from one seed
+LARGE_REWARD = 100.0  # mean size of a step's reward from which the critics start far from their target
+LISTED = 20  # dimensions named in a note
+LARGE_OBSERVATION = 1e4  # from which float32 and a running mean lose precision
+
+
+@dataclass
+class Played:
+    """What random episodes gave."""
+
+    observations: list[Floats] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
+    lengths: list[int] = field(default_factory=list)  # of episodes that ended
+    terminated: int = 0
+    seconds: float = 0.0
+
+    def play(self, env: Env, steps: int, seed: int) -> None:
+        """So many steps with uniform actions. Raises what the environment raises."""
+        rng, length = np.random.default_rng(seed), 0
+        self.observations.append(env.reset(seed=seed)[0])
+        for _ in range(steps):
+            start = time.perf_counter()
+            observation, reward, terminated, truncated, _ = env.step(_action(env, rng))
+            self.seconds += time.perf_counter() - start
+            self.observations.append(observation)
+            self.rewards.append(float(reward))
+            length += 1
+            if terminated or truncated:
+                self.lengths.append(length)
+                self.terminated += bool(terminated)
+                self.observations.append(env.reset()[0])
+                length = 0
+
+
+def check(config: EnvConfig, steps: int, console: Console) -> int:
+    """Print facts, notes and faults; 0 where there is no fault, else 1. Raises ConfigError as ``rmc train`` would."""
+    env, played = first_env(config), Played()
+    stages: list[Callable[[], Iterable[str]]] = [
+        lambda: _gymnasiums_notes(env),
+        lambda: _guarded(lambda: played.play(env, steps, seed=0)),
+        lambda: _nonsense(played),
+        lambda: _hints(env, played),
+    ]
+    found: list[str] = []
+    while stages and not _faults(found):  # what comes later needs what was before to be sound
+        found += stages.pop(0)()
+    for line in [*_facts(env, played), *dict.fromkeys(found)]:
+        console.print(line, soft_wrap=True)
+    env.close()
+    sound = not _faults(found)
+    console.print("it can be trained on" if sound else "mend the fault first")
+    return 0 if sound else 1
+
+
+def _faults(found: list[str]) -> list[str]:
+    return [text for text in found if text.startswith("fault: ")]
+
+
+def _gymnasiums_notes(env: Env) -> Iterator[str]:
+    """What gymnasium's own checks find: worth a look, but what counts is whether it can be played."""
+    for text in _guarded(lambda: gymnasiums_checks(env.unwrapped, skip_render_check=True, skip_close_check=True)):
+        if not any(words in text for words in BESIDE_THE_POINT):
+            yield "note: gymnasium says: " + text.partition(": ")[2]
+
+
+def _guarded(action: Callable[[], None]) -> Iterator[str]:
+    """What was raised, as a fault, and what was warned of, as notes."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            action()
+        except Exception as error:  # whatever a user's environment raises is a finding
+            yield f"fault: {type(error).__name__}: {' '.join(str(error).split())}"
+    for text in dict.fromkeys(_plain(str(warning.message)) for warning in caught):
+        yield f"note: {text}"
+
+
+def _plain(text: str) -> str:
+    """Without gymnasium's colours and its name for a warning."""
+    return " ".join(text.replace("\x1b[33m", "").replace("\x1b[0m", "").removeprefix("WARN: ").split())
+
+
+def _facts(env: Env, played: Played) -> Iterator[str]:
+    limit = env.spec.max_episode_steps if env.spec else None
+    sizes = [space.shape[0] for space in (env.observation_space, env.action_space) if space.shape]
+    yield f"observations {sizes[0]}, actions {sizes[1]}, time limit {limit or 'none'}"
+    if played.rewards:
+        rewards = np.array(played.rewards)
+        speed = len(rewards) / played.seconds
+        yield f"{len(rewards):,} random steps, {speed:,.0f} a second; reward {rewards.mean():.3g} ± {rewards.std():.3g}"
+    if played.lengths:
+        ended = f"{played.terminated} of them terminated, the others cut off"
+        yield f"{len(played.lengths)} episodes of {min(played.lengths)} to {max(played.lengths)} steps, {ended}"
+
+
+def _nonsense(played: Played) -> Iterator[str]:
+    observations = np.stack(played.observations)
+    for name, values in (("observation", observations), ("reward", np.array(played.rewards))):
+        if not np.isfinite(values).all():
+            yield f"fault: {name}s are not finite; such an episode is dropped and its environment made anew"
+
+
+def _hints(env: Env, played: Played) -> Iterator[str]:
+    observations, rewards = np.stack(played.observations), np.array(played.rewards)
+    still = np.flatnonzero(observations.std(0) == 0.0).tolist()
+    if still:
+        yield f"note: observations {_listed(still)} never changed"
+    if np.abs(observations).max() > LARGE_OBSERVATION:
+        yield f"note: observations reach {np.abs(observations).max():.3g}; scale them in the environment"
+    if np.abs(rewards).mean() > LARGE_REWARD:
+        scale = 1.0 / np.abs(rewards).mean()
+        yield f"note: rewards are large; try --reward-scale {scale:.1g}"
+    if not rewards.any():
+        yield "note: no random step was rewarded; learning will need luck, or curiosity (--curiosity)"
+    if not played.lengths:
+        yield "note: no episode ended; without a time limit an evaluation stops at 10 000 steps (--time-limit)"
+    if not np.array_equal(_again(env), _again(env)):
+        yield "note: the same seed and actions gave other observations; runs will not be repeatable"
+
+
+def _listed(numbers: list[int]) -> str:
+    shown = ", ".join(map(str, numbers[:LISTED]))
+    return f"{shown} and {len(numbers) - LISTED} more" if len(numbers) > LISTED else shown
+
+
+def _again(env: Env) -> NDArray[np.float32]:
+    repeated = Played()
+    repeated.play(env, REPEATED_STEPS, seed=1)
+    return np.stack(repeated.observations)
+
+
+def _action(env: Env, rng: np.random.Generator) -> Any:
+    space = env.action_space
+    assert isinstance(space, gym.spaces.Box)
+    return rng.uniform(space.low, space.high).astype(np.float32)

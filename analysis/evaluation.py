@@ -1,0 +1,117 @@
+"""Playing a checkpoint: the one way in which ``rmc evaluate`` and the end of a run judge a policy."""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+import torch
+
+from rmc.actors.evaluator import first_start, play_episodes
+from rmc.actors.policy_runner import PolicyRunner
+from rmc.common.agent import Agent
+from rmc.common.checkpoint import POLICY, PROGRESS, STATE, CheckpointFolder
+from rmc.common.env.make import make_env
+from rmc.common.errors import CheckpointError, ConfigError, MessageError
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder
+
+FINAL_EPISODES = 10  # of a run's first and last evaluation
+
+
+def evaluate_blob(config: RunConfig, blob: bytes, episodes: int, flicker: float | None = None) -> dict[str, Any]:
+    """Deterministic episodes of a policy: mean, standard deviation and number of returns."""
+    env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
+    spec = config.window_spec()
+    runner = PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, episodes)
+    runner.load(blob)
+    with _one_thread():
+        returns = play_episodes(runner, lambda: make_env(env), episodes, first_start(config.seed, final=True))
+    return {
+        "eval_return_mean": float(np.mean(returns)),
+        "eval_return_std": float(np.std(returns)),
+        "eval_episodes": len(returns),
+        "eval_flicker": env.flicker,
+    }
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """A product's last bits depend on its threads, and an episode on them: so they must not on the machine's cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def evaluate_checkpoint(
+    folder: RunFolder, config: RunConfig, checkpoint: str, episodes: int, flicker: float | None = None
+) -> dict[str, Any]:
+    """Deterministic episodes of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
+    progress, blob = load_checkpoint(folder, config, checkpoint)
+    return {
+        "env": config.env.id,
+        "preset": config.preset,
+        "seed": config.seed,
+        "env_steps": progress["env_steps"],
+        "updates": progress["updates"],
+        **evaluate_blob(config, blob, episodes, flicker),
+    }
+
+
+def load_checkpoint(folder: RunFolder, config: RunConfig, checkpoint: str) -> tuple[dict[str, Any], bytes]:
+    """Progress and policy of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError, also where the
+    policy is not this config's.
+
+    The best is of those that were evaluated while it trained, which the last one need not be.
+    """
+    files, spec = _load(folder, checkpoint), config.window_spec()
+    try:
+        PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, envs=1).load(files[POLICY])
+    except MessageError as error:
+        raise ConfigError("--checkpoint", checkpoint, f"{error}; use another") from None
+    return json.loads(files[PROGRESS]), files[POLICY]
+
+
+def load_state(folder: RunFolder, checkpoint: str) -> bytes:
+    """The learner's whole state of a checkpoint, for ``torch.load``. Raises ConfigError."""
+    return _load(folder, checkpoint)[STATE]
+
+
+def _load(folder: RunFolder, checkpoint: str) -> dict[str, bytes]:
+    checkpoints = CheckpointFolder(folder.checkpoints)
+    number = _number(checkpoints, checkpoint)
+    try:
+        return checkpoints.load(number)
+    except CheckpointError as error:
+        others = [other for other in checkpoints.numbers() if other != number]
+        fix = f"use one of {others}" if others else "there is no other"
+        raise ConfigError("--checkpoint", checkpoint, f"{error}; {fix}") from None
+
+
+def _number(checkpoints: CheckpointFolder, which: str) -> int:
+    numbers = checkpoints.numbers()
+    if not numbers:
+        raise ConfigError("RUN", str(checkpoints.folder.parent), "it has no checkpoint yet; train it for longer")
+    if which == "latest":
+        return numbers[-1]
+    if which == "best":
+        best = checkpoints.best()
+        if best is None or best not in numbers:
+            raise ConfigError("--checkpoint", which, "none was evaluated yet; use latest")
+        return best
+    if which.isdecimal() and int(which) in numbers:
+        return int(which)
+    raise ConfigError("--checkpoint", which, f"use latest, best or one of {numbers}")
+
+
+def initial_policy(config: RunConfig) -> bytes:
+    """The policy that the run's learner starts from, before it has learnt anything."""
+    spec = config.window_spec()
+    torch.manual_seed(config.seed)
+    return safetensors.torch.save(Agent(spec.obs_dim, spec.action_dim, config.agent).policy_weights())

@@ -1,0 +1,74 @@
+"""A policy as an ONNX file, for programs without torch.
+
+Inputs: observation (N, O) raw, previous_action (N, A), blank (N,) bool, state (N, S), zeros at an episode's start.
+Outputs: action (N, A) in [-1, 1], the policy's mean, and next_state (N, S).
+"""
+
+import contextlib
+import importlib.util
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+
+from rmc.analysis.evaluation import load_checkpoint
+from rmc.common.agent import Agent
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.folder import RunFolder, check_writable
+
+INPUTS, OUTPUTS = ("observation", "previous_action", "blank", "state"), ("action", "next_state")
+NEEDED = ("onnx", "onnxscript")
+
+
+class _Step(nn.Module):
+    """One step of the policy's mean."""
+
+    def __init__(self, agent: Agent) -> None:
+        super().__init__()
+        self.agent = agent
+
+    def forward(
+        self, observation: Tensor, previous_action: Tensor, blank: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """See the module's docstring."""
+        seen = self.agent.normalizer(observation, blank).unsqueeze(1)
+        now = blank.unsqueeze(1), previous_action.unsqueeze(1), state
+        remembered, _, state = self.agent.remember(seen, *now)
+        mean, _ = self.agent.policy(self.agent.features(remembered).squeeze(1))
+        return torch.tanh(mean), state
+
+
+def export(folder: RunFolder, checkpoint: str, out: Path) -> None:
+    """Write the policy of a checkpoint to ``out``. Raises ConfigError."""
+    for name in NEEDED:
+        if importlib.util.find_spec(name) is None:
+            raise ConfigError("--out", str(out), f"{name} is missing; pip install 'rmc[onnx]'")
+    check_writable("--out", out, (".onnx",))
+    config = folder.config()
+    (_, blob), spec = load_checkpoint(folder, config, checkpoint), config.window_spec()
+    agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
+    agent.load_state_dict(safetensors.torch.load(blob), strict=False)
+    two = [torch.zeros(2, size) for size in (spec.obs_dim, spec.action_dim, spec.state)]
+    example = (two[0], two[1], torch.zeros(2, dtype=torch.bool), two[2])
+    rows = torch.export.Dim("rows", min=1)
+    with _quiet():
+        torch.onnx.export(
+            _Step(agent).eval(), example, str(out), input_names=INPUTS, output_names=OUTPUTS,
+            dynamic_shapes=({0: rows},) * 4, dynamo=True, external_data=False,
+        )  # fmt: skip
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """The exporter tells of its own steps and of deprecations in its own code."""
+    level = logging.getLogger("torch.onnx").level
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        yield
+    logging.getLogger("torch.onnx").setLevel(level)

@@ -1,0 +1,207 @@
+"""What runs went through: their evaluations over environment steps, updates and wall time, read from their folders.
+
+A file of JSON lines holds many, one a line, so that results can be kept without their runs.
+"""
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rmc.analysis import baseline_settings
+from rmc.common.bus.metrics_record import is_finite
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import RunConfig, option
+from rmc.deploy.run.folder import MAY_CHANGE, RunFolder, flat
+from rmc.deploy.run.presets import preset
+
+UNTOLD = MAY_CHANGE | {"seed", "preset", "evaluator.episodes", "env.id"}  # makes no other agent
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Deterministic episodes of one checkpoint."""
+
+    env_steps: int
+    updates: int
+    wall_s: float
+    return_mean: float
+    return_std: float
+
+
+@dataclass(frozen=True)
+class History:
+    """One run. ``agent`` and ``env`` say all that tells it from others but its seed."""
+
+    agent: str
+    env: str
+    seed: int
+    env_steps: int
+    updates: int
+    transitions: int  # trained, a step of a window each
+    wall_s: float
+    initial_return: float | None
+    evaluations: list[Evaluation] = field(default_factory=list)
+    finished: bool = False  # then the last evaluation is the result's
+    commit: str = field(default="", compare=False)
+
+    def to_line(self) -> str:
+        """As one line of JSON."""
+        return json.dumps(dataclasses.asdict(self))
+
+
+def read(path: Path) -> list[History]:
+    """The histories in a run's folder, or in a file of lines. Raises ConfigError."""
+    if path.is_dir():
+        return [of_run(RunFolder(path))]
+    return [_of_line(line, place) for place, line in objects(path, "evaluations").items()]
+
+
+def objects(path: Path, *names: str) -> dict[str, dict[str, Any]]:
+    """What a file of JSON lines holds, by PATH:LINE, each with these ``names``. Raises ConfigError."""
+    try:
+        lines = path.read_bytes().splitlines()
+    except OSError as error:
+        raise ConfigError("RUNS", str(path), f"{error.strerror}; give runs' folders or files of JSON lines") from None
+    return {f"{path}:{i}": _object(line, f"{path}:{i}", names) for i, line in enumerate(lines, 1) if line.strip()}
+
+
+def _object(line: bytes, place: str, names: Sequence[str]) -> dict[str, Any]:
+    try:
+        found = json.loads(line)
+    except ValueError as error:
+        raise ConfigError("RUNS", place, f"not JSON ({error}); mend the line, or remove it") from None
+    if not isinstance(found, dict) or not found.keys() >= set(names):
+        raise ConfigError("RUNS", place, f"must be an object with {', '.join(names)}; mend the line, or remove it")
+    return found
+
+
+def _of_line(raw: dict[str, Any], place: str) -> History:
+    try:
+        found = History(**{**raw, "evaluations": [Evaluation(**one) for one in raw["evaluations"]]})
+    except TypeError as error:
+        raise ConfigError("RUNS", place, f"not a history ({error}); mend the line, or remove it") from None
+    numbers: list[Any] = [found.seed, found.env_steps, found.updates, found.transitions, found.wall_s]
+    numbers += [] if found.initial_return is None else [found.initial_return]
+    numbers += [value for one in found.evaluations for value in dataclasses.astuple(one)]
+    texts = found.agent, found.env, found.commit
+    if not (found.evaluations and all(map(is_finite, numbers)) and all(isinstance(text, str) for text in texts)):
+        fix = "not a history (its evaluations, numbers and names); mend the line, or remove it"
+        raise ConfigError("RUNS", place, fix)
+    return found
+
+
+def of_run(folder: RunFolder) -> History:
+    """A run's, finished or not. Raises ConfigError where it is none, or was not evaluated yet."""
+    about = describe(folder.path)
+    evaluations = _evaluations(list(folder.records()))
+    result = folder.result() or {}
+    if result:
+        ours = not folder.is_baseline()  # of its last checkpoint's own evaluation only the update is known
+        below = result["env_steps"], result["updates"] if ours else math.inf
+        evaluations = [one for one in evaluations if one.env_steps < below[0] and one.updates < below[1]]
+        mean, std = result["eval_return_mean"], result["eval_return_std"]
+        evaluations.append(Evaluation(result["env_steps"], result["updates"], result["wall_s"], mean, std))
+    if not evaluations:
+        raise ConfigError("RUNS", str(folder.path), "it has no evaluation yet; train it for longer")
+    last = evaluations[-1]
+    return History(
+        about.agent,
+        about.env,
+        about.seed,
+        last.env_steps,
+        last.updates,
+        last.updates * about.transitions_per_update,
+        last.wall_s,
+        result.get("initial_return_mean"),
+        evaluations,
+        bool(result),
+    )
+
+
+@dataclass(frozen=True)
+class About:
+    """What a run is, from its ``config.json``."""
+
+    agent: str
+    env: str
+    seed: int
+    transitions_per_update: int
+
+
+def describe(path: Path) -> About:
+    """Of a run of RMC, or of a baseline. Raises ConfigError."""
+    folder = RunFolder(path)
+    if folder.is_baseline():
+        theirs = baseline_settings.read(folder)
+        per_update = baseline_settings.transitions_per_update(theirs)
+        return About(_with(theirs.name, _stack(theirs.env)), _seen(theirs.env), theirs.seed, per_update)
+    config = folder.config()
+    name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
+    agent = _with(name, [*_changes(config), *_stack(config.env)])
+    return About(agent, _seen(config.env), config.seed, config.learner.batch_size * _trained_steps(config))
+
+
+def _trained_steps(config: RunConfig) -> int:
+    """Of a window. Only for whole episodes an environment is made, which a machine that plots may lack."""
+    whole = config.actor.state_strategy == "episode"
+    return config.window_spec().train if whole else config.window.trained_steps
+
+
+def _with(name: str, words: list[str]) -> str:
+    return " ".join([name, *words])
+
+
+def _changes(config: RunConfig) -> list[str]:
+    """Options that differ from the preset's, as they are typed."""
+    was, now = flat(preset(config.preset, config.env)), flat(config)
+    return [_typed(path, now[path]) for path in now if path not in UNTOLD and now[path] != was[path]]
+
+
+def _typed(path: str, value: Any) -> str:
+    if isinstance(value, bool):
+        return option(path) if value else option(path).replace("--", "--no-", 1)
+    return f"{option(path)} {' '.join(map(str, value)) if isinstance(value, tuple) else value}"
+
+
+def _stack(env: EnvConfig) -> list[str]:
+    """A stack of frames belongs to the agent: what there is to see is the same."""
+    return [f"--frame-stack {env.frame_stack}"] if env.frame_stack > 1 else []
+
+
+def _seen(env: EnvConfig) -> str:
+    plain = EnvConfig(env.id)
+    names = [item.name for item in dataclasses.fields(env) if item.name not in ("frame_stack", "env_timeout")]
+    odd = [name for name in names if getattr(env, name) != getattr(plain, name)]
+    return ", ".join([env.id, *(f"{name.replace('_', ' ')} {getattr(env, name)}" for name in odd)])
+
+
+def _evaluations(records: list[dict[str, Any]]) -> list[Evaluation]:
+    """In order of environment steps; of a checkpoint played twice, what came last."""
+    steps = {r["updates"]: r["env_steps"] for r in records if _says(r, "learner", "updates", "env_steps")}
+    walls = {r["time"]: r["wall_s"] for r in records if _says(r, "launcher", "time", "wall_s")}
+    found = {}
+    for record in records:
+        if _says(record, "evaluator", "time", "eval_update", "eval_return_mean", "eval_return_std"):
+            updates, own = record["eval_update"], _says(record, "evaluator", "eval_env_steps")
+            at = int(record["eval_env_steps"] if own else _between(updates, steps))  # of ours only the update is known
+            wall, mean, std = _between(record["time"], walls), record["eval_return_mean"], record["eval_return_std"]
+            found[at] = Evaluation(at, updates, wall, mean, std)
+    return [found[at] for at in sorted(found)]
+
+
+def _says(record: dict[str, Any], role: str, *names: str) -> bool:
+    """Whether it is that role's and has all of these, as finite numbers: half of an evaluation is none."""
+    return record.get("role") == role and all(is_finite(record.get(name)) for name in names)
+
+
+def _between(at: float, known: dict[Any, Any]) -> float:
+    """What lies at ``at`` on the line through the points that are known."""
+    places = sorted(known)
+    return float(np.interp(at, places, [known[place] for place in places])) if places else 0.0

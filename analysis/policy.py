@@ -1,0 +1,63 @@
+"""A trained policy as a library: step it in a loop of your own.
+
+    policy = load_policy("runs/first")
+    env = policy.make_env()
+    observation, info = env.reset()
+    policy.reset()
+    action = policy.act(observation, info.get("blank", False))
+    observation, reward, terminated, truncated, info = env.step(action)
+
+Shapes: O observation, A action, S state.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from rmc.actors.policy_runner import PolicyRunner
+from rmc.analysis.evaluation import load_checkpoint
+from rmc.common.env.make import make_env
+from rmc.common.env.wrappers import Env, Floats
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder
+
+
+def load_policy(run: str | Path, checkpoint: str = "latest") -> "Policy":
+    """The policy of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
+    folder = RunFolder(Path(run))
+    config = folder.config()
+    _, blob = load_checkpoint(folder, config, checkpoint)
+    return Policy(config, blob)
+
+
+class Policy:
+    """Acts in one environment, and remembers: ``reset`` at the start of every episode, then ``act`` at every step."""
+
+    def __init__(self, config: RunConfig, blob: bytes, seed: int = 0) -> None:
+        """``blob`` is the safetensors of a policy; ``seed`` is for actions that explore. Raises MessageError."""
+        spec = config.window_spec()
+        self.config = config
+        self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, envs=1)
+        self._runner.load(blob)
+        self._rng = np.random.default_rng(seed)
+        self.reset()
+
+    def make_env(self) -> Env:
+        """An environment as the policy saw it in training: actions in [-1, 1], and all that the run's options hide."""
+        return make_env(self.config.env)
+
+    def reset(self) -> None:
+        """Forget: a new episode begins."""
+        self._prev_action, self._state = self._runner.start()
+
+    def act(self, observation: Floats, blank: bool = False, explore: bool = False) -> Floats:
+        """(O,) -> (A,) in [-1, 1]: the policy's mean, or a sample of it.
+
+        ``blank`` says that the frame is missing (``info["blank"]`` under flicker).
+        """
+        noise = self._rng.standard_normal(self._prev_action.shape, np.float32) if explore else None
+        seen = np.asarray(observation, np.float32)[None]
+        action, state = self._runner.act(seen, self._prev_action, np.array([blank]), self._state, noise)
+        self._prev_action, self._state[:] = action, state
+        found: Floats = action[0].copy()
+        return found

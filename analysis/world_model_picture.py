@@ -1,0 +1,197 @@
+"""``rmc inspect``: what a run's world model knows, along one episode, as a picture and a few numbers.
+
+Shapes: T steps of the episode, O observation, A action, H hidden, K steps ahead. Observations are normalised ones.
+"""
+
+import importlib.util
+import io
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rmc.actors.evaluator import LONGEST_EPISODE
+from rmc.analysis.evaluation import load_state
+from rmc.analysis.policy import load_policy
+from rmc.common.agent import Agent, Remembered
+from rmc.common.checkpoint import STATE
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder, check_writable
+from rmc.learner.losses import model_error
+from rmc.learner.update import share_unexplained
+
+PICTURES = (".png", ".pdf", ".svg", ".jpg")
+HORIZONS = (1, 5, 15)  # steps ahead
+SHOWN, SHOWN_STEPS = 4, 100  # dimensions in the picture, those that change the most, and from when on how long
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What was played, as tensors with a batch of one."""
+
+    observation: Tensor  # (1, T + 1, O)
+    action: Tensor  # (1, T, A)
+    reward: Tensor  # (T,), scaled as for training
+    blank: Tensor  # (1, T + 1) bool
+
+    @property
+    def seen(self) -> Tensor:
+        """(T,) bool: neither the step's frame nor the next one is blank."""
+        return ~(self.blank[0, 1:] | self.blank[0, :-1])
+
+
+@dataclass(frozen=True)
+class Insight:
+    """What the world model says of an episode."""
+
+    real: Floats  # (T, O), the next observations
+    predicted: Floats  # (T, O), one step ahead
+    curiosity: Floats  # (T,), the world model's error of the online memory's change
+    reward: Floats  # (T,)
+    predicted_reward: Floats  # (T,)
+    ahead: dict[int, Floats]  # horizon K -> (T - K + 1, O), predicted without looking, K steps ahead
+    unexplained: Floats  # (O,), error of the change as a share of its size; above 1 is worse than "no change"
+    open_loop: dict[int, float]  # horizon -> the same over all dimensions
+
+
+def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
+    """The whole agent of a checkpoint, with its world model. Raises ConfigError."""
+    spec = config.window_spec()
+    agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
+    raw = load_state(folder, checkpoint)
+    try:
+        agent.load_state_dict(torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)["agent"])
+    except (pickle.UnpicklingError, EOFError, RuntimeError, KeyError, TypeError) as error:
+        reason = (str(error).strip() or "empty").splitlines()[0]
+        fix = f"its {STATE} is not this run's ({reason}); use another"
+        raise ConfigError("--checkpoint", checkpoint, fix) from None
+    return agent.eval()
+
+
+def play(folder: RunFolder, agent: Agent, config: RunConfig, checkpoint: str) -> Episode:
+    """One deterministic episode."""
+    policy = load_policy(folder.path, checkpoint)
+    env = policy.make_env()
+    observation, info = env.reset(seed=config.seed)
+    policy.reset()
+    observations, blanks, actions, rewards = [observation], [bool(info.get("blank", False))], [], []
+    for _ in range(LONGEST_EPISODE):
+        actions.append(policy.act(observation, blanks[-1]))
+        observation, reward, terminated, truncated, info = env.step(actions[-1])
+        observations.append(observation)
+        blanks.append(bool(info.get("blank", False)))
+        rewards.append(config.actor.reward_scale * float(reward))
+        if terminated or truncated:
+            break
+    env.close()
+    raw, blank = torch.from_numpy(np.stack(observations)), torch.tensor(blanks)
+    return Episode(
+        agent.normalizer(raw, blank).unsqueeze(0),
+        torch.from_numpy(np.stack(actions)).unsqueeze(0),
+        torch.tensor(rewards),
+        blank.unsqueeze(0),
+    )
+
+
+@torch.no_grad()
+def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> Insight:
+    """Everything from one pass over the episode, and open-loop rollouts from each of its steps.
+
+    ``norm`` is that of the world model's error.
+    """
+    previous = torch.cat([torch.zeros_like(episode.action[:, :1]), episode.action], 1)
+    start = torch.zeros(1, agent.config.state_size(agent.obs_dim))
+    memory, seen, _ = agent.remember(episode.observation, episode.blank, previous, start)
+    prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
+    latent_change = memory.hidden[0].diff(dim=0)
+    real = episode.observation[0, 1:]
+    ahead = _open_loop(agent, memory, seen[0, :-1], episode.action[0])
+    return Insight(
+        real=real.numpy(),
+        predicted=ahead[1].numpy(),
+        curiosity=model_error(prediction.hidden_change[0], latent_change, norm).numpy(),
+        reward=episode.reward.numpy(),
+        predicted_reward=prediction.reward[0].numpy(),
+        ahead={horizon: found.numpy() for horizon, found in ahead.items()},
+        unexplained=share_unexplained(*_error(ahead[1], episode, 1)).numpy(),
+        open_loop={horizon: _overall(*_error(found, episode, horizon)) for horizon, found in ahead.items()},
+    )
+
+
+def _open_loop(agent: Agent, memory: Remembered, observation: Tensor, action: Tensor) -> dict[int, Tensor]:
+    """Horizon K -> (T - K + 1, O): from every step on, the model's own states and observations in place of the real.
+
+    Observations (T, O) to start from, actions (T, A).
+    """
+    hidden, beside = memory.hidden[0, :-1], memory.beside[0, :-1]
+    steps, found = len(action), {}
+    for ahead in range(1, min(max(HORIZONS), steps) + 1):
+        count = steps - ahead + 1  # starts from which so many steps were played
+        hidden, beside, observation, a = hidden[:count], beside[:count], observation[:count], action[ahead - 1 :]
+        step = agent.world_model(agent.features(Remembered(hidden, beside)), a)
+        hidden, observation = hidden + step.hidden_change, observation + step.observation_change
+        beside = agent.memory.beside(observation, torch.zeros(count, dtype=torch.bool), a)
+        if ahead in HORIZONS:
+            found[ahead] = observation
+    return found
+
+
+def _overall(error: Tensor, size: Tensor) -> float:
+    return float(error.sum() / size.sum().clamp(min=1e-9))
+
+
+def _error(predicted: Tensor, episode: Episode, horizon: int) -> tuple[Tensor, Tensor]:
+    """(O,) sums of |predicted - real| and of |real - where it started|, where both frames were seen."""
+    observation = episode.observation[0]
+    start, end = observation[: len(predicted)], observation[horizon:]
+    seen = (episode.seen[: len(predicted)] & episode.seen[horizon - 1 :]).unsqueeze(-1)
+    return ((predicted - end).abs() * seen).sum(0), ((end - start).abs() * seen).sum(0)
+
+
+def inspect(run: Path, checkpoint: str, out: Path) -> Insight:
+    """Play, look, and write the picture. Raises ConfigError."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ConfigError("--out", str(out), "matplotlib is missing; pip install 'rmc[plot]'")
+    check_writable("--out", out, PICTURES)
+    folder = RunFolder(run)
+    config = folder.config()
+    if not config.agent.grounding:
+        raise ConfigError("RUN", str(run), "its world model predicts no observations; train with --grounding")
+    agent = load_agent(folder, config, checkpoint)
+    insight = look(agent, play(folder, agent, config, checkpoint), config.update.model_norm)
+    draw(insight, f"{config.env.id}, {config.preset}, seed {config.seed}", out)
+    return insight
+
+
+def draw(insight: Insight, title: str, out: Path) -> None:
+    """Predicted against real amid the episode, then curiosity and reward over all of it."""
+    from matplotlib.figure import Figure  # an extra
+
+    shown = np.argsort(-np.abs(np.diff(insight.real, axis=0)).mean(0))[:SHOWN]
+    figure = Figure(figsize=(11, 2.0 * (len(shown) + 2)), layout="constrained")
+    axes = figure.subplots(len(shown) + 2, 1)
+    time = np.arange(1, len(insight.real) + 1)
+    start = max(1, (len(time) - SHOWN_STEPS) // 2)
+    for axis, dimension in zip(axes, shown, strict=False):
+        axis.plot(time, insight.real[:, dimension], color="black", linewidth=2.0, label="real")
+        for horizon, predicted in insight.ahead.items():
+            label = f"{horizon} step{'s' * (horizon > 1)} ahead"
+            axis.plot(time[horizon - 1 :], predicted[:, dimension], linewidth=1.0, label=label)
+        axis.set_xlim(start, start + SHOWN_STEPS)
+        axis.set_ylabel(f"observation {dimension}")
+    axes[-2].plot(time, insight.curiosity, color="tab:purple", linewidth=0.8)
+    axes[-2].set_ylabel("curiosity")
+    axes[-1].plot(time, insight.reward, color="black", linewidth=1.2, label="real")
+    axes[-1].plot(time, insight.predicted_reward, color="tab:blue", linewidth=0.8, label="predicted")
+    axes[-1].set_ylabel("reward")
+    axes[-1].set_xlabel("step of the episode")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(insight.ahead) + 1)
+    figure.suptitle(f"{title}: the world model against one episode (observations normalised)")
+    figure.savefig(out, dpi=110)

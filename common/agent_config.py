@@ -1,0 +1,47 @@
+"""Sizes and switches of the agent's networks, readable without torch."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+LOG_STD_RANGE = (-20.0, 2.0)  # of the policy's Gaussian before the tanh
+NORMALIZED_CLIP = 10.0  # standard deviations
+HeadInput = Literal["hidden", "hidden+embedding", "hidden+observation", "observation"]
+POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what it takes to act
+FILL_PARTS = ("next_frame.",)  # what else it takes where blanks are filled
+CRITIC_PARTS = ("critic.", "log_alpha")  # what else it takes to rate a window
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """Sizes and switches of the networks; the same in every role of a run."""
+
+    hidden: int = 256
+    """H, units of the GRU."""
+    embedding: int = 256
+    """E, units of the Linear + ReLU before the GRU; 0 feeds the raw input (the paper)."""
+    heads: tuple[int, int] = (400, 300)
+    """Hidden layers of every head."""
+    layer_norm: bool = False
+    """LayerNorm between the embedding's Linear and its ReLU."""
+    head_input: HeadInput = "hidden"
+    """What the heads read: the hidden state; beside it the current embedding, or observation; or the observation alone,
+    an agent without a memory."""
+    critic_norm: bool = False
+    """LayerNorm before the ReLUs of the critics."""
+    normalize_observations: bool = False
+    """Observations are normalised by the replay server's running statistics."""
+    grounding: bool = True
+    """The world model also predicts the next observation's change and the reward."""
+    blank_flag: bool = False
+    """The memory has one more input, which says whether the observation is blank (flickered out)."""
+    fill_blanks: bool = False
+    """A blank observation is replaced, before the memory reads it, by what a small network of its own predicts from the
+    observation before (filled itself if it was blank), the memory and the last action. The stored state then is h and
+    that observation. Needs normalized observations."""
+    initial_priority: Literal["max", "actor"] = "max"
+    """Priority that a window enters a prioritized replay with: the largest seen, or the TD error that its actor
+    computes, to which the critics are then sent, too."""
+
+    def state_size(self, obs_dim: int) -> int:
+        """S, numbers that an actor carries from step to step, and stores: h, and what was last seen where it fills."""
+        return self.hidden + self.fill_blanks * obs_dim

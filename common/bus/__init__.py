@@ -1,0 +1,1 @@
+"""How roles reach each other: the protocol, and its two implementations."""

@@ -1,0 +1,196 @@
+"""The bus: one small interface between the roles, over Redis or inside one process.
+
+Every Redis key, R = ``rmc:{run}``:
+
+| key                     | type   | writer   | holds                                                    |
+|-------------------------|--------|----------|----------------------------------------------------------|
+| R:config                | string | launcher | the run's config, JSON                                   |
+| R:epoch:ROLE            | string | ROLE     | INCR at a role's start; the larger epoch wins            |
+| R:actors                | set    | actors   | ids of the actors that said hello                        |
+| R:windows:ACTOR         | stream | actor    | entries ``epoch-seq``, field ``p`` = a wire entry        |
+| R:acks                  | hash   | replay   | ACTOR -> ``epoch seq granted_steps final``               |
+| R:progress              | hash   | replay   | ROLE of a shard -> its newest commit's counters          |
+| R:replay                | hash   | replay   | ROLE of a shard -> ``epoch address`` of its socket       |
+| R:weights               | string | learner  | ``epoch update pieces crc32`` of the newest weights      |
+| R:weights:EPOCH:UPDATE:I| string | learner  | piece I (256 KiB) of a policy, safetensors               |
+| R:evaluate              | string | learner  | ``epoch update pieces crc32`` the evaluator should play  |
+| R:evaluate:EPOCH:UPDATE:I| string | learner | piece I of that policy                                   |
+| R:metrics:ROLE          | stream | ROLE     | records, msgpack, about the last 300                     |
+| R:stop                  | string | launcher | why the run should end                                   |
+| R:dead                  | stream | replay   | refused entries: actor, id, reason, first 1 KiB; 1 000   |
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+from rmc.common.checksum import crc32
+from rmc.common.errors import MessageError
+
+METRICS_KEPT = 300  # records of a role, at least: five minutes
+
+
+class EntryId(NamedTuple):
+    """A stream entry's explicit id; ``seq`` 0 is the hello."""
+
+    epoch: int
+    seq: int
+
+
+class Entry(NamedTuple):
+    """One stream entry as read by the replay server."""
+
+    actor: int
+    id: EntryId
+    payload: bytes
+
+
+class Ack(NamedTuple):
+    """What the replay server committed of an actor's stream, and how far the actor may step.
+
+    ``granted_steps`` counts environment steps of the actor in epoch ``id.epoch``. ``final``: the run's
+    total is reached with them, so what is still open at that point should be sent, cut short.
+    """
+
+    id: EntryId
+    granted_steps: int
+    final: bool = False
+
+
+class Version(NamedTuple):
+    """A policy's version; readers take the highest."""
+
+    epoch: int
+    update: int
+
+
+class Holder(NamedTuple):
+    """A replay server in its epoch, by which the bus knows one that was replaced."""
+
+    role: str
+    epoch: int
+
+
+@dataclass(frozen=True)
+class ReplayAddress:
+    """Where a replay server listens: ``unix:PATH`` or ``tcp:HOST:PORT``."""
+
+    epoch: int
+    address: str
+
+
+class Bus(Protocol):
+    """All that crosses between roles, except batches (they have a socket of their own).
+
+    Every method may raise BusUnavailable (retry) and, where it writes, BusFull (wait).
+    """
+
+    refused: Counter[str]
+    """What roles wrote and could not be read, by reason."""
+
+    def set_config(self, config: bytes) -> None:
+        """Register the run's config."""
+
+    def config(self) -> bytes | None:
+        """The run's config, or None where no run of this name is registered."""
+
+    def take_epoch(self, role: str, floor: int = 0) -> int:
+        """A new epoch of this role, larger than ``floor`` and than any taken before."""
+
+    def check_room(self, role: str) -> None:
+        """Raises BusFull or BusUnavailable where what this role writes would not be taken now."""
+
+    def current_epoch(self, role: str) -> int:
+        """The newest epoch taken by this role; 0 before the first."""
+
+    def append(self, actor: int, entry_id: EntryId, payload: bytes) -> None:
+        """Add an entry; one that is stored already is left as it is. Raises FencedError.
+
+        Only a hello makes a stream: where it is gone, BusUnavailable says that Redis has lost its data,
+        and everything from the hello on is to be added again.
+        """
+
+    def actors(self) -> list[int]:
+        """Ids of all actors that have appended anything."""
+
+    def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
+        """Up to ``count`` entries of each actor named in ``after``, past the id given, in order.
+
+        None that is there already is missing, but after ``expect``: then only what has come of that.
+        """
+
+    def expect(self, after: Mapping[int, EntryId], count: int) -> None:
+        """Begin to read: ``read`` past the same ids takes what has come by then, without a wait."""
+
+    def commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
+        """Publish acks and trim what they cover, unless a newer replay has come. Raises FencedError.
+
+        ``progress``, where there is any, is kept for a replay server that has to begin with an empty ring.
+        """
+
+    def progress(self, role: str) -> bytes | None:
+        """What that replay server last committed, as it said then."""
+
+    def set_progress(self, role: str, progress: bytes) -> None:
+        """Say it in its place, where Redis has nothing."""
+
+    def drop_stream(self, holder: Holder, actor: int) -> None:
+        """Make an actor send everything again from its hello on, unless a newer replay has come. Raises FencedError."""
+
+    def ack(self, actor: int) -> Ack | None:
+        """The newest ack for an actor."""
+
+    def dead_letter(self, entry: Entry, reason: str) -> None:
+        """Put a refused entry aside."""
+
+    def announce_replay(self, holder: Holder, address: str) -> None:
+        """Say where a replay server listens."""
+
+    def replay_address(self, role: str) -> ReplayAddress | None:
+        """Where that replay server listens, once it does."""
+
+    def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
+        """Make a policy the newest that acts, or the newest that the evaluator should play. Raises FencedError."""
+
+    def latest_version(self, evaluate: bool = False) -> Version | None:
+        """Of the newest policy that acts, or of the newest to evaluate."""
+
+    def weights(self, evaluate: bool = False) -> tuple[Version, bytes] | None:
+        """The newest policy, or the newest to evaluate. None if there is none or it was just replaced."""
+
+    def emit(self, role: str, record: Mapping[str, Any]) -> None:
+        """Append a metrics record, see ``common/record.py``."""
+
+    def records(self, after: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, str]]:
+        """Records of each role past its cursor ("0" = all that is kept), with a ``role``, and the next cursors.
+
+        What is no record is left out.
+        """
+
+    def request_stop(self, reason: str) -> None:
+        """Ask every role to end."""
+
+    def stop_requested(self) -> str | None:
+        """Why the run should end, or None."""
+
+    def clear_stop(self) -> None:
+        """Forget an earlier run's stop, before its roles start again."""
+
+
+PIECE_BYTES = 256 * 1024  # 10 MB blobs collapse redis-py; pieces of this size run at memory speed
+
+
+def split_pieces(blob: bytes) -> list[bytes]:
+    """A blob as pieces of at most 256 KiB, at least one."""
+    return [blob[start : start + PIECE_BYTES] for start in range(0, max(len(blob), 1), PIECE_BYTES)]
+
+
+def join_pieces(pieces: Sequence[bytes | None], crc: int) -> bytes:
+    """The blob again. Raises MessageError where a piece is missing or the CRC-32 differs."""
+    if any(piece is None for piece in pieces):
+        raise MessageError("weights", "a piece is gone: a newer version has replaced this one")
+    blob = b"".join(piece for piece in pieces if piece is not None)
+    if crc32(blob) != crc:
+        raise MessageError("crc", "weights")
+    return blob

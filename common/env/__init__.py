@@ -1,0 +1,1 @@
+"""Environments as the roles see them: made by id, wrapped by option."""

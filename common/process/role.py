@@ -1,0 +1,121 @@
+"""A role and the loop that every role shares: stop signal, heartbeat metrics, waiting out Redis."""
+
+import signal
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Protocol
+
+from rmc.common.bus.protocol import Bus
+from rmc.common.errors import BusFull, BusUnavailable
+from rmc.common.metrics import BusyClock
+from rmc.common.process.outage import Outage
+
+METRICS_PERIOD = 1.0  # seconds between a role's metrics records, which are its heartbeat too
+STOP_PERIOD = 0.5  # seconds between looks at the bus's stop key
+IDLE_SLEEP = 0.002  # seconds slept when a step had nothing to do
+RECONNECT_SLEEP = 0.5  # seconds between tries while Redis is away or full
+
+
+class Role(Protocol):
+    """A process of a run. ``name`` is unique in it, like ``actor-0``."""
+
+    name: str
+
+    def step(self) -> bool:
+        """One bounded piece of work; False where there was none and the loop should sleep briefly."""
+
+    def waiting_for(self) -> str:
+        """What the role waits for when ``step`` found nothing to do, like ``credit``."""
+
+    def metrics(self) -> dict[str, Any]:
+        """Flat metrics since the last call."""
+
+    def close(self) -> None:
+        """End in order: save what must be saved, leave nothing behind."""
+
+
+class StopSignal:
+    """Set by SIGTERM and SIGINT; the loop looks at it between steps."""
+
+    def __init__(self) -> None:
+        self.requested = False
+
+    def install(self) -> None:
+        """Catch both signals in this process."""
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: self.request())
+
+    def request(self) -> None:
+        self.requested = True
+
+
+class _Pulse:
+    """What every role says and hears once in a while: its metrics, and whether the run should end."""
+
+    def __init__(self, role: Role, bus: Bus, clock: BusyClock) -> None:
+        self._role, self._bus, self._clock = role, bus, clock
+        self.outage = Outage(role.name)
+        self._next_metrics = self._next_stop = 0.0
+
+    def says_stop(self) -> bool:
+        """Whether the bus says so; while Redis is away the role goes on with what needs none."""
+        now = time.monotonic()
+        try:
+            if now >= self._next_stop:
+                self._next_stop = now + STOP_PERIOD
+                if self._bus.stop_requested() is not None:
+                    return True
+            if now >= self._next_metrics:
+                self._next_metrics = now + METRICS_PERIOD
+                self._bus.emit(self._role.name, self.record())
+                self.outage.over()
+        except (BusUnavailable, BusFull) as error:
+            self.outage.note(error)
+            self._clock.wait("redis")
+            self._next_stop = self._next_metrics = next_try(now)
+        return False
+
+    def record(self) -> dict[str, Any]:
+        """What the role has to say now."""
+        refused = {"refused_values": self._bus.refused.total()}
+        return {"time": time.time(), **self._role.metrics(), **refused, **self._clock.shares()}
+
+
+def next_try(began: float) -> float:
+    """When to try again what failed: where Redis hangs, half of the time is for what needs none."""
+    now = time.monotonic()
+    return now + max(RECONNECT_SLEEP, now - began)
+
+
+def run_role(
+    role: Role,
+    bus: Bus,
+    stop: StopSignal,
+    finished: Callable[[], bool] = lambda: False,
+    beat: Callable[[], None] = lambda: None,
+) -> None:
+    """Step a role until it is stopped, fenced or finished; always closes it. ``beat`` is called before every step.
+
+    Redis away or full is waited out here; every other error ends the role.
+    """
+    clock = BusyClock()
+    pulse = _Pulse(role, bus, clock)
+    try:
+        while not (stop.requested or finished() or pulse.says_stop()):
+            beat()
+            try:
+                if role.step():
+                    clock.busy()
+                else:
+                    time.sleep(IDLE_SLEEP)
+                    clock.wait(role.waiting_for())
+            except (BusUnavailable, BusFull) as error:
+                time.sleep(RECONNECT_SLEEP)
+                pulse.outage.note(error)
+                clock.wait("redis")
+        last = pulse.record()
+    finally:
+        role.close()
+    with suppress(BusUnavailable, BusFull):  # said last, so that a Redis that hangs delays nothing
+        bus.emit(role.name, last)

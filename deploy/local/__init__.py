@@ -1,0 +1,1 @@
+"""A run on this machine: processes under a supervisor, or all roles in one thread."""

@@ -1,0 +1,120 @@
+"""The supervisor's end of the fork server; the program itself is ``rmc/cli/fork_server.py``."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import msgpack
+
+from rmc.common.errors import RoleDied
+from rmc.common.process import parent_death
+from rmc.deploy.local.role_environment import SINGLE_THREAD, inherited
+
+POLL_SECONDS = 0.01
+END_SECONDS = 2.0
+IMPORT_SECONDS, REPLY_SECONDS = 120.0, 10.0  # until one that does not answer counts as gone
+FAILED_STATUS = 1
+LARGEST = 65_536  # bytes of a request
+
+
+class Forked:
+    """A process that a nursery forked; what it has of ``subprocess.Popen`` does the same."""
+
+    def __init__(self, nursery: "Nursery", generation: int, pid: int, returncode: int | None = None) -> None:
+        self._nursery, self._generation, self.pid = nursery, generation, pid
+        self.returncode = returncode
+
+    def poll(self) -> int | None:
+        """Its exit status, negative for a signal; None while it runs."""
+        if self.returncode is None:
+            self.returncode = self._nursery.status_of(self.pid, self._generation)
+        return self.returncode
+
+    def wait(self, timeout: float) -> int:
+        """Its exit status, once it has one. Raises subprocess.TimeoutExpired."""
+        deadline = time.monotonic() + timeout
+        while (status := self.poll()) is None:
+            if time.monotonic() >= deadline:
+                raise subprocess.TimeoutExpired(str(self.pid), timeout)
+            time.sleep(POLL_SECONDS)
+        return status
+
+
+class Nursery:
+    """Started with the first role, and again if it is killed: with it go those it forked."""
+
+    def __init__(self, log: Path) -> None:
+        self._log = log
+        self._program: subprocess.Popen[bytes] | None = None
+        self._generation = 0  # of the program
+        self._ours: socket.socket | None = None
+
+    def fork(self, words: tuple[str, ...], environment: dict[str, str], log: int) -> Forked:
+        """A process of ``rmc`` and these words, its output to ``log``. Raises RoleDied where no nursery comes up.
+
+        Where the system has no room for a process, its log says so and it has ended already.
+        """
+        request = {"words": words, "environment": environment}
+        for _ in range(2):  # one that was killed since is found out by asking it
+            self.start()
+            pid = self._ask(request, log)
+            if pid is not None:
+                return Forked(self, self._generation, pid, None if pid else FAILED_STATUS)
+        raise RoleDied(f"the nursery of roles does not start; its log is {self._log}")
+
+    def status_of(self, pid: int, generation: int) -> int | None:
+        """The exit status of one that it forked; those of a nursery that is gone were killed with it."""
+        if generation != self._generation or self._program is None or self._program.poll() is not None:
+            return -signal.SIGKILL
+        reply = self._ask(pid)
+        if reply is None:
+            return -signal.SIGKILL
+        return None if reply == "running" else int(reply)
+
+    def start(self) -> None:
+        """Unless it is there."""
+        if self._program is not None and self._program.poll() is None:
+            return
+        self.close()
+        self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        environment = {**inherited(), **SINGLE_THREAD, parent_death.PARENT_VARIABLE: str(os.getpid())}
+        words = [sys.executable, "-P", "-m", "rmc.cli.fork_server", str(theirs.fileno())]
+        with theirs, self._log.open("ab") as log:
+            self._program = subprocess.Popen(
+                words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0,
+                pass_fds=(theirs.fileno(),),
+            )  # fmt: skip
+        self._generation += 1
+        self._ours.settimeout(IMPORT_SECONDS)
+
+    def _ask(self, request: Any, descriptor: int | None = None) -> Any:
+        """Its reply, or None where it is gone."""
+        assert self._ours is not None
+        try:
+            socket.send_fds(self._ours, [msgpack.packb(request)], [] if descriptor is None else [descriptor])
+            reply = self._ours.recv(LARGEST)
+            self._ours.settimeout(REPLY_SECONDS)
+        except OSError:  # or it hangs
+            reply = b""
+        if not reply:
+            self.close()
+            return None
+        return msgpack.unpackb(reply)
+
+    def close(self) -> None:
+        """End it, and with it those that it forked."""
+        if self._ours is not None:
+            self._ours.close()
+            self._ours = None
+        if self._program is not None:
+            try:
+                self._program.wait(END_SECONDS)
+            except subprocess.TimeoutExpired:
+                self._program.kill()
+                self._program.wait()
+            self._program = None

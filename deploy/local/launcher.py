@@ -1,0 +1,171 @@
+"""A run as processes of this machine: embedded Redis if none is given, roles under the supervisor, the monitor."""
+
+import logging
+import os
+import shutil
+import tempfile
+import time
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+import psutil
+
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.errors import BusFull, BusUnavailable
+from rmc.common.process.role import StopSignal
+from rmc.common.shard import Shard
+from rmc.deploy.local.role_environment import URL_VARIABLE
+from rmc.deploy.local.supervisor import STOP_SECONDS, RoleCommand, Supervisor
+from rmc.deploy.monitor.monitor import Monitor
+from rmc.deploy.redis.connect import PATIENCE_VARIABLE, connect
+from rmc.deploy.redis.registration import Registration
+from rmc.deploy.redis.server import RedisServer
+from rmc.deploy.redis.users import LAUNCHER, RedisUsers
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder
+
+TICK_SECONDS = 0.1
+OUTAGE_SECONDS = 86_400.0  # of a Redis that answered once, until a role that is started amid it gives up
+KEPT_SECONDS = 3600  # in a user's Redis, after the end
+PREFIX = "rmc-run-"  # of the temporary folders that hold the sockets
+log = logging.getLogger(__name__)
+
+
+def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -> list[RoleCommand]:
+    """How each role of the run is started here; the same commands start them by hand."""
+    place = ("--run", folder.name)
+    secret = ("--secret-file", str(folder.secret_file))
+    learn = ("--folder", str(folder.checkpoints), "--device", device)
+    actors = [RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))) for index in range(config.actors)]
+    return [
+        *(_replay_command(shard, folder, sockets, (*place, *secret)) for shard in config.shards()),
+        RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
+        RoleCommand("evaluator", ("evaluator", *place)),
+        *actors,
+    ]
+
+
+def _replay_command(shard: Shard, folder: RunFolder, sockets: Path, place: tuple[str, ...]) -> RoleCommand:
+    listen = f"unix:{sockets / shard.role}.sock"
+    words = ("--folder", str(folder.path / shard.role), "--listen", listen, "--shard", str(shard.index))
+    return RoleCommand(shard.role, ("replay", *place, *words))
+
+
+def _redis(config: RunConfig, folder: RunFolder, sockets: Path) -> RedisServer:
+    return RedisServer(sockets, users=RedisUsers(folder.name, folder.secret(), config.roles()))
+
+
+class LocalRun:
+    """A run's processes between ``start`` and ``close``."""
+
+    def __init__(self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str) -> None:
+        self._leave = ExitStack()
+        sweep()
+        self.sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))  # private, and short: see redis_server
+        self._leave.callback(shutil.rmtree, self.sockets)
+        try:
+            self._server = None if redis_url else self._leave.enter_context(_redis(config, folder, self.sockets))
+            self.bus = connect(redis_url or self._url(LAUNCHER), folder.name)
+            self._registration = Registration(config, folder, self.bus)
+        except BaseException:
+            self._leave.close()
+            raise
+        self.supervisor = Supervisor(
+            commands(config, folder, self.sockets, device),
+            lambda role: {URL_VARIABLE: redis_url or self._url(role), PATIENCE_VARIABLE: str(OUTAGE_SECONDS)},
+            folder.logs,
+        )
+
+    def _url(self, user: str) -> str:
+        assert self._server is not None
+        return self._server.url(user)
+
+    def tend(self) -> None:
+        """Start again what died: roles, and the embedded Redis. Raises RoleDied."""
+        if self._server is not None and not self._server.alive():
+            log.warning("the embedded Redis died; starting it again")
+            self._server.start()
+        self._registration.tend()
+        self.supervisor.tend()
+
+    def finished(self) -> bool:
+        """Whether the learner has ended in order."""
+        return self.supervisor.roles["learner"].finished
+
+    def close(self) -> None:
+        """End everything; nothing is left but the run's folder."""
+        try:
+            self.supervisor.stop()
+            self._registration.keep()
+            if self._server is None:
+                _expire(self.bus)
+        finally:
+            self._leave.close()
+
+
+def sweep() -> None:
+    """Remove what launchers killed by force have left; their processes died with them."""
+    for left in Path(tempfile.gettempdir()).glob(f"{PREFIX}*-*"):
+        owner = left.name.removeprefix(PREFIX).partition("-")[0]
+        with suppress(FileNotFoundError):  # another launcher sweeps, too
+            if owner.isdigit() and not psutil.pid_exists(int(owner)) and left.stat().st_uid == os.getuid():
+                shutil.rmtree(left, ignore_errors=True)
+
+
+def _expire(bus: RedisBus) -> None:
+    """Do not leave a user's Redis full of runs that are over; what they need to go on is in their folders."""
+    with suppress(BusUnavailable, BusFull):
+        bus.expire(KEPT_SECONDS)
+
+
+def train(
+    config: RunConfig, folder: RunFolder, redis_url: str | None, device: str, monitor: Monitor, stop: StopSignal
+) -> bool:
+    """Train until the total is reached or ``stop`` is set; whether it was reached. Raises RoleDied, ConfigError."""
+    run = LocalRun(config, folder, redis_url, device)
+    monitor.restarts = run.supervisor.restarts
+    try:
+        monitor.skip_old(run.bus)
+        run.supervisor.start()
+        while not stop.requested and not run.finished():
+            run.tend()
+            watch(monitor, run.bus)
+            time.sleep(TICK_SECONDS)
+        run.supervisor.stop()
+        watch(monitor, run.bus)  # what the roles said last
+        return monitor.learner_finished()
+    finally:
+        run.close()
+
+
+def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monitor, stop: StopSignal) -> bool:
+    """Register a run whose roles are started by hand, watch it and end it; whether its total was reached."""
+    bus = connect(redis_url, folder.name)
+    registration = Registration(config, folder, bus)
+    monitor.skip_old(bus)
+    while not stop.requested and not monitor.learner_finished():
+        registration.tend()
+        watch(monitor, bus)
+        time.sleep(TICK_SECONDS)
+    with suppress(BusUnavailable, BusFull):
+        bus.request_stop("stopped by its launcher" if stop.requested else "finished")
+    deadline = time.monotonic() + STOP_SECONDS
+    while stop.requested and time.monotonic() < deadline:  # the learner saves; what it says then is still recorded
+        watch(monitor, bus)
+        time.sleep(TICK_SECONDS)
+    _expire(bus)
+    return monitor.learner_finished()
+
+
+def watch(monitor: Monitor, bus: RedisBus) -> None:
+    """Let the monitor see what is new; a Redis that is away for a while costs nothing but that."""
+    try:
+        monitor.watch(bus)
+        monitor.outage.over()
+    except (BusUnavailable, BusFull) as error:
+        monitor.outage.note(error)
+
+
+def check_redis(url: str) -> None:
+    """Raises ConfigError where no Redis answers."""
+    connect(url, "check")

@@ -1,0 +1,119 @@
+"""Every role in one thread over the in-process bus: same seed, same bits. For debugging and tests."""
+
+import itertools
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rmc.actors.actor import Actor
+from rmc.actors.evaluator import Evaluator
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.protocol import Bus
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.env.make import make_env
+from rmc.common.metrics import BusyClock
+from rmc.common.process.role import METRICS_PERIOD, Role, StopSignal
+from rmc.deploy.local.roles import initial_priority
+from rmc.deploy.run.config import RunConfig
+from rmc.learner.learner import Learner
+from rmc.replay_server.server import ReplayServer
+
+
+class Lockstep:
+    """A whole run, stepped in a fixed order: the learner while the limiter lets it, else the actors.
+
+    Checkpoints drop unfinished episodes and reseed the environments, whether or not the run stops
+    there: only so can stop-and-resume give the same bits for any environment.
+    """
+
+    def __init__(self, config: RunConfig, folder: Path, device: str = "cpu") -> None:
+        spec, self.bus = config.window_spec(), MemoryBus()
+        self.server = ReplayServer(
+            spec,
+            config.replay,
+            folder / "replay",
+            config.seed,
+            config.total_steps,
+            config.actors,
+            config.slack_steps(),
+            self.bus,
+        )
+        self.server.step()  # publishes what a resumed ring has seen, from which actors take their epochs
+        checkpoints = CheckpointFolder(folder / "checkpoints", config.learner.keep_checkpoints)
+        self.learner = Learner(
+            spec, config.agent, config.update, config.learner, self.server, self.bus, checkpoints, config.seed, device
+        )
+        ticks = itertools.count()  # timers count calls, so that no clock decides anything
+        self.actors = [
+            Actor(
+                index,
+                config.seed,
+                lambda: make_env(config.env),
+                spec,
+                config.agent,
+                config.actor,
+                self.bus,
+                clock=lambda: float(next(ticks)),
+                rater=initial_priority(config, index),
+            )
+            for index in range(config.actors)
+        ]
+        self.evaluator = Evaluator(
+            config.seed,
+            lambda: make_env(config.env),
+            config.agent,
+            config.evaluator,
+            self.bus,
+            clock=lambda: float(next(ticks)),
+        )
+        self._seen = self.learner.last_checkpoint
+        self._restart_due = False
+
+    @property
+    def roles(self) -> list[Role]:
+        return [self.learner, self.server, *self.actors, self.evaluator]
+
+    def step(self) -> None:
+        """One update, or one round of collection where none is due."""
+        if self._restart_due:
+            self._restart_due = False
+            for actor in self.actors:
+                actor.restart()
+        if not self.learner.step():
+            for actor in self.actors:
+                actor.step()
+            while self.server.step():
+                pass
+        if self.learner.last_checkpoint != self._seen:
+            self._after_checkpoint()
+
+    def _after_checkpoint(self) -> None:
+        """Save the ring beside the learner; the actors begin anew in the next step, as those of a resumed run do."""
+        self._seen = self.learner.last_checkpoint
+        while self.evaluator.step():
+            pass
+        self.server.checkpoint()
+        self._restart_due = True
+
+    def close(self) -> None:
+        """Close every role; the learner saves first."""
+        for role in self.roles:
+            role.close()
+
+
+def train(config: RunConfig, folder: Path, watch: Callable[[Bus], None], stop: StopSignal, device: str = "cpu") -> None:
+    """Train until the total is reached or ``stop`` is set; ``watch`` sees the bus about once a second."""
+    run = Lockstep(config, folder, device)
+    clock, due = BusyClock(), 0.0
+    try:
+        while not run.learner.finished and not stop.requested:
+            run.step()
+            clock.busy()
+            if time.monotonic() >= due:
+                due = time.monotonic() + METRICS_PERIOD
+                for role in run.roles:
+                    run.bus.emit(role.name, {"time": time.time(), **role.metrics(), **clock.shares()})
+                watch(run.bus)
+    finally:
+        run.close()
+        watch(run.bus)

@@ -1,0 +1,184 @@
+"""Keeps a run's roles alive as processes of this machine, and ends them so that nothing is left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from rmc.common.errors import RoleDied
+from rmc.common.process.parent_death import PARENT_VARIABLE
+from rmc.deploy.local.fork_server import Forked, Nursery
+from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inherited
+
+# So many deaths of a role's own in a row, each within so long of its start, end the run.
+QUICK_DEATHS, QUICK_SECONDS = 3, 60.0
+FIRST_BACKOFF, LONGEST_BACKOFF = 0.25, 10.0  # seconds before a role is started again, doubled at each quick death
+STOP_SECONDS = 3.5  # for the roles to end in order; then they are killed
+EXIT_CONFIG = 2  # the exit status of an error that starting again cannot mend
+TRACEBACK_BYTES = 8192
+
+
+def from_outside(status: int) -> bool:
+    """Whether somebody else ended it, for whom it can do nothing: it is started again, however often."""
+    return status in (-signal.SIGKILL, -signal.SIGTERM)
+
+
+@dataclass(frozen=True)
+class RoleCommand:
+    """How a role is started: ``rmc`` and its words."""
+
+    name: str
+    words: tuple[str, ...]
+    single_thread: bool = True
+    ends: bool = False  # in order, once the run is done; any other that ends unasked is started again
+
+
+class RoleProcess:
+    """One role: its process, its log, its deaths. Of a single thread, it is forked where there is a nursery."""
+
+    def __init__(
+        self, command: RoleCommand, environment: dict[str, str], logs: Path, nursery: Nursery | None = None
+    ) -> None:
+        self.command, self.log, self.restarts = command, logs / f"{command.name}.log", 0
+        self._environment = {**environment, **(SINGLE_THREAD if command.single_thread else {})}
+        self._nursery = nursery if command.single_thread else None
+        self._process: subprocess.Popen[bytes] | Forked | None = None
+        self.log_start = 0  # where in its log this start's words begin
+        self._started_at, self._start_at = 0.0, 0.0
+        self._quick_deaths, self.finished = 0, False
+
+    @property
+    def running(self) -> bool:
+        """Whether its process is there."""
+        return self._process is not None and self._process.poll() is None
+
+    @property
+    def pid(self) -> int | None:
+        """Its process, if it runs."""
+        return self._process.pid if self._process is not None and self.running else None
+
+    @property
+    def status(self) -> int | None:
+        """Its exit status, negative for a signal; None while it runs."""
+        return self._process.poll() if self._process is not None else None
+
+    def start(self) -> None:
+        """Start its process, in a process group of its own: Ctrl-C is for the supervisor alone."""
+        self.log_start = self.log.stat().st_size if self.log.exists() else 0
+        self._started_at = time.monotonic()
+        with self.log.open("ab") as log:
+            if self._nursery is not None:
+                self._process = self._nursery.fork(self.command.words, self._environment, log.fileno())
+            else:
+                self._process = self._new_process(log)
+
+    def _new_process(self, log: BinaryIO) -> subprocess.Popen[bytes]:
+        environment = {**inherited(), **self._environment, PARENT_VARIABLE: str(os.getpid())}
+        words = command_line(self.command.words)
+        return subprocess.Popen(
+            words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0
+        )
+
+    def tend(self) -> None:
+        """Note a death, or start again when it is time. Raises RoleDied."""
+        if self.finished or self.running:
+            return
+        if (status := self.status) is not None:
+            self._process = None
+            if status == 0 and self.command.ends:
+                self.finished = True
+            else:
+                self._note_death(status)
+        elif time.monotonic() >= self._start_at:
+            self.restarts += 1
+            self.start()
+
+    def _note_death(self, status: int) -> None:
+        now = time.monotonic()
+        quick = now - self._started_at < QUICK_SECONDS and not from_outside(status)
+        self._quick_deaths = self._quick_deaths + 1 if quick else 0
+        if self._quick_deaths >= QUICK_DEATHS or status == EXIT_CONFIG:
+            how = f"killed by signal {-status}" if status < 0 else f"exit status {status}"
+            often = f"{self._quick_deaths} times in a row soon after its start" if self._quick_deaths > 1 else "at once"
+            raise RoleDied(f"{self.command.name} ended {often}, {how}; its last words:\n{self.last_words()}")
+        self._start_at = now + min(FIRST_BACKOFF * 2**self._quick_deaths, LONGEST_BACKOFF)
+
+    def last_words(self) -> str:
+        """The end of its log, of this start only: the traceback, if it left one."""
+        with self.log.open("rb") as log:
+            log.seek(max(self.log_start, self.log.stat().st_size - TRACEBACK_BYTES))
+            text = log.read().decode(errors="replace").rstrip()
+        start = text.rfind("Traceback (most recent call last)")
+        return text[start:] if start >= 0 else "\n".join(text.splitlines()[-20:]) or "(none)"
+
+    def signal(self, number: int) -> None:
+        """Send a signal to its process group, if it runs."""
+        if self.running:
+            assert self._process is not None
+            with suppress(ProcessLookupError):  # it has ended since
+                os.killpg(self._process.pid, number)
+
+    def reap(self, timeout: float) -> bool:
+        """Wait for its end; whether it came."""
+        if self._process is None:
+            return True
+        try:
+            self._process.wait(max(0.0, timeout))
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+
+class Supervisor:
+    """All roles of a run. ``tend`` them often; ``stop`` them at the end, whatever the end was."""
+
+    def __init__(self, commands: list[RoleCommand], environment: Callable[[str], dict[str, str]], logs: Path) -> None:
+        """``environment`` is of each role by its name, beside this process's own."""
+        self._nursery = Nursery(logs / "nursery.log") if sys.platform == "linux" else None  # elsewhere a fork may crash
+        self.roles = {
+            command.name: RoleProcess(command, environment(command.name), logs, self._nursery) for command in commands
+        }
+
+    def start(self) -> None:
+        """Start every role: first those that need no nursery, which takes its time to begin."""
+        if self._nursery is not None:
+            self._nursery.start()
+        for role in sorted(self.roles.values(), key=lambda role: role.command.single_thread):
+            role.start()
+
+    def tend(self) -> None:
+        """Start dead roles again. Raises RoleDied for one that dies too often."""
+        for role in self.roles.values():
+            role.tend()
+
+    def restarts(self) -> dict[str, int]:
+        """How often each role was started again."""
+        return {name: role.restarts for name, role in self.roles.items()}
+
+    def stop(self) -> None:
+        """End every role, the replay servers after the others, which may need them; kill what does not end in time."""
+        deadline = time.monotonic() + STOP_SECONDS
+        last = [role for name, role in self.roles.items() if name.startswith("replay")]
+        others = [role for role in self.roles.values() if role not in last]
+        try:
+            self._end(others, deadline - STOP_SECONDS / 4)
+            self._end(last, deadline)
+        finally:
+            for role in self.roles.values():
+                role.signal(signal.SIGKILL)
+                role.reap(STOP_SECONDS)
+            if self._nursery is not None:
+                self._nursery.close()
+
+    @staticmethod
+    def _end(roles: list[RoleProcess], deadline: float) -> None:
+        for role in roles:
+            role.signal(signal.SIGTERM)
+        for role in roles:
+            role.reap(deadline - time.monotonic())

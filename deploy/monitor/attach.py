@@ -1,0 +1,96 @@
+"""Watching a run from outside its launcher, and ending it: by its folder alone, on the machine that holds that."""
+
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from rmc.common.errors import ConfigError
+from rmc.deploy.monitor.view import Board, View
+from rmc.deploy.run.folder import RunFolder, record
+
+LOOK_SECONDS = 0.2
+AWAY_SECONDS = 30.0  # a launcher on Ray that was killed begins again within that
+STOP_SECONDS = 60.0
+
+
+class Tail:
+    """The records of a ``metrics.jsonl`` that others write to."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._position = path, 0
+
+    def take(self) -> list[dict[str, Any]]:
+        """Those that are new since the last call."""
+        with suppress(FileNotFoundError), self._path.open("rb") as file:
+            file.seek(self._position)
+            text = file.read()
+            whole = text[: text.rfind(b"\n") + 1]
+            self._position += len(whole)
+            return list(filter(None, map(record, whole.splitlines())))
+        return []
+
+
+def watch(folder: RunFolder, console: Console, gone: Callable[[], bool]) -> int | None:
+    """Show a run until its launcher ends, and give its exit status; None where it is ``gone`` without one."""
+    config = folder.config()
+    board = Board(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
+    tail, view = Tail(folder.metrics), View(board, console)
+    try:
+        while folder.ended() is None and not gone():
+            for found in tail.take():
+                board.take(found)
+            view.refresh()
+            time.sleep(LOOK_SECONDS)
+    finally:
+        for found in tail.take():
+            board.take(found)
+        view.close()
+    return folder.ended()
+
+
+class Absence:
+    """Whether no launcher has trained a run for long."""
+
+    def __init__(self, folder: RunFolder) -> None:
+        self._folder, self._seen = folder, time.monotonic()
+
+    def __call__(self) -> bool:
+        if self._folder.trainer() is not None:
+            self._seen = time.monotonic()
+        return time.monotonic() - self._seen > AWAY_SECONDS
+
+
+def trained_now(folder: RunFolder) -> int:
+    """The launcher's process. Raises ConfigError where nobody trains this run."""
+    comes_back = (folder.path / "learner-at").exists() and folder.ended() is None  # on Ray, where it was killed
+    deadline = time.monotonic() + AWAY_SECONDS * comes_back
+    while (trainer := folder.trainer()) is None:
+        if time.monotonic() >= deadline:
+            folder.settings()
+            fix = "nobody trains it now; the command that began it goes on with it, given its --run-dir"
+            raise ConfigError("RUN", str(folder.path), fix)
+        time.sleep(LOOK_SECONDS)
+    return trainer
+
+
+def stop(folder: RunFolder) -> int:
+    """Ask the launcher to end the run in order, and wait until it has; its exit status. Raises ConfigError."""
+    trainer = trained_now(folder)
+    if (host := folder.trainer_host()) not in ("", socket.gethostname()):
+        raise ConfigError("RUN", str(folder.path), f"is trained on {host}; stop it there")
+    with suppress(ProcessLookupError):  # it has just ended
+        os.kill(trainer, signal.SIGTERM)
+    deadline = time.monotonic() + STOP_SECONDS
+    while folder.trainer() is not None:
+        if time.monotonic() > deadline:
+            raise ConfigError("RUN", str(folder.path), f"did not end within {STOP_SECONDS:.0f} s; see {folder.logs}")
+        time.sleep(LOOK_SECONDS)
+    ended = folder.ended()
+    return 0 if ended is None else ended

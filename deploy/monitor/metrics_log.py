@@ -1,0 +1,79 @@
+"""A run's records as they are kept: lines of metrics.jsonl and TensorBoard's events. A full disk is waited out."""
+
+import errno
+import json
+import logging
+import os
+import time
+from contextlib import suppress
+from typing import Any
+
+from tensorboard.compat.proto.event_pb2 import Event
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+from rmc.deploy.run.folder import RunFolder
+
+RETRY_SECONDS = 10.0  # until the next try after a write that failed
+log = logging.getLogger(__name__)
+
+
+class Journal:
+    """Of one launcher. What is said while nothing can be written is not kept, which the log says once."""
+
+    def __init__(self, folder: RunFolder) -> None:
+        self._lines = os.open(folder.metrics, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        self._path, self._events_folder = folder.metrics, folder.events
+        self._events: EventFileWriter | None = None
+        self._retry_at: float | None = None
+
+    def write(self, record: dict[str, Any], env_steps: int) -> None:
+        """A record with its ``role``, at an environment step."""
+        if self._retry_at is not None and time.monotonic() < self._retry_at:
+            return
+        try:
+            _append(self._lines, (json.dumps(record) + "\n").encode())
+            self._add_event(record, env_steps)
+        except OSError as error:
+            if self._retry_at is None:
+                log.warning("%s is not written: %s; it is again once that is over", self._path, error.strerror)
+            self._retry_at = time.monotonic() + RETRY_SECONDS
+            self._drop_events()  # its thread ends at the first error
+            return
+        if self._retry_at is not None:
+            log.warning("%s is written again", self._path)
+            self._retry_at = None
+
+    def _add_event(self, record: dict[str, Any], env_steps: int) -> None:
+        if self._events is None:
+            self._events = EventFileWriter(str(self._events_folder))
+        values = [
+            Summary.Value(tag=f"{record['role']}/{name}", simple_value=value)
+            for name, value in record.items()
+            if isinstance(value, int | float) and name != "time"
+        ]
+        when = record.get("time", time.time())
+        self._events.add_event(Event(wall_time=when, step=env_steps, summary=Summary(value=values)))
+
+    def _drop_events(self) -> None:
+        events, self._events = self._events, None
+        with suppress(OSError):
+            if events is not None:
+                events.close()
+
+    def close(self) -> None:
+        """Write what is left."""
+        os.close(self._lines)
+        self._drop_events()
+
+
+def _append(file: int, line: bytes) -> None:
+    """The whole line or none of it. Raises OSError."""
+    size = os.fstat(file).st_size
+    try:
+        if os.write(file, line) < len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    except OSError:
+        with suppress(OSError):
+            os.ftruncate(file, size)
+        raise

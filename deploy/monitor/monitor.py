@@ -1,0 +1,109 @@
+"""What everyone looks at: metrics from the bus to metrics.jsonl, TensorBoard, and a live view or plain lines."""
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from rich.console import Console
+
+from rmc.common.bus.metrics_record import is_finite
+from rmc.common.bus.protocol import Bus
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.process.outage import Outage
+from rmc.deploy.monitor.metrics_log import Journal
+from rmc.deploy.monitor.view import Board, View
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder
+
+RECORD_SECONDS = 5.0  # between the launcher's own records
+
+
+class Monitor:
+    """Reads every role's records and shows them. ``watch`` as often as you like; ``close`` at the end."""
+
+    def __init__(self, folder: RunFolder, config: RunConfig, console: Console) -> None:
+        self.board = Board(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
+        self.restarts: Callable[[], dict[str, int]] = dict  # how often each role was started again
+        self.unplaced: Callable[[], list[str]] = list  # roles that run nowhere now
+        self._checkpoints = CheckpointFolder(folder.checkpoints, config.learner.keep_checkpoints)
+        self.roles: Callable[[], tuple[str, ...]] = config.roles  # who may have something to say
+        self._cursors: dict[str, str] = {}
+        self._refused = 0  # records and values that could not be read
+        self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
+        self._next_record = 0.0
+        self._journal = Journal(folder)
+        self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
+        self.view, self.outage = View(self.board, console), Outage("launcher")
+
+    @property
+    def wall_seconds(self) -> float:
+        """Seconds trained, over all starts of the run."""
+        return self._wall_before + time.monotonic() - self._started
+
+    def learner_finished(self) -> bool:
+        """Whether the learner said that all steps are in and its last checkpoint is written."""
+        return bool(self.board.get("learner", "finished"))
+
+    def skip_old(self, bus: Bus) -> None:
+        """Pass over what an earlier start left in a shared Redis."""
+        while self._read(bus):
+            pass
+
+    def watch(self, bus: Bus) -> None:
+        """Take in what is new, and refresh the view when it is due."""
+        self._take_in(bus)
+        now = time.monotonic()
+        if now >= self._next_record:
+            self._next_record = now + RECORD_SECONDS
+            self._record_launcher()
+        self.view.refresh()
+
+    def _take_in(self, bus: Bus) -> None:
+        while records := self._read(bus):
+            for record in records:
+                self.record(record)
+
+    def _read(self, bus: Bus) -> list[dict[str, Any]]:
+        self._refused = bus.refused.total()
+        records, self._cursors = bus.records({role: self._cursors.get(role, "0") for role in self.roles()})
+        return records
+
+    def record(self, record: dict[str, Any]) -> None:
+        """Write one record (with its ``role``) and take it into the view."""
+        self.board.take(record)
+        at = self.board.checkpoint_steps(record.get("eval_update"))  # an evaluation belongs where its checkpoint was
+        if at is None:
+            self._journal.write(record, self.board.env_steps)
+        else:
+            self._journal.write(record | {"eval_env_steps": at}, at)
+        update, score = record.get("eval_update"), record.get("eval_return_mean")
+        if (
+            record["role"] == "evaluator" and isinstance(update, int) and is_finite(score)
+        ):  # who says half, says nothing
+            self._unmarked[update] = float(score)
+        with suppress(OSError):  # no room; the next record tries again
+            for update in list(self._unmarked):
+                self._checkpoints.mark_best(update, self._unmarked[update])
+                del self._unmarked[update]
+
+    def _record_launcher(self) -> None:
+        restarts = {f"restarts_{role}": count for role, count in self.restarts().items()}
+        total = sum(restarts.values())
+        self.record(
+            {
+                "role": "launcher",
+                "time": time.time(),
+                "wall_s": self.wall_seconds,
+                "restarts": total,
+                **restarts,
+                "refused_values": self._refused,
+                "not_running": " ".join(self.unplaced()),
+            }
+        )
+
+    def close(self) -> None:
+        """Show the last state and close the files."""
+        self._record_launcher()
+        self.view.close()
+        self._journal.close()

@@ -1,0 +1,93 @@
+"""A run's launcher on a Ray cluster, from outside: joining the cluster, starting a launcher there, finding one."""
+
+import logging
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+try:
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+except ImportError as missing:
+    from rmc.common.errors import ConfigError
+
+    raise ConfigError("--launcher", "ray", "Ray is not installed; pip install 'rmc[ray]'") from missing
+
+from rmc.common.errors import ConfigError
+from rmc.deploy.local.supervisor import RoleCommand
+from rmc.deploy.ray.launcher_actor import LauncherHost
+from rmc.deploy.ray.role_actor import NAMESPACE, Task, host_name, last_line
+from rmc.deploy.run import tls
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder
+
+BEGIN_SECONDS = 60.0  # of the launcher's host
+
+
+@contextmanager
+def joined(address: str, cpus: int | None = None) -> Iterator[None]:
+    """In a cluster as a driver; ``local`` starts one for this process alone. Raises ConfigError."""
+    quiet: dict[str, Any] = {"namespace": NAMESPACE, "log_to_driver": False, "logging_level": logging.ERROR}
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    mask = os.umask(0o077)  # Ray may write its token, and lets everyone read it
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        if address == "local":
+            ray.init(address="local", num_cpus=cpus, include_dashboard=False, **quiet)
+        else:
+            ray.init(address=address, **quiet)
+    except (ConnectionError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
+        said = (str(error).strip() or type(error).__name__).splitlines()[0]
+        fix = f"no Ray cluster answers ({said}); start one with ray start --head, or take local"
+        raise ConfigError("--ray-address", address, fix) from None
+    finally:
+        os.umask(mask)
+        for number, handler in handlers.items():  # Ray takes SIGTERM for itself
+            signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> None:
+    """Start a run's launcher on this node, which must be the head. Raises ConfigError."""
+    context = ray.get_runtime_context()
+    head = next((node for node in ray.nodes() if "node:__internal_head__" in node["Resources"]), None)
+    if head is None or head["NodeID"] != context.get_node_id():
+        raise ConfigError(
+            "--launcher", "ray", "this is not the cluster's head; run it there, by ray attach or ray exec"
+        )
+    for file in (tls.CERTIFICATE, tls.KEY):  # for the address that the head has now
+        (folder.path / file).unlink(missing_ok=True)
+    words = ["launcher", str(folder.path), "--ray-address", context.gcs_address, "--device", device]
+    words += ["--all-cpus"] * all_cpus + ["--tls"] * encrypted
+    command = RoleCommand("launcher", tuple(words), single_thread=False, ends=True)
+    options = ray.remote(LauncherHost).options(
+        name=host_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
+        max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
+    )  # fmt: skip
+    task = Task(folder.name, command, {}, {}, os.getcwd())
+    host = options.remote(task, str(folder.path), config.learner.keep_checkpoints)
+    try:
+        ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)
+    except ray.exceptions.RayError as error:
+        fix = f"the run's launcher could not begin on the head ({last_line(error)})"
+        raise ConfigError("--launcher", "ray", fix) from None
+
+
+def check_not_there(folder: RunFolder) -> None:
+    """Raises ConfigError where the run has a launcher, if only one that is being started again."""
+    if is_there(folder):
+        raise ConfigError("--run-dir", str(folder.path), "this run is being trained; rmc attach watches it")
+
+
+def is_there(folder: RunFolder) -> bool:
+    """Whether the run's launcher has a host."""
+    try:
+        ray.get_actor(host_name(folder.name, "launcher"), NAMESPACE)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,79 @@
+"""``LearnerHost``: the Ray actor that runs the learner and carries its checkpoints to the head."""
+
+import shutil
+import time
+from typing import Any
+
+import ray
+
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.deploy.ray.role_actor import (
+    AWAY,
+    CLAIM_SECONDS,
+    LOOK_SECONDS,
+    NAMESPACE,
+    SETTLE_SECONDS,
+    RoleHost,
+    host_name,
+    last_line,
+)
+
+
+class LearnerHost(RoleHost):
+    """The learner's: brings the newest checkpoint from the head before, and takes every new one there."""
+
+    def prepare(self) -> None:
+        folder, place = self.scratch / "checkpoints", ray.get_runtime_context().get_node_id()
+        self._folder = CheckpointFolder(folder)
+        launcher, was_here = self._claim(place)
+        if not was_here:
+            shutil.rmtree(folder, ignore_errors=True)  # of an earlier stay on this node: the run has gone on elsewhere
+        found = self._folder.latest()
+        newest = ray.get(launcher.newest.remote(found[0] if found is not None else -1))
+        if newest is not None:
+            self._folder.save(*newest)
+        self._archived = set(ray.get(launcher.numbers.remote()))
+        self._epoch: int = ray.get(launcher.last_epoch.remote())
+        self._folder.note_epoch(max(self._epoch, self._folder.last_epoch()))
+
+    def _claim(self, place: str) -> tuple[Any, bool]:
+        """The launcher, and whether the learner was here before."""
+        deadline = time.monotonic() + CLAIM_SECONDS
+        while True:
+            try:
+                launcher = self._launcher()
+                return launcher, ray.get(launcher.claim.remote(self._life, place))
+            except AWAY:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(LOOK_SECONDS)
+
+    def _launcher(self) -> Any:
+        return ray.get_actor(host_name(self._task.run, "launcher"), NAMESPACE)
+
+    def tend(self) -> None:
+        try:
+            self._bring()
+            self.trouble = ""
+        except AWAY as error:
+            self.trouble = f"checkpoints do not reach the head: {last_line(error)}"
+            raise
+
+    def _bring(self) -> None:
+        newest = max(self._archived, default=-1)
+        for number in self._folder.numbers():
+            if number > newest and number not in self._archived:
+                ray.get(self._launcher().archive.remote(self._life, number, self._folder.load(number)))
+                self._archived.add(number)
+        epoch = self._folder.last_epoch()
+        if epoch > self._epoch:
+            self._epoch = ray.get(self._launcher().note_epoch.remote(self._life, epoch))
+
+    def settle(self) -> None:
+        deadline = time.monotonic() + SETTLE_SECONDS
+        while time.monotonic() < deadline:
+            try:
+                self.tend()
+                return
+            except AWAY:
+                time.sleep(LOOK_SECONDS)

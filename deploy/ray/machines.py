@@ -1,0 +1,142 @@
+"""``rmc cluster up`` and ``down``: ``ray up`` and ``ray down`` with what these leave undone (docs/cluster.md)."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+
+from rmc.common.errors import ConfigError, RmcError
+
+UP_SECONDS = 900.0  # for all nodes to have joined once the head is up: new machines install everything first
+LOOK_SECONDS = 2.0
+TOKEN = Path("~/.ray/auth_token")
+# Counts what is alive; run on the head.
+COUNT = (
+    "import ray; ray.init(address='auto', logging_level='ERROR'); print('alive', sum(n['Alive'] for n in ray.nodes()))"
+)
+# how many processes of Ray are on a machine, once they have had 10 s to end
+_RAYS = "[r]aylet/raylet|[g]cs_server|[r]ay::|/[r]ay/(dashboard|autoscaler|_private)/"
+LEFT = f"for i in $(seq 20); do n=$(pgrep -fc '{_RAYS}'); [ $n = 0 ] && break; sleep 0.5; done; echo $n"
+
+
+def up(path: Path, console: Console) -> None:
+    """Bring a cluster up and wait until every node that its file promises is there. Raises RmcError."""
+    config = read(path)
+    secure_token()
+    console.print(f"ray up {path}", soft_wrap=True)
+    _ray("up", "-y", str(path))
+    expected = expected_nodes(config)
+    deadline = time.monotonic() + UP_SECONDS
+    while (alive := _alive(path)) < expected:
+        if time.monotonic() > deadline:
+            fix = "look at the workers' setup by ray monitor, and mend or take them out of the file"
+            raise RmcError(f"{path}: {alive} of {expected} nodes are there after {UP_SECONDS:.0f} s; {fix}")
+        time.sleep(LOOK_SECONDS)
+    console.print(f"{alive} nodes are up; ray attach {path} goes to the head", soft_wrap=True)
+
+
+def down(path: Path, console: Console) -> None:
+    """Take a cluster down; on machines of one's own also what ``ray down`` leaves running. Raises RmcError."""
+    config = read(path)
+    console.print(f"ray down {path}", soft_wrap=True)
+    _ray("down", "-y", str(path))
+    if config["provider"]["type"] != "local":
+        return
+    left = {}
+    for address in [config["provider"]["head_ip"], *config["provider"]["worker_ips"]]:
+        _ssh(config, address, _stop_command(config))
+        count = _ssh(config, address, LEFT).strip().splitlines()[-1:]
+        if count != ["0"]:
+            left[address] = " ".join(count) or "no answer"
+    if left:
+        raise RmcError(f"{path}: Ray still runs on {left}; ssh there and run ray stop --force")
+    console.print("no process of Ray is left on any node")
+
+
+def read(path: Path) -> dict[str, Any]:
+    """A cluster's file. Raises ConfigError where it is none."""
+    try:
+        config = yaml.safe_load(path.read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError("CONFIG", str(path), f"cannot be read ({' '.join(str(error).split())})") from None
+    provider = config.get("provider") if isinstance(config, dict) else None
+    if not isinstance(provider, dict) or "type" not in provider:
+        raise ConfigError("CONFIG", str(path), "is no Ray cluster's file; start from one in deploy/cluster/")
+    return dict(config)
+
+
+def expected_nodes(config: dict[str, Any]) -> int:
+    """How many nodes there must be once all is up: the head and all workers that are always wanted."""
+    if config["provider"]["type"] == "local":
+        return 1 + min(len(config["provider"]["worker_ips"]), int(config.get("max_workers", 10**9)))
+    kinds = config.get("available_node_types", {})
+    head = config.get("head_node_type")
+    return 1 + sum(int(kind.get("min_workers", 0)) for name, kind in kinds.items() if name != head)
+
+
+def secure_token() -> None:
+    """Make Ray's token where there is none, and let only its owner read it."""
+    path = TOKEN.expanduser()
+    mask = os.umask(0o077)
+    try:
+        if not path.exists():
+            _ray("get-auth-token", "--generate", quiet=True)
+    finally:
+        os.umask(mask)
+    if not path.exists():
+        raise ConfigError("cluster", str(path), "Ray made no token there; unset RAY_AUTH_TOKEN and RAY_AUTH_TOKEN_PATH")
+    path.chmod(0o600)
+
+
+def _ray_program() -> str:
+    beside = Path(sys.executable).with_name("ray")
+    found = str(beside) if beside.exists() else shutil.which("ray")
+    if found is None:
+        raise ConfigError("cluster", "ray", "Ray is not installed; pip install 'rmc[ray]'")
+    return found
+
+
+def _ray(*words: str, quiet: bool = False) -> str:
+    """Run Ray's own command line, its words seen unless ``quiet``. Raises RmcError."""
+    environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_UP_enable_autoscaler_v2": "0"}
+    captured = subprocess.PIPE if quiet else None
+    done = subprocess.run(
+        [_ray_program(), *words], env=environment, stdin=subprocess.DEVNULL, stdout=captured, stderr=captured, text=True
+    )
+    if done.returncode and not quiet:
+        raise RmcError(f"ray {' '.join(words)} ended with status {done.returncode}")
+    return done.stdout or ""
+
+
+def _alive(path: Path) -> int:
+    said = _ray("exec", str(path), f'PATH=~/rmc-env/bin:$PATH RAY_AUTH_MODE=token python3 -c "{COUNT}"', quiet=True)
+    counts = [line.split()[1] for line in said.splitlines() if line.startswith("alive ")]
+    return int(counts[-1]) if counts else 0
+
+
+def _stop_command(config: dict[str, Any]) -> str:
+    """As the file itself stops Ray before it starts it."""
+    found = [line for line in config.get("worker_start_ray_commands", []) if "ray stop" in line]
+    return str(found[0]) if found else "ray stop --force"
+
+
+def _ssh(config: dict[str, Any], address: str, command: str) -> str:
+    auth = config.get("auth", {})
+    key = ["-i", str(Path(auth["ssh_private_key"]).expanduser())] if "ssh_private_key" in auth else []
+    options = ["-o", "BatchMode=yes", "-o", "StrictHostKeyChecking=no", "-o", "UserKnownHostsFile=/dev/null"]
+    words = [
+        "ssh",
+        "-q",
+        *key,
+        *options,
+        "-o",
+        "ConnectTimeout=10",
+        f"{auth.get('ssh_user', os.environ.get('USER', ''))}@{address}",
+    ]
+    return subprocess.run([*words, command], stdin=subprocess.DEVNULL, capture_output=True, text=True).stdout

@@ -1,0 +1,124 @@
+"""Where a run's roles go on a Ray cluster, and what each of them takes."""
+
+import time
+from dataclasses import dataclass
+from math import ceil
+from typing import Any
+
+import ray
+
+from rmc.common.errors import ConfigError
+from rmc.deploy.local.supervisor import RoleCommand
+from rmc.deploy.ray.learner_actor import LearnerHost
+from rmc.deploy.ray.role_actor import RoleHost
+from rmc.deploy.run.config import RunConfig
+
+REPLAY_CPUS = EVALUATOR_CPUS = 0.5  # beside the learner
+SHARD_CPUS = 1.0  # of a replay server among several, wherever it is: whole ones, so that what is left is whole, too
+FREE_SECONDS = 10.0  # for what ran before to give back its CPUs
+
+
+def cpus() -> float:
+    """CPUs of all nodes that are alive."""
+    return float(sum(node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]))
+
+
+def learner_cpus(config: RunConfig) -> int:
+    """CPUs set aside for the learner: its threads, one by default."""
+    return max(1, config.learner.threads)
+
+
+def reserved_cpus(config: RunConfig) -> float:
+    """CPUs of everything but the actors."""
+    shards = config.replay.replay_shards
+    return bundle(config, "cpu")["CPU"] + (SHARD_CPUS * shards if shards > 1 else 0.0)
+
+
+def bundle(config: RunConfig, device: str) -> dict[str, float]:
+    """What the node of the learner must hold."""
+    found = {"CPU": float(ceil(learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS))}
+    return found | {"GPU": 1.0} if device.startswith("cuda") else found
+
+
+def check_room(config: RunConfig, device: str) -> None:
+    """Raises ConfigError where no node can hold the learner."""
+    need = bundle(config, device)
+    if not any(node["Alive"] and holds(node, need) for node in ray.nodes()):
+        wanted = ", ".join(f"{amount:g} {name}" for name, amount in need.items())
+        fix = f"no node of the cluster has {wanted}, which the learner and what is beside it take; start one that has"
+        raise ConfigError("--device", device, fix)
+
+
+def actors_that_fit(config: RunConfig) -> int:
+    """One for every CPU that is left. Raises ConfigError where there is none."""
+    need = reserved_cpus(config) + config.replay.replay_shards
+    deadline = time.monotonic() + FREE_SECONDS
+    while free_cpus() < need:
+        if time.monotonic() > deadline:
+            free = f"{free_cpus()} of the cluster's {cpus():g} CPUs are free"
+            raise ConfigError(
+                "--launcher", "ray", f"{free} and a run needs {need:g}; start more nodes, or end other runs"
+            )
+        time.sleep(0.2)
+    return whole_shares(free_cpus() - int(reserved_cpus(config)), config)
+
+
+def free_cpus() -> int:
+    """CPUs that nothing on the cluster has taken."""
+    return int(ray.available_resources().get("CPU", 0.0))
+
+
+def whole_shares(actors: int, config: RunConfig) -> int:
+    """As many of them as give every replay server the same share."""
+    return actors - actors % config.replay.replay_shards
+
+
+def holds(node: dict[str, Any], bundle: dict[str, float]) -> bool:
+    """Whether a node is as large as that, were nothing else on it."""
+    return all(node["Resources"].get(name, 0.0) >= amount for name, amount in bundle.items())
+
+
+@dataclass(frozen=True)
+class Place:
+    """How Ray is asked for a role's host."""
+
+    kind: type[RoleHost]
+    command: RoleCommand
+    cpus: float
+    gpus: float = 0.0
+    group: str = ""  # of bundles that a node is found for: the learner's or the replay servers'
+
+
+def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[str, Place]:
+    """All roles of a run but its launcher, by name."""
+    place = ("--run", run)
+    secret: tuple[str, ...] = ("--secret-file", "{scratch}/secret")
+    if encrypted and config.replay.replay_shards > 1:  # one alone has a unix socket
+        secret += ("--tls-folder", "{scratch}")
+    learn = ("--folder", "{scratch}/checkpoints", "--device", device)
+    found = [
+        *_replays(config, (*place, *secret)),
+        Place(
+            LearnerHost, RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
+            learner_cpus(config), float(device.startswith("cuda")), group="learner",
+        ),
+        Place(RoleHost, RoleCommand("evaluator", ("evaluator", *place)), EVALUATOR_CPUS, group="learner"),
+        *(
+            Place(RoleHost, RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))), 1.0)
+            for index in range(config.actors)
+        ),
+    ]  # fmt: skip
+    return {place.command.name: place for place in found}
+
+
+def _replays(config: RunConfig, words: tuple[str, ...]) -> list[Place]:
+    """One beside the learner on a unix socket, or several anywhere on the cluster's network."""
+    count = config.replay.replay_shards
+    found = []
+    for shard in config.shards():
+        listen = "unix:{scratch}/replay.sock" if count == 1 else "tcp:{ip}:0"
+        rest = ("--folder", f"{{scratch}}/{shard.role}", "--listen", listen, "--shard", str(shard.index))
+        command = RoleCommand(shard.role, ("replay", *words, *rest))
+        cpus, group = (REPLAY_CPUS, "learner") if count == 1 else (SHARD_CPUS, "replay")
+        found.append(Place(RoleHost, command, cpus, group=group))
+    return found

@@ -1,0 +1,205 @@
+"""Ray actors that hold a role each: its process, its files and its end. Ray starts them again where they die."""
+
+import os
+import shutil
+import tempfile
+import threading
+import time
+import uuid
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import ray
+
+from rmc.common.errors import CheckpointError
+from rmc.deploy.local.supervisor import EXIT_CONFIG, RoleCommand, RoleProcess
+
+NAMESPACE = "rmc"
+LAST_WORDS_SECONDS = 1.5  # a host outlives its role so long, for the launcher to hear why it died
+LOOK_SECONDS = 0.5  # between looks for new checkpoints
+LOG_BYTES = 64 << 10  # of a role's log in one report
+ENDED_IN_ORDER = 0
+STOP_SECONDS = 5.0
+SETTLE_SECONDS = 60.0  # for the last checkpoint to reach the head
+CLAIM_SECONDS = 60.0  # for a launcher that is being started again
+AWAY = (ray.exceptions.RayError, ValueError, CheckpointError, OSError)  # of who keeps the checkpoints
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a host runs. In its texts ``{scratch}`` is its folder on the node, and ``{ip}`` the address."""
+
+    run: str
+    command: RoleCommand
+    environment: dict[str, str]
+    secrets: dict[str, bytes] = field(repr=False)
+    """Text files that only the owner may read, by name, in the scratch folder."""
+    working_folder: str
+    """Where the launcher was started; roles start there, too, where the node has such a folder."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """How a host's role is."""
+
+    life: str
+    """Of the host, which Ray may have started again."""
+    node: str
+    """Its address."""
+    pid: int | None
+    status: int | None
+    """Exit status, once the role has ended and all that it left is put away."""
+    last_words: str
+    log: bytes
+    """What its log holds past where the last report ended."""
+    log_end: int
+    trouble: str
+    """What keeps it from bringing to the head what belongs there; empty where all is there."""
+
+
+def scratch_folder(run: str) -> Path:
+    """Where this node keeps what a run's roles need at hand. Raises RuntimeError where it is somebody else's.
+
+    Short, for the sockets in it; the run's folder itself lies with its launcher, on the head.
+    """
+    folder = Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{run[-8:]}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise RuntimeError(f"{folder} is not private; remove it")
+    return folder
+
+
+def last_line(error: BaseException) -> str:
+    """What an error says in the end; Ray puts whole tracebacks before that."""
+    return (str(error).strip() or type(error).__name__).splitlines()[-1]
+
+
+def host_name(run: str, role: str) -> str:
+    """The Ray actor's name of a role."""
+    return f"{run}:{role}"
+
+
+class RoleHost:
+    """Holds a role. Where it dies this actor ends, too, and Ray starts both again, here or on another node."""
+
+    def __init__(self, task: Task) -> None:
+        self._task, self._life = task, uuid.uuid4().hex
+        self._replaced = self._run_ends = False
+        self.trouble = ""
+        self.scratch = scratch_folder(task.run)
+        for name, content in task.secrets.items():
+            _write_private(self.scratch / name, self._filled(content.decode()).encode())
+        self._status: int | None = None
+        self.prepare()
+        logs = self.log_folder()
+        logs.mkdir(exist_ok=True)
+        self._role = RoleProcess(self._here(task.command), self._environment(), logs)
+        self._start()
+
+    def _here(self, command: RoleCommand) -> RoleCommand:
+        return replace(command, words=tuple(map(self._filled, command.words)))
+
+    def _filled(self, text: str) -> str:
+        return text.replace("{scratch}", str(self.scratch)).replace("{ip}", ray.util.get_node_ip_address())
+
+    def _environment(self) -> dict[str, str]:
+        """Without what Ray says to its own workers: a role is none, and the launcher begins a job of its own."""
+        for name in ("RAY_JOB_ID", "RAY_RAYLET_PID", "OMP_NUM_THREADS"):
+            os.environ.pop(name, None)
+        if os.path.isdir(self._task.working_folder):
+            os.chdir(self._task.working_folder)
+        return {name: self._filled(value) for name, value in self._task.environment.items()}
+
+    def _start(self) -> None:
+        self._role.start()
+        threading.Thread(target=self._watch, args=(self._role.pid,), daemon=True).start()
+
+    # What a role's host does beyond holding it.
+
+    def prepare(self) -> None:
+        """Before the role starts."""
+
+    def settle(self) -> None:
+        """After it has ended in order."""
+
+    def tend(self) -> None:
+        """Once in a while meanwhile."""
+
+    def log_folder(self) -> Path:
+        """Where the role's log goes."""
+        return self.scratch / "logs"
+
+    def over(self, status: int) -> bool:
+        """Whether such an end is the last one; after any other, all starts again."""
+        ended = status == ENDED_IN_ORDER and (self._task.command.ends or self._run_ends)
+        return ended or status == EXIT_CONFIG
+
+    def stopping(self, now: bool) -> None:
+        """Whether the run is being ended; where it is not after all, a role that has heard so begins again."""
+        self._run_ends = now
+        if not now and self._status == ENDED_IN_ORDER and not self._task.command.ends:
+            os._exit(1)
+
+    def _watch(self, pid: int | None) -> None:
+        while not self._role.reap(LOOK_SECONDS):
+            if self._role.pid not in (pid, None):  # started again on purpose: another thread watches
+                return
+            with suppress(*AWAY):  # the next look tries again
+                self.tend()
+        status = self._role.status
+        assert status is not None
+        if self._replaced:
+            return
+        if self.over(status):
+            self.settle()
+            self._status = status
+        else:
+            self._status = status
+            time.sleep(LAST_WORDS_SECONDS)
+            os._exit(1)
+
+    def report(self, life: str, log_start: int) -> Report:
+        """How the role is, and its log from there on; of another life's, from this one's start on."""
+        start = log_start if life == self._life else self._role.log_start
+        log = b""
+        with suppress(FileNotFoundError), self._role.log.open("rb") as file:
+            file.seek(start)
+            log = file.read(LOG_BYTES)
+        words = self._role.last_words() if self._status else ""
+        return Report(
+            self._life, ray.util.get_node_ip_address(), self._role.pid, self._status, words, log, start + len(log),
+            self.trouble,
+        )  # fmt: skip
+
+    def clear(self) -> None:
+        """Remove what the run keeps on this node."""
+        shutil.rmtree(self.scratch, ignore_errors=True)
+
+    def again(self) -> None:
+        """End the role in order and start it again, because the run's config has changed."""
+        self._replaced = True
+        self._end()
+        self._replaced = False
+        self._start()
+
+    def _end(self) -> None:
+        self._role.signal(15)
+        if not self._role.reap(STOP_SECONDS):
+            self._role.signal(9)
+            self._role.reap(STOP_SECONDS)
+
+    def close(self) -> None:
+        """End the role, whatever it does, and put away what it left; this actor is killed next."""
+        if self._status is None:
+            self._replaced = True
+            self._end()
+            self.settle()
+
+
+def _write_private(path: Path, content: bytes) -> None:
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)  # a run's hosts begin together
+    with os.fdopen(handle, "wb") as file:
+        file.write(content)
+    os.replace(temporary, path)

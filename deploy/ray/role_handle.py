@@ -1,0 +1,93 @@
+"""A role's host on a Ray cluster, as its launcher sees it."""
+
+import dataclasses
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import ray
+
+from rmc.common.errors import RoleDied
+from rmc.deploy.local.supervisor import EXIT_CONFIG, QUICK_DEATHS, QUICK_SECONDS, from_outside
+from rmc.deploy.ray.role_actor import Report
+
+POLL_SECONDS = 0.5  # between questions to each host
+log = logging.getLogger(__name__)
+
+
+class Hosted:
+    """A role's host as the launcher sees it: asked how it is again and again, without waiting for it."""
+
+    def __init__(self, name: str, handle: Any, cpus: float) -> None:
+        self.name, self.handle, self.cpus = name, handle, cpus
+        self.report: Report | None = None  # the newest; None until the first
+        self.restarts = 0
+        self.dead = ""  # for good, and why: somebody killed it, or it could not begin
+        self.waits_since = time.monotonic()  # for a CPU, or to be started again; unless it runs
+        self._question: Any = None
+        self._asked_at = self._began_at = 0.0
+        self._quick_deaths, self._mourned = 0, ""
+
+    @property
+    def running(self) -> bool:
+        """Whether its role was running when last heard of."""
+        return self.report is not None and self.report.pid is not None
+
+    @property
+    def awaited(self) -> bool:
+        """Whether its role runs, or what it left is not yet put away."""
+        return self.report is not None and self.report.status is None
+
+    @property
+    def node(self) -> str:
+        """Where its role was last heard of."""
+        return self.report.node if self.report is not None else ""
+
+    @property
+    def trouble(self) -> str:
+        """What kept it, when last heard of, from bringing to the head what belongs there."""
+        return self.report.trouble if self.report is not None else ""
+
+    def ask(self, logs: Path) -> None:
+        """Take in an answer that has come, and ask again. Raises RoleDied."""
+        if self._question is None:
+            if time.monotonic() >= self._asked_at + POLL_SECONDS:
+                self._asked_at = time.monotonic()
+                life, end = (self.report.life, self.report.log_end) if self.report else ("", 0)
+                self._question = self.handle.report.remote(life, end)
+            return
+        if not ray.wait([self._question], timeout=0)[0]:
+            return
+        question, self._question = self._question, None
+        try:
+            self._hear(ray.get(question), logs)
+        except ray.exceptions.ActorDiedError as error:
+            self.dead = str(error)
+        except ray.exceptions.RayError:  # being started again
+            self.waits_since = time.monotonic() if self.running else self.waits_since
+            self.report = dataclasses.replace(self.report, pid=None) if self.report else None
+
+    def _hear(self, report: Report, logs: Path) -> None:
+        if self.report is None or report.life != self.report.life:
+            self.restarts += self._began_at > 0
+            self._began_at = time.monotonic()
+        if self.running and report.pid is None:
+            self.waits_since = time.monotonic()
+        if report.trouble != self.trouble:
+            log.warning("%s: %s", self.name, report.trouble or "checkpoints reach the head again")
+        self.report = report
+        if report.log or not (logs / f"{self.name}.log").exists():
+            with (logs / f"{self.name}.log").open("ab") as file:
+                file.write(report.log)
+        if report.status and self._mourned != report.life:
+            self._mourned = report.life
+            self._note_death(report)
+
+    def _note_death(self, report: Report) -> None:
+        assert report.status is not None
+        quick = time.monotonic() - self._began_at < QUICK_SECONDS and not from_outside(report.status)
+        self._quick_deaths = self._quick_deaths + 1 if quick else 0
+        if report.status == EXIT_CONFIG or self._quick_deaths >= QUICK_DEATHS:
+            often = f"{self._quick_deaths} times in a row soon after its start" if self._quick_deaths > 1 else "at once"
+            raise RoleDied(f"{self.name} ended {often} on {report.node}; its last words:\n{report.last_words}")

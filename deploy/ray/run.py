@@ -1,0 +1,355 @@
+"""A run on Ray: the roles of ``local.py`` as named, detached actors on the nodes of a cluster.
+
+Ray core starts again what dies, here or elsewhere. The launcher is such an actor itself, on the head, beside
+the run's Redis and folder; it places the others, gives new nodes actors, and hears why a role died.
+Learner, evaluator and a single replay server share a node; actors take a CPU each, anywhere.
+"""
+
+import dataclasses
+import logging
+import os
+import shutil
+import socket
+import tempfile
+import time
+import zlib
+from contextlib import ExitStack, suppress
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+try:
+    import ray
+    from ray.util.placement_group import placement_group, placement_group_table, remove_placement_group
+    from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
+except ImportError as missing:
+    from rmc.common.errors import ConfigError
+
+    raise ConfigError("--launcher", "ray", "Ray is not installed; pip install 'rmc[ray]'") from missing
+
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RoleDied
+from rmc.common.process.role import StopSignal
+from rmc.common.shard import WHOLE
+from rmc.deploy.local.launcher import PREFIX, TICK_SECONDS, sweep, watch
+from rmc.deploy.local.role_environment import URL_VARIABLE
+from rmc.deploy.local.supervisor import QUICK_DEATHS
+from rmc.deploy.monitor.monitor import Monitor
+from rmc.deploy.ray.placement import (
+    SHARD_CPUS,
+    Place,
+    bundle,
+    cpus,
+    free_cpus,
+    holds,
+    places,
+    reserved_cpus,
+    whole_shares,
+)
+from rmc.deploy.ray.ring_nodes import Rings
+from rmc.deploy.ray.role_actor import NAMESPACE, Task, host_name
+from rmc.deploy.ray.role_handle import Hosted
+from rmc.deploy.redis.connect import PATIENCE_VARIABLE, connect
+from rmc.deploy.redis.registration import Registration
+from rmc.deploy.redis.server import Port, RedisServer
+from rmc.deploy.redis.users import RedisUsers
+from rmc.deploy.run import tls
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder
+
+NODES_SECONDS = 2.0  # between looks for nodes that came
+HOMELESS_SECONDS = 8.0  # without a node for the learner, after which actors make room
+LOST_SECONDS = 120.0  # within which a role's host may be lost for good twice
+STOP_SECONDS = 20.0  # for all roles to end in order and for the last checkpoint to reach the head
+PATIENCE_SECONDS = 120.0  # of a role that starts while launcher and Redis are being started again
+FIRST_PORT, LAST_PORT = 6380, 6479  # for Redis; 6379 is Ray's
+TOLD_SECONDS = 2.0  # for hosts to hear that the run ends
+log = logging.getLogger(__name__)
+
+
+class ClusterRun:
+    """A run's roles on Ray between ``start`` and ``close``. Ray must be connected."""
+
+    def __init__(self, config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> None:
+        self.config, self._folder, self._device, self._all_cpus = config, folder, device, all_cpus
+        self._encrypted, self._rings = encrypted, Rings(folder)
+        self._leave = ExitStack()
+        sweep()
+        sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))
+        self._leave.callback(shutil.rmtree, sockets)
+        try:
+            ip = ray.util.get_node_ip_address()
+            if encrypted:
+                tls.make_certificate(folder.path, ip)
+            number, self._moved = _port(folder, ip)
+            port = Port(ip, number, folder.path if encrypted else None)
+            self._server = RedisServer(sockets, port=port, users=self._users())
+            self._leave.enter_context(self._server)
+            self.bus = connect(self._server.url(), folder.name)
+            self._registration = Registration(config, folder, self.bus)
+        except BaseException:
+            self._leave.close()
+            raise
+        self._hosts: dict[str, Hosted] = {}
+        self._groups: dict[str, Any] = {}
+        self._bundles: dict[str, int] = {}  # of the replay servers' group
+        self._lost: dict[str, list[float]] = {}  # when hosts died for good, by role
+        self._look_at = 0.0
+        self._homeless_since: float | None = None
+
+    def _users(self) -> RedisUsers:
+        return RedisUsers(self._folder.name, self._folder.secret(), self.config.roles())
+
+    # -- placing --------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Place every role, or find again those that an earlier launcher of the run has placed."""
+        if self._moved:
+            self._end_left_hosts()
+        near = self._rings.node(WHOLE.role)
+        self._groups["learner"] = self._group("learner", [bundle(self.config, self._device)], "STRICT_PACK", near)
+        if self.config.replay.replay_shards > 1:  # a ring stays on its node: so does its server
+            roles = [shard.role for shard in self.config.shards()]
+            self._groups["replay"] = self._group("replay", [{"CPU": SHARD_CPUS}] * len(roles), "SPREAD")
+            self._bundles = self._rings.bundles(self._groups["replay"], roles)
+        self._place_all()
+
+    def _group(self, name: str, bundles: list[dict[str, float]], strategy: str, near: str | None = None) -> Any:
+        name = host_name(self._folder.name, name)
+        try:
+            return ray.util.get_placement_group(name)
+        except ValueError:
+            return placement_group(
+                bundles, strategy=strategy, name=name, lifetime="detached", _soft_target_node_id=near
+            )
+
+    def _end_left_hosts(self) -> None:
+        """Those of an earlier launcher, where Redis could not have its port again: they would never find it."""
+        for name in places(self.config, self._folder.name, self._device, self._encrypted):
+            with suppress(ValueError):
+                ray.kill(ray.get_actor(host_name(self._folder.name, name), NAMESPACE), no_restart=True)
+
+    def _place_all(self) -> None:
+        for name, place in places(self.config, self._folder.name, self._device, self._encrypted).items():
+            if name not in self._hosts:
+                self._hosts[name] = Hosted(name, self._create(name, place), place.cpus)
+                self._hosts[name].handle.stopping.remote(False)  # one that was found may have heard otherwise
+
+    def _create(self, name: str, place: Place) -> Any:
+        strategy: Any = "SPREAD"
+        if place.group:
+            strategy = PlacementGroupSchedulingStrategy(
+                self._groups[place.group], placement_group_bundle_index=self._bundles.get(name, 0)
+            )
+        options = ray.remote(place.kind).options(
+            name=host_name(self._folder.name, name), namespace=NAMESPACE, lifetime="detached", get_if_exists=True,
+            max_restarts=-1, num_cpus=place.cpus, num_gpus=place.gpus, scheduling_strategy=strategy,
+        )  # fmt: skip
+        url = self._server.network_url(name, f"{{scratch}}/{tls.CERTIFICATE}")
+        secrets = {f"redis-url-{name}": url.encode()}  # roles on one node share its scratch folder
+        if name == "learner" or name.startswith("replay"):
+            secrets["secret"] = self._folder.secret()
+        if self._encrypted:
+            files = (tls.CERTIFICATE, tls.KEY) if name.startswith("replay") else (tls.CERTIFICATE,)
+            secrets |= {file: (self._folder.path / file).read_bytes() for file in files}
+        environment = {URL_VARIABLE: f"file:{{scratch}}/redis-url-{name}", PATIENCE_VARIABLE: str(PATIENCE_SECONDS)}
+        return options.remote(Task(self._folder.name, place.command, environment, secrets, os.getcwd()))
+
+    # -- tending --------------------------------------------------------------------------------------
+
+    def tend(self) -> None:
+        """Hear every host, and place what is not. Raises RoleDied."""
+        if not self._server.alive():
+            log.warning("the embedded Redis died; starting it again")
+            self._server.start()
+        self._registration.tend()
+        for hosted in list(self._hosts.values()):
+            hosted.ask(self._folder.logs)
+            if hosted.dead:
+                self._mourn(hosted)
+            elif hosted.name.startswith("replay") and hosted.running:
+                self._rings.note(hosted.name, hosted.node)
+        if time.monotonic() >= self._look_at:
+            self._look_at = time.monotonic() + NODES_SECONDS
+            self._look_at_nodes()
+
+    def _mourn(self, hosted: Hosted) -> None:
+        """Let go of a host that Ray does not start again; the next look at the nodes makes another."""
+        log.warning("the host of %s is gone: %s", hosted.name, hosted.dead)
+        del self._hosts[hosted.name]
+        now = time.monotonic()
+        lost = [when for when in self._lost.get(hosted.name, []) if now - when < LOST_SECONDS]
+        self._lost[hosted.name] = [*lost, now]
+        if len(lost) + 1 >= QUICK_DEATHS:
+            raise RoleDied(f"the host of {hosted.name} could not be held:\n{hosted.dead}")
+
+    def _look_at_nodes(self) -> None:
+        if not self._at_home():
+            return
+        if self._all_cpus and not self.waiting():
+            self._grow()
+        self._place_all()
+        self._keep_low_actors()
+
+    def _keep_low_actors(self) -> None:
+        """Where CPUs are lost for good, it is the highest actors that wait: the run's last steps go to the lowest."""
+        if cpus() >= reserved_cpus(self.config) + self.config.actors:  # they are only being started again
+            return
+        actors = [self._hosts[name] for name in self._hosts if name.startswith("actor-")]
+        actors.sort(key=lambda hosted: int(hosted.name.removeprefix("actor-")))
+        waiting = [one for one in actors if not one.running and time.monotonic() > one.waits_since + HOMELESS_SECONDS]
+        if waiting and actors[-1].running:
+            log.warning("%s waits for a CPU; %s gives it its own", waiting[0].name, actors[-1].name)
+            self._end_host(actors[-1])
+
+    def _end_host(self, hosted: Hosted) -> None:
+        ray.kill(hosted.handle, no_restart=True)
+        self._hosts.pop(hosted.name)
+
+    def _at_home(self) -> bool:
+        """Whether the learner has a node; where it has none for long, actors make room for it."""
+        if placement_group_table(self._groups["learner"])["state"] == "CREATED":
+            self._homeless_since = None
+            return True
+        self._homeless_since = self._homeless_since or time.monotonic()
+        if time.monotonic() >= self._homeless_since + HOMELESS_SECONDS:
+            self._make_room()
+        return False
+
+    def _make_room(self) -> None:
+        """End the actors that wait for a CPU, which would take what becomes free, and enough on the largest node."""
+        self._homeless_since = time.monotonic()
+        need = bundle(self.config, self._device)
+        node = max(
+            (node for node in ray.nodes() if node["Alive"] and holds(node, need)),
+            key=lambda node: float(node["Resources"]["CPU"]),
+            default=None,
+        )
+        if node is None:
+            log.warning("no node is large enough for the learner, which needs %s", need)
+            return
+        actors = [hosted for name, hosted in self._hosts.items() if name.startswith("actor-")]
+        there = [hosted for hosted in actors if hosted.running and hosted.node == node["NodeManagerAddress"]]
+        taken = sum(one.cpus for one in self._hosts.values() if one.running and one.node == node["NodeManagerAddress"])
+        short = need["CPU"] - (node["Resources"]["CPU"] - taken)
+        going = [hosted for hosted in actors if not hosted.running] + (there[-ceil(short) :] if short > 0 else [])
+        for hosted in going:
+            self._end_host(hosted)
+        log.warning("no node has room for the learner; ended for it: %s", ", ".join(one.name for one in going))
+
+    def _grow(self) -> None:
+        """Give CPUs that came an actor each; the replay servers start again to know of them."""
+        room = int(cpus() - reserved_cpus(self.config))  # what is free may be an old view of it
+        fit = whole_shares(min(self.config.actors + free_cpus(), room), self.config)
+        if fit <= self.config.actors:
+            return
+        grown = dataclasses.replace(self.config, actors=fit)
+        try:
+            self._registration.change(grown)
+        except (BusUnavailable, BusFull):  # the next look tries again
+            return
+        self.config = grown
+        self._server.admit(self._users())
+        self._folder.write_config(grown)
+        for name, hosted in self._hosts.items():
+            if name.startswith("replay"):
+                hosted.handle.again.remote()
+
+    def restarts(self) -> dict[str, int]:
+        """How often each role was started again."""
+        return {name: hosted.restarts for name, hosted in self._hosts.items()}
+
+    def waiting(self) -> list[str]:
+        """Roles that run nowhere now."""
+        return [name for name, hosted in self._hosts.items() if not hosted.running]
+
+    def finished(self) -> bool:
+        """Whether the learner has ended in order, and its last checkpoint is on the head."""
+        learner = self._hosts.get("learner")
+        return learner is not None and learner.report is not None and learner.report.status == 0
+
+    # -- the end --------------------------------------------------------------------------------------
+
+    def stop(self, reason: str) -> None:
+        """Ask every role to end, and wait until the learner's last checkpoint is on the head."""
+        told = [hosted.handle.stopping.remote(True) for hosted in self._hosts.values() if hosted.running]
+        if told:
+            ray.wait(told, num_returns=len(told), timeout=TOLD_SECONDS)
+        with suppress(BusUnavailable, BusFull):
+            self.bus.request_stop(reason)
+        deadline = time.monotonic() + STOP_SECONDS
+        while time.monotonic() < deadline and any(hosted.awaited for hosted in self._hosts.values()):
+            for hosted in self._hosts.values():
+                with suppress(RoleDied):
+                    hosted.ask(self._folder.logs)
+            time.sleep(TICK_SECONDS)
+        self._registration.keep()
+
+    def _kept_elsewhere(self) -> bool:
+        """Whether something of the run is on a node alone, where its hosts share a folder."""
+        troubled = [hosted for hosted in self._hosts.values() if hosted.trouble]
+        for hosted in troubled:
+            log.warning("what %s left stays on %s: %s", hosted.name, hosted.node, hosted.trouble)
+        return bool(troubled)
+
+    def close(self, over: bool) -> None:
+        """End everything; nothing is left but the run's folder and, on its node, the ring of a run that may go on."""
+        try:
+            closing = [hosted.handle.close.remote() for hosted in self._hosts.values() if hosted.awaited]
+            if closing:
+                ray.wait(closing, num_returns=len(closing), timeout=STOP_SECONDS / 2)
+            if over and not self._kept_elsewhere():
+                clearing = [
+                    hosted.handle.clear.remote() for hosted in self._hosts.values() if hosted.report is not None
+                ]
+                ray.wait(clearing, num_returns=len(clearing), timeout=STOP_SECONDS / 4)
+            for hosted in self._hosts.values():
+                ray.kill(hosted.handle, no_restart=True)
+            for group in self._groups.values():
+                remove_placement_group(group)
+        finally:
+            self._leave.close()
+
+
+def train(
+    config: RunConfig,
+    folder: RunFolder,
+    device: str,
+    all_cpus: bool,
+    encrypted: bool,
+    monitor: Monitor,
+    stop: StopSignal,
+) -> bool:
+    """Train until the total is reached or ``stop`` is set; whether it was reached. Raises RoleDied, ConfigError."""
+    run = ClusterRun(config, folder, device, all_cpus, encrypted)
+    monitor.restarts, monitor.unplaced = run.restarts, run.waiting
+    monitor.roles = lambda: run.config.roles()
+    over = False
+    try:
+        monitor.skip_old(run.bus)
+        run.start()
+        while not stop.requested and not run.finished():
+            run.tend()
+            watch(monitor, run.bus)
+            time.sleep(TICK_SECONDS)
+        run.stop("stopped by its launcher" if stop.requested else "finished")
+        watch(monitor, run.bus)  # what the roles said last
+        over = monitor.learner_finished()  # one that was stopped has ended in order, too
+        return over
+    finally:
+        run.close(over)
+
+
+def _port(folder: RunFolder, ip: str) -> tuple[int, bool]:
+    """A port for the run's Redis, and whether it had another before, which is taken now."""
+    note = folder.path / "redis-port"
+    had = int(note.read_text()) if note.exists() else None
+    ports = list(range(FIRST_PORT, LAST_PORT + 1))
+    own = zlib.crc32(folder.name.encode()) % len(ports)  # runs that begin together do not want the same
+    wanted = [*([had] if had else []), *ports[own:], *ports[:own]]
+    for port in wanted:
+        with socket.socket() as probe, suppress(OSError):
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((ip, port))
+            note.write_text(f"{port}\n")
+            return port, had not in (None, port)
+    raise ConfigError("--launcher", "ray", f"no port from {FIRST_PORT} to {LAST_PORT} is free on {ip} for Redis")

@@ -1,0 +1,1 @@
+"""The run's Redis: the server, its users, connecting, registering the run."""

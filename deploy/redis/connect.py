@@ -1,0 +1,61 @@
+"""How a role reaches the run's Redis, and how long it waits for it."""
+
+import logging
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.bus.redis_url import shown
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError
+from rmc.common.process.role import RECONNECT_SLEEP, StopSignal
+
+log = logging.getLogger(__name__)
+PATIENCE_VARIABLE = "RMC_PATIENCE"  # seconds that a role which starts while Redis is coming back waits for it
+PATIENCE_SECONDS = "30"  # of one that is started by hand, at the same time as its run perhaps
+
+
+class Patience:
+    """So many seconds for something that is about to come, less where a stop is asked for.
+
+    The log says once what is waited for.
+    """
+
+    def __init__(self, seconds: float, stop: StopSignal) -> None:
+        self._seconds, self._deadline = seconds, time.monotonic() + seconds
+        self._stop = stop
+        self._said = False
+
+    def on(self, awaited: str) -> bool:
+        """Wait a moment; False once there is none left."""
+        if self._stop.requested or time.monotonic() >= self._deadline:
+            return False
+        if not self._said:
+            log.warning("waiting up to %g s for %s", self._seconds, awaited)
+            self._said = True
+        time.sleep(RECONNECT_SLEEP)
+        return True
+
+
+def connect(url: str, run: str, waits: Patience | None = None) -> RedisBus:
+    """A bus whose Redis answers, at once or within that patience; ``file:PATH`` holds the URL. Raises ConfigError."""
+    if url.startswith("file:"):
+        url = _in_file(Path(url.removeprefix("file:")))
+    bus = RedisBus(url, run)
+    while True:
+        try:
+            with suppress(BusFull):  # that is an answer
+                bus.ping()
+            return bus
+        except BusUnavailable as error:
+            if waits is None or not waits.on(f"the Redis at {shown(url)}: {error}"):
+                raise ConfigError("--redis-url", shown(url), f"no Redis answers there ({error})") from None
+
+
+def _in_file(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except OSError as error:
+        raise ConfigError("--redis-url", f"file:{path}", f"cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise ConfigError("--redis-url", f"file:{path}", "is no text; write the URL into it, in one line") from None

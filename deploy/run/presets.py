@@ -1,0 +1,52 @@
+"""The presets: where a run's defaults come from."""
+
+from rmc.actors.config import ActorConfig, EvaluatorConfig
+from rmc.common.agent_config import AgentConfig
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.run.config import Preset, RunConfig
+from rmc.learner.config import LearnerConfig, UpdateConfig
+from rmc.replay_server.config import ReplayConfig
+
+
+def preset(name: Preset, env: EnvConfig) -> RunConfig:
+    """A preset's RunConfig for an environment."""
+    return {"robust": robust, "paper": paper, "debug": debug}[name](env)
+
+
+def robust(env: EnvConfig) -> RunConfig:
+    """The default: what has been learnt since the paper."""
+    return RunConfig(
+        env=env,
+        preset="robust",
+        agent=AgentConfig(normalize_observations=True, fill_blanks=True),
+        actor=ActorConfig(envs_per_actor=8),
+        replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0),
+        update=UpdateConfig(scheme=3, policy_average=2_000),
+        learner=LearnerConfig(batch_size=8, importance_exponent=0.0, publish_updates=80),
+    )
+
+
+def paper(env: EnvConfig) -> RunConfig:
+    """What the paper and its authors' code say."""
+    return RunConfig(
+        env=env,
+        preset="paper",
+        agent=AgentConfig(embedding=0, grounding=False),
+        actor=ActorConfig(envs_per_actor=8),
+        replay=ReplayConfig(warmup_steps=10_000),
+        update=UpdateConfig(learning_rate=1e-4, alpha_learning_rate=1e-5, policy_q="first", curiosity=0.5),
+    )
+
+
+def debug(env: EnvConfig) -> RunConfig:
+    """Small and short: every part runs, within a minute on two cores."""
+    return RunConfig(
+        env=env,
+        preset="debug",
+        total_steps=4_000,
+        agent=AgentConfig(hidden=32, embedding=32, heads=(64, 64)),
+        actor=ActorConfig(envs_per_actor=2),
+        replay=ReplayConfig(capacity=2_000, replay_ratio=32.0, warmup_steps=500),
+        learner=LearnerConfig(batch_size=16, checkpoint_steps=1_000, precision="fp32"),
+        evaluator=EvaluatorConfig(episodes=2),
+    )

@@ -1,0 +1,93 @@
+"""Which configurations make no sense, judged in one place."""
+
+from typing import Any
+
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import RunConfig, option
+
+_RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no range
+    "seed": (0, 2**63 - 1),
+    "total_steps": (1, 2**53),
+    "actors": (1, 4096),
+    "env.flicker": (0, 1),
+    "env.noise": (0, 1e12),
+    "env.frame_stack": (1, 1_000),
+    "env.action_repeat": (1, 10_000),
+    "env.time_limit": (0, 2**31),
+    "env.env_timeout": (0.1, 1e6),
+    "window.burn_in": (0, 10_000),
+    "window.trained_steps": (1, 10_000),
+    "agent.hidden": (1, 65_536),
+    "agent.embedding": (0, 65_536),
+    "actor.envs_per_actor": (1, 4096),
+    "actor.reward_scale": (1e-12, 1e12),
+    "actor.refresh_steps": (1, 2**31),
+    "actor.chunk_windows": (1, 65_536),
+    "actor.chunk_seconds": (1e-3, 3600),
+    "actor.unacked_bytes": (1 << 20, 1 << 40),
+    "replay.capacity": (1, 2**40),
+    "replay.replay_ratio": (1e-6, 1e9),
+    "replay.warmup_steps": (0, 2**53),
+    "replay.priority_exponent": (0, 4),
+    "replay.replay_shards": (1, 1024),
+    "update.learning_rate": (1e-12, 1),
+    "update.memory_learning_scale": (0, 1_000),
+    "update.alpha_learning_rate": (0, 1),
+    "update.gamma": (0, 1),
+    "update.polyak": (0, 1),
+    "update.clip_norm": (0, 1e12),
+    "update.curiosity": (0, 1e12),
+    "update.curiosity_steps": (1, 2**53),
+    "update.scheme": (1, 6),
+    "update.n_step": (1, 10_000),
+    "update.eta": (0, 1),
+    "update.policy_average": (0, 2**31),
+    "learner.batch_size": (1, 65_536),
+    "learner.importance_exponent": (0, 1),
+    "learner.publish_updates": (1, 2**31),
+    "learner.checkpoint_steps": (1, 2**53),
+    "learner.keep_checkpoints": (1, 1_000_000),
+    "learner.threads": (0, 1024),
+    "evaluator.episodes": (1, 10_000),
+}
+
+
+def validate(config: RunConfig) -> None:
+    """Raises ConfigError for the first value that makes no sense; the one place that judges numbers."""
+    for path, (low, high) in _RANGES.items():
+        value: Any = config
+        for name in path.split("."):
+            value = getattr(value, name)
+        if not low <= value <= high:
+            raise ConfigError(option(path), value, f"take a number from {low:,} to {high:,}".replace(",", "_"))
+    if min(config.agent.heads) < 1:
+        raise ConfigError("--heads", config.agent.heads, "take at least 1 unit a layer")
+    if config.agent.layer_norm and not config.agent.embedding:
+        raise ConfigError("--layer-norm", True, "it normalises the embedding, so it needs --embedding above 0")
+    if config.agent.head_input == "observation" and config.update.curiosity:
+        raise ConfigError("--curiosity", config.update.curiosity, "it is the error in a memory's change; take 0")
+    if config.agent.initial_priority == "actor" and config.replay.priority_exponent == 0.0:
+        raise ConfigError(
+            "--initial-priority", "actor", "uniform replay has no priorities; try --priority-exponent 0.6"
+        )
+    if config.replay.replay_shards > config.actors:
+        fix = f"every shard needs an actor: take at most --actors={config.actors}"
+        raise ConfigError("--replay-shards", config.replay.replay_shards, fix)
+    if config.actors % config.replay.replay_shards:
+        fix = f"every shard has as many actors: take a multiple of --replay-shards={config.replay.replay_shards}"
+        raise ConfigError("--actors", config.actors, fix)
+    if not 0 <= config.actor.stride <= config.window.trained_steps:
+        raise ConfigError("--stride", config.actor.stride, f"take 0 to --trained-steps={config.window.trained_steps}")
+    if config.actor.stride and config.actor.state_strategy == "episode":
+        raise ConfigError("--stride", config.actor.stride, "an episode is one window; leave it, or use burn-in")
+    if config.agent.blank_flag and config.env.frame_stack > 1:
+        raise ConfigError("--blank-flag", True, "a stack of frames has no flag; leave it, or use --frame-stack 1")
+    if config.agent.fill_blanks and not config.agent.normalize_observations:
+        fix = "it takes --normalize-observations; or leave blanks as they are: --no-fill-blanks"
+        raise ConfigError("--fill-blanks", True, fix)
+    if not config.update.policy_through_q and config.update.scheme < 4:
+        raise ConfigError("--policy-through-q", False, "schemes 1 to 3 have no such way; take --scheme 4, 5 or 6")
+    if config.total_steps <= config.replay.warmup_steps:
+        raise ConfigError(
+            "--total-steps", config.total_steps, f"take more than --warmup-steps={config.replay.warmup_steps}"
+        )

@@ -1,0 +1,78 @@
+"""How the learner runs, and the algorithm's constants, readable without torch."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class UpdateConfig:
+    """The algorithm's constants; equations in ``learner/losses.py``."""
+
+    learning_rate: float = 3e-4
+    """Adam's step size for every network."""
+    memory_learning_scale: float = 1.0
+    """The memory's step size, as a multiple of the others'."""
+    alpha_learning_rate: float = 3e-4
+    """Adam's step size for the temperature."""
+    gamma: float = 0.99
+    """Discount per step of the agent."""
+    polyak: float = 0.995
+    """Share of itself that a target network keeps at every update."""
+    clip_norm: float = 0.0
+    """Largest global gradient norm; 0 does not clip."""
+    latent_target: Literal["online", "ema"] = "online"
+    """Which memory gives the change that the world model predicts."""
+    target_memory: Literal["online", "ema"] = "online"
+    """Which memory the target critics read."""
+    policy_q: Literal["first", "min"] = "min"
+    """Which critic the policy climbs: Q_1 (the paper) or the smaller of both."""
+    curiosity: float = 0.0
+    """beta_0, weight of the curiosity reward at the start; 0 switches it off."""
+    curiosity_scale: Literal["raw", "std"] = "raw"
+    """Curiosity as it is (the paper), or divided by its running standard deviation."""
+    curiosity_steps: int = 100_000
+    """Environment steps after which beta has decayed to 0, linearly."""
+    scheme: Literal[1, 2, 3, 4, 5, 6] = 1
+    """Whose losses train the memory: 1 model and value, 2 value, 3 model, 4 all, 5 model and policy, 6 value and
+    policy (table 1 of the paper)."""
+    policy_through_q: bool = True
+    """In schemes 4 to 6: the policy's loss also reaches the memory by the state that Q reads, not by the policy's
+    own input alone."""
+    update_order: Literal["joint", "alternate"] = "joint"
+    """All losses from the parameters as they stood, in one step; or one after the other, each from what the one
+    before left, with optimisers of their own (algorithm 1 as printed)."""
+    model_norm: Literal["l1", "l2"] = "l1"
+    """How the world model's error is measured, as loss and as curiosity."""
+    n_step: int = 1
+    """Steps of reward in a target before it bootstraps; 1 is the paper."""
+    eta: float = 0.9
+    """Weight of the largest against the mean absolute TD error in a window's priority."""
+
+    policy_average: int = 0
+    """Updates over which the policy that checkpoints hold, and evaluations play, is averaged, at most a tenth of those
+    made; actors have the newest. 0 does not average."""
+
+    def beta(self, env_steps: int) -> float:
+        """beta after so many environment steps."""
+        return self.curiosity * max(0.0, 1.0 - env_steps / self.curiosity_steps)
+
+
+@dataclass(frozen=True)
+class LearnerConfig:
+    """How the learner runs; what it computes is in UpdateConfig."""
+
+    batch_size: int = 64
+    """B, windows in a batch."""
+    importance_exponent: float = 0.4
+    """How far importance weights undo prioritized sampling; 1 is wholly."""
+    publish_updates: int = 20
+    """Updates between broadcasts of the policy."""
+    checkpoint_steps: int = 10_000
+    """Environment steps between checkpoints, each of which the evaluator plays."""
+    keep_checkpoints: int = 3
+    """Newest checkpoints kept, beside the best."""
+    precision: Literal["auto", "bf16", "fp32"] = "auto"
+    """Matrix products in bfloat16 (auto: where this CPU or GPU has instructions for it) or float32."""
+    threads: int = 0
+    """CPU threads of the learner; 0 takes all cores but one, which is left to the other roles; on Ray and in lockstep
+    it takes one."""

@@ -1,0 +1,41 @@
+"""The memory over a window: burn-in, then the trained steps; missing observations imputed.
+
+Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, S state.
+"""
+
+import torch
+from torch import Tensor
+
+from rmc.common.agent import Agent, Memory, Remembered
+from rmc.learner.batch import Batch
+
+
+def remember(memory: Memory, o: Tensor, batch: Batch, burn_in: int) -> Remembered:
+    """(B, L_t + 1, ·) from the stored state, which starts the trained part itself where the burn-in is padding."""
+    n, hidden = burn_in, _burned_in(memory, o, batch, burn_in)
+    remembered: Remembered = memory(o[:, n:], batch.blank[:, n:], batch.prev_action[:, n:], hidden)
+    return remembered
+
+
+@torch.no_grad()
+def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
+    """(B, H), the state before the first trained step."""
+    if not n:
+        return batch.state
+    hidden = batch.state[:, : memory.gru.hidden_size]
+    burned = memory(o[:, :n], batch.blank[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
+    torch.clear_autocast_cache()  # older torch would go on with these casts, which carry no gradient
+    return torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
+
+
+def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
+    """(B, L + 1, O) with blank frames filled where configured, along the states that ``remember`` goes through."""
+    if not agent.fills(batch.blank):
+        return o
+
+    def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:
+        return agent.fill(o[:, steps], batch.blank[:, steps], batch.prev_action[:, steps], state)
+
+    past, state = part(slice(burn_in), batch.state)
+    state = torch.where(batch.burned_in.unsqueeze(1), state, batch.state)
+    return torch.cat([past, part(slice(burn_in, None), state)[0]], 1)

@@ -1,0 +1,109 @@
+"""Where roles that need one thread are forked from: what they import is in memory there, which saves each seconds.
+
+``deploy/local/fork_server.py`` is the supervisor's end; this is the program:
+``python -P -m rmc.cli.fork_server DESCRIPTOR``.
+One request and its reply at a time, msgpack, over a pair of sockets: ``{words, environment}`` with the descriptor of a
+log gives the process number of a new role, a process number gives its exit status, once it has one.
+"""
+
+import gc
+import os
+import signal
+import socket
+import sys
+import traceback
+from typing import Any
+
+import msgpack
+import numpy as np
+import setproctitle
+
+from rmc.common.process import parent_death
+from rmc.deploy.local.fork_server import LARGEST
+from rmc.deploy.local.role_environment import command_line
+
+
+def serve(requests: socket.socket) -> None:
+    """Fork what is asked for, until the other end is closed."""
+    _import_all()
+    while True:
+        raw, descriptors, _, _ = socket.recv_fds(requests, LARGEST, 1)
+        if not raw:
+            return
+        request = msgpack.unpackb(raw)
+        if isinstance(request, int):
+            requests.send(msgpack.packb(_status(request)))
+            continue
+        for log in descriptors:
+            requests.send(msgpack.packb(_forked(requests, request, log)))
+            os.close(log)
+
+
+def _forked(requests: socket.socket, request: dict[str, Any], log: int) -> int:
+    """The process number of a new role; 0 where there is no room for one."""
+    nursery = os.getpid()
+    try:
+        pid = os.fork()
+    except OSError as error:
+        os.write(log, f"no process can be forked: {error.strerror}\n".encode())
+        return 0
+    if pid == 0:
+        requests.close()
+        _be(request["words"], {**request["environment"], parent_death.PARENT_VARIABLE: str(nursery)}, log)
+    _lead_group(pid)  # here, too: who hears of it may signal its group at once
+    return pid
+
+
+def _import_all() -> None:
+    """What the roles import, and what gymnasium imports when it makes one of MuJoCo's environments."""
+    import gymnasium.envs.mujoco.mujoco_env
+
+    import rmc.cli.commands
+
+    assert rmc.cli.commands, gymnasium.envs.mujoco.mujoco_env
+    gc.collect()
+    gc.freeze()  # the collector does not write to these pages, so that they stay shared
+
+
+def _status(pid: int) -> int | str:
+    found, status = os.waitpid(pid, os.WNOHANG)
+    return os.waitstatus_to_exitcode(status) if found else "running"
+
+
+def _be(words: list[str], environment: dict[str, str], log: int) -> None:
+    """In the new process: become the role; never returns."""
+    try:
+        _lead_group(0)
+        for stream in (1, 2):
+            os.dup2(log, stream)
+        os.close(log)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        np.random.seed()  # noqa: NPY002 - an environment may draw from it, and forks would all draw the same
+        os.environ.update(environment)
+        sys.argv = ["rmc", *words]
+        setproctitle.setproctitle(" ".join(command_line(words)))
+        from rmc.cli import main
+
+        main.main()
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(1)
+
+
+def _lead_group(pid: int) -> None:
+    os.setpgid(pid, 0)
+
+
+if __name__ == "__main__":
+    parent_death.die_with(int(os.environ.pop(parent_death.PARENT_VARIABLE)))
+    for number in (signal.SIGINT, signal.SIGTERM):  # roles end in order first
+        signal.signal(number, signal.SIG_IGN)
+    try:
+        serve(socket.socket(fileno=int(sys.argv[1])))
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(0)  # at once: Python's own clearing up takes seconds here

@@ -1,0 +1,98 @@
+"""``rmc``: every command's entry, and how errors reach the user: one line, exit status 2."""
+
+import contextlib
+import errno
+import io
+import logging
+import os
+import sys
+
+from rmc.common.process.parent_death import PARENT_VARIABLE, die_with
+
+SINGLE_THREADED = {"actor", "replay", "evaluator"}
+ROLES = SINGLE_THREADED | {"learner", "launcher"}
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
+CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
+
+
+def main() -> None:
+    """The entry point.
+
+    Leaves without Python's own clearing up: all is closed by then, and with torch loaded that takes seconds,
+    which a user waits for after Ctrl-C.
+    """
+    status = run(sys.argv[1:])
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
+
+
+def run(words: list[str]) -> int:
+    """Run one command; its exit status."""
+    parent = os.environ.pop(PARENT_VARIABLE, None)
+    if parent is not None:  # before the slow imports, so that there is no time in which a role could be left behind
+        die_with(int(parent))
+    if words and words[0] in SINGLE_THREADED:  # before numpy and torch are imported, which read these once
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+            os.environ.setdefault(name, "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
+    if os.getcwd() not in sys.path:  # a user's own environments, last, so that they cannot shadow ours
+        sys.path.append(os.getcwd())
+    from rmc.common.errors import ConfigError, RmcError
+
+    try:
+        return _parse_and_run(words)
+    except ConfigError as error:
+        return _complain(str(error), CONFIG_STATUS)
+    except KeyboardInterrupt:  # before the command took the signal over
+        return INTERRUPTED_STATUS
+    except RmcError as error:
+        if words[0] in ROLES:
+            raise  # a role: the supervisor shows its traceback
+        return _complain(str(error), FAILED_STATUS)
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        return _complain(f"{error.filename or 'disk'}: {error.strerror}; make room and try again", FAILED_STATUS)
+
+
+def _parse_and_run(words: list[str]) -> int:
+    from rmc.cli import commands, options
+    from rmc.common.bus.redis_url import without_passwords
+
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):
+            command = options.parse(words)
+    except SystemExit as ending:
+        if not ending.code:  # --help
+            return 0
+        return _complain(_complaint([without_passwords(word) for word in words]), CONFIG_STATUS)
+    return commands.execute(command)
+
+
+def _complaint(words: list[str]) -> str:
+    """What is wrong with words that cannot be parsed; it quotes them."""
+    from rmc.cli import options
+
+    with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.suppress(SystemExit):
+        options.parse(words)
+    return _as_line(said.getvalue())
+
+
+def _as_line(boxed: str) -> str:
+    """tyro's boxed message as one line, without its frame, headings and help text."""
+    rows = [row.strip("│╭╮╰╯─ \t") for row in boxed.splitlines()]
+    body = [row for row in rows if row]
+    ends = [i for i, row in enumerate(body) if row.startswith(("For full helptext", "Argument helptext"))]
+    heading = 1 if len(body) > 1 else 0
+    return " ".join(body[heading : ends[0] if ends else None]) + " (see rmc --help)"
+
+
+def _complain(message: str, status: int) -> int:
+    sys.stderr.write(f"rmc: {message}\n")
+    return status
+
+
+if __name__ == "__main__":
+    main()
