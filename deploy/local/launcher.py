@@ -48,7 +48,7 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
 def _replay_command(shard: Shard, folder: RunFolder, sockets: Path, place: tuple[str, ...]) -> RoleCommand:
     listen = f"unix:{sockets / shard.role}.sock"
     words = ("--folder", str(folder.path / shard.role), "--listen", listen, "--shard", str(shard.index))
-    return RoleCommand(shard.role, ("replay", *place, *words))
+    return RoleCommand(shard.role, ("replay", *place, *words), forked=False)
 
 
 def _redis(config: RunConfig, folder: RunFolder, sockets: Path) -> RedisServer:

@@ -13,7 +13,7 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.make import make_env
 from rmc.common.metrics import BusyClock
 from rmc.common.process.role import METRICS_PERIOD, Role, StopSignal
-from rmc.deploy.local.roles import initial_priority
+from rmc.deploy.local.actor_process import initial_priority
 from rmc.deploy.run.config import RunConfig
 from rmc.learner.learner import Learner
 from rmc.replay_server.server import ReplayServer

@@ -36,6 +36,7 @@ class RoleCommand:
     name: str
     words: tuple[str, ...]
     single_thread: bool = True
+    forked: bool = True  # if of a single thread: by the fork server, which has torch in memory
     ends: bool = False  # in order, once the run is done; any other that ends unasked is started again
 
 
@@ -47,7 +48,7 @@ class RoleProcess:
     ) -> None:
         self.command, self.log, self.restarts = command, logs / f"{command.name}.log", 0
         self._environment = {**environment, **(SINGLE_THREAD if command.single_thread else {})}
-        self._nursery = nursery if command.single_thread else None
+        self._nursery = nursery if command.single_thread and command.forked else None
         self._process: subprocess.Popen[bytes] | Forked | None = None
         self.log_start = 0  # where in its log this start's words begin
         self._started_at, self._start_at = 0.0, 0.0

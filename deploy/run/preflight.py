@@ -1,4 +1,4 @@
-"""Whether the ring fits, asked before anything starts."""
+"""Whether this machine can do it, asked before anything starts: the ring, the device, the cores."""
 
 import os
 import re
@@ -6,7 +6,6 @@ import shutil
 from pathlib import Path
 
 import psutil
-import torch
 
 from rmc.common.errors import ConfigError
 from rmc.common.window import WindowSpec
@@ -48,5 +47,8 @@ def check_device(device: str) -> None:
     """Raises ConfigError where the device is not there."""
     if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
         raise ConfigError("--device", device, "take cpu, cuda or cuda:N")
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise ConfigError("--device", device, "PyTorch sees no CUDA device; use --device cpu")
+    if device.startswith("cuda"):
+        import torch  # takes a second, which no other check needs
+
+        if not torch.cuda.is_available():
+            raise ConfigError("--device", device, "PyTorch sees no CUDA device; use --device cpu")

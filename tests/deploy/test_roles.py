@@ -16,7 +16,7 @@ from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
-from rmc.deploy.local.roles import Place, Process, wait_for_room
+from rmc.deploy.local.role_process import Place, Process, wait_for_room
 from rmc.deploy.redis.connect import Patience, connect
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.server import RedisServer
@@ -131,5 +131,5 @@ def test_one_that_answers_that_it_is_full_is_there(short: Path) -> None:
 
         bus._redis.ping = full
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("rmc.deploy.local.roles.RedisBus", lambda url, run: bus)
+            patch.setattr("rmc.deploy.redis.connect.RedisBus", lambda url, run: bus)
             assert connect(server.url(), "run") is bus

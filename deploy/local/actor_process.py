@@ -1,0 +1,55 @@
+"""The processes that play environments: actors and the evaluator."""
+
+import os
+
+import torch
+
+from rmc.actors.actor import Actor
+from rmc.actors.evaluator import Evaluator
+from rmc.common.errors import ConfigError
+from rmc.common.process.role import Role, run_role
+from rmc.common.process.watchdog import Watchdog
+from rmc.deploy.local.role_process import Place, Process, wait_for_room
+from rmc.deploy.run.config import RunConfig
+from rmc.learner.initial_priority import InitialPriority
+
+EVALUATOR_NICENESS = 10  # it must not take the learner's core
+
+
+def run_actor(place: Place, index: int) -> None:
+    """The process of actor ``index``."""
+    process = Process(place)
+    config = process.config
+    if not 0 <= index < config.actors:
+        raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
+    wait_for_room(process.bus, f"actor-{index}", process.stop)
+    torch.set_num_threads(1)
+    spec, rater = config.window_spec(), initial_priority(config, index)
+    actor = Actor(index, config.seed, process.make_env, spec, config.agent, config.actor, process.bus, rater=rater)
+    _run_watched(actor, process)
+
+
+def initial_priority(config: RunConfig, index: int) -> InitialPriority | None:
+    """What rates the windows of an actor, where actors do."""
+    if config.agent.initial_priority == "max":
+        return None
+    return InitialPriority(config.window_spec(), config.agent, config.update, config.seed + index)
+
+
+def run_evaluator(place: Place) -> None:
+    """The evaluator's process."""
+    process = Process(place)
+    config = process.config
+    wait_for_room(process.bus, "evaluator", process.stop)
+    torch.set_num_threads(1)
+    os.nice(EVALUATOR_NICENESS)
+    evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, process.bus)
+    _run_watched(evaluator, process)
+
+
+def _run_watched(role: Role, process: Process) -> None:
+    """A role that dies where an environment hangs; Redis may hang."""
+    watchdog = Watchdog(process.config.env.env_timeout)
+    process.bus.around = watchdog.asleep
+    run_role(role, process.bus, process.stop, beat=watchdog.beat)
+    watchdog.close()

@@ -1,0 +1,58 @@
+"""The learner's process."""
+
+import ssl
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.process.role import run_role
+from rmc.common.shard import Shard
+from rmc.deploy.local.role_process import Place, Process, wait_for_room
+from rmc.deploy.run import tls
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.preflight import check_device, cores
+from rmc.learner.learner import Learner
+from rmc.learner.replay_client import ReplayClient
+from rmc.learner.sharded_replay import ShardedReplay
+
+
+def run_learner(place: Place, folder: Path, device: str) -> None:
+    """The learner's process; checkpoints go to ``folder``. Its last record says ``finished`` where the run is."""
+    secret, process = place.secret(), Process(place)
+    config, spec, bus = process.config, process.config.window_spec(), process.bus
+    torch.set_num_threads(config.learner.threads or max(1, cores() - 1))
+    check_device(device)
+    wait_for_room(bus, Learner.name, process.stop)
+    pinned, batch = device.startswith("cuda"), config.learner.batch_size
+    context = tls.client_context(place.tls_folder) if place.tls_folder is not None else None
+    clients = replay_clients(config, bus, secret, pinned, context)
+    replay = clients[0] if len(clients) == 1 else ShardedReplay(clients, spec, batch, config.seed, pinned)
+    checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
+    learner = Learner(spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device)
+    run_role(learner, bus, process.stop, lambda: learner.finished)
+    for client in clients:
+        client.close()
+    if learner.finished:
+        bus.emit(learner.name, {"time": time.time(), **learner.metrics(), "finished": 1})
+
+
+def replay_clients(
+    config: RunConfig, bus: RedisBus, secret: bytes, pinned: bool, context: ssl.SSLContext | None
+) -> list[ReplayClient]:
+    """A client of each replay server. What one draws is its part of a batch, where there are several."""
+
+    def address_of(role: str) -> Callable[[], str | None]:
+        def address() -> str | None:
+            found = bus.replay_address(role)
+            return found.address if found else None
+
+        return address
+
+    count = config.replay.replay_shards
+    part = max(1, config.learner.batch_size // count)
+    roles = [Shard(index, count).role for index in range(count)]
+    return [ReplayClient(address_of(role), secret, config.window_spec(), part, pinned, context) for role in roles]

@@ -1,0 +1,88 @@
+"""What every role's process has: where its run is, its bus, the run's config."""
+
+import logging
+import os
+import sys
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rmc.common.bus.protocol import Bus
+from rmc.common.env.make import make_env
+from rmc.common.env.wrappers import Env
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError
+from rmc.common.process.outage import Outage
+from rmc.common.process.role import RECONNECT_SLEEP, StopSignal
+from rmc.deploy.local.role_environment import SECRET_VARIABLE
+from rmc.deploy.redis.connect import PATIENCE_SECONDS, PATIENCE_VARIABLE, Patience, connect
+from rmc.deploy.run.config import RunConfig, from_json
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a role finds its run."""
+
+    run: str
+    redis_url: str = field(repr=False)
+    given_secret: str = field(repr=False, default="")
+    secret_file: Path | None = None
+    tls_folder: Path | None = None
+
+    def secret(self) -> bytes:
+        """The run's secret, from its file or as it was given. Raises ConfigError."""
+        if self.secret_file is None:
+            secret = self.given_secret.encode()
+        else:
+            try:
+                secret = self.secret_file.read_bytes().strip()
+            except OSError as error:
+                raise ConfigError(
+                    "--secret-file", str(self.secret_file), f"cannot be read ({error.strerror})"
+                ) from None
+        if not secret:
+            raise ConfigError(
+                "--secret-file", None, f"give the file secret of the run's folder, or set {SECRET_VARIABLE}"
+            )
+        return secret
+
+
+class Process:
+    """What every role's process has: stop signal, bus, the run's config."""
+
+    def __init__(self, place: Place) -> None:
+        logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
+        self.stop = StopSignal()
+        self.stop.install()
+        patience = float(os.environ.get(PATIENCE_VARIABLE, PATIENCE_SECONDS))
+        self.bus = connect(place.redis_url, place.run, Patience(patience, self.stop))
+        self.config = self._registered_config(place.run, Patience(patience, self.stop))
+
+    def _registered_config(self, run: str, waits: Patience) -> RunConfig:
+        """The run's config; a Redis that has just come back empty gets it again within moments."""
+        while True:
+            with suppress(BusUnavailable):
+                if (raw := self.bus.config()) is not None:
+                    return from_json(raw)
+            if not waits.on(f"run {run} to be registered in that Redis"):
+                raise ConfigError("--run", run, "no run of this name is registered in that Redis; start it first")
+
+    def make_env(self) -> Env:
+        """A new environment of the run."""
+        return make_env(self.config.env)
+
+
+def wait_for_room(bus: Bus, role: str, stop: StopSignal) -> None:
+    """Until Redis takes what this role writes, or it is stopped: one that begins amid an outage waits as others do."""
+    outage = Outage(role)
+    while not stop.requested:
+        try:
+            bus.check_room(role)
+        except (BusUnavailable, BusFull) as error:
+            outage.note(error)
+            time.sleep(RECONNECT_SLEEP)
+        else:
+            outage.over()
+            return
