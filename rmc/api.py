@@ -1,0 +1,62 @@
+"""What the commands ``rmc train`` and ``rmc evaluate`` do, as functions for scripts and notebooks."""
+
+from pathlib import Path
+from typing import Any
+
+from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_checkpoint
+from rmc.cli import training
+from rmc.common.errors import ConfigError
+from rmc.deploy.monitor.view import terminal
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import IfExists, RunFolder
+from rmc.deploy.run.launch_options import Launcher, LaunchOptions
+
+
+def train(
+    config: RunConfig,
+    run_dir: str | Path,
+    *,
+    launcher: Launcher = "local",
+    device: str = "cpu",
+    if_exists: IfExists = "resume",
+    redis_url: str | None = None,
+) -> dict[str, Any]:
+    """Train a run to its ``total_steps``, or go on with the one in ``run_dir``; its ``result.json``.
+
+    Progress goes to standard output. Call it from the main thread: Ctrl-C ends the run in order. With the launcher
+    ``local``, the roles are processes of their own, which import the environment by its id.
+
+    Raises ConfigError for options that cannot work, before anything starts; RoleDied where a role keeps dying;
+    KeyboardInterrupt where the run was stopped, which the same call goes on with.
+    """
+    folder = Path(run_dir)
+    options = LaunchOptions(folder, if_exists, launcher, device, redis_url)
+    console = terminal()
+    if launcher == "ray":
+        status = training.train(config, options, console)
+    else:
+        run = training.prepare(config, options)  # with if_exists="new" the folder is another one
+        folder, status = run.path, training.conduct(config, run, options, console)
+    if status == training.STOPPED:
+        raise KeyboardInterrupt
+    result = RunFolder(folder).result()
+    assert result is not None  # written by every run that ends in order
+    return result
+
+
+def evaluate(
+    run: str | Path, episodes: int = FINAL_EPISODES, *, checkpoint: str = "latest", flicker: float | None = None
+) -> dict[str, Any]:
+    """Play deterministic episodes with a run's ``latest``, ``best`` or numbered checkpoint.
+
+    ``flicker`` is the probability of a missing observation, by default the run's own. The keys are those of
+    ``rmc evaluate --json``: ``eval_return_mean``, ``eval_return_std``, ``eval_episodes``, ``env_steps`` and more.
+
+    Raises ConfigError.
+    """
+    if not 1 <= episodes <= 10_000:
+        raise ConfigError("episodes", episodes, "take 1 to 10_000")
+    if flicker is not None and not 0.0 <= flicker <= 1.0:
+        raise ConfigError("flicker", flicker, "take a probability from 0 to 1")
+    folder = RunFolder(Path(run))
+    return evaluate_checkpoint(folder, folder.config(), checkpoint, episodes, flicker)
