@@ -23,8 +23,8 @@ from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder, check_writable
+from rmc.learner.diagnostics import relative_l1_error
 from rmc.learner.losses import model_error
-from rmc.learner.update import share_unexplained
 
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 HORIZONS = (1, 5, 15)  # steps ahead
@@ -120,7 +120,7 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
         reward=episode.reward.numpy(),
         predicted_reward=prediction.reward[0].numpy(),
         ahead={horizon: found.numpy() for horizon, found in ahead.items()},
-        unexplained=share_unexplained(*_error(ahead[1], episode, 1)).numpy(),
+        unexplained=relative_l1_error(*_error(ahead[1], episode, 1)).numpy(),
         open_loop={horizon: _overall(*_error(found, episode, horizon)) for horizon, found in ahead.items()},
     )
 

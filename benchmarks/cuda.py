@@ -13,9 +13,8 @@ from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.presets import robust
 from rmc.learner.batch import view_batch
-from rmc.learner.cuda_graph import HostCopy
+from rmc.learner.device_update import DeviceUpdate, HostCopy
 from rmc.learner.learner import bf16_is_native
-from rmc.learner.static_update import StaticUpdate
 from rmc.learner.update import JointUpdate, make_update
 
 CHUNK = 10  # updates between looks at the clock
@@ -32,7 +31,7 @@ def measure(run: RunConfig, batch_size: int, seconds: float, rounds: int) -> lis
     spec = run.window_spec()
     raw = torch.from_numpy(random_rows(spec, batch_size).view("u1").reshape(batch_size, -1)).pin_memory()
     importance = torch.ones(batch_size).pin_memory()
-    plain, graphed = _update(run), StaticUpdate(_update(run), spec, batch_size)
+    plain, graphed = _update(run), DeviceUpdate(_update(run), spec, batch_size)
     beta = torch.zeros((), device="cuda")
 
     def one_by_one() -> int:

@@ -25,10 +25,9 @@ from rmc.common.replay import Draw, Replay, Sample
 from rmc.common.window import Rows, WindowSpec
 from rmc.learner.batch import clear_padding, importance_weights
 from rmc.learner.config import LearnerConfig, UpdateConfig
-from rmc.learner.cuda_graph import HostCopy
-from rmc.learner.staleness import SLICE, measurable, staleness
-from rmc.learner.static_update import StaticUpdate
-from rmc.learner.update import AVERAGE_UPDATES, Updated, make_update
+from rmc.learner.device_update import DeviceUpdate, HostCopy
+from rmc.learner.diagnostics import SLICE, latent_rank, measurable, staleness
+from rmc.learner.update import AVERAGE_UPDATES, UpdateResult, make_update
 
 log = logging.getLogger(__name__)
 NOT_OURS = (pickle.UnpicklingError, EOFError, RuntimeError, LookupError, ValueError, TypeError, AttributeError)
@@ -80,7 +79,7 @@ class Learner:
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent).to(self.device)
         bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_is_native(self.device))
         self.update = make_update(self.agent, spec.burn_in, update, seed, bf16)
-        self._updated = StaticUpdate(self.update, spec, config.batch_size)
+        self._updated = DeviceUpdate(self.update, spec, config.batch_size)
         self._returning: deque[tuple[NDArray[np.int64], HostCopy]] = deque()  # priorities, and of which windows
         checkpoints.lock()
         floor = max(self._resume(), checkpoints.last_epoch())
@@ -145,7 +144,7 @@ class Learner:
             serials, priorities = self._returning.popleft()
             self.replay.update_priorities(serials, priorities.wait().numpy())
 
-    def _measure(self, updated: Updated) -> None:
+    def _measure(self, updated: UpdateResult) -> None:
         if self.updates % METRICS_UPDATES == 0:
             for name, value in updated.metrics.items():
                 self._means.add(name, float(value))
@@ -310,16 +309,3 @@ def tensors_in(state: Any) -> Iterator[Tensor]:
 def is_finite(values: Tensor) -> bool:
     """Whether all are. Their sum is only where they are, and takes a CPU a fraction of the time."""
     return bool(values.sum().isfinite()) or bool(values.isfinite().all())  # large ones may overflow it
-
-
-def latent_rank(hidden: Tensor) -> tuple[float, float]:
-    """Effective rank, exp(entropy of the normalised singular values), and mean per-unit standard deviation.
-
-    ``hidden`` (..., H). A rank near 1 or a deviation near 0 is a collapsed latent.
-    """
-    flat = hidden.reshape(-1, hidden.shape[-1]).float()
-    flat = flat - flat.mean(0)
-    p = torch.linalg.svdvals(flat)
-    p = p / p.sum().clamp(min=1e-12)
-    entropy = -(p * p.clamp(min=1e-12).log()).sum()
-    return float(entropy.exp()), float(flat.std(0).mean())

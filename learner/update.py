@@ -14,10 +14,11 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from rmc.common.agent import Agent, Remembered, squashed_sample
+from rmc.common.agent import Agent, Prediction, Remembered, squashed_sample
 from rmc.learner import losses
 from rmc.learner.batch import Batch
 from rmc.learner.config import UpdateConfig
+from rmc.learner.diagnostics import Trace, unexplained_change, update_metrics
 from rmc.learner.fused import fuse
 from rmc.learner.unroll import filled, remember
 
@@ -33,7 +34,7 @@ TRAINS_MEMORY = {  # the paper's table 1
 }
 
 
-class Updated(NamedTuple):
+class UpdateResult(NamedTuple):
     """What an update gives back, all on the device and without gradient."""
 
     priorities: Tensor  # (B,)
@@ -41,7 +42,7 @@ class Updated(NamedTuple):
     curiosity_variance: Tensor  # (2,), as it is after this batch
     hidden: Tensor  # (B, L_t + 1, H), for the latent's rank
     observed: Tensor  # (B, L_t + 1) bool, which of them are real
-    observation_unexplained: Tensor  # (O,), see ``_unexplained``; (0,) without grounding
+    observation_unexplained: Tensor  # (O,), see ``diagnostics.unexplained_change``; (0,) without grounding
 
 
 class JointUpdate:
@@ -63,14 +64,14 @@ class JointUpdate:
     def _make_optimizers(self) -> list[torch.optim.Adam]:
         return [_adam(self.agent, self.config, "memory", "world_model", "next_frame", "critic", "policy", "log_alpha")]
 
-    def __call__(self, batch: Batch, beta: Tensor) -> Updated:
+    def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
         """One update from a Batch; ``beta`` is a scalar tensor."""
         parts, updated = self.forward(batch, beta)
         norm = self._step(self.optimizers[0], parts.values())
         self._follow(updated)
         return updated._replace(metrics=updated.metrics | {"grad_norm": norm})
 
-    def forward(self, batch: Batch, beta: Tensor) -> tuple[dict[str, Tensor], Updated]:
+    def forward(self, batch: Batch, beta: Tensor) -> tuple[dict[str, Tensor], UpdateResult]:
         """Every loss from the parameters as they stand, in the order of the paper's section 3."""
         agent, c = self.agent, self.config
         steps = slice(self.burn_in, None)
@@ -109,40 +110,44 @@ class JointUpdate:
             q_pi = functional_call(agent.critic, frozen, (z_climbed[:, :-1], pi[:, :-1]))
             q_pi = q_pi[0] if c.policy_q == "first" else q_pi.min(0).values
 
-        log_pi = log_pi[:, :-1]
+        log_pi, td_error = log_pi[:, :-1], (q.detach() - y).abs().mean(0)
         parts = {
             "model_loss": losses.model_loss(error, d, m),
             "q_loss": losses.q_loss(q, y, batch.importance, m),
             "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, m),
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
-        unexplained = o.new_zeros(0)
-        now, after = o[:, steps][:, :-1], o[:, steps][:, 1:]
-        seen_now, seen_after = _seen(batch)[:, steps][:, :-1], _seen(batch)[:, steps][:, 1:]
+        observation_losses, unexplained = self._observation_losses(o, memory, prediction, batch, m)
+        parts |= observation_losses
+        detached = {name: value.detach() for name, value in parts.items()}
+        trace = Trace(detached, alpha, log_pi.detach(), q.detach(), td_error, i, change, r, d, m)
+        return parts, UpdateResult(
+            priorities=losses.priority(td_error, c.eta, m),
+            metrics=update_metrics(trace, beta, c.model_norm),
+            curiosity_variance=curiosity_variance,
+            hidden=memory.hidden.detach(),
+            observed=batch.observation_valid[:, steps],
+            observation_unexplained=unexplained,
+        )
+
+    def _observation_losses(
+        self, o: Tensor, memory: Remembered, prediction: Prediction, batch: Batch, m: Tensor
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """The losses of what predicts observations, where configured, and what the world model leaves unexplained."""
+        agent, steps = self.agent, slice(self.burn_in, None)
+        a, r, seen = batch.action[:, steps], batch.reward[:, steps], _seen(batch)[:, steps]
+        now, after, seen_now, seen_after = o[:, steps][:, :-1], o[:, steps][:, 1:], seen[:, :-1], seen[:, 1:]
+        found = {}
         if agent.next_frame is not None:
             with self._autocast():
                 expected = agent.next_frame(self._low(memory.hidden.detach()[:, :-1]), now, a)
-            parts["fill_loss"] = losses.fill_loss(expected, after, seen_after, m)
-        if agent.config.grounding:
-            predicted = now + prediction.observation_change.float()
-            seen = seen_after if agent.config.fill_blanks else seen_after * seen_now
-            parts["grounding_loss"] = losses.grounding_loss(predicted, after, prediction.reward.float(), r, seen, m)
-            unexplained = _unexplained(predicted.detach() - now, after - now, m * seen_after * seen_now)
-
-        td_error = (q.detach() - y).abs().mean(0)
-        no_change = losses.model_loss(losses.model_error(torch.zeros_like(change), change, c.model_norm), d, m)
-        metrics = {name: value.detach() for name, value in parts.items()} | {
-            "alpha": alpha,
-            "entropy": -losses.masked_mean(log_pi.detach(), m),
-            "q_mean": losses.masked_mean(q.detach().mean(0), m),
-            "td_error": losses.masked_mean(td_error, m),
-            "model_unexplained": parts["model_loss"].detach() / no_change.clamp(min=1e-8),
-            "curiosity_mean": losses.masked_mean(i, m),
-            "curiosity_share": beta * i.sum() / (beta * i.sum() + (m * r.abs()).sum()).clamp(min=1e-8),
-        }
-        observed = batch.observation_valid[:, steps]
-        priority = losses.priority(td_error, c.eta, m)
-        return parts, Updated(priority, metrics, curiosity_variance, memory.hidden.detach(), observed, unexplained)
+            found["fill_loss"] = losses.fill_loss(expected, after, seen_after, m)
+        if not agent.config.grounding:
+            return found, o.new_zeros(0)
+        predicted = now + prediction.observation_change.float()
+        grounded = seen_after if agent.config.fill_blanks else seen_after * seen_now
+        found["grounding_loss"] = losses.grounding_loss(predicted, after, prediction.reward.float(), r, grounded, m)
+        return found, unexplained_change(predicted.detach() - now, after - now, m * seen_after * seen_now)
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
@@ -178,7 +183,7 @@ class JointUpdate:
         optimizer.step()
         return norm.detach()
 
-    def _follow(self, updated: Updated) -> None:
+    def _follow(self, updated: UpdateResult) -> None:
         """What follows the step: targets by Polyak, and the running variance."""
         self._polyak(self.target_critic.parameters(), self.agent.critic.parameters())
         if self._has_target_memory:
@@ -255,7 +260,7 @@ class AlternateUpdate(JointUpdate):
     def _stages(self) -> list[tuple[str, tuple[str, ...]]]:
         return [(part, names) for part, names in self._STAGES if getattr(self.agent, part) is not None]
 
-    def __call__(self, batch: Batch, beta: Tensor) -> Updated:
+    def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
         """One round from a Batch. Each metric is from its own stage's forward; priorities from the critics'."""
         metrics: dict[str, Tensor] = {}
         norms = []
@@ -298,17 +303,6 @@ def _adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
     ]
     on_gpu = agent.log_alpha.device.type == "cuda"
     return torch.optim.Adam([group for group in groups if group["params"]], fused=True, capturable=on_gpu)
-
-
-def _unexplained(predicted: Tensor, change: Tensor, m: Tensor) -> Tensor:
-    """(O,): mean size of the error over that of the change itself, by observation dimension; 1 is "no change"."""
-    weight = m.unsqueeze(-1)
-    return share_unexplained(*((weight * x.abs()).sum((0, 1)) for x in (predicted - change, change)))
-
-
-def share_unexplained(error: Tensor, size: Tensor) -> Tensor:
-    """(O,) error over size. What hardly changes counts as a thousandth of what changes most: else it is all noise."""
-    return error / torch.maximum(size, 1e-3 * size.max()).clamp(min=1e-8)
 
 
 def _seen(batch: Batch) -> Tensor:

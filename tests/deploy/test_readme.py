@@ -12,7 +12,7 @@ from docs import fault_table
 from docs.generate import page
 from rmc.common import agent
 from rmc.common.env import wrappers
-from rmc.learner import losses, staleness, update
+from rmc.learner import diagnostics, losses, update
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -40,7 +40,7 @@ def test_the_faults_that_were_run_are_in_their_page() -> None:
 
 def test_every_equation_leads_to_its_code_and_back() -> None:
     """What the docs' table names is there, and its docstring names the equation."""
-    modules = {"losses": losses, "agent": agent, "update": update, "wrappers": wrappers, "staleness": staleness}
+    modules = {"losses": losses, "agent": agent, "update": update, "wrappers": wrappers, "diagnostics": diagnostics}
     table = (ROOT / "docs" / "algorithm.md").read_text().split("## From the paper to the code")[1].split("\n\n")[1]
     seen = set()
     for row in table.splitlines()[2:]:

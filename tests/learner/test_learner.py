@@ -14,7 +14,8 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import CheckpointError, FencedError, RmcError
 from rmc.common.wire import encode_hello, encode_windows
 from rmc.learner.config import LearnerConfig, UpdateConfig
-from rmc.learner.learner import Learner, is_finite, latent_rank
+from rmc.learner.diagnostics import latent_rank
+from rmc.learner.learner import Learner, is_finite
 from rmc.learner.update import AVERAGE_UPDATES
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.server import ReplayServer

@@ -127,10 +127,10 @@ def learner() -> None:
 
     from rmc.common import checkpoint
     from rmc.common.checkpoint import STATE
+    from rmc.learner.device_update import DeviceUpdate
     from rmc.learner.learner import Learner
-    from rmc.learner.static_update import StaticUpdate
 
-    write, resume, update = checkpoint._write, Learner._resume, StaticUpdate.__call__
+    write, resume, update = checkpoint._write, Learner._resume, DeviceUpdate.__call__
 
     def half_a_file(path: Path, content: bytes) -> None:
         if path.name == STATE and strikes("half-a-checkpoint"):
@@ -157,7 +157,7 @@ def learner() -> None:
         return result
 
     checkpoint._write, Learner._resume = half_a_file, compared  # type: ignore[method-assign]
-    StaticUpdate.__call__ = slower  # type: ignore[method-assign]
+    DeviceUpdate.__call__ = slower  # type: ignore[method-assign]
     after(checkpoint, "_sync_folder", "synchronised")
     after(checkpoint.CheckpointFolder, "save", "saved")
 

@@ -16,8 +16,7 @@ from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.learner.batch import clear_padding, view_batch
 from rmc.learner.config import UpdateConfig
-from rmc.learner.cuda_graph import WARM_UP, CopiesAhead, CudaGraph, HostCopy
-from rmc.learner.static_update import StaticUpdate
+from rmc.learner.device_update import WARM_UP, CopiesAhead, CudaGraph, DeviceUpdate, HostCopy
 from rmc.learner.update import JointUpdate, make_update
 from tests.learner.rows import SPEC, random_rows
 
@@ -52,7 +51,7 @@ def host_batch(seed: int, pinned: bool = False) -> tuple[torch.Tensor, torch.Ten
 @pytest.mark.parametrize("order", ["joint", "alternate"])
 def test_it_is_the_same_update(order):
     plain, update = make(order), make(order)
-    static = StaticUpdate(update, SPEC, BATCH)
+    static = DeviceUpdate(update, SPEC, BATCH)
     for step in range(20):
         raw, importance = host_batch(step)
         expected = plain(view_batch(raw, importance, SPEC), torch.tensor(0.1 * step))
@@ -165,7 +164,7 @@ def test_a_tensor_on_the_host_is_there_at_once():
 def test_a_graph_trains_as_the_updates_one_by_one(order, bf16):
     """100 updates; equal losses to 1e-3."""
     plain, update = make(order, "cuda", bf16), make(order, "cuda", bf16)
-    static = StaticUpdate(update, SPEC, BATCH)
+    static = DeviceUpdate(update, SPEC, BATCH)
     for step in range(100):
         raw, importance = host_batch(step, pinned=True)
         expected = plain(view_batch(raw.cuda(), importance.cuda(), SPEC), torch.tensor(0.1, device="cuda"))

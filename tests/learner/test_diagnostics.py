@@ -9,7 +9,7 @@ import torch
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.window import Rows, WindowSpec
-from rmc.learner.staleness import measurable, staleness
+from rmc.learner.diagnostics import measurable, staleness
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=5)
 UNBURNED = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=0, train=5)

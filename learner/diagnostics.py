@@ -1,8 +1,10 @@
-"""How stale replayed states are: what a window starts from, against what today's weights would remember there.
+"""What the learner measures of itself; nothing here changes what is learnt.
 
-Shapes: n steps from an episode's start to a window's end, T = L_b + L_t steps of the window, O observation, A action.
-The measures are those of R2D2 (Kapturowski et al., 2019, section 3), with Q of the actions that were taken.
+Shapes: B batch, T = L_b + L_t steps of a window, O observation, A action, H hidden; n steps from an episode's start to
+a window's end. Staleness is R2D2's (Kapturowski et al., 2019, section 3), with Q of the actions that were taken.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,9 +13,65 @@ from torch import Tensor
 
 from rmc.common.agent import Agent
 from rmc.common.window import BoolArray, Rows, WindowSpec
+from rmc.learner import losses
 
 Floats = NDArray[np.float32]
 SLICE = 4  # windows of a batch that are looked at
+
+
+class Trace(NamedTuple):
+    """What a forward pass computed on its way, without gradient, to be measured."""
+
+    losses: dict[str, Tensor]  # scalars
+    alpha: Tensor  # scalar
+    log_pi: Tensor  # (B, L_t)
+    q: Tensor  # (2, B, L_t)
+    td_error: Tensor  # (B, L_t)
+    curiosity: Tensor  # (B, L_t)
+    hidden_change: Tensor  # (B, L_t, H), what the world model predicts
+    reward: Tensor  # (B, L_t)
+    terminated: Tensor  # (B, L_t)
+    m: Tensor  # (B, L_t), which steps are real
+
+
+def update_metrics(trace: Trace, beta: Tensor, model_norm: str) -> dict[str, Tensor]:
+    """Scalars of one update, on its device."""
+    m, i = trace.m, trace.curiosity
+    unmoved = losses.model_error(torch.zeros_like(trace.hidden_change), trace.hidden_change, model_norm)
+    no_change = losses.model_loss(unmoved, trace.terminated, m)
+    return trace.losses | {
+        "alpha": trace.alpha,
+        "entropy": -losses.masked_mean(trace.log_pi, m),
+        "q_mean": losses.masked_mean(trace.q.mean(0), m),
+        "td_error": losses.masked_mean(trace.td_error, m),
+        "model_unexplained": trace.losses["model_loss"] / no_change.clamp(min=1e-8),
+        "curiosity_mean": losses.masked_mean(i, m),
+        "curiosity_share": beta * i.sum() / (beta * i.sum() + (m * trace.reward.abs()).sum()).clamp(min=1e-8),
+    }
+
+
+def unexplained_change(predicted: Tensor, change: Tensor, m: Tensor) -> Tensor:
+    """(O,): mean size of the error over that of the change itself, by observation dimension; 1 is "no change"."""
+    weight = m.unsqueeze(-1)
+    return relative_l1_error(*((weight * x.abs()).sum((0, 1)) for x in (predicted - change, change)))
+
+
+def relative_l1_error(error: Tensor, size: Tensor) -> Tensor:
+    """(O,) error over size. What hardly changes counts as a thousandth of what changes most: else it is all noise."""
+    return error / torch.maximum(size, 1e-3 * size.max()).clamp(min=1e-8)
+
+
+def latent_rank(hidden: Tensor) -> tuple[float, float]:
+    """Effective rank, exp(entropy of the normalised singular values), and mean per-unit standard deviation.
+
+    ``hidden`` (..., H). A rank near 1 or a deviation near 0 is a collapsed latent.
+    """
+    flat = hidden.reshape(-1, hidden.shape[-1]).float()
+    flat = flat - flat.mean(0)
+    p = torch.linalg.svdvals(flat)
+    p = p / p.sum().clamp(min=1e-12)
+    entropy = -(p * p.clamp(min=1e-12).log()).sum()
+    return float(entropy.exp()), float(flat.std(0).mean())
 
 
 def measurable(rows: Rows, spec: WindowSpec) -> BoolArray:

@@ -1,6 +1,7 @@
-"""What a GPU needs so that it never waits for the host: work as one CUDA graph, copies that go beside it.
+"""The update on its device: rows in, priorities out, the batch always in the same memory.
 
-An update launches more than a thousand kernels of some microseconds each; a graph launches them by one call.
+A GPU must never wait for the host: an update launches more than a thousand kernels of some microseconds each, so they
+are recorded as one CUDA graph, and copies go beside it. A CPU takes the same way, without a graph. Shapes: B batch.
 """
 
 from collections.abc import Callable
@@ -8,6 +9,10 @@ from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
+
+from rmc.common.window import WindowSpec
+from rmc.learner.batch import view_batch
+from rmc.learner.update import JointUpdate, UpdateResult
 
 T = TypeVar("T")
 WARM_UP = 3  # calls as they are, in which libraries choose their kernels and Adam makes its moments
@@ -88,3 +93,34 @@ class HostCopy:
         if self._there is not None:
             self._there.synchronize()
         return self._host
+
+
+class DeviceUpdate:
+    """An update of batches of one size. A checkpoint must be taken up before the first call, not after."""
+
+    def __init__(self, update: JointUpdate, spec: WindowSpec, batch_size: int) -> None:
+        device = update.agent.log_alpha.device
+        self._update, self._spec = update, spec
+        self._raw = torch.zeros(batch_size, spec.dtype.itemsize, dtype=torch.uint8, device=device)
+        self._importance, self._beta = torch.ones(batch_size, device=device), torch.zeros((), device=device)
+        self._work, self._copy, self.in_flight = self._once, self._copy_now, 0
+        if device.type == "cuda":
+            self._work = CudaGraph(self._once, update.generator)
+            self._copy = CopiesAhead([self._raw, self._importance])
+            self.in_flight = 1
+
+    def __call__(self, raw: Tensor, importance: Tensor, beta: float) -> UpdateResult:
+        """(B, row bytes) uint8 without padding, (B,) float32. What it returns is overwritten by the next call.
+
+        On a GPU this only launches. ``raw`` may be written again once the update's priorities are on the host.
+        """
+        self._copy([raw, importance])
+        self._beta.fill_(beta)
+        return self._work()
+
+    def _once(self) -> UpdateResult:
+        return self._update(view_batch(self._raw, self._importance, self._spec), self._beta)
+
+    def _copy_now(self, tensors: list[Tensor]) -> None:
+        for place, tensor in zip((self._raw, self._importance), tensors, strict=True):
+            place.copy_(tensor)
