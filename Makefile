@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo wheel site test test-faults test-cluster test-dm-control lint results trial comparisons docs bench peers clean
+.PHONY: env demo wheel site test test-faults test-cluster test-dm-control test-newest lint results trial comparisons docs bench peers clean
 
 env: $(STAMP)
 
@@ -22,6 +22,23 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadscope --durations=25 --durations-min=5
+
+# The newest Python that every wheel resolves for, without torch, whose wheels there bring gigabytes of CUDA: all that
+# never imports it, in an environment of its own.
+NEWEST := 3.13
+NEWEST_PYTHON ?= $(firstword $(wildcard $(HOME)/.pyenv/versions/$(NEWEST).*/bin/python) $(shell command -v python$(NEWEST)))
+WITHOUT_TORCH := import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; print(*(one for one in project["dependencies"] if not one.startswith("torch")), sep="\n")
+
+test-newest: $(VENV)-$(NEWEST)/.installed
+	$(VENV)-$(NEWEST)/bin/python -m pytest -q tests/replay_server tests/common tests/cli
+
+$(VENV)-$(NEWEST)/.installed: pyproject.toml constraints.txt
+	test -n "$(NEWEST_PYTHON)" || { echo "no Python $(NEWEST) here: make test-newest NEWEST_PYTHON=/path/to/python$(NEWEST)"; exit 1; }
+	test -x $(@D)/bin/python || $(NEWEST_PYTHON) -m venv $(@D)
+	$(NEWEST_PYTHON) -c '$(WITHOUT_TORCH)' > $(@D)/requirements.txt
+	$(@D)/bin/python -m pip install --quiet -r $(@D)/requirements.txt pytest pytest-timeout hypothesis -c constraints.txt
+	$(@D)/bin/python -m pip install --quiet --no-deps -e .
+	@touch $@
 
 # The scripts of tests/faults at length, some two hours in all; each puts its rows into tests/faults/results.json.
 # Linux; disk_full wants root, clock a C compiler.

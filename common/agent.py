@@ -153,7 +153,7 @@ class WorldModel(nn.Module):
 class NextFrame(nn.Module):
     """g(h_t, o_t, a_t): the normalised o_{t+1} that fills a blank. It trains nothing but itself.
 
-    It reads o_t, which the world model does not: where that one did, returns fell (``docs/history.md``).
+    It reads o_t, which the world model does not: where that one did, returns fell (``studies/notebook.md``).
     """
 
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
