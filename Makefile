@@ -27,16 +27,18 @@ test: $(STAMP)
 # never imports it, in an environment of its own.
 NEWEST := 3.13
 NEWEST_PYTHON ?= $(firstword $(wildcard $(HOME)/.pyenv/versions/$(NEWEST).*/bin/python) $(shell command -v python$(NEWEST)))
+NEEDS_TORCH := common/test_wire.py replay_server/test_process.py replay_server/test_recovery.py replay_server/test_server.py \
+	replay_server/test_socket_server.py
 WITHOUT_TORCH := import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; print(*(one for one in project["dependencies"] if not one.startswith("torch")), sep="\n")
 
 test-newest: $(VENV)-$(NEWEST)/.installed
-	$(VENV)-$(NEWEST)/bin/python -m pytest -q tests/replay_server tests/common tests/cli
+	$(VENV)-$(NEWEST)/bin/python -m pytest -q tests/common tests/cli tests/replay_server $(addprefix --ignore tests/,$(NEEDS_TORCH))
 
 $(VENV)-$(NEWEST)/.installed: pyproject.toml constraints.txt
 	test -n "$(NEWEST_PYTHON)" || { echo "no Python $(NEWEST) here: make test-newest NEWEST_PYTHON=/path/to/python$(NEWEST)"; exit 1; }
 	test -x $(@D)/bin/python || $(NEWEST_PYTHON) -m venv $(@D)
 	$(NEWEST_PYTHON) -c '$(WITHOUT_TORCH)' > $(@D)/requirements.txt
-	$(@D)/bin/python -m pip install --quiet -r $(@D)/requirements.txt pytest pytest-timeout hypothesis -c constraints.txt
+	$(@D)/bin/python -m pip install --quiet -r $(@D)/requirements.txt pytest pytest-timeout pytest-xdist hypothesis -c constraints.txt
 	$(@D)/bin/python -m pip install --quiet --no-deps -e .
 	@touch $@
 
