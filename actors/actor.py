@@ -20,7 +20,7 @@ from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Ack, Bus, Version
 from rmc.common.env.make import rebuilt, sound_reset
 from rmc.common.env.wrappers import Env, Floats
-from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
+from rmc.common.errors import BusFull, BusUnavailable, FencedError, MessageError
 from rmc.common.metrics import Means, Rate
 from rmc.common.window import Rows, WindowSpec
 
@@ -72,7 +72,6 @@ class Actor:
 
         Without a ``rater`` windows enter the replay with the largest priority seen.
         """
-        _check(config, spec)
         self.name = f"actor-{index}"
         self._index, self._seed, self._spec, self._config = index, seed, spec, config
         self._bus, self._clock, self._rater = bus, clock, rater
@@ -351,11 +350,3 @@ class Actor:
     def _send(self) -> None:
         if self._outbox.send():
             self._poll_ack()
-
-
-def _check(config: ActorConfig, spec: WindowSpec) -> None:
-    if not 0 <= config.stride <= spec.train:
-        raise ConfigError("--stride", config.stride, f"from 1 to the {spec.train} trained steps of a window, or 0")
-    for name in ("envs_per_actor", "refresh_steps", "chunk_windows", "unacked_bytes"):
-        if getattr(config, name) < 1:
-            raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), "at least 1")

@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-from rmc.common.errors import ConfigError
-
 
 @dataclass(frozen=True)
 class ReplayConfig:
@@ -19,13 +17,3 @@ class ReplayConfig:
     """How strongly priorities steer sampling; 0 is uniform."""
     replay_shards: int = 1
     """Replay servers, each with a share of the actors and of the capacity."""
-
-    def __post_init__(self) -> None:
-        if self.capacity < 1:
-            raise ConfigError("--capacity", self.capacity, "take at least 1 window")
-        if not 0.0 < self.replay_ratio < float("inf"):
-            raise ConfigError("--replay-ratio", self.replay_ratio, "take a positive number, like 128")
-        if self.warmup_steps < 0:
-            raise ConfigError("--warmup-steps", self.warmup_steps, "take 0 or more")
-        if not 0.0 <= self.priority_exponent <= 4.0:
-            raise ConfigError("--priority-exponent", self.priority_exponent, "take 0 (uniform) to 4")

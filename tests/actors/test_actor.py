@@ -20,7 +20,7 @@ from rmc.common.bus.protocol import Ack, Bus, Entry, EntryId, Holder, Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
-from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
+from rmc.common.errors import BusFull, BusUnavailable, FencedError
 from rmc.common.window import Rows, WindowSpec
 from rmc.common.wire import decode_rows
 from tests.actors.support import join_rows
@@ -389,20 +389,6 @@ def test_a_replaced_actor_ends(bus: Bus) -> None:
     play(bus, new, reader, 200)
     assert {int(epoch) for epoch in reader.rows()["epoch"]} == {2}
     new.close()
-
-
-@pytest.mark.parametrize(
-    ("config", "option"),
-    [
-        (ActorConfig(stride=-1), "--stride"),
-        (ActorConfig(stride=7), "--stride"),
-        (ActorConfig(stride=6, envs_per_actor=0), "--envs-per-actor"),
-        (ActorConfig(stride=6, chunk_windows=0), "--chunk-windows"),
-    ],
-)
-def test_nonsense_is_refused(config: ActorConfig, option: str) -> None:
-    with pytest.raises(ConfigError, match=option):
-        make_actor(MemoryBus(), config=config)
 
 
 def test_epochs_that_redis_forgot_do_not_strand_the_actor(bus: Bus) -> None:
