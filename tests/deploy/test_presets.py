@@ -13,9 +13,9 @@ from rmc.common.agent_config import HeadInput
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run import config
-from rmc.deploy.run.config import RunConfig, from_json, to_json
+from rmc.deploy.run.config import RunConfig, from_json, option, to_json
 from rmc.deploy.run.folder import flat
-from rmc.deploy.run.presets import paper, preset, robust
+from rmc.deploy.run.presets import debug, paper, preset, robust
 from rmc.deploy.run.validation import validate
 
 ENV = EnvConfig("InvertedPendulum-v5")
@@ -137,3 +137,16 @@ def test_a_window_that_no_redis_would_take_is_refused() -> None:
     config = with_value(robust(EnvConfig("InvertedPendulum-v5", time_limit=2**31)), "actor.state_strategy", "episode")
     with pytest.raises(ConfigError, match=r"--time-limit=2147483648: .* more than 32 MiB"):
         config.window_spec()
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("replay.capacity", 0), ("replay.replay_ratio", 0.0), ("replay.replay_ratio", float("nan")),
+        ("replay.warmup_steps", -1), ("replay.priority_exponent", -0.1), ("actor.stride", -1),
+        ("actor.envs_per_actor", 0), ("actor.chunk_windows", 0),
+    ],
+)  # fmt: skip
+def test_a_number_out_of_range_is_named(path: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=option(path)):
+        validate(with_value(debug(EnvConfig("Pendulum-v1")), path, value))
