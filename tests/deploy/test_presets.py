@@ -12,21 +12,20 @@ from hypothesis import strategies as st
 from rmc.common.agent_config import HeadInput
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run import config
-from rmc.deploy.run.config import RunConfig, from_json, option, to_json
+from rmc.deploy.run.config import Preset, RunConfig, from_json, option, to_json
 from rmc.deploy.run.folder import flat
 from rmc.deploy.run.presets import debug, paper, preset, robust
 from rmc.deploy.run.validation import validate
 
 ENV = EnvConfig("InvertedPendulum-v5")
-NAMES: list[config.Preset] = ["robust", "paper", "debug"]
+NAMES: list[Preset] = ["robust", "paper", "debug"]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_presets_are_valid_and_come_back_from_json(name: config.Preset) -> None:
+def test_presets_are_valid_and_come_back_from_json(name: Preset) -> None:
     config = preset(name, ENV)
     validate(config)
-    assert preset == name
+    assert config.preset == name
     assert from_json(to_json(config)) == config
 
 
