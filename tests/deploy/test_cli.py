@@ -16,7 +16,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import to_json
 from rmc.deploy.run.folder import RunFolder, open_run
-from rmc.deploy.run.launch_options import Placement
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.presets import debug, paper
 
 PENDULUM = "InvertedPendulum-v5"
@@ -151,7 +151,7 @@ def test_a_password_on_the_command_line_is_warned_of_once(words: list[str], logi
 
 def test_a_redis_beside_ray_is_refused_without_its_password() -> None:
     """Where the check is made: to get there from the command line takes a cluster."""
-    placement = Placement(None, "fail", "ray", "cpu", "redis://user:hush@localhost:1")
+    placement = LaunchOptions(None, "fail", "ray", "cpu", "redis://user:hush@localhost:1")
     with pytest.raises(ConfigError, match="--redis-url='redis://localhost:1': a run on Ray"):
         prepare(debug(EnvConfig(PENDULUM)), placement)
 
