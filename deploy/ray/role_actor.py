@@ -114,7 +114,8 @@ class RoleHost:
 
     def _start(self) -> None:
         self._role.start()
-        threading.Thread(target=self._watch, args=(self._role.pid,), daemon=True).start()
+        self._watcher = threading.Thread(target=self._watch, daemon=True)
+        self._watcher.start()
 
     # What a role's host does beyond holding it.
 
@@ -142,10 +143,8 @@ class RoleHost:
         if not now and self._status == ENDED_IN_ORDER and not self._task.command.ends:
             os._exit(1)
 
-    def _watch(self, pid: int | None) -> None:
+    def _watch(self) -> None:
         while not self._role.reap(LOOK_SECONDS):
-            if self._role.pid not in (pid, None):  # started again on purpose: another thread watches
-                return
             with suppress(*AWAY):  # the next look tries again
                 self.tend()
         status = self._role.status
@@ -181,6 +180,7 @@ class RoleHost:
         """End the role in order and start it again, because the run's config has changed."""
         self._replaced = True
         self._end()
+        self._watcher.join()  # it must not take the new process's absence, or its presence, for the old one's end
         self._replaced = False
         self._start()
 
