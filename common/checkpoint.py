@@ -4,7 +4,6 @@
 the best one evaluated, which is kept beside the newest few, and ``checkpoints/epoch`` the writer's epoch.
 """
 
-import fcntl
 import hashlib
 import json
 import logging
@@ -15,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rmc.common.errors import CheckpointError, ConfigError
+from rmc.common.process.file_lock import take_lock
 
 log = logging.getLogger(__name__)
 MANIFEST = "manifest.json"
@@ -30,15 +30,12 @@ class CheckpointFolder:
         self._lock: int | None = None
 
     def lock(self) -> None:
-        """Become the one writer. Raises ConfigError where another process is."""
+        """Become the one writer. Raises ConfigError where another process stays it."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(
-                "--run-dir", str(self.folder.parent), "another process trains in this folder; stop it first"
-            ) from None
+        self._lock = take_lock(self.folder / ".lock")
+        if self._lock is None:
+            fix = "another process trains in this folder; stop it first"
+            raise ConfigError("--run-dir", str(self.folder.parent), fix)
         for left in self.folder.glob(".tmp-*"):
             shutil.rmtree(left)
 
