@@ -1,7 +1,8 @@
 """A folder of checkpoints that are whole or absent: temp folder, fsync, rename, SHA-256 manifest.
 
 ``checkpoints/000001200/{FILES…, manifest.json}``, one folder an update count; ``checkpoints/best.json`` names
-the best one evaluated, which is kept beside the newest few, and ``checkpoints/epoch`` the writer's epoch.
+the best one evaluated, which is kept beside the newest few, ``checkpoints/epoch`` the writer's epoch, and
+``checkpoints/save-seconds`` how long its last save took.
 """
 
 import hashlib
@@ -19,7 +20,8 @@ from rmc.common.process.file_lock import take_lock
 log = logging.getLogger(__name__)
 MANIFEST = "manifest.json"
 BEST = "best.json"
-EPOCH = "epoch"
+EPOCH, SAVE_SECONDS = "epoch", "save-seconds"
+SAVES_GRANTED = 3  # a writer that is told to end may take so many times its last save
 
 
 class CheckpointFolder:
@@ -79,9 +81,7 @@ class CheckpointFolder:
 
     def note_epoch(self, epoch: int) -> None:
         """The writer's, so that the next one's is larger though Redis forgets; where there is no room, unnoted."""
-        with suppress(OSError):
-            _write(self.folder / f".{EPOCH}", str(epoch).encode())
-            (self.folder / f".{EPOCH}").rename(self.folder / EPOCH)
+        self._note(EPOCH, str(epoch))
 
     def last_epoch(self) -> int:
         """What was noted last; 0 where nothing was."""
@@ -89,6 +89,27 @@ class CheckpointFolder:
             return int((self.folder / EPOCH).read_bytes())
         except (OSError, ValueError):
             return 0
+
+    def note_save(self, seconds: float) -> None:
+        """How long a save took, from the first look at the state until it was on the disk."""
+        self._note(SAVE_SECONDS, str(seconds))
+
+    def last_save(self) -> float:
+        """What was noted last; 0.0 where nothing was."""
+        try:
+            seconds = float((self.folder / SAVE_SECONDS).read_bytes())
+        except (OSError, ValueError):
+            return 0.0
+        return seconds if 0.0 <= seconds < float("inf") else 0.0
+
+    def patience(self, least: float) -> float:
+        """The seconds in which a writer that is told to end can save, at least so many."""
+        return max(least, SAVES_GRANTED * self.last_save())
+
+    def _note(self, name: str, text: str) -> None:
+        with suppress(OSError):
+            _write(self.folder / f".{name}", text.encode())
+            (self.folder / f".{name}").rename(self.folder / name)
 
     def _prune(self) -> None:
         best = self.best()

@@ -128,6 +128,10 @@ class RoleHost:
     def tend(self) -> None:
         """Once in a while meanwhile."""
 
+    def patience(self) -> float:
+        """The seconds that it has to end in order."""
+        return STOP_SECONDS
+
     def log_folder(self) -> Path:
         """Where the role's log goes."""
         return self.scratch / "logs"
@@ -186,7 +190,7 @@ class RoleHost:
 
     def _end(self) -> None:
         self._role.signal(15)
-        if not self._role.reap(STOP_SECONDS):
+        if not self._role.reap(self.patience()):
             self._role.signal(9)
             self._role.reap(STOP_SECONDS)
 

@@ -151,3 +151,10 @@ def manifest_of(number: int, files: dict[str, bytes]) -> bytes:
     """As it is written, to the byte."""
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     return json.dumps({"update": number, "sha256": digests}, indent=1).encode()
+
+
+@pytest.mark.parametrize(("noted", "granted"), [(2.0, 6.0), (0.5, 2.6), (float("nan"), 2.6), (float("inf"), 2.6)])
+def test_the_next_save_may_take_three_times_the_last_one(tmp_path, noted, granted):
+    assert CheckpointFolder(tmp_path / "none").patience(2.6) == 2.6
+    CheckpointFolder(tmp_path).note_save(noted)
+    assert CheckpointFolder(tmp_path).patience(2.6) == granted

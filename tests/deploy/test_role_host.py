@@ -10,9 +10,11 @@ import pytest
 
 pytest.importorskip("ray")
 
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.local import supervisor
 from rmc.deploy.local.supervisor import RoleCommand
 from rmc.deploy.ray import role_actor
+from rmc.deploy.ray.learner_actor import LearnerHost
 from rmc.deploy.ray.role_actor import RoleHost, Task
 
 
@@ -25,13 +27,23 @@ def ends(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return found
 
 
+ENDS = "#!/bin/sh\ntrap 'exit 0' TERM\nwhile :; do sleep 0.05; done\n"
+
+
 @pytest.fixture
-def host(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[RoleHost]:
-    """Of a role that ends in order when it is told to; its watcher is slow to see an end."""
-    program = tmp_path / "program"
-    program.write_text("#!/bin/sh\ntrap 'exit 0' TERM\nwhile :; do sleep 0.05; done\n")
-    program.chmod(0o700)
-    monkeypatch.setattr(supervisor.sys, "executable", str(program))
+def program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """In a role's place: it ends in order when it is told to."""
+    made = tmp_path / "program"
+    made.write_text(ENDS)
+    made.chmod(0o700)
+    monkeypatch.setattr(supervisor.sys, "executable", str(made))
+    return made
+
+
+@pytest.fixture
+def host(program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[RoleHost]:
+    """Its watcher is slow to see an end."""
+    assert program.exists()
     reap = supervisor.RoleProcess.reap
 
     def slow_for_watchers(role: supervisor.RoleProcess, timeout: float) -> bool:
@@ -64,3 +76,31 @@ def test_a_role_that_is_replaced_does_not_end_its_host(host: RoleHost, ends: lis
     assert after.pid is not None
     os.kill(after.pid, 9)
     assert wait_for(ends, 10.0) == [1]
+
+
+class Learner(LearnerHost):
+    """With a folder, and no launcher that it would bring checkpoints to."""
+
+    def prepare(self) -> None:
+        self._folder = CheckpointFolder(self.scratch / "checkpoints")
+        self._folder.folder.mkdir()
+        self._folder.note_save(2.0)
+
+    def settle(self) -> None:
+        pass
+
+    def tend(self) -> None:
+        pass
+
+
+def test_a_learner_that_saves_for_long_is_not_killed(
+    program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    said = tmp_path / "said"
+    program.write_text(ENDS.replace("exit 0", f"sleep 1.5; echo saved >> {said}; exit 0"))
+    monkeypatch.setattr(role_actor, "STOP_SECONDS", 0.5)
+    host = Learner(Task("test-run", RoleCommand("learner", ("learner",)), {}, {}, str(tmp_path)))
+    time.sleep(0.5)
+    host.close()
+    host.clear()
+    assert said.read_text() == "saved\n"
