@@ -1,10 +1,10 @@
 """A folder of checkpoints that are whole or absent: temp folder, fsync, rename, SHA-256 manifest.
 
 ``checkpoints/000001200/{FILES…, manifest.json}``, one folder an update count; ``checkpoints/best.json`` names
-the best one evaluated, which is kept beside the newest few, and ``checkpoints/epoch`` the writer's epoch.
+the best one evaluated, which is kept beside the newest few, ``checkpoints/epoch`` the writer's epoch, and
+``checkpoints/save-seconds`` how long its last save took.
 """
 
-import fcntl
 import hashlib
 import json
 import logging
@@ -15,11 +15,13 @@ from contextlib import suppress
 from pathlib import Path
 
 from rmc.common.errors import CheckpointError, ConfigError
+from rmc.common.process.file_lock import take_lock
 
 log = logging.getLogger(__name__)
 MANIFEST = "manifest.json"
 BEST = "best.json"
-EPOCH = "epoch"
+EPOCH, SAVE_SECONDS = "epoch", "save-seconds"
+SAVES_GRANTED = 3  # a writer that is told to end may take so many times its last save
 
 
 class CheckpointFolder:
@@ -30,15 +32,12 @@ class CheckpointFolder:
         self._lock: int | None = None
 
     def lock(self) -> None:
-        """Become the one writer. Raises ConfigError where another process is."""
+        """Become the one writer. Raises ConfigError where another process stays it."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(
-                "--run-dir", str(self.folder.parent), "another process trains in this folder; stop it first"
-            ) from None
+        self._lock = take_lock(self.folder / ".lock")
+        if self._lock is None:
+            fix = "another process trains in this folder; stop it first"
+            raise ConfigError("--run-dir", str(self.folder.parent), fix)
         for left in self.folder.glob(".tmp-*"):
             shutil.rmtree(left)
 
@@ -82,9 +81,7 @@ class CheckpointFolder:
 
     def note_epoch(self, epoch: int) -> None:
         """The writer's, so that the next one's is larger though Redis forgets; where there is no room, unnoted."""
-        with suppress(OSError):
-            _write(self.folder / f".{EPOCH}", str(epoch).encode())
-            (self.folder / f".{EPOCH}").rename(self.folder / EPOCH)
+        self._note(EPOCH, str(epoch))
 
     def last_epoch(self) -> int:
         """What was noted last; 0 where nothing was."""
@@ -92,6 +89,27 @@ class CheckpointFolder:
             return int((self.folder / EPOCH).read_bytes())
         except (OSError, ValueError):
             return 0
+
+    def note_save(self, seconds: float) -> None:
+        """How long a save took, from the first look at the state until it was on the disk."""
+        self._note(SAVE_SECONDS, str(seconds))
+
+    def last_save(self) -> float:
+        """What was noted last; 0.0 where nothing was."""
+        try:
+            seconds = float((self.folder / SAVE_SECONDS).read_bytes())
+        except (OSError, ValueError):
+            return 0.0
+        return seconds if 0.0 <= seconds < float("inf") else 0.0
+
+    def patience(self, least: float) -> float:
+        """The seconds in which a writer that is told to end can save, at least so many."""
+        return max(least, SAVES_GRANTED * self.last_save())
+
+    def _note(self, name: str, text: str) -> None:
+        with suppress(OSError):
+            _write(self.folder / f".{name}", text.encode())
+            (self.folder / f".{name}").rename(self.folder / name)
 
     def _prune(self) -> None:
         best = self.best()

@@ -231,6 +231,7 @@ class Learner:
 
         Raises CheckpointError where that cannot be, RmcError where any of it is not finite.
         """
+        began = time.monotonic()
         learnt, state = self.update.state_dict(), io.BytesIO()
         self._check_finite(learnt)  # critics or moments may be spoilt while the policy, for one more update, is not
         torch.save(learnt, state)
@@ -241,6 +242,7 @@ class Learner:
             PROGRESS: json.dumps(progress).encode(),
         }
         self.checkpoints.save(self.updates, files)
+        self.checkpoints.note_save(time.monotonic() - began)
 
     def _after(self, env_steps: int) -> int:
         return (env_steps // self.config.checkpoint_steps + 1) * self.config.checkpoint_steps

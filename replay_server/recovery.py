@@ -4,7 +4,6 @@ Folder: ``ring`` (identity, commit records, rows), ``priorities`` (float32 per s
 exponent), ``lock``. The sum tree is never stored: it is rebuilt from the priorities of the valid windows.
 """
 
-import fcntl
 import logging
 import os
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.errors import ConfigError
+from rmc.common.process.file_lock import take_lock
 from rmc.common.window import WindowSpec
 from rmc.replay_server.ring import Ring, reserve
 from rmc.replay_server.sum_tree import SumTree, Values
@@ -82,12 +82,9 @@ def valid_leaves(store: ReplayStore) -> Values:
 
 
 def _lock(folder: Path) -> int:
-    lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(lock)
-        raise ConfigError("--run-dir", str(folder), "another replay server holds this folder; stop it first") from None
+    lock = take_lock(folder / "lock")
+    if lock is None:
+        raise ConfigError("--run-dir", str(folder), "another replay server holds this folder; stop it first")
     return lock
 
 

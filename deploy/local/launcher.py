@@ -11,6 +11,7 @@ from pathlib import Path
 import psutil
 
 from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.process.role import StopSignal
 from rmc.common.shard import Shard
@@ -74,6 +75,7 @@ class LocalRun:
             commands(config, folder, self.sockets, device),
             lambda role: {URL_VARIABLE: redis_url or self._url(role), PATIENCE_VARIABLE: str(OUTAGE_SECONDS)},
             folder.logs,
+            lambda role: CheckpointFolder(folder.checkpoints).patience(0.0) if role == "learner" else 0.0,
         )
 
     def _url(self, user: str) -> str:
@@ -149,7 +151,7 @@ def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monito
         time.sleep(TICK_SECONDS)
     with suppress(BusUnavailable, BusFull):
         bus.request_stop("stopped by its launcher" if stop.requested else "finished")
-    deadline = time.monotonic() + STOP_SECONDS
+    deadline = time.monotonic() + CheckpointFolder(folder.checkpoints).patience(STOP_SECONDS)
     while stop.requested and time.monotonic() < deadline:  # the learner saves; what it says then is still recorded
         watch(monitor, bus)
         time.sleep(TICK_SECONDS)

@@ -11,7 +11,7 @@ from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.process.role import run_role
 from rmc.common.shard import Shard
-from rmc.deploy.local.role_process import Place, Process, wait_for_room
+from rmc.deploy.local.role_process import Place, Process, until_taken, wait_for_room
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.preflight import check_device, cores
@@ -37,7 +37,8 @@ def run_learner(place: Place, folder: Path, device: str) -> None:
     for client in clients:
         client.close()
     if learner.finished:
-        bus.emit(learner.name, {"time": time.time(), **learner.metrics(), "finished": 1})
+        last = {"time": time.time(), **learner.metrics(), "finished": 1}
+        until_taken(lambda: bus.emit(learner.name, last), learner.name, process.stop)  # its launcher waits for it
 
 
 def replay_clients(

@@ -4,6 +4,7 @@ import logging
 import os
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -76,13 +77,21 @@ class Process:
 
 def wait_for_room(bus: Bus, role: str, stop: StopSignal) -> None:
     """Until Redis takes what this role writes, or it is stopped: one that begins amid an outage waits as others do."""
+    if not stop.requested:
+        until_taken(lambda: bus.check_room(role), role, stop)
+
+
+def until_taken(write: Callable[[], None], role: str, stop: StopSignal) -> None:
+    """Write until Redis takes it, once at least, or the role is stopped."""
     outage = Outage(role)
-    while not stop.requested:
+    while True:
         try:
-            bus.check_room(role)
+            write()
         except (BusUnavailable, BusFull) as error:
             outage.note(error)
-            time.sleep(RECONNECT_SLEEP)
         else:
             outage.over()
             return
+        if stop.requested:
+            return
+        time.sleep(RECONNECT_SLEEP)

@@ -139,8 +139,18 @@ class RoleProcess:
 class Supervisor:
     """All roles of a run. ``tend`` them often; ``stop`` them at the end, whatever the end was."""
 
-    def __init__(self, commands: list[RoleCommand], environment: Callable[[str], dict[str, str]], logs: Path) -> None:
-        """``environment`` is of each role by its name, beside this process's own."""
+    def __init__(
+        self,
+        commands: list[RoleCommand],
+        environment: Callable[[str], dict[str, str]],
+        logs: Path,
+        patience: Callable[[str], float] = lambda _: 0.0,
+    ) -> None:
+        """``environment`` is of each role by its name, beside this process's own.
+
+        ``patience``, asked at the end, is how many seconds a role may need to end in order, if more than is usual.
+        """
+        self._patience = patience
         self._nursery = Nursery(logs / "nursery.log") if sys.platform == "linux" else None  # elsewhere a fork may crash
         self.roles = {
             command.name: RoleProcess(command, environment(command.name), logs, self._nursery) for command in commands
@@ -168,8 +178,8 @@ class Supervisor:
         last = [role for name, role in self.roles.items() if name.startswith("replay")]
         others = [role for role in self.roles.values() if role not in last]
         try:
-            self._end(others, deadline - STOP_SECONDS / 4)
-            self._end(last, deadline)
+            self._end(others, STOP_SECONDS * 3 / 4)
+            self._end(last, max(deadline - time.monotonic(), STOP_SECONDS / 4))
         finally:
             for role in self.roles.values():
                 role.signal(signal.SIGKILL)
@@ -177,9 +187,9 @@ class Supervisor:
             if self._nursery is not None:
                 self._nursery.close()
 
-    @staticmethod
-    def _end(roles: list[RoleProcess], deadline: float) -> None:
+    def _end(self, roles: list[RoleProcess], seconds: float) -> None:
+        began = time.monotonic()
         for role in roles:
             role.signal(signal.SIGTERM)
         for role in roles:
-            role.reap(deadline - time.monotonic())
+            role.reap(began + max(seconds, self._patience(role.command.name)) - time.monotonic())

@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import Board, View
 from rmc.deploy.run.folder import RunFolder, record
@@ -87,10 +88,11 @@ def stop(folder: RunFolder) -> int:
         raise ConfigError("RUN", str(folder.path), f"is trained on {host}; stop it there")
     with suppress(ProcessLookupError):  # it has just ended
         os.kill(trainer, signal.SIGTERM)
-    deadline = time.monotonic() + STOP_SECONDS
+    seconds = STOP_SECONDS + CheckpointFolder(folder.checkpoints).patience(0.0)
+    deadline = time.monotonic() + seconds
     while folder.trainer() is not None:
         if time.monotonic() > deadline:
-            raise ConfigError("RUN", str(folder.path), f"did not end within {STOP_SECONDS:.0f} s; see {folder.logs}")
+            raise ConfigError("RUN", str(folder.path), f"did not end within {seconds:.0f} s; see {folder.logs}")
         time.sleep(LOOK_SECONDS)
     ended = folder.ended()
     return 0 if ended is None else ended

@@ -57,10 +57,11 @@ class LauncherHost(RoleHost):
         self._claim.write_text(f"{node} {life}")
         return before[:1] == [node]
 
-    def archive(self, life: str, number: int, files: dict[str, bytes]) -> None:
-        """Keep a checkpoint, if it comes from the learner's present host."""
+    def archive(self, life: str, number: int, files: dict[str, bytes], took: float) -> None:
+        """Keep a checkpoint, and how long the learner took to save, if it comes from the learner's present host."""
         if self._holds(life):
             self._checkpoints.save(number, files)
+            self._checkpoints.note_save(took)
 
     def note_epoch(self, life: str, epoch: int) -> int:
         """Keep the learner's epoch, likewise; returns what is kept."""
@@ -71,6 +72,10 @@ class LauncherHost(RoleHost):
     def last_epoch(self) -> int:
         """Of the learner; 0 where there was none."""
         return self._checkpoints.last_epoch()
+
+    def last_save(self) -> float:
+        """How long the learner's took; 0.0 where there was none."""
+        return self._checkpoints.last_save()
 
     def _holds(self, life: str) -> bool:
         return self._claim.read_text().split()[1:] == [life]

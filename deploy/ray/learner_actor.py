@@ -7,6 +7,7 @@ from typing import Any
 import ray
 
 from rmc.common.checkpoint import CheckpointFolder
+from rmc.deploy.ray import role_actor
 from rmc.deploy.ray.role_actor import (
     AWAY,
     CLAIM_SECONDS,
@@ -32,6 +33,7 @@ class LearnerHost(RoleHost):
         newest = ray.get(launcher.newest.remote(found[0] if found is not None else -1))
         if newest is not None:
             self._folder.save(*newest)
+            self._folder.note_save(ray.get(launcher.last_save.remote()))
         self._archived = set(ray.get(launcher.numbers.remote()))
         self._epoch: int = ray.get(launcher.last_epoch.remote())
         self._folder.note_epoch(max(self._epoch, self._folder.last_epoch()))
@@ -60,14 +62,17 @@ class LearnerHost(RoleHost):
             raise
 
     def _bring(self) -> None:
-        newest = max(self._archived, default=-1)
+        newest, took = max(self._archived, default=-1), self._folder.last_save()
         for number in self._folder.numbers():
             if number > newest and number not in self._archived:
-                ray.get(self._launcher().archive.remote(self._life, number, self._folder.load(number)))
+                ray.get(self._launcher().archive.remote(self._life, number, self._folder.load(number), took))
                 self._archived.add(number)
         epoch = self._folder.last_epoch()
         if epoch > self._epoch:
             self._epoch = ray.get(self._launcher().note_epoch.remote(self._life, epoch))
+
+    def patience(self) -> float:
+        return self._folder.patience(role_actor.STOP_SECONDS)
 
     def settle(self) -> None:
         deadline = time.monotonic() + SETTLE_SECONDS

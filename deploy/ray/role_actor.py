@@ -114,7 +114,8 @@ class RoleHost:
 
     def _start(self) -> None:
         self._role.start()
-        threading.Thread(target=self._watch, args=(self._role.pid,), daemon=True).start()
+        self._watcher = threading.Thread(target=self._watch, daemon=True)
+        self._watcher.start()
 
     # What a role's host does beyond holding it.
 
@@ -126,6 +127,10 @@ class RoleHost:
 
     def tend(self) -> None:
         """Once in a while meanwhile."""
+
+    def patience(self) -> float:
+        """The seconds that it has to end in order."""
+        return STOP_SECONDS
 
     def log_folder(self) -> Path:
         """Where the role's log goes."""
@@ -142,10 +147,8 @@ class RoleHost:
         if not now and self._status == ENDED_IN_ORDER and not self._task.command.ends:
             os._exit(1)
 
-    def _watch(self, pid: int | None) -> None:
+    def _watch(self) -> None:
         while not self._role.reap(LOOK_SECONDS):
-            if self._role.pid not in (pid, None):  # started again on purpose: another thread watches
-                return
             with suppress(*AWAY):  # the next look tries again
                 self.tend()
         status = self._role.status
@@ -181,12 +184,13 @@ class RoleHost:
         """End the role in order and start it again, because the run's config has changed."""
         self._replaced = True
         self._end()
+        self._watcher.join()  # it must not take the new process's absence, or its presence, for the old one's end
         self._replaced = False
         self._start()
 
     def _end(self) -> None:
         self._role.signal(15)
-        if not self._role.reap(STOP_SECONDS):
+        if not self._role.reap(self.patience()):
             self._role.signal(9)
             self._role.reap(STOP_SECONDS)
 

@@ -27,6 +27,7 @@ except ImportError as missing:
 
     raise ConfigError("--launcher", "ray", "Ray is not installed; pip install 'rmc[ray]'") from missing
 
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RoleDied
 from rmc.common.process.role import StopSignal
 from rmc.common.shard import WHOLE
@@ -276,13 +277,17 @@ class ClusterRun:
             ray.wait(told, num_returns=len(told), timeout=TOLD_SECONDS)
         with suppress(BusUnavailable, BusFull):
             self.bus.request_stop(reason)
-        deadline = time.monotonic() + STOP_SECONDS
+        deadline = time.monotonic() + STOP_SECONDS + self._saving()
         while time.monotonic() < deadline and any(hosted.awaited for hosted in self._hosts.values()):
             for hosted in self._hosts.values():
                 with suppress(RoleDied):
                     hosted.ask(self._folder.logs)
             time.sleep(TICK_SECONDS)
         self._registration.keep()
+
+    def _saving(self) -> float:
+        """The seconds that the learner has to save, which are none of those in which a small state is on the head."""
+        return CheckpointFolder(self._folder.checkpoints).patience(0.0)
 
     def _kept_elsewhere(self) -> bool:
         """Whether something of the run is on a node alone, where its hosts share a folder."""
@@ -296,7 +301,7 @@ class ClusterRun:
         try:
             closing = [hosted.handle.close.remote() for hosted in self._hosts.values() if hosted.awaited]
             if closing:
-                ray.wait(closing, num_returns=len(closing), timeout=STOP_SECONDS / 2)
+                ray.wait(closing, num_returns=len(closing), timeout=STOP_SECONDS / 2 + self._saving())
             if over and not self._kept_elsewhere():
                 clearing = [
                     hosted.handle.clear.remote() for hosted in self._hosts.values() if hosted.report is not None

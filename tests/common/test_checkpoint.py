@@ -10,6 +10,7 @@ import pytest
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import CheckpointError, ConfigError
+from tests.holding import held_for_a_moment
 
 FILES = {"state": b"\x00" * 100, "progress.json": b"{}"}
 OUTSIDE = [
@@ -97,13 +98,21 @@ def test_a_half_written_checkpoint_is_not_seen(tmp_path):
     assert not (tmp_path / ".tmp-000000005").exists()
 
 
-def test_two_writers_exclude_each_other(tmp_path):
+def test_two_writers_exclude_each_other(tmp_path, monkeypatch):
+    monkeypatch.setattr("rmc.common.process.file_lock.LOCK_SECONDS", 0.2)
     first, second = CheckpointFolder(tmp_path / "c"), CheckpointFolder(tmp_path / "c")
     first.lock()
     with pytest.raises(ConfigError, match="another process"):
         second.lock()
     first.unlock()
     second.lock()
+
+
+def test_a_writer_that_is_about_to_end_is_waited_for(tmp_path):
+    folder = CheckpointFolder(tmp_path)
+    with held_for_a_moment(tmp_path / ".lock"):
+        folder.lock()
+    folder.unlock()
 
 
 @pytest.mark.parametrize("name", OUTSIDE)
@@ -142,3 +151,10 @@ def manifest_of(number: int, files: dict[str, bytes]) -> bytes:
     """As it is written, to the byte."""
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     return json.dumps({"update": number, "sha256": digests}, indent=1).encode()
+
+
+@pytest.mark.parametrize(("noted", "granted"), [(2.0, 6.0), (0.5, 2.6), (float("nan"), 2.6), (float("inf"), 2.6)])
+def test_the_next_save_may_take_three_times_the_last_one(tmp_path, noted, granted):
+    assert CheckpointFolder(tmp_path / "none").patience(2.6) == 2.6
+    CheckpointFolder(tmp_path).note_save(noted)
+    assert CheckpointFolder(tmp_path).patience(2.6) == granted

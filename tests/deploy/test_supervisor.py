@@ -7,7 +7,7 @@ import pytest
 
 from rmc.common.errors import RoleDied
 from rmc.deploy.local import supervisor
-from rmc.deploy.local.supervisor import RoleCommand, RoleProcess
+from rmc.deploy.local.supervisor import RoleCommand, RoleProcess, Supervisor
 
 
 @pytest.fixture
@@ -75,3 +75,36 @@ def test_a_role_that_crashes_ends_the_run(quick: Path) -> None:
     role.start()
     with pytest.raises(RoleDied, match=r"3 times in a row soon after its start, killed by signal 11"):
         tend_until(role)
+
+
+def test_a_learner_that_saves_for_long_is_not_killed_and_others_are(
+    quick: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The replay server, which it may need, is told only then."""
+    said = quick / "said"
+    program = Path(supervisor.sys.executable)
+    program.write_text(ENDING.replace("SAID", str(said)))
+    monkeypatch.setattr(supervisor, "STOP_SECONDS", 1.0)
+    commands = [RoleCommand(name, (name,), forked=False) for name in ("replay", "actor", "learner")]
+    keeper = Supervisor(commands, lambda _: {}, quick, lambda name: 6.0 if name == "learner" else 0.0)
+    for role in keeper.roles.values():
+        role.start()
+    deadline = time.monotonic() + 10.0
+    while not said.exists() or len(said.read_text().split()) < 3:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    said.write_text("")
+    keeper.stop()
+    assert said.read_text().split() == ["learner", "replay"]
+    assert [keeper.roles[name].status for name in ("learner", "replay", "actor")] == [0, 0, -9]
+
+
+ENDING = """#!/bin/sh
+case $4 in
+    learner) trap 'sleep 2; echo learner >> SAID; exit 0' TERM ;;
+    replay) trap 'echo replay >> SAID; exit 0' TERM ;;
+    actor) trap '' TERM ;;
+esac
+echo ready >> SAID
+while :; do sleep 0.05; done
+"""

@@ -2,6 +2,7 @@
 
 import io
 import json
+import time
 
 import pytest
 import safetensors.torch
@@ -361,3 +362,10 @@ def test_priorities_of_what_a_gpu_still_works_on_come_later_but_come(setting, mo
     while setting.learner.step():
         pass
     assert len(returned) == setting.learner.updates
+
+
+def test_how_long_a_save_takes_is_noted(setting, monkeypatch):
+    whole = setting.learner.checkpoints.save
+    monkeypatch.setattr(setting.learner.checkpoints, "save", lambda *given: (time.sleep(0.5), whole(*given))[1])
+    assert setting.learner.checkpoint()
+    assert setting.learner.checkpoints.patience(0.0) > 3 * 0.5

@@ -17,6 +17,7 @@ from rmc.common.replay import Draw
 from rmc.learner.replay_client import ReplayClient
 from rmc.replay_server.recovery import ReplayStore, open_store, valid_leaves
 from rmc.replay_server.sum_tree import SumTree
+from tests.holding import held_for_a_moment
 from tests.replay_server.replay_child import ACTORS, SECRET
 from tests.replay_server.support import SPEC, Sender, make_rows
 
@@ -175,6 +176,11 @@ def test_damaged_priorities_only_cost_their_values(tmp_path: Path, damage: str) 
 def test_a_killed_creation_is_begun_again(tmp_path: Path) -> None:
     (tmp_path / "ring.tmp").write_bytes(b"half")
     with opened(tmp_path, 10) as store:
+        assert store.ring.progress.windows == 0
+
+
+def test_a_server_that_is_about_to_end_is_waited_for(tmp_path: Path) -> None:
+    with held_for_a_moment(tmp_path / "lock"), opened(tmp_path, 10) as store:
         assert store.ring.progress.windows == 0
 
 

@@ -251,7 +251,8 @@ def test_a_ring_that_is_ahead_of_another_that_came_after_it_goes(make: Make, bus
     assert again.stats()["windows"] == 5
 
 
-def test_one_server_a_folder(make: Make) -> None:
+def test_one_server_a_folder(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rmc.common.process.file_lock.LOCK_SECONDS", 0.2)
     make()
     with pytest.raises(ConfigError, match="another replay server holds this folder"):
         make()

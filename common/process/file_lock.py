@@ -1,0 +1,35 @@
+"""A lock on a file that one process holds at a time, and that goes with it."""
+
+import fcntl
+import logging
+import os
+import time
+from pathlib import Path
+
+LOCK_SECONDS = 5.0  # that a lock is waited for: who held it may be about to end
+LOOK_SECONDS = 0.1
+log = logging.getLogger(__name__)
+
+
+def take_lock(path: Path) -> int | None:
+    """A handle that holds the lock until it is closed; None where another process keeps it."""
+    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    began = time.monotonic()
+    said = False
+    while not _taken(handle):
+        if time.monotonic() >= began + LOCK_SECONDS:
+            os.close(handle)
+            return None
+        if not said:
+            log.warning("waiting up to %g s for another process to let go of %s", LOCK_SECONDS, path)
+            said = True
+        time.sleep(LOOK_SECONDS)
+    return handle
+
+
+def _taken(handle: int) -> bool:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

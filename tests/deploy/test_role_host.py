@@ -1,0 +1,106 @@
+"""A role's host on Ray, without a cluster: what it does when its role ends or is ended."""
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("ray")
+
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.deploy.local import supervisor
+from rmc.deploy.local.supervisor import RoleCommand
+from rmc.deploy.ray import role_actor
+from rmc.deploy.ray.learner_actor import LearnerHost
+from rmc.deploy.ray.role_actor import RoleHost, Task
+
+
+@pytest.fixture
+def ends(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """With what status hosts have ended themselves."""
+    found: list[int] = []
+    monkeypatch.setattr(role_actor.os, "_exit", found.append)
+    monkeypatch.setattr(role_actor, "LAST_WORDS_SECONDS", 0.0)
+    return found
+
+
+ENDS = "#!/bin/sh\ntrap 'exit 0' TERM\nwhile :; do sleep 0.05; done\n"
+
+
+@pytest.fixture
+def program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """In a role's place: it ends in order when it is told to."""
+    made = tmp_path / "program"
+    made.write_text(ENDS)
+    made.chmod(0o700)
+    monkeypatch.setattr(supervisor.sys, "executable", str(made))
+    return made
+
+
+@pytest.fixture
+def host(program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[RoleHost]:
+    """Its watcher is slow to see an end."""
+    assert program.exists()
+    reap = supervisor.RoleProcess.reap
+
+    def slow_for_watchers(role: supervisor.RoleProcess, timeout: float) -> bool:
+        ended = reap(role, timeout)
+        if threading.current_thread() is not threading.main_thread():
+            time.sleep(0.3)
+        return ended
+
+    monkeypatch.setattr(supervisor.RoleProcess, "reap", slow_for_watchers)
+    made = RoleHost(Task("test-run", RoleCommand("replay", ("replay",)), {}, {}, str(tmp_path)))
+    yield made
+    made.close()
+    made.clear()
+
+
+def wait_for(watched: list[int], seconds: float) -> list[int]:
+    deadline = time.monotonic() + seconds
+    while not watched and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return watched
+
+
+@pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_role_that_is_replaced_does_not_end_its_host(host: RoleHost, ends: list[int]) -> None:
+    before = host.report("", 0).pid
+    host.again()
+    after = host.report("", 0)
+    assert after.pid not in (None, before)
+    assert wait_for(ends, 1.5) == []  # nor does the new one, which is watched, too:
+    assert after.pid is not None
+    os.kill(after.pid, 9)
+    assert wait_for(ends, 10.0) == [1]
+
+
+class Learner(LearnerHost):
+    """With a folder, and no launcher that it would bring checkpoints to."""
+
+    def prepare(self) -> None:
+        self._folder = CheckpointFolder(self.scratch / "checkpoints")
+        self._folder.folder.mkdir()
+        self._folder.note_save(2.0)
+
+    def settle(self) -> None:
+        pass
+
+    def tend(self) -> None:
+        pass
+
+
+def test_a_learner_that_saves_for_long_is_not_killed(
+    program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    said = tmp_path / "said"
+    program.write_text(ENDS.replace("exit 0", f"sleep 1.5; echo saved >> {said}; exit 0"))
+    monkeypatch.setattr(role_actor, "STOP_SECONDS", 0.5)
+    host = Learner(Task("test-run", RoleCommand("learner", ("learner",)), {}, {}, str(tmp_path)))
+    time.sleep(0.5)
+    host.close()
+    host.clear()
+    assert said.read_text() == "saved\n"
