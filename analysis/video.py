@@ -15,6 +15,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
+from rmc.common.extra import how_to_install
 from rmc.deploy.run.folder import check_writable
 
 VIDEOS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
@@ -27,7 +28,7 @@ FRAMES_PER_SECOND = 30
 def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path) -> float:
     """Play one deterministic episode and write it to ``out``; its return. Raises ConfigError, before it plays."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise ConfigError("--video", str(out), "imageio-ffmpeg is missing; pip install 'rmc[video]'")
+        raise ConfigError("--video", str(out), f"imageio-ffmpeg is missing; {how_to_install('video')}")
     check_writable("--video", out, VIDEOS)
     os.environ["MUJOCO_GL"] = _working_backend(env_config, out)
     from imageio_ffmpeg import write_frames  # an extra
