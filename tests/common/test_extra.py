@@ -21,7 +21,7 @@ def test_from_a_checkout() -> None:
 
 
 def test_from_a_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rmc, "__file__", str(tmp_path / "rmc" / "__init__.py"))
+    monkeypatch.setattr(rmc.__spec__, "origin", str(tmp_path / "rmc" / "__init__.py"))
     assert how_to_install("onnx") == "pip install 'rmc-rl[onnx]'"
 
 
