@@ -22,6 +22,7 @@ from rmc.analysis.statistics import (
     probability_of_improvement,
 )
 from rmc.common.errors import ConfigError
+from rmc.common.extra import how_to_install
 from rmc.deploy.run.folder import check_writable
 
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
@@ -56,7 +57,7 @@ def curve(run: History, by: Axis) -> tuple[NDArray[np.float64], NDArray[np.float
 def draw(groups: Groups, by: Axis, out: Path) -> None:
     """A panel an environment, a colour an agent. Raises ConfigError where it cannot be written."""
     if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError("--out", str(out), "matplotlib is missing; pip install 'rmc[plot]'")
+        raise ConfigError("--out", str(out), f"matplotlib is missing; {how_to_install('plot')}")
     check_writable("--out", out, PICTURES)
     from matplotlib.figure import Figure  # an extra
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from rmc.analysis.evaluation import load_checkpoint
 from rmc.common.agent import Agent
 from rmc.common.errors import ConfigError
+from rmc.common.extra import how_to_install
 from rmc.deploy.run.folder import RunFolder, check_writable
 
 INPUTS, OUTPUTS = ("observation", "previous_action", "blank", "state"), ("action", "next_state")
@@ -47,7 +48,7 @@ def export(folder: RunFolder, checkpoint: str, out: Path) -> None:
     """Write the policy of a checkpoint to ``out``. Raises ConfigError."""
     for name in NEEDED:
         if importlib.util.find_spec(name) is None:
-            raise ConfigError("--out", str(out), f"{name} is missing; pip install 'rmc[onnx]'")
+            raise ConfigError("--out", str(out), f"{name} is missing; {how_to_install('onnx')}")
     check_writable("--out", out, (".onnx",))
     config = folder.config()
     (_, blob), spec = load_checkpoint(folder, config, checkpoint), config.window_spec()

@@ -15,6 +15,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
+from rmc.common.extra import how_to_install
 from rmc.deploy.run.folder import check_writable
 
 VIDEOS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
@@ -27,7 +28,7 @@ FRAMES_PER_SECOND = 30
 def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path) -> float:
     """Play one deterministic episode and write it to ``out``; its return. Raises ConfigError, before it plays."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise ConfigError("--video", str(out), "imageio-ffmpeg is missing; pip install 'rmc[video]'")
+        raise ConfigError("--video", str(out), f"imageio-ffmpeg is missing; {how_to_install('video')}")
     check_writable("--video", out, VIDEOS)
     os.environ["MUJOCO_GL"] = _working_backend(env_config, out)
     from imageio_ffmpeg import write_frames  # an extra
@@ -72,16 +73,25 @@ def _working_backend(env: EnvConfig, out: Path) -> str:
     asked = os.environ.get("MUJOCO_GL")
     said = {}
     for backend in (asked,) if asked else BACKENDS:
+        fault = _fault(backend, env)
+        if fault is None:
+            return backend
+        said[backend] = fault
+    reasons = "; ".join(f"{backend}: {reason}" for backend, reason in said.items())
+    raise ConfigError("--video", str(out), f"nothing here can render ({reasons}); install libegl1 or libosmesa6")
+
+
+def _fault(backend: str, env: EnvConfig) -> str | None:
+    """Why a backend renders nothing, in a line; None where it does."""
+    try:
         done = subprocess.run(
             [sys.executable, "-c", PROBE, env.id],
             env={**os.environ, "MUJOCO_GL": backend, "PYTHONPATH": os.pathsep.join(sys.path)},
             capture_output=True, text=True, timeout=PROBE_SECONDS, check=False,
         )  # fmt: skip
-        if done.returncode == 0:
-            return backend
-        said[backend] = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-    reasons = "; ".join(f"{backend}: {reason}" for backend, reason in said.items())
-    raise ConfigError("--video", str(out), f"nothing here can render ({reasons}); install libegl1 or libosmesa6")
+    except subprocess.TimeoutExpired:  # a driver that hangs
+        return f"no frame in {PROBE_SECONDS} s"
+    return None if done.returncode == 0 else (done.stderr.strip().splitlines() or ["no reason given"])[-1]
 
 
 def probe(env_id: str) -> None:

@@ -21,6 +21,7 @@ from rmc.analysis.policy import load_policy
 from rmc.common.agent import Agent, Remembered
 from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError
+from rmc.common.extra import how_to_install
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder, check_writable
 from rmc.learner.diagnostics import relative_l1_error
@@ -158,7 +159,7 @@ def _error(predicted: Tensor, episode: Episode, horizon: int) -> tuple[Tensor, T
 def inspect(run: Path, checkpoint: str, out: Path) -> Insight:
     """Play, look, and write the picture. Raises ConfigError."""
     if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError("--out", str(out), "matplotlib is missing; pip install 'rmc[plot]'")
+        raise ConfigError("--out", str(out), f"matplotlib is missing; {how_to_install('plot')}")
     check_writable("--out", out, PICTURES)
     folder = RunFolder(run)
     config = folder.config()

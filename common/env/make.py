@@ -25,11 +25,11 @@ from gymnasium.envs.registration import EnvSpec
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.wrappers import Env, Flicker, Floats, FrameStack, Noise, Partial, Standardised
 from rmc.common.errors import ConfigError
+from rmc.common.extra import how_to_install
 
 log = logging.getLogger(__name__)
 DM_CONTROL = "dm_control/"
 LARGEST_ACTION = 1e9  # of an action space that means its bounds
-INSTALL_DM_CONTROL = "pip install 'rmc[dm-control]'"
 
 
 def make_env(config: EnvConfig, render: bool = False) -> Env:
@@ -66,7 +66,7 @@ def _make(config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
     except Exception as error:
         if not config.id.startswith(DM_CONTROL):
             raise
-        fix = f"dm_control cannot make it ({_one_line(error)}); it wants MuJoCo 3: {INSTALL_DM_CONTROL}"
+        fix = f"dm_control cannot make it ({_one_line(error)}); it wants MuJoCo 3: {how_to_install('dm-control')}"
         raise ConfigError("ENV", config.id, fix) from None
 
 
@@ -207,7 +207,7 @@ def _import_users_module(env_id: str, module: str) -> None:
 def _import_dm_control(env_id: str) -> None:
     """Its tasks are gymnasium's once shimmy is imported."""
     if importlib.util.find_spec("dm_control") is None or importlib.util.find_spec("shimmy") is None:
-        raise ConfigError("ENV", env_id, f"shimmy or dm_control is missing; {INSTALL_DM_CONTROL}")
+        raise ConfigError("ENV", env_id, f"shimmy or dm_control is missing; {how_to_install('dm-control')}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it looks for a screen, and says so where there is none
         importlib.import_module("shimmy")

@@ -12,8 +12,9 @@ try:
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 except ImportError as missing:
     from rmc.common.errors import ConfigError
+    from rmc.common.extra import how_to_install
 
-    raise ConfigError("--launcher", "ray", "Ray is not installed; pip install 'rmc[ray]'") from missing
+    raise ConfigError("--launcher", "ray", f"Ray is not installed; {how_to_install('ray')}") from missing
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.supervisor import RoleCommand

@@ -12,6 +12,7 @@ import yaml
 from rich.console import Console
 
 from rmc.common.errors import ConfigError, RmcError
+from rmc.common.extra import how_to_install
 
 UP_SECONDS = 900.0  # for all nodes to have joined once the head is up: new machines install everything first
 LOOK_SECONDS = 2.0
@@ -98,7 +99,7 @@ def _ray_program() -> str:
     beside = Path(sys.executable).with_name("ray")
     found = str(beside) if beside.exists() else shutil.which("ray")
     if found is None:
-        raise ConfigError("cluster", "ray", "Ray is not installed; pip install 'rmc[ray]'")
+        raise ConfigError("cluster", "ray", f"Ray is not installed; {how_to_install('ray')}")
     return found
 
 

@@ -24,8 +24,9 @@ try:
     from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 except ImportError as missing:
     from rmc.common.errors import ConfigError
+    from rmc.common.extra import how_to_install
 
-    raise ConfigError("--launcher", "ray", "Ray is not installed; pip install 'rmc[ray]'") from missing
+    raise ConfigError("--launcher", "ray", f"Ray is not installed; {how_to_install('ray')}") from missing
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RoleDied

@@ -34,6 +34,7 @@ RESULT = (
     "eval_episodes",
     "initial_return_mean",
 )
+INITIAL = ("eval_return_mean", "eval_return_std", "eval_episodes")
 MAY_CHANGE = {
     "total_steps",
     "actors",
@@ -52,6 +53,7 @@ class RunFolder:
         self.checkpoints, self.replay, self.logs = self.path / "checkpoints", self.path / "replay", self.path / "logs"
         self.metrics, self.events = self.path / "metrics.jsonl", self.path / "events"
         self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
+        self.initial_file = self.path / "initial.json"
         self._lock: int | None = None
 
     @property
@@ -94,6 +96,17 @@ class RunFolder:
     def write_result(self, result: dict[str, Any]) -> None:
         """Write ``result.json``, whole or not at all."""
         write_whole(self.result_file, f"{json.dumps(result, indent=2)}\n".encode())
+
+    def initial(self) -> dict[str, Any] | None:
+        """How the untrained policy played, if a start before this one has kept it; damaged, it is as none."""
+        try:
+            return read_object(self.initial_file, *INITIAL)
+        except (OSError, ConfigError):
+            return None
+
+    def write_initial(self, played: dict[str, Any]) -> None:
+        """Write ``initial.json``, whole or not at all."""
+        write_whole(self.initial_file, f"{json.dumps(played, indent=2)}\n".encode())
 
     def reopen(self, total_steps: int) -> None:
         """Drop the result where steps are missing: what it says is no longer the end. Raises ConfigError."""

@@ -15,6 +15,7 @@ from rmc.analysis.evaluation import evaluate_checkpoint
 from rmc.analysis.policy import load_policy
 from rmc.cli import options, training
 from rmc.common.errors import ConfigError
+from rmc.common.extra import how_to_install
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.folder import RunFolder
 
@@ -58,7 +59,7 @@ def _played(folder: RunFolder, command: options.Evaluate, flicker: float | None)
 def _check_baselines(what: str) -> None:
     for package in ("stable_baselines3", "sb3_contrib"):
         if importlib.util.find_spec(package) is None:
-            raise ConfigError("baseline", what, f"{package} is missing; pip install 'rmc[baselines]'")
+            raise ConfigError("baseline", what, f"{package} is missing; {how_to_install('baselines')}")
 
 
 def _said(played: dict[str, Any]) -> str:

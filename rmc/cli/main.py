@@ -30,6 +30,8 @@ def main() -> None:
 
 def run(words: list[str]) -> int:
     """Run one command; its exit status."""
+    if words == ["--version"]:
+        return _say_version()
     parent = os.environ.pop(PARENT_VARIABLE, None)
     if parent is not None:  # before the slow imports, so that there is no time in which a role could be left behind
         die_with(int(parent))
@@ -55,6 +57,14 @@ def run(words: list[str]) -> int:
         if error.errno not in NO_ROOM:
             raise
         return _complain(f"{error.filename or 'disk'}: {error.strerror}; make room and try again", FAILED_STATUS)
+
+
+def _say_version() -> int:
+    """Without the slow imports."""
+    from importlib.metadata import version
+
+    sys.stdout.write(f"rmc {version('rmc-rl')}\n")
+    return 0
 
 
 def _parse_and_run(words: list[str]) -> int:

@@ -42,12 +42,10 @@ def train(config: RunConfig, options: LaunchOptions, console: Console) -> int:
 
 def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
     """Be the launcher of a run whose folder is locked, from its first evaluation to its last."""
-    from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_blob, initial_policy  # imports torch
-
     status = 1
     try:
         console.print(f"run folder {folder.path}", soft_wrap=True)
-        before = evaluate_blob(config, initial_policy(config), FINAL_EPISODES)
+        before = _before(config, folder)
         console.print(f"before training: {_said(before)}")
         monitor = Monitor(folder, config, console)
         if options.launcher == "manual":
@@ -202,6 +200,18 @@ def _launch(config: RunConfig, folder: RunFolder, options: LaunchOptions, monito
     torch.set_num_threads(config.learner.threads or 1)  # the bits may depend on it, so it must not on the machine
     lockstep.train(config, folder.path, watch, stop, options.device)
     return not stop.requested
+
+
+def _before(config: RunConfig, folder: RunFolder) -> dict[str, Any]:
+    """How the untrained policy plays: at a run's first start it does so, later ones read it."""
+    kept = folder.initial()
+    if kept is not None:
+        return kept
+    from rmc.analysis import evaluation  # imports torch
+
+    played = evaluation.evaluate_blob(config, evaluation.initial_policy(config), evaluation.FINAL_EPISODES)
+    folder.write_initial(played)
+    return played
 
 
 def _result(config: RunConfig, folder: RunFolder, monitor: Monitor, before: dict[str, Any]) -> dict[str, Any]:

@@ -57,6 +57,29 @@ def test_damage_is_found_and_an_older_one_used(tmp_path, damage):
     assert found[0] == 1
 
 
+@pytest.mark.parametrize("next_number", [15, 20, 40])
+def test_after_a_fall_back_damaged_ones_are_not_counted_among_the_kept(tmp_path, next_number):
+    """Neither that newer ones are there, nor that they were passed over, costs the run its newest whole one."""
+    for number in (10, 20, 30):
+        CheckpointFolder(tmp_path).save(number, FILES)
+    for number in (20, 30):
+        (tmp_path / f"{number:09d}" / "state").write_bytes(b"damaged")
+    folder = CheckpointFolder(tmp_path, keep=2)
+    found = folder.latest()
+    assert found is not None
+    assert found[0] == 10
+    folder.save(next_number, FILES)
+    assert folder.numbers() == [10, next_number]
+    assert folder.load(next_number) == FILES
+
+
+def test_the_one_just_written_is_kept_where_newer_ones_lie(tmp_path):
+    CheckpointFolder(tmp_path).save(20, FILES)
+    folder = CheckpointFolder(tmp_path, keep=1)
+    folder.save(15, FILES)
+    assert folder.load(15) == FILES
+
+
 @pytest.mark.parametrize("place", range(0, 160, 3))
 def test_every_byte_of_a_manifest_counts(tmp_path, place):
     folder = CheckpointFolder(tmp_path)

@@ -18,7 +18,7 @@ WALKER = "dm_control/walker-walk-v0"
 
 @pytest.mark.skipif(INSTALLED, reason="it is installed")
 def test_who_has_it_not_is_told_how_to_get_it() -> None:
-    with pytest.raises(ConfigError, match=r"ENV='dm_control/walker-walk-v0': .* pip install 'rmc\[dm-control\]'"):
+    with pytest.raises(ConfigError, match=r"ENV='dm_control/walker-walk-v0': .* pip install -e '\.\[dm-control\]' in "):
         make_env(EnvConfig(WALKER))
 
 

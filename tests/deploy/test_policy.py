@@ -125,7 +125,7 @@ def test_export_says_what_is_wrong_in_one_line(
     assert "cannot be written" in capsys.readouterr().err
     monkeypatch.setattr("rmc.analysis.export.NEEDED", ("no_such_package",))
     assert main.run(["export", str(run.path)]) == 2
-    assert "pip install 'rmc[onnx]'" in capsys.readouterr().err
+    assert "pip install -e '.[onnx]' in /" in capsys.readouterr().err
 
 
 def test_another_environments_policy_is_refused(run: RunFolder, tmp_path: Path, capsys) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
 
+from rmc.analysis import video
 from rmc.analysis.video import _follow
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
@@ -56,6 +57,19 @@ def test_what_stands_in_the_way_is_one_line(tmp_path: Path, capsys: pytest.Captu
     assert main.run([*words, str(tmp_path / "episode.mp4")]) == 2
     said = capsys.readouterr().err
     assert "nothing here can render (nonsense: " in said
+    assert "libegl1 or libosmesa6" in said
+    assert len(said.splitlines()) == 1
+
+
+def test_a_backend_that_hangs_is_passed_over_and_named(tmp_path: Path, capsys, monkeypatch) -> None:
+    folder = str(make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5").path)
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(video, "PROBE", "import time; time.sleep(60)")
+    monkeypatch.setattr(video, "PROBE_SECONDS", 0.2)
+    out = tmp_path / "episode.mp4"
+    assert main.run(["evaluate", folder, "--episodes", "1", "--video", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert f"--video={str(out)!r}: nothing here can render (egl: no frame in 0.2 s; osmesa: no frame in 0.2 s" in said
     assert "libegl1 or libosmesa6" in said
     assert len(said.splitlines()) == 1
 

@@ -89,6 +89,9 @@ def test_roles_by_hand_over_tcp(told: str, redis_url: str, run_name: str, tmp_pa
         for role in roles:
             stack.callback(role.wait)
             stack.callback(role.kill)
+        training.wait_for(lambda: training.newest("learner", "updates") > 0)
+        assert "libtorch" not in Path(f"/proc/{roles[0].pid}/maps").read_text()  # the replay server has no network
+        assert "libtorch" in Path(f"/proc/{roles[1].pid}/maps").read_text()
         assert training.finish(150) == 0, training.text()
         assert [role.wait(20) for role in roles] == [0, 0, 0, 0]
     assert json.loads((folder / "result.json").read_bytes())["env_steps"] == 1200

@@ -1,0 +1,15 @@
+"""What the package does not need by itself: how a user installs it."""
+
+import importlib.util
+from pathlib import Path
+
+
+def how_to_install(extra: str) -> str:
+    """The command for an extra of pyproject.toml. PyPI's ``rmc`` is another project, ours is ``rmc-rl``."""
+    package = importlib.util.find_spec("rmc")  # not imported: this is a layer below it
+    assert package is not None
+    assert package.origin is not None
+    above = Path(package.origin).parents[1]
+    if (above / "pyproject.toml").exists():  # a checkout; a wheel's files lie in site-packages
+        return f"pip install -e '.[{extra}]' in {above}"
+    return f"pip install 'rmc-rl[{extra}]'"

@@ -1,0 +1,54 @@
+"""What a command imports before it has anything to do: a user waits for it, and every role's memory holds it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TOLD = """
+import sys
+from rmc.cli import main
+
+status = main.run(sys.argv[1:])
+print("IMPORTED", *(name for name in ("torch", "tyro") if name in sys.modules))
+sys.exit(status)
+"""
+
+
+def rmc(at: Path, *words: str) -> tuple[subprocess.CompletedProcess[str], set[str]]:
+    """A command, and which of the slow libraries it imported."""
+    command = [sys.executable, "-c", TOLD, *words]
+    done = subprocess.run(command, cwd=at, capture_output=True, text=True, timeout=60, check=False)
+    said, told, imported = done.stdout.rpartition("IMPORTED")
+    assert told, done.stderr
+    done.stdout = said
+    return done, set(imported.split())
+
+
+def test_help_imports_no_torch(tmp_path: Path) -> None:
+    done, imported = rmc(tmp_path, "--help")
+    assert done.returncode == 0, done.stderr
+    assert "check-env" in done.stdout
+    assert "torch" not in imported
+
+
+def test_a_refused_option_imports_no_torch(tmp_path: Path) -> None:
+    done, imported = rmc(tmp_path, "train", "HalfCheetah-v5", "--batch-size", "0")
+    assert done.returncode == 2
+    assert "--batch-size=0" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert "torch" not in imported
+
+
+def test_the_version_imports_nothing(tmp_path: Path) -> None:
+    done, imported = rmc(tmp_path, "--version")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "rmc 0.1.0\n", "")
+    assert imported == set()
+
+
+@pytest.mark.parametrize("module", ["rmc.deploy.local.replay_process", "rmc.deploy.run.folder"])
+def test_what_needs_no_network_imports_no_torch(module: str, tmp_path: Path) -> None:
+    code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
