@@ -13,12 +13,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from rmc.actors.config import ActorConfig
-from rmc.actors.outbox import Outbox
 from rmc.actors.policy_runner import PolicyRunner
+from rmc.actors.unacked_entries import UnackedEntries
 from rmc.actors.window_builder import WindowBuilder
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Ack, Bus, Version
-from rmc.common.env.make import rebuilt, sound_reset
+from rmc.common.env.make import checked_reset, recreate_env
 from rmc.common.env.wrappers import Env, Floats
 from rmc.common.errors import BusFull, BusUnavailable, FencedError, MessageError
 from rmc.common.metrics import Means, Rate
@@ -32,7 +32,7 @@ BROKEN_STARTS = 5  # episodes in a row that an environment breaks in their first
 _NOISE = -1  # the place of the policy's noise among the environments' seeds
 
 
-class Rater(Protocol):
+class PriorityFn(Protocol):
     """Gives windows their initial priority."""
 
     def load(self, blob: bytes) -> None:
@@ -66,15 +66,15 @@ class Actor:
         config: ActorConfig,
         bus: Bus,
         clock: Callable[[], float] = time.monotonic,
-        rater: Rater | None = None,
+        priority_fn: PriorityFn | None = None,
     ) -> None:
         """``clock`` times polls and the chunk's timer; a lockstep run passes one that counts calls.
 
-        Without a ``rater`` windows enter the replay with the largest priority seen.
+        Without a ``priority_fn`` windows enter the replay with the largest priority seen.
         """
         self.name = f"actor-{index}"
         self._index, self._seed, self._spec, self._config = index, seed, spec, config
-        self._bus, self._clock, self._rater = bus, clock, rater
+        self._bus, self._clock, self._priority_fn = bus, clock, priority_fn
         n = config.envs_per_actor
         self._make_env, self._envs = make_env, [make_env() for _ in range(n)]
         self._faults: dict[int, Exception] = {}  # of this step, by environment
@@ -90,13 +90,13 @@ class Actor:
 
     def restart(self) -> None:
         """Forget unfinished episodes and what was not sent, and begin a new epoch with new seeds and newest weights."""
-        self._resends += self._outbox.resends
+        self._resends += self._unacked.resends
         self._start_epoch()
 
     def _start_epoch(self) -> None:
         ack = self._bus.ack(self._index)
         epoch = self._bus.take_epoch(self.name, floor=ack.id.epoch if ack else 0)
-        self._outbox = Outbox(self._bus, self._index, epoch, self._spec)
+        self._unacked = UnackedEntries(self._bus, self._index, epoch, self._spec)
         self._ack: Ack | None = None
         self._older_since = float("inf")
         self._version: Version | None = None
@@ -115,7 +115,7 @@ class Actor:
         for env in range(n):
             self._begin_episode(env, environment_seed(self._seed, self._index, epoch, env))
         with suppress(BusUnavailable, BusFull):  # the hello; ``step`` tries again
-            self._outbox.send()
+            self._unacked.send()
 
     def step(self) -> bool:
         """One step of all environments; False where weights, credit or acknowledgements are missing."""
@@ -136,8 +136,8 @@ class Actor:
             "steps_per_s": self._rate.take(self._total_steps),
             "episodes": self._episodes,
             "weights_update": self._version.update if self._version else -1,
-            "unacked_entries": len(self._outbox),
-            "resends": self._resends + self._outbox.resends,
+            "unacked_entries": len(self._unacked),
+            "resends": self._resends + self._unacked.resends,
             "broken_episodes": self._broken,
             "refused_weights": self._refused_weights,
         }
@@ -166,7 +166,7 @@ class Actor:
         """What is missing for a step; empty if nothing is."""
         if self._version is None:
             return "weights"
-        if self._outbox.bytes >= self._config.unacked_bytes:
+        if self._unacked.bytes >= self._config.unacked_bytes:
             return "acknowledgements"
         if self._ack is None or self._steps >= self._ack.granted_steps:
             return "the end" if self._ack and self._ack.final else "credit"
@@ -196,8 +196,8 @@ class Actor:
             return
         try:
             self._runner.load(found[1])
-            if self._rater is not None:
-                self._rater.load(found[1])
+            if self._priority_fn is not None:
+                self._priority_fn.load(found[1])
         except MessageError as error:
             self._refused_weights += 1
             log.warning("%s: refused %s: %s", self.name, found[0], error)
@@ -208,15 +208,15 @@ class Actor:
         now = self._clock()
         ack = self._believed(self._bus.ack(self._index), now)
         if ack is not None and self._is_forgotten_life(ack):
-            log.warning("%s: the replay server does not know epoch %d any more", self.name, self._outbox.epoch)
+            log.warning("%s: the replay server does not know epoch %d any more", self.name, self._unacked.epoch)
             self.restart()
             return
-        if ack is not None and ack.id.epoch == self._outbox.epoch:
+        if ack is not None and ack.id.epoch == self._unacked.epoch:
             self._ack = ack
-            if self._outbox.acknowledge(ack):
+            if self._unacked.acknowledge(ack):
                 self._resend_at = now + RESEND_SECONDS
         if now >= self._resend_at:  # a Redis that came back empty has lost what the replay server never saw
-            self._outbox.send_again()
+            self._unacked.send_again()
             self._resend_at = now + RESEND_SECONDS
 
     def _believed(self, ack: Ack | None, now: float) -> Ack | None:
@@ -234,12 +234,12 @@ class Actor:
         The former: our epoch is too small (before its first credit a life has sent its hello alone). The latter: we
         are granted less than what was acknowledged. Raises FencedError where a newer life is real.
         """
-        ours = self._outbox.epoch
+        ours = self._unacked.epoch
         if ack.id.epoch != ours:
             if ack.id.epoch > ours and self._bus.current_epoch(self.name) > ours:
                 raise FencedError(f"{self.name}: epoch {ack.id.epoch} has replaced epoch {ours}")
             return ack.id.epoch > ours
-        return (self._ack is None and ack.id.seq > 0) or ack.granted_steps < self._outbox.committed_steps
+        return (self._ack is None and ack.id.seq > 0) or ack.granted_steps < self._unacked.committed_steps
 
     # Stepping
 
@@ -255,7 +255,7 @@ class Actor:
                 self._step_environment(i, action[i])
             except Exception as error:
                 self._faults[i] = error
-        self._find_nonsense()
+        self._mark_non_finite()
         for i in self._faults:
             self._steps -= self._builder.forget(i) + 1
         ended = self._builder.add(
@@ -277,7 +277,7 @@ class Actor:
         self._observation[i], self._reward[i], self._blank[i] = observation, reward, info.get("blank", False)
         self._terminated[i], self._truncated[i] = terminated, truncated
 
-    def _find_nonsense(self) -> None:
+    def _mark_non_finite(self) -> None:
         """Whose observation or reward is not finite. What a broken environment left behind must not end an episode."""
         if not (np.isfinite(self._observation).all() and np.isfinite(self._reward).all()):
             sound = np.isfinite(self._observation).all(1) & np.isfinite(self._reward)
@@ -297,7 +297,7 @@ class Actor:
         self._broken_starts = self._broken_starts + 1 if self._lengths[i] <= 1 else 0
         if self._broken_starts >= BROKEN_STARTS:
             raise error
-        self._envs[i] = rebuilt(self._envs[i], self._make_env)
+        self._envs[i] = recreate_env(self._envs[i], self._make_env)
         self._begin_episode(i, self._new_seed(i))
 
     def _end_episode(self, env: int) -> None:
@@ -308,17 +308,17 @@ class Actor:
 
     def _new_seed(self, env: int) -> int:
         """Of an environment made anew; no other of this epoch has it."""
-        return environment_seed(self._seed, self._index, self._outbox.epoch, len(self._envs) * self._broken + env)
+        return environment_seed(self._seed, self._index, self._unacked.epoch, len(self._envs) * self._broken + env)
 
     def _begin_episode(self, env: int, seed: int | None) -> None:
         """Raises what the environment raises where it breaks in a reset, and again when it was made anew."""
         try:
-            observation, info = sound_reset(self._envs[env], seed)
+            observation, info = checked_reset(self._envs[env], seed)
         except Exception as error:
             log.warning("%s: environment %d broke in a reset: %r", self.name, env, error)
             self._broken += 1
-            self._envs[env] = rebuilt(self._envs[env], self._make_env)
-            observation, info = sound_reset(self._envs[env], self._new_seed(env))
+            self._envs[env] = recreate_env(self._envs[env], self._make_env)
+            observation, info = checked_reset(self._envs[env], self._new_seed(env))
         self._builder.begin(env, observation, info.get("blank", False))
         self._returns[env] = self._lengths[env] = 0
 
@@ -341,12 +341,12 @@ class Actor:
     def _flush(self) -> None:
         if self._builder.count:
             rows = self._builder.take()
-            if self._rater is not None:
+            if self._priority_fn is not None:
                 learnt = rows["weights_update"] > 0  # what the first weights think of a window says nothing
-                rows["initial_priority"] = np.where(learnt, self._rater(rows), 0.0)
-            self._outbox.put(rows)
+                rows["initial_priority"] = np.where(learnt, self._priority_fn(rows), 0.0)
+            self._unacked.put(rows)
         self._send()
 
     def _send(self) -> None:
-        if self._outbox.send():
+        if self._unacked.send():
             self._poll_ack()

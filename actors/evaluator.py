@@ -19,7 +19,7 @@ from rmc.actors.config import EvaluatorConfig
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Bus, Version
-from rmc.common.env.make import rebuilt, sound_reset
+from rmc.common.env.make import checked_reset, recreate_env
 from rmc.common.env.wrappers import Env, Floats
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, MessageError, RmcError
 
@@ -36,7 +36,7 @@ def first_start(run_seed: int, final: bool = False) -> int:
     return int(np.random.SeedSequence([run_seed, final]).generate_state(1)[0]) >> 1  # leaves room for those after it
 
 
-class Player(Protocol):
+class PolicyLike(Protocol):
     """What plays: a ``PolicyRunner``, or another agent that acts like one."""
 
     def start(self) -> tuple[Floats, Floats]:
@@ -54,13 +54,13 @@ class Player(Protocol):
         """(N, O), (N, A), (N,), (N, S), and noise or None for the mean -> (N, A) in [-1, 1], (N, S)."""
 
 
-class Match:
+class Rollout:
     """The first episode of each of N environments, played to its end; those that ended stand still.
 
     Without a time limit, an episode's first 10 000 steps are what counts.
     """
 
-    def __init__(self, runner: Player, envs: Sequence[Env], seed: int) -> None:
+    def __init__(self, runner: PolicyLike, envs: Sequence[Env], seed: int) -> None:
         """``runner`` is for N environments. The i-th one is reset with seed + i."""
         self._runner, self._envs = runner, envs
         shape = envs[0].observation_space.shape
@@ -94,7 +94,7 @@ class Match:
             self._observation[i] = 0.0
 
     def _reset(self, i: int, seed: int) -> None:
-        self._observation[i], info = sound_reset(self._envs[i], seed)
+        self._observation[i], info = checked_reset(self._envs[i], seed)
         self._blank[i] = info.get("blank", False)
 
     def _step_environment(self, i: int, action: Floats) -> None:
@@ -112,14 +112,14 @@ class Match:
         return self._returns[~self.broken]
 
 
-def play_episodes(runner: Player, make_env: Callable[[], Env], episodes: int, seed: int) -> list[float]:
+def play_episodes(runner: PolicyLike, make_env: Callable[[], Env], episodes: int, seed: int) -> list[float]:
     """Returns of so many deterministic episodes, played as one batch; ``runner`` is for as many environments.
 
     Those in which the environment broke are left out. Raises RmcError where none is left.
     """
     envs = [make_env() for _ in range(episodes)]
     try:
-        match = Match(runner, envs, seed)
+        match = Rollout(runner, envs, seed)
         while match.step():
             pass
     finally:
@@ -159,7 +159,7 @@ class Evaluator:
         self._runner = PolicyRunner(observation[0], action[0], agent, config.episodes)
         self._version = Version(0, -1)  # the newest that was looked at: none yet
         self._refused_weights = 0
-        self._match: Match | None = None
+        self._match: Rollout | None = None
         self._next_look = float("-inf")
         self._records: deque[dict[str, Any]] = deque()
 
@@ -172,11 +172,11 @@ class Evaluator:
         if not self._match.step():
             self._records.append(_record(self._match, self._version))
             for i in np.flatnonzero(self._match.broken).tolist():
-                self._envs[i] = rebuilt(self._envs[i], self._make_env)
+                self._envs[i] = recreate_env(self._envs[i], self._make_env)
             self._match = None
         return True
 
-    def _begin(self) -> Match | None:
+    def _begin(self) -> Rollout | None:
         if self._clock() < self._next_look:
             return None
         self._next_look = self._clock() + POLL_SECONDS
@@ -185,7 +185,7 @@ class Evaluator:
         if found is None:
             return None
         self._version, blob = found
-        return Match(self._runner, self._envs, self._seed) if self._load(blob) else None
+        return Rollout(self._runner, self._envs, self._seed) if self._load(blob) else None
 
     def _load(self, blob: bytes) -> bool:
         """Whether it is a policy; what cannot be read is refused, and the next one is waited for."""
@@ -215,7 +215,7 @@ class Evaluator:
             env.close()
 
 
-def _record(match: Match, version: Version) -> dict[str, Any]:
+def _record(match: Rollout, version: Version) -> dict[str, Any]:
     broken = {"eval_broken_episodes": int(match.broken.sum())}
     if not match.returns.size:
         return broken

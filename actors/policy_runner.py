@@ -100,8 +100,8 @@ class PolicyRunner:
         self._obs_dim, self._action_dim = obs_dim, action_dim
         inputs = obs_dim + action_dim + config.blank_flag
         embedding = config.embedding or inputs
-        self._beside = {"hidden": 0, "hidden+embedding": embedding}.get(config.head_input, obs_dim)
-        features = self._beside + (config.hidden if config.head_input != "observation" else 0)
+        self._skip = {"hidden": 0, "hidden+embedding": embedding}.get(config.head_input, obs_dim)
+        features = self._skip + (config.hidden if config.head_input != "observation" else 0)
         self._input = np.zeros((envs, inputs), np.float32)
         self._embed = _Linear(inputs, embedding, envs, relu=not config.layer_norm) if config.embedding else None
         self._from_embedding = _Linear(embedding, 3 * config.hidden, envs)
@@ -162,9 +162,9 @@ class PolicyRunner:
         else:
             embedding = self._embedded(seen)
             x = new_hidden = self._gru(embedding, torch.from_numpy(hidden))
-            if self._beside:
-                beside = embedding if self._config.head_input == "hidden+embedding" else seen
-                x = torch.cat([x, beside[:, : self._beside]], 1)
+            if self._skip:
+                skip = embedding if self._config.head_input == "hidden+embedding" else seen
+                x = torch.cat([x, skip[:, : self._skip]], 1)
         for layer in self._head:
             x = layer(x)
         new_state: Floats = new_hidden.numpy()

@@ -127,7 +127,7 @@ def _grow(buffer: ReplayBuffer, size: int) -> None:
     buffer.buffer_size = size
 
 
-class Opponent:
+class SB3Adapter:
     """A model as our evaluator plays an agent; its memory, if it has one, is kept in here."""
 
     def __init__(self, model: Any, scaled: Callable[[Floats], Floats], envs: int) -> None:
@@ -260,7 +260,7 @@ class _Run(BaseCallback):
     # -- evaluation and records -------------------------------------------------------------------------
 
     def _play(self, episodes: int, final: bool) -> dict[str, Any]:
-        opponent, seed = Opponent(self._model, _scaled_by(self._vec), episodes), first_start(self.config.seed, final)
+        opponent, seed = SB3Adapter(self._model, _scaled_by(self._vec), episodes), first_start(self.config.seed, final)
         return _returns(play_episodes(opponent, lambda: make_env(self.config.env), episodes, seed))
 
     def _first_evaluation(self) -> float:
@@ -317,7 +317,7 @@ def evaluate(folder: RunFolder, episodes: int, flicker: float | None = None) -> 
         model = CLASSES[config.algorithm].load(states[-1] / MODEL, device="cpu")
         scaled = _scaled_by(VecNormalize.load(str(scales), bare) if scales.exists() else bare)
     seed = first_start(config.seed, final=True)
-    returns = play_episodes(Opponent(model, scaled, episodes), lambda: make_env(env), episodes, seed)
+    returns = play_episodes(SB3Adapter(model, scaled, episodes), lambda: make_env(env), episodes, seed)
     bare.close()
     about = {"env": env.id, "preset": config.name, "seed": config.seed, **progress}
     return about | _returns(returns) | {"eval_flicker": env.flicker}

@@ -39,7 +39,7 @@ class _Step(nn.Module):
         """See the module's docstring."""
         seen = self.agent.normalizer(observation, blank).unsqueeze(1)
         now = blank.unsqueeze(1), previous_action.unsqueeze(1), state
-        remembered, _, state = self.agent.remember(seen, *now)
+        remembered, _, state = self.agent.unroll(seen, *now)
         mean, _ = self.agent.policy(self.agent.features(remembered).squeeze(1))
         return torch.tanh(mean), state
 

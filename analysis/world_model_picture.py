@@ -18,7 +18,7 @@ from torch import Tensor
 from rmc.actors.evaluator import LONGEST_EPISODE
 from rmc.analysis.evaluation import load_state
 from rmc.analysis.policy import load_policy
-from rmc.common.agent import Agent, Remembered
+from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
@@ -109,7 +109,7 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     """
     previous = torch.cat([torch.zeros_like(episode.action[:, :1]), episode.action], 1)
     start = torch.zeros(1, agent.config.state_size(agent.obs_dim))
-    memory, seen, _ = agent.remember(episode.observation, episode.blank, previous, start)
+    memory, seen, _ = agent.unroll(episode.observation, episode.blank, previous, start)
     prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
     latent_change = memory.hidden[0].diff(dim=0)
     real = episode.observation[0, 1:]
@@ -126,19 +126,19 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     )
 
 
-def _open_loop(agent: Agent, memory: Remembered, observation: Tensor, action: Tensor) -> dict[int, Tensor]:
+def _open_loop(agent: Agent, memory: MemoryOutput, observation: Tensor, action: Tensor) -> dict[int, Tensor]:
     """Horizon K -> (T - K + 1, O): from every step on, the model's own states and observations in place of the real.
 
     Observations (T, O) to start from, actions (T, A).
     """
-    hidden, beside = memory.hidden[0, :-1], memory.beside[0, :-1]
+    hidden, skip = memory.hidden[0, :-1], memory.skip[0, :-1]
     steps, found = len(action), {}
     for ahead in range(1, min(max(HORIZONS), steps) + 1):
         count = steps - ahead + 1  # starts from which so many steps were played
-        hidden, beside, observation, a = hidden[:count], beside[:count], observation[:count], action[ahead - 1 :]
-        step = agent.world_model(agent.features(Remembered(hidden, beside)), a)
+        hidden, skip, observation, a = hidden[:count], skip[:count], observation[:count], action[ahead - 1 :]
+        step = agent.world_model(agent.features(MemoryOutput(hidden, skip)), a)
         hidden, observation = hidden + step.hidden_change, observation + step.observation_change
-        beside = agent.memory.beside(observation, torch.zeros(count, dtype=torch.bool), a)
+        skip = agent.memory.skip(observation, torch.zeros(count, dtype=torch.bool), a)
         if ahead in HORIZONS:
             found[ahead] = observation
     return found

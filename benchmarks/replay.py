@@ -36,7 +36,7 @@ from benchmarks.sender import CHUNK, Sender
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import env_spaces
-from rmc.common.replay import Draw
+from rmc.common.replay import SampleStatus
 from rmc.common.window import WindowSpec
 from rmc.learner.batch import Batch, clear_padding, importance_weights, view_batch
 from rmc.learner.config import LearnerConfig
@@ -84,7 +84,7 @@ class Learner:
     def step(self) -> int:
         """One batch, its priorities sent back."""
         sample = self.client.sample(BATCH)
-        assert sample.draw is Draw.BATCH
+        assert sample.draw is SampleStatus.BATCH
         assert sample.rows is not None
         assert sample.values is not None
         self.env_steps = sample.env_steps

@@ -59,7 +59,7 @@ def _serve(url: str, folder: str, spec: WindowSpec, actors: int, shard: Shard) -
     bus = RedisBus(url, RUN)
     config = ReplayConfig(capacity=4096 * shard.count, warmup_steps=ENDLESS)
     server = ReplayServer(spec, config, Path(folder), 0, ENDLESS, actors, ENDLESS, bus, shard)
-    bus.announce_replay(server.holder, "nowhere")
+    bus.announce_replay(server.owner, "nowhere")
     while bus.stop_requested() is None:
         end = time.monotonic() + 0.5
         while time.monotonic() < end:

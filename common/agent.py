@@ -45,11 +45,11 @@ class Normalizer(nn.Module):
         self.std.copy_(variance.sqrt().clamp(min=STD_FLOOR))
 
 
-class Remembered(NamedTuple):
+class MemoryOutput(NamedTuple):
     """What the memory makes of a sequence."""
 
     hidden: Tensor  # (B, T, H), h_t after (o_t, a_{t-1}); zeros without a memory
-    beside: Tensor  # (B, T, ·), what the heads read beside it: e_t, o_t, or nothing
+    skip: Tensor  # (B, T, ·), what the heads read beside it: e_t, o_t, or nothing
 
 
 class Memory(nn.Module):
@@ -69,16 +69,16 @@ class Memory(nn.Module):
                 layers.insert(1, nn.LayerNorm(config.embedding))
         self.embed = nn.Sequential(*layers)
         embedding = config.embedding or width
-        self.beside_dim = {"hidden": 0, "hidden+embedding": embedding}.get(config.head_input, obs_dim)
+        self.skip_dim = {"hidden": 0, "hidden+embedding": embedding}.get(config.head_input, obs_dim)
         self.gru = nn.GRU(embedding, config.hidden, batch_first=True)
 
-    def forward(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Remembered:
+    def forward(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> MemoryOutput:
         """(B, T, O) normalised, (B, T) bool, (B, T, A), (B, S) the state before the first step, which begins with h."""
         if self.head_input == "observation":
-            return Remembered(observation.new_zeros(*observation.shape[:2], self.gru.hidden_size), observation)
+            return MemoryOutput(observation.new_zeros(*observation.shape[:2], self.gru.hidden_size), observation)
         embedding = self._embedded(observation, blank, prev_action)
         hidden = self._unroll(embedding, hidden[:, : self.gru.hidden_size].unsqueeze(0).contiguous())
-        return Remembered(hidden, self._beside(observation, embedding))
+        return MemoryOutput(hidden, self._skip(observation, embedding))
 
     def step(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
         """One step of it: (B, O) normalised, (B,) bool, (B, A), (B, H) -> (B, H) float32."""
@@ -87,17 +87,17 @@ class Memory(nn.Module):
         embedding = self._embedded(observation, blank, prev_action)
         return torch.gru_cell(embedding, hidden, *self.gru.all_weights[0])
 
-    def beside(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
+    def skip(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
         """What the heads read beside h: (..., O) normalised, (...) bool, (..., A) -> (..., ·)."""
-        return self._beside(observation, self._embedded(observation, blank, prev_action))
+        return self._skip(observation, self._embedded(observation, blank, prev_action))
 
     def inputs(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
         """What is embedded: (..., O) normalised, (...) bool, (..., A) -> (..., O + A), or one more with the flag."""
         flag = [blank.unsqueeze(-1).to(observation.dtype)] if self.blank_flag else []
         return torch.cat([observation, prev_action, *flag], dim=-1)
 
-    def _beside(self, observation: Tensor, embedding: Tensor) -> Tensor:
-        return (embedding if self.head_input == "hidden+embedding" else observation)[..., : self.beside_dim]
+    def _skip(self, observation: Tensor, embedding: Tensor) -> Tensor:
+        return (embedding if self.head_input == "hidden+embedding" else observation)[..., : self.skip_dim]
 
     def _embedded(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
         """(..., O) normalised, (...) bool, (..., A) -> (..., E)."""
@@ -150,7 +150,7 @@ class WorldModel(nn.Module):
         return Prediction(hidden_change, observation_change, reward.sum(-1))
 
 
-class NextFrame(nn.Module):
+class ObservationImputer(nn.Module):
     """g(h_t, o_t, a_t): the normalised o_{t+1} that fills a blank. It trains nothing but itself.
 
     It reads o_t, which the world model does not: where that one did, returns fell (``studies/notebook.md``).
@@ -237,20 +237,20 @@ class Agent(nn.Module):
         self.config, self.obs_dim, self.action_dim = config, obs_dim, action_dim
         self.normalizer = Normalizer(obs_dim, config.normalize_observations)
         self.memory = Memory(obs_dim, action_dim, config)
-        features = self.memory.beside_dim + (config.hidden if config.head_input != "observation" else 0)
+        features = self.memory.skip_dim + (config.hidden if config.head_input != "observation" else 0)
         self.world_model = WorldModel(features, obs_dim, action_dim, config)
         self.critic = TwinQ(features, action_dim, config)
         self.policy = Policy(features, action_dim, config)
         self.log_alpha = nn.Parameter(torch.zeros(()))
-        self.next_frame = NextFrame(obs_dim, action_dim, config) if config.fill_blanks else None
+        self.next_frame = ObservationImputer(obs_dim, action_dim, config) if config.fill_blanks else None
 
-    def features(self, remembered: Remembered) -> Tensor:
+    def features(self, remembered: MemoryOutput) -> Tensor:
         """What the heads read: h_t, what is beside it, or both."""
         match self.config.head_input:
             case "hidden":
                 return remembered.hidden
             case "observation":
-                return remembered.beside
+                return remembered.skip
         return torch.cat(remembered, dim=-1)
 
     @torch.no_grad()
@@ -271,14 +271,14 @@ class Agent(nn.Module):
                 frames.append(seen.unsqueeze(1))
         return torch.cat(frames, 1), torch.cat([hidden, seen], 1)
 
-    def remember(
+    def unroll(
         self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor
-    ) -> tuple[Remembered, Tensor, Tensor]:
+    ) -> tuple[MemoryOutput, Tensor, Tensor]:
         """The memory along a sequence; what it was given, (B, T, O), blanks filled; and the state after, (B, S)."""
         seen = observation
         if self.fills(blank):
             seen, after = self.fill(observation, blank, prev_action, state)
-        remembered: Remembered = self.memory(seen, blank, prev_action, state)
+        remembered: MemoryOutput = self.memory(seen, blank, prev_action, state)
         if seen is observation:
             last_seen = seen[:, -1, : state.shape[1] - self.config.hidden]
             after = torch.cat([remembered.hidden[:, -1], last_seen], 1)

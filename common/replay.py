@@ -12,7 +12,7 @@ from rmc.common.window import Rows
 EPISODE_BYTES = 16 << 20  # of rows at most in the answer to ``Replay.episode``
 
 
-class Draw(Enum):
+class SampleStatus(Enum):
     """How a request for a batch ended."""
 
     BATCH = "batch"
@@ -28,7 +28,7 @@ class Sample:
     ``values``, priority ** exponent each, of ``mass`` over all ``windows``.
     """
 
-    draw: Draw
+    draw: SampleStatus
     rows: Rows | None  # (B,)
     values: NDArray[np.float64] | None  # (B,)
     mass: float
@@ -37,7 +37,7 @@ class Sample:
     drawn_steps: int  # trained steps drawn so far
 
 
-NOTHING_YET = Sample(Draw.WAIT, None, None, 0.0, 0, 0, 0)  # of a server that was not heard yet
+EMPTY_SAMPLE = Sample(SampleStatus.WAIT, None, None, 0.0, 0, 0, 0)  # of a server that was not heard yet
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,14 @@ class ObservationStatistics:
 class Replay(Protocol):
     """A replay server as its learner sees it."""
 
-    def introduce(self, epoch: int) -> None:
+    def register_learner(self, epoch: int) -> None:
         """Say which learner asks, before it asks: those of smaller epochs are served no more, and hear FencedError."""
 
-    def sample(self, batch_size: int, elsewhere: int = 0) -> Sample:
-        """Draw a batch, or learn why there is none. ``elsewhere``: trained steps drawn from other shards so far."""
+    def sample(self, batch_size: int, drawn_elsewhere_steps: int = 0) -> Sample:
+        """Draw a batch, or learn why there is none.
+
+        ``drawn_elsewhere_steps`` are the trained steps drawn from other shards so far.
+        """
 
     def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
         """Give priorities back, (B,) each; those of evicted serials are dropped and counted."""

@@ -4,7 +4,7 @@ Shapes: B batch, T = L_b + L_t steps of a window, O observation, A action, H hid
 a window's end. Staleness is R2D2's (Kapturowski et al., 2019, section 3), with Q of the actions that were taken.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -34,7 +34,7 @@ class Trace(NamedTuple):
     m: Tensor  # (B, L_t), which steps are real
 
 
-def update_metrics(trace: Trace, beta: Tensor, model_norm: str) -> dict[str, Tensor]:
+def update_metrics(trace: Trace, beta: Tensor, model_norm: Literal["l1", "l2"]) -> dict[str, Tensor]:
     """Scalars of one update, on its device."""
     m, i = trace.m, trace.curiosity
     unmoved = losses.model_error(torch.zeros_like(trace.hidden_change), trace.hidden_change, model_norm)
@@ -95,9 +95,9 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
     window = slice(-spec.steps - 1, -1)  # its steps; the bootstrap observation starts none
     past = slice(None, -spec.steps - 1)
-    _, _, before = agent.remember(o[:, past], blank[:, past], prev_action[:, past], start)
+    _, _, before = agent.unroll(o[:, past], blank[:, past], prev_action[:, past], start)
     replayed, recomputed = (
-        agent.remember(o[:, window], blank[:, window], prev_action[:, window], state)[0] for state in (stored, before)
+        agent.unroll(o[:, window], blank[:, window], prev_action[:, window], state)[0] for state in (stored, before)
     )
     q, q_replayed = (
         agent.critic(agent.features(remembered), action[:, -spec.steps :]).mean(0).squeeze(0)

@@ -17,7 +17,7 @@ from rmc.common.agent import Agent, Float32Linear, StackedLinear, TwinQ
 from rmc.common.agent_config import NORMALIZED_CLIP
 from rmc.learner import kernels
 
-LOW = torch.bfloat16
+BF16 = torch.bfloat16
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
@@ -40,7 +40,7 @@ def _as(kind: type[ModuleT], module: nn.Module) -> ModuleT:
 
 
 def _applies(x: Tensor) -> bool:
-    return x.device.type == "cpu" and torch.is_autocast_enabled("cpu") and torch.get_autocast_dtype("cpu") is LOW
+    return x.device.type == "cpu" and torch.is_autocast_enabled("cpu") and torch.get_autocast_dtype("cpu") is BF16
 
 
 class FusedAgent(Agent):
@@ -117,24 +117,24 @@ def _fill(
     gru, size = agent.memory.gru, agent.config.hidden
     nets = agent.next_frame.net, agent.memory.embed
     linear = [layer for net in nets for layer in net if isinstance(layer, nn.Linear)]
-    w1, w2, w3, w_embed, wi, wh = (w.to(LOW).t() for w in (*(x.weight for x in linear), *gru.all_weights[0][:2]))
+    w1, w2, w3, w_embed, wi, wh = (w.to(BF16).t() for w in (*(x.weight for x in linear), *gru.all_weights[0][:2]))
     b1, b2, b3, b_embed = (x.bias for x in linear)
     bi, bh = (b.numpy() for b in gru.all_weights[0][2:])
-    inputs = agent.memory.inputs(observation, blank, prev_action).to(LOW)
-    h, low, kept = (
+    inputs = agent.memory.inputs(observation, blank, prev_action).to(BF16)
+    h, low, gate_cache = (
         state[:, :size].clone().numpy(),
-        state[:, :size].to(LOW),
+        state[:, :size].to(BF16),
         np.empty((len(state), 4 * size), np.float32),
     )
     seen, before = observation.clone(), state[:, size:]
-    by_step = (x.transpose(0, 1) for x in (seen, blank.unsqueeze(2), prev_action.to(LOW), inputs))
+    by_step = (x.transpose(0, 1) for x in (seen, blank.unsqueeze(2), prev_action.to(BF16), inputs))
     for o, was_blank, a, x in zip(*by_step, strict=True):
-        second = _layer(_layer(torch.cat([low, before.to(LOW), a], 1), w1, b1), w2, b2)
+        second = _layer(_layer(torch.cat([low, before.to(BF16), a], 1), w1, b1), w2, b2)
         expected = torch.mm(second, w3).float().add_(b3).add_(before)
         torch.where(was_blank, expected.clamp_(-NORMALIZED_CLIP, NORMALIZED_CLIP), o, out=o)
         x[:, : agent.obs_dim] = o
         gi, gh = torch.mm(_layer(x.contiguous(), w_embed, b_embed), wi), torch.mm(low, wh)
-        kernels.gru_step(_bits(gi), _bits(gh), bi, bh, h, kept, h, _bits(low))
+        kernels.gru_step(_bits(gi), _bits(gh), bi, bh, h, gate_cache, h, _bits(low))
         before = o
     return seen, torch.cat([torch.from_numpy(h), before], 1)
 
@@ -145,38 +145,42 @@ class _GRU(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, hidden: Tensor, wi: Tensor, wh: Tensor, bi: Tensor, bh: Tensor) -> Tensor:
         (b, t, e), h = x.shape, hidden.shape[1]
-        x_low = x.to(LOW).transpose(0, 1).reshape(t * b, e)
-        wi_low, wh_low = wi.to(LOW), wh.to(LOW)
-        gi, gh = torch.mm(x_low, wi_low.t()).view(t, b, 3 * h), torch.empty(b, 3 * h, dtype=LOW)
-        states, kept = torch.empty(t + 1, b, h), torch.empty(t, b, 4 * h)
-        states_low = torch.empty(t + 1, b, h, dtype=LOW)
+        x_low = x.to(BF16).transpose(0, 1).reshape(t * b, e)
+        wi_low, wh_low = wi.to(BF16), wh.to(BF16)
+        gi, gh = torch.mm(x_low, wi_low.t()).view(t, b, 3 * h), torch.empty(b, 3 * h, dtype=BF16)
+        states, gate_cache = torch.empty(t + 1, b, h), torch.empty(t, b, 4 * h)
+        states_low = torch.empty(t + 1, b, h, dtype=BF16)
         states[0], states_low[0] = hidden, hidden
-        of_x, of_h, all_h, low, gates = _bits(gi), _bits(gh), states.numpy(), _bits(states_low), kept.numpy()
+        of_x, of_h, all_h, low, gates = _bits(gi), _bits(gh), states.numpy(), _bits(states_low), gate_cache.numpy()
         bias_i, bias_h = bi.detach().numpy(), bh.detach().numpy()
         for k in range(t):
             torch.mm(states_low[k], wh_low.t(), out=gh)
             kernels.gru_step(of_x[k], of_h, bias_i, bias_h, all_h[k], gates[k], all_h[k + 1], low[k + 1])
-        ctx.save_for_backward(x_low, wi_low, wh_low, states, states_low, kept)
+        ctx.save_for_backward(x_low, wi_low, wh_low, states, states_low, gate_cache)
         return states[1:].transpose(0, 1)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        x_low, wi_low, wh_low, states, states_low, kept = ctx.saved_tensors
-        t, b, h = kept.shape[0], kept.shape[1], states.shape[2]
-        grads, d, through = grad.float().transpose(0, 1).contiguous(), torch.zeros(b, h), torch.zeros(b, h, dtype=LOW)
-        dgi, dgh = torch.empty(t, b, 3 * h, dtype=LOW), torch.empty(t, b, 3 * h, dtype=LOW)
+        x_low, wi_low, wh_low, states, states_low, gate_cache = ctx.saved_tensors
+        t, b, h = gate_cache.shape[0], gate_cache.shape[1], states.shape[2]
+        grads, d, grad_recurrent = (
+            grad.float().transpose(0, 1).contiguous(),
+            torch.zeros(b, h),
+            torch.zeros(b, h, dtype=BF16),
+        )
+        dgi, dgh = torch.empty(t, b, 3 * h, dtype=BF16), torch.empty(t, b, 3 * h, dtype=BF16)
         dbi, dbn = torch.zeros(3 * h), torch.zeros(h)
-        let_through, by_product, biases = d.numpy(), _bits(through), (dbi.numpy(), dbn.numpy())
-        by_step = grads.numpy(), states.numpy(), kept.numpy(), _bits(dgi), _bits(dgh)
+        grad_state, by_product, biases = d.numpy(), _bits(grad_recurrent), (dbi.numpy(), dbn.numpy())
+        by_step = grads.numpy(), states.numpy(), gate_cache.numpy(), _bits(dgi), _bits(dgh)
         for k in reversed(range(t)):
             out, h_before, gates, of_i, of_h = (array[k] for array in by_step)
-            kernels.gru_step_back(let_through, by_product, out, h_before, gates, of_i, of_h, *biases)
-            torch.mm(dgh[k], wh_low, out=through)
+            kernels.gru_step_back(grad_state, by_product, out, h_before, gates, of_i, of_h, *biases)
+            torch.mm(dgh[k], wh_low, out=grad_recurrent)
         flat_i, flat_h = dgi.view(t * b, 3 * h), dgh.view(t * b, 3 * h)
         dx = torch.mm(flat_i, wi_low).view(t, b, -1).transpose(0, 1) if ctx.needs_input_grad[0] else None
         dwi, dwh = torch.mm(flat_i.t(), x_low).float(), torch.mm(flat_h.t(), states_low[:-1].view(t * b, h)).float()
-        return dx, d + through, dwi, dwh, dbi, torch.cat([dbi[: 2 * h], dbn])
+        return dx, d + grad_recurrent, dwi, dwh, dbi, torch.cat([dbi[: 2 * h], dbn])
 
 
 class _Heads(torch.autograd.Function):
@@ -185,8 +189,8 @@ class _Heads(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, action: Tensor, float32_last: bool, *parameters: Tensor) -> Tensor:
         w1, b1, w2, b2, w3, b3 = parameters
-        x = torch.cat([features.to(LOW), action.to(LOW)], dim=1)
-        low = w1.to(LOW), w2.to(LOW), w3 if float32_last else w3.to(LOW)
+        x = torch.cat([features.to(BF16), action.to(BF16)], dim=1)
+        low = w1.to(BF16), w2.to(BF16), w3 if float32_last else w3.to(BF16)
         hidden: list[Tensor] = []
         out = torch.empty(w1.shape[0], len(x), w3.shape[2])
         for net in range(w1.shape[0]):
@@ -249,7 +253,7 @@ def _last_layer_back(grad: Tensor, x: Tensor, w: Tensor, dw: Tensor, db: Tensor,
         return back
     d = grad.to(w.dtype)
     _product(x.to(w.dtype), d, dw)
-    back = torch.mm(d, w.t()).to(LOW)
+    back = torch.mm(d, w.t()).to(BF16)
     kernels.relu_back(_bits(back), _bits(x), db_before.numpy())
     return back
 

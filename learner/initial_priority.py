@@ -16,7 +16,7 @@ from rmc.common.window import Rows, WindowSpec
 from rmc.learner import losses
 from rmc.learner.batch import view_batch
 from rmc.learner.config import UpdateConfig
-from rmc.learner.unroll import filled, remember
+from rmc.learner.unroll import impute, unroll
 
 
 class InitialPriority:
@@ -43,8 +43,8 @@ class InitialPriority:
         batch = view_batch(raw, torch.ones(len(rows)), self._spec)
         m = batch.step_valid[:, steps].float()
         o = agent.normalizer(batch.observation, batch.blank)
-        o = filled(agent, o, batch, self._spec.burn_in)
-        z = agent.features(remember(agent.memory, o, batch, self._spec.burn_in))
+        o = impute(agent, o, batch, self._spec.burn_in)
+        z = agent.features(unroll(agent.memory, o, batch, self._spec.burn_in))
         mean, log_std = agent.policy(z)
         pi, log_pi = squashed_sample(mean, log_std, torch.randn(mean.shape, generator=self._generator))
         next_value = losses.soft_value(agent.critic(z[:, 1:], pi[:, 1:]), agent.log_alpha.exp(), log_pi[:, 1:])

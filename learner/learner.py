@@ -21,7 +21,7 @@ from rmc.common.bus.protocol import Bus, Version
 from rmc.common.checkpoint import POLICY, PROGRESS, STATE, CheckpointFolder
 from rmc.common.errors import CheckpointError, FencedError, RmcError
 from rmc.common.metrics import Means, Rate
-from rmc.common.replay import Draw, Replay, Sample
+from rmc.common.replay import Replay, Sample, SampleStatus
 from rmc.common.window import Rows, WindowSpec
 from rmc.learner.batch import clear_padding, importance_weights
 from rmc.learner.config import LearnerConfig, UpdateConfig
@@ -85,7 +85,7 @@ class Learner:
         floor = max(self._resume(), checkpoints.last_epoch())
         self.epoch = bus.take_epoch(self.name, floor)
         checkpoints.note_epoch(self.epoch)
-        replay.introduce(self.epoch)
+        replay.register_learner(self.epoch)
         self.publish()
 
     def step(self) -> bool:
@@ -103,13 +103,13 @@ class Learner:
             self._ask_for_evaluation()
         sample = self.replay.sample(self.config.batch_size)
         self.env_steps = max(self.env_steps, sample.env_steps)
-        if sample.draw is not Draw.BATCH:
+        if sample.draw is not SampleStatus.BATCH:
             self._return_priorities(leave=0)
-        if sample.draw is Draw.WAIT:
+        if sample.draw is SampleStatus.WAIT:
             self._waiting = "experience"
             self._publish_if_forgotten()
             return False
-        if sample.draw is Draw.FINISHED:
+        if sample.draw is SampleStatus.FINISHED:
             self._waiting = "disk"
             self.finished = self.checkpoint()
             return self.finished
@@ -132,7 +132,7 @@ class Learner:
         updated = self._updated(raw, torch.from_numpy(weights), self.update.config.beta(self.env_steps))
         self.updates += 1
         if self.update.config.policy_average and self.updates % AVERAGE_UPDATES == 0:
-            self.update.follow_average(self.updates)
+            self.update.update_ema(self.updates)
         self._returning.append((rows["serial"].copy(), HostCopy(updated.priorities)))
         self._return_priorities(leave=self._updated.in_flight)
         self._measure(updated)

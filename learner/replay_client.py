@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from rmc.common.errors import AuthenticationError, FencedError, MessageError, RmcError
-from rmc.common.replay import EPISODE_BYTES, NOTHING_YET, Draw, ObservationStatistics, Sample
+from rmc.common.replay import EMPTY_SAMPLE, EPISODE_BYTES, ObservationStatistics, Sample, SampleStatus
 from rmc.common.shared_batches import SharedBatches
 from rmc.common.window import Rows, WindowSpec
 from rmc.common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame, proof
@@ -93,7 +93,7 @@ class Connection:
 
     def send(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...] = ()) -> None:
         """Send a frame whose body is the parts in order, after what was put off."""
-        self.put_off(kind, meta, parts)
+        self.enqueue(kind, meta, parts)
         self.flush()
 
     def flush(self) -> None:
@@ -102,7 +102,7 @@ class Connection:
             self._socket.sendall(b"".join(self._unsent))
             self._unsent.clear()
 
-    def put_off(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...]) -> None:
+    def enqueue(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...]) -> None:
         """Let a frame go with the next that is sent: the server is woken once for both."""
         self._unsent += [encode_frame(kind, meta, parts), *parts]
 
@@ -154,7 +154,7 @@ def _equal(given: Any, expected: bytes) -> bool:
     return isinstance(given, bytes) and hmac.compare_digest(given, expected)
 
 
-def _counters(meta: dict[str, Any]) -> tuple[float, int, int, int]:
+def _progress_backup(meta: dict[str, Any]) -> tuple[float, int, int, int]:
     """Mass, windows, env_steps and drawn_steps of an answer to a draw. Raises MessageError."""
     mass = meta.get("mass")
     if type(mass) is not float or not 0.0 <= mass < float("inf"):
@@ -210,7 +210,7 @@ class ReplayClient:
         self._buffers = [tensor.numpy().data for tensor in tensors]
         self._answer = memoryview(bytearray(max(EPISODE_BYTES, spec.dtype.itemsize, 2 * 8 * spec.obs_dim)))
         self._turn = self._in_flight = 0
-        self._last = NOTHING_YET
+        self._last = EMPTY_SAMPLE
         self._may_share = not pinned and hasattr(os, "memfd_create")
         self._shared: SharedBatches | None = None
         self._batches: Connection | None = None
@@ -218,14 +218,14 @@ class ReplayClient:
         self._is_away = False  # said in the log already
         self._epoch = 0
 
-    def introduce(self, epoch: int) -> None:
+    def register_learner(self, epoch: int) -> None:
         self._epoch = epoch
 
-    def sample(self, batch_size: int, elsewhere: int = 0) -> Sample:
+    def sample(self, batch_size: int, drawn_elsewhere_steps: int = 0) -> Sample:
         """The oldest draw asked for; asks for the next. ``rows`` stay valid until the next draw but one."""
         assert batch_size == self._batch_size, (batch_size, self._batch_size)
         try:
-            self._last = self._receive_sample(elsewhere)
+            self._last = self._receive_sample(drawn_elsewhere_steps)
             return self._last
         except AWAY as error:
             self._drop(error)
@@ -233,28 +233,28 @@ class ReplayClient:
 
     def _away(self) -> Sample:
         """What was known last, without a batch."""
-        return replace(self._last, draw=Draw.WAIT, rows=None, values=None)
+        return replace(self._last, draw=SampleStatus.WAIT, rows=None, values=None)
 
-    def _receive_sample(self, elsewhere: int) -> Sample:
+    def _receive_sample(self, drawn_elsewhere_steps: int) -> Sample:
         connection = self._batches = self._batches or self._open_batches()
         if connection is None:
             return self._away()
         while self._in_flight < AHEAD:
-            connection.send(Kind.SAMPLE, {"batch_size": self._batch_size, "elsewhere": elsewhere})
+            connection.send(Kind.SAMPLE, {"batch_size": self._batch_size, "elsewhere": drawn_elsewhere_steps})
             self._in_flight += 1
         self._turn = (self._turn + 1) % AHEAD
         header, meta, body = connection.receive(self._buffers[self._turn])
         self._in_flight -= 1
         if header.kind is Kind.ERROR:
             connection.raise_error(meta)
-        about = _counters(meta)
-        draw, rows, values = Draw.BATCH, None, None
+        about = _progress_backup(meta)
+        draw, rows, values = SampleStatus.BATCH, None, None
         if header.kind is Kind.SHARED and self._shared is not None:
             rows, values = self._shared.take(meta)
         elif header.kind is Kind.BATCH:
             rows, values = self._split(body)
         else:
-            draw = Draw.FINISHED if header.kind is Kind.FINISHED else Draw.WAIT
+            draw = SampleStatus.FINISHED if header.kind is Kind.FINISHED else SampleStatus.WAIT
         self._is_away = False
         return Sample(draw, rows, values, *about)
 
@@ -298,7 +298,7 @@ class ReplayClient:
         if self._batches is None:
             return
         parts = (serials.tobytes(), priorities.astype(np.float32).tobytes())
-        self._batches.put_off(Kind.PRIORITIES, {"count": len(serials)}, parts)
+        self._batches.enqueue(Kind.PRIORITIES, {"count": len(serials)}, parts)
 
     def statistics(self) -> ObservationStatistics:
         """Running observation statistics; a count of 0 while the server is away."""

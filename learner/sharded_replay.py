@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rmc.common.replay import NOTHING_YET, Draw, ObservationStatistics, Replay, Sample
+from rmc.common.replay import EMPTY_SAMPLE, ObservationStatistics, Replay, Sample, SampleStatus
 from rmc.common.window import Rows, WindowSpec
 
 
@@ -20,20 +20,20 @@ class _Stock:
     """Windows that a shard has drawn and that are in no batch yet."""
 
     def __init__(self, replay: Replay, spec: WindowSpec, chunk: int) -> None:
-        self.replay, self.last = replay, NOTHING_YET
+        self.replay, self.last = replay, EMPTY_SAMPLE
         self._chunk = chunk  # windows of one draw
         self._rows: Rows = np.empty(0, spec.dtype)
         self._values = np.empty(0)
 
-    def fill(self, count: int, elsewhere: int) -> Draw:
+    def fill(self, count: int, drawn_elsewhere_steps: int) -> SampleStatus:
         """Draw until there are ``count`` windows; else why there are not."""
         while len(self._rows) < count:
-            self.last = self.replay.sample(self._chunk, elsewhere)
+            self.last = self.replay.sample(self._chunk, drawn_elsewhere_steps)
             if self.last.rows is None or self.last.values is None:
                 return self.last.draw
             self._rows = np.concatenate([self._rows, self.last.rows])
             self._values = np.concatenate([self._values, self.last.values])
-        return Draw.BATCH
+        return SampleStatus.BATCH
 
     def take(self, rows: Rows, values: NDArray[np.float64]) -> None:
         """Fill both with the oldest."""
@@ -56,11 +56,11 @@ class ShardedReplay:
         self._buffers: list[Rows] = [tensor.numpy().view(spec.dtype).reshape(-1) for tensor in tensors]
         self._parts: NDArray[np.int64] | None = None  # (S,) windows of each in the batch that is being gathered
 
-    def introduce(self, epoch: int) -> None:
+    def register_learner(self, epoch: int) -> None:
         for stock in self._stocks:
-            stock.replay.introduce(epoch)
+            stock.replay.register_learner(epoch)
 
-    def sample(self, batch_size: int, elsewhere: int = 0) -> Sample:
+    def sample(self, batch_size: int, drawn_elsewhere_steps: int = 0) -> Sample:
         """A batch once every shard has given its part. ``rows`` stay valid until the next draw but one.
 
         Shards finish one after the other, within a batch or the last steps of an actor; the rest fill the batch then.
@@ -69,22 +69,22 @@ class ShardedReplay:
         while (live := self._live()).any():
             parts = live.astype(np.int64) if self._parts is None else self._parts  # one of each: masses are known then
             draws = [
-                stock.fill(part, elsewhere + self._drawn_outside(stock))
+                stock.fill(part, drawn_elsewhere_steps + self._drawn_outside(stock))
                 for stock, part in zip(self._stocks, parts.tolist(), strict=True)
             ]
-            if Draw.FINISHED in draws:
+            if SampleStatus.FINISHED in draws:
                 self._parts = None
-            elif Draw.WAIT in draws:
-                return self._sample(Draw.WAIT)
+            elif SampleStatus.WAIT in draws:
+                return self._sample(SampleStatus.WAIT)
             elif self._parts is None:
                 self._parts = self._apportion(live)
             else:
                 return self._gathered()
-        return self._sample(Draw.FINISHED)
+        return self._sample(SampleStatus.FINISHED)
 
     def _live(self) -> NDArray[np.bool_]:
         """(S,) which shards have not finished."""
-        return np.array([stock.last.draw is not Draw.FINISHED for stock in self._stocks])
+        return np.array([stock.last.draw is not SampleStatus.FINISHED for stock in self._stocks])
 
     def _drawn_outside(self, stock: _Stock) -> int:
         """Trained steps drawn from the other shards."""
@@ -107,9 +107,11 @@ class ShardedReplay:
             rows["serial"][part] = rows["serial"][part] * len(self._stocks) + shard
             start += count
         self._parts = None
-        return self._sample(Draw.BATCH, rows, values)
+        return self._sample(SampleStatus.BATCH, rows, values)
 
-    def _sample(self, draw: Draw, rows: Rows | None = None, values: NDArray[np.float64] | None = None) -> Sample:
+    def _sample(
+        self, draw: SampleStatus, rows: Rows | None = None, values: NDArray[np.float64] | None = None
+    ) -> Sample:
         last = [stock.last for stock in self._stocks]
         mass, windows, env_steps, drawn_steps = (
             sum(getattr(sample, name) for sample in last) for name in ("mass", "windows", "env_steps", "drawn_steps")

@@ -6,14 +6,14 @@ Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, S stat
 import torch
 from torch import Tensor
 
-from rmc.common.agent import Agent, Memory, Remembered
+from rmc.common.agent import Agent, Memory, MemoryOutput
 from rmc.learner.batch import Batch
 
 
-def remember(memory: Memory, o: Tensor, batch: Batch, burn_in: int) -> Remembered:
+def unroll(memory: Memory, o: Tensor, batch: Batch, burn_in: int) -> MemoryOutput:
     """(B, L_t + 1, ·) from the stored state, which starts the trained part itself where the burn-in is padding."""
     n, hidden = burn_in, _burned_in(memory, o, batch, burn_in)
-    remembered: Remembered = memory(o[:, n:], batch.blank[:, n:], batch.prev_action[:, n:], hidden)
+    remembered: MemoryOutput = memory(o[:, n:], batch.blank[:, n:], batch.prev_action[:, n:], hidden)
     return remembered
 
 
@@ -28,8 +28,8 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
     return torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
 
 
-def filled(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
-    """(B, L + 1, O) with blank frames filled where configured, along the states that ``remember`` goes through."""
+def impute(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
+    """(B, L + 1, O) with blank frames filled where configured, along the states that ``unroll`` goes through."""
     if not agent.fills(batch.blank):
         return o
 

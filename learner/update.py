@@ -14,13 +14,13 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from rmc.common.agent import Agent, Prediction, Remembered, squashed_sample
+from rmc.common.agent import Agent, MemoryOutput, Prediction, squashed_sample
 from rmc.learner import losses
 from rmc.learner.batch import Batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.diagnostics import Trace, unexplained_change, update_metrics
 from rmc.learner.fused import fuse
-from rmc.learner.unroll import filled, remember
+from rmc.learner.unroll import impute, unroll
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 AVERAGE_UPDATES = 10  # updates between moves of the policy's average, which reads and writes all that acts
@@ -82,14 +82,14 @@ class JointUpdate:
             o = agent.normalizer(batch.observation, batch.blank)
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
-            o = filled(agent, o, batch, self.burn_in)
-            memory = remember(agent.memory, o, batch, self.burn_in)
-            z = self._low(agent.features(memory))
+            o = impute(agent, o, batch, self.burn_in)
+            memory = unroll(agent.memory, o, batch, self.burn_in)
+            z = self._to_bf16(agent.features(memory))
             trains = TRAINS_MEMORY[c.scheme]
             z_model, z_value, z_policy = (z if loss in trains else z.detach() for loss in ("model", "value", "policy"))
 
             # Prediction, and curiosity from its error
-            target = self._remember_target(o, batch) if self._has_target_memory else memory
+            target = self._unroll_target(o, batch) if self._has_target_memory else memory
             latent = (target if c.latent_target == "ema" else memory).hidden.detach().float()
             prediction = agent.world_model(z_model[:, :-1], a)
             change = latent[:, 1:] - latent[:, :-1]
@@ -100,14 +100,14 @@ class JointUpdate:
             mean, log_std = agent.policy(z_policy)
             pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean))
             with torch.no_grad():
-                next_z = (self._low(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:]
+                next_z = (self._to_bf16(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:]
                 next_q = self.target_critic(next_z, pi[:, 1:])
                 next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:])
                 y = losses.td_target(r + beta * i, c.gamma, d, next_value, m, c.n_step)
             q = agent.critic(z_value[:, :-1], a)
             frozen = {name: value.detach() for name, value in agent.critic.named_parameters()}
-            z_climbed = z_policy if c.policy_through_q else z.detach()
-            q_pi = functional_call(agent.critic, frozen, (z_climbed[:, :-1], pi[:, :-1]))
+            z_actor = z_policy if c.policy_through_q else z.detach()
+            q_pi = functional_call(agent.critic, frozen, (z_actor[:, :-1], pi[:, :-1]))
             q_pi = q_pi[0] if c.policy_q == "first" else q_pi.min(0).values
 
         log_pi, td_error = log_pi[:, :-1], (q.detach() - y).abs().mean(0)
@@ -131,7 +131,7 @@ class JointUpdate:
         )
 
     def _observation_losses(
-        self, o: Tensor, memory: Remembered, prediction: Prediction, batch: Batch, m: Tensor
+        self, o: Tensor, memory: MemoryOutput, prediction: Prediction, batch: Batch, m: Tensor
     ) -> tuple[dict[str, Tensor], Tensor]:
         """The losses of what predicts observations, where configured, and what the world model leaves unexplained."""
         agent, steps = self.agent, slice(self.burn_in, None)
@@ -140,7 +140,7 @@ class JointUpdate:
         found = {}
         if agent.next_frame is not None:
             with self._autocast():
-                expected = agent.next_frame(self._low(memory.hidden.detach()[:, :-1]), now, a)
+                expected = agent.next_frame(self._to_bf16(memory.hidden.detach()[:, :-1]), now, a)
             found["fill_loss"] = losses.fill_loss(expected, after, seen_after, m)
         if not agent.config.grounding:
             return found, o.new_zeros(0)
@@ -152,13 +152,13 @@ class JointUpdate:
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
 
-    def _low(self, z: Tensor) -> Tensor:
+    def _to_bf16(self, z: Tensor) -> Tensor:
         """What all heads read, rounded once for all where their products are in bfloat16."""
         return z.bfloat16() if self.bf16 else z
 
     @torch.no_grad()
-    def _remember_target(self, o: Tensor, batch: Batch) -> Remembered:
-        return remember(self.target_memory, o, batch, self.burn_in)
+    def _unroll_target(self, o: Tensor, batch: Batch) -> MemoryOutput:
+        return unroll(self.target_memory, o, batch, self.burn_in)
 
     def _noise_like(self, x: Tensor) -> Tensor:
         return torch.randn(x.shape, generator=self.generator, device=x.device)
@@ -195,7 +195,7 @@ class JointUpdate:
         torch._foreach_lerp_(list(target), list(source), 1.0 - self.config.polyak)
 
     @torch.no_grad()
-    def follow_average(self, updates: int) -> None:
+    def update_ema(self, updates: int) -> None:
         """Move theta-bar of algorithm 1 towards what acts; every ``AVERAGE_UPDATES``, the last time at ``updates``."""
         over = min(self.config.policy_average, updates / 10) / AVERAGE_UPDATES
         torch._foreach_lerp_(list(self.average.values()), list(self.agent.acting().values()), 1.0 / max(1.0, over))

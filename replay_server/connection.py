@@ -34,14 +34,14 @@ class Connection:
         self.nonce = b""  # of a client that has shown its proof
         self.opened = time.monotonic()
         self._inbox = bytearray()
-        self._outbox: deque[memoryview] = deque()
+        self._unacked: deque[memoryview] = deque()
         self.shared: SharedBatches | None = None  # where its batches lie, if not in the socket
-        self._lent = False  # the outbox may hold views of the sender's buffers
+        self._zero_copy = False  # the outbox may hold views of the sender's buffers
 
     @property
     def sending(self) -> bool:
         """Whether something is still to be sent; until then nothing more is read from this client."""
-        return bool(self._outbox)
+        return bool(self._unacked)
 
     def encrypt(self) -> bool:
         """Go on with the handshake of a socket that needs one; whether it is over."""
@@ -85,38 +85,38 @@ class Connection:
 
     def send(self, kind: Kind, meta: Mapping[str, Any], parts: tuple[memoryview, ...] = ()) -> None:
         """Send what the kernel takes now and keep the rest, without a copy: see ``own``."""
-        self._outbox += [memoryview(encode_frame(kind, meta, parts)), *(part for part in parts if part.nbytes)]
-        self._lent = True
+        self._unacked += [memoryview(encode_frame(kind, meta, parts)), *(part for part in parts if part.nbytes)]
+        self._zero_copy = True
         self.flush()
 
     def send_descriptor(self, kind: Kind, descriptor: int) -> None:
         """Send an empty frame and a file descriptor with it."""
         frame = encode_frame(kind, {})
         sent = socket.send_fds(self.socket, [frame], [descriptor])
-        self._outbox += [memoryview(frame[sent:])] * (sent < len(frame))
+        self._unacked += [memoryview(frame[sent:])] * (sent < len(frame))
 
     def flush(self) -> None:
         """Go on sending."""
-        while self._outbox:
+        while self._unacked:
             try:
                 sent = self._send_some()
             except (BlockingIOError, ssl.SSLWantWriteError, ssl.SSLWantReadError):
                 return
-            while self._outbox and sent >= self._outbox[0].nbytes:
-                sent -= self._outbox.popleft().nbytes
-            if self._outbox:
-                self._outbox[0] = self._outbox[0][sent:]
+            while self._unacked and sent >= self._unacked[0].nbytes:
+                sent -= self._unacked.popleft().nbytes
+            if self._unacked:
+                self._unacked[0] = self._unacked[0][sent:]
 
     def _send_some(self) -> int:
         if isinstance(self.socket, ssl.SSLSocket):  # which cannot gather
-            return self.socket.send(self._outbox[0])
-        return self.socket.sendmsg(self._outbox)
+            return self.socket.send(self._unacked[0])
+        return self.socket.sendmsg(self._unacked)
 
     def own(self) -> None:
         """Copy what is still unsent, because its buffer is about to be used again."""
-        if self._lent:
-            self._outbox = deque(memoryview(bytes(part)) for part in self._outbox)
-            self._lent = False
+        if self._zero_copy:
+            self._unacked = deque(memoryview(bytes(part)) for part in self._unacked)
+            self._zero_copy = False
 
     def close(self) -> None:
         self.socket.close()

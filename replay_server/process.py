@@ -40,7 +40,7 @@ class ReplayProcess:
             if now >= self._next_announcement:
                 self._next_announcement = now + ANNOUNCE_PERIOD
                 self.sockets.fence(self.server.bus.current_epoch("learner"))  # an older one may come to us first
-                self.server.bus.announce_replay(self.server.holder, self.sockets.address)
+                self.server.bus.announce_replay(self.server.owner, self.sockets.address)
         except (BusUnavailable, BusFull):
             self._bus_is_away, self._next_intake = True, next_try(now)
             return False

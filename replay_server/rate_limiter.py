@@ -11,7 +11,7 @@ waits for the other for ever where the slack covers the steps that actors may ho
 
 from dataclasses import dataclass
 
-from rmc.common.replay import Draw
+from rmc.common.replay import SampleStatus
 
 
 @dataclass(frozen=True)
@@ -23,16 +23,16 @@ class RateLimiter:
     total_steps: int
     slack_steps: int
 
-    def draw(self, inserted: int, drawn: int, batch_steps: int) -> Draw:
+    def draw(self, inserted: int, drawn: int, batch_steps: int) -> SampleStatus:
         """Whether a batch of at most ``batch_steps`` trained steps may be drawn now.
 
         Once all steps are in, what the ratio still owes is drawn without the tolerance.
         """
         owed = (inserted - self.warmup_steps) * self.replay_ratio - drawn - batch_steps
         if inserted >= self.total_steps:
-            return Draw.BATCH if owed >= 0 else Draw.FINISHED
+            return SampleStatus.BATCH if owed >= 0 else SampleStatus.FINISHED
         tolerance = batch_steps + self.slack_steps * self.replay_ratio
-        return Draw.BATCH if inserted >= self.warmup_steps and owed + tolerance >= 0 else Draw.WAIT
+        return SampleStatus.BATCH if inserted >= self.warmup_steps and owed + tolerance >= 0 else SampleStatus.WAIT
 
     def limit(self, drawn: int) -> int:
         """Environment steps that all actors together may insert."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rmc.common.errors import ConfigError
 from rmc.common.window import Rows, WindowSpec
-from rmc.replay_server.record import Progress, RecordPair, record_bytes
+from rmc.replay_server.commit_record import Progress, RecordPair, record_bytes
 
 _IDENTITY = struct.Struct("<8s16sQQ")  # magic, fingerprint, capacity, row bytes; then its CRC
 _IDENTITY_BYTES = 4096

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rmc.common.bus.protocol import Ack, Bus, Holder, Version
+from rmc.common.bus.protocol import Ack, Bus, ReplayOwner, Version
 from rmc.common.metrics import Means, Rate
-from rmc.common.replay import EPISODE_BYTES, Draw, ObservationStatistics, Sample
+from rmc.common.replay import EPISODE_BYTES, ObservationStatistics, Sample, SampleStatus
 from rmc.common.shard import WHOLE, Shard
 from rmc.common.window import Rows, WindowSpec
+from rmc.replay_server.commit_record import Progress, decode_published
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.episode import find_episode
-from rmc.replay_server.intake import Intake, Round
 from rmc.replay_server.observation_sums import observation_sums
 from rmc.replay_server.rate_limiter import RateLimiter
-from rmc.replay_server.record import Progress, decode_published
 from rmc.replay_server.recovery import open_store, valid_leaves
+from rmc.replay_server.stream_reader import IngestBatch, StreamReader
 
 log = logging.getLogger(__name__)
 PRIORITY_FLOOR = 1e-6  # so that every window keeps a chance
@@ -55,14 +55,14 @@ class ReplayServer:
         self._own_actors = [actor for actor in range(actors) if shard.owns(actor)]
         self._share = len(self._own_actors) / actors  # of all that is collected
         self._slack_steps = shard.part(slack_steps, actors)
-        self._intake = Intake(spec, bus, actors, shard)
+        self._intake = StreamReader(spec, bus, actors, shard)
         self._store = open_store(folder, spec, -(-config.capacity // shard.count), config.priority_exponent)
         try:
             epoch = self._take_over()
         except BaseException:
             self._store.close()
             raise
-        self.holder = Holder(self.name, epoch)
+        self.owner = ReplayOwner(self.name, epoch)
         self._store.ring.progress.replay_epoch = epoch
         self._store.ring.commit()
         self._store.ring.flush_commit()  # by its epoch this ring is known again after a power cut, too
@@ -138,11 +138,11 @@ class ReplayServer:
         if taken is None:
             return False
         for actor, before in taken.broken.items():
-            self.bus.drop_stream(self.holder, actor)
+            self.bus.drop_stream(self.owner, actor)
             self._intake.sends_again(actor, before)
         return True
 
-    def _insert(self, taken: Round) -> None:
+    def _insert(self, taken: IngestBatch) -> None:
         ring, progress, rows = self._store.ring, self._store.ring.progress, taken.rows
         sums = observation_sums(rows, self.spec)
         slots = ring.write(rows)
@@ -198,12 +198,12 @@ class ReplayServer:
         """
         if not self._published or time.monotonic() >= self._republish_at:
             self._republish_at = time.monotonic() + REPUBLISH_PERIOD
-            self.bus.commit(self.holder, self._published or self._acks(), self._store.ring.progress.encode())
+            self.bus.commit(self.owner, self._published or self._acks(), self._store.ring.progress.encode())
         acks = {actor: ack for actor, ack in self._acks().items() if self._published.get(actor) != ack}
         quantum = max(1, self._slack_steps // (8 * len(self._own_actors)))
         at_once = at_once or bool(self._waiting_for)
         if acks and (at_once or any(self._grown(actor, ack) >= quantum for actor, ack in acks.items())):
-            self.bus.commit(self.holder, acks, self._store.ring.progress.encode())
+            self.bus.commit(self.owner, acks, self._store.ring.progress.encode())
             self._published.update(acks)
 
     def _grown(self, actor: int, ack: Ack) -> int:
@@ -212,22 +212,22 @@ class ReplayServer:
 
     # -- out --------------------------------------------------------------------------------------------
 
-    def introduce(self, epoch: int) -> None:
+    def register_learner(self, epoch: int) -> None:
         """The learner of the same thread has nobody beside it; of others the socket's server knows."""
 
-    def sample(self, batch_size: int, elsewhere: int = 0, out: Rows | None = None) -> Sample:
+    def sample(self, batch_size: int, drawn_elsewhere_steps: int = 0, out: Rows | None = None) -> Sample:
         """Draw (B,) rows in proportion to priority ** exponent, if the limiter lets it.
 
         The rows lie in ``out``, else in one of two buffers that draws take in turn. A draw depends on the seed, its
         number and the ring alone.
         """
         progress, tree = self._store.ring.progress, self._store.tree
-        progress.elsewhere_steps = max(progress.elsewhere_steps, elsewhere)
+        progress.elsewhere_steps = max(progress.elsewhere_steps, drawn_elsewhere_steps)
         draw = self._limiter.draw(self._inserted, self._drawn, batch_size * self.spec.train)
-        if draw is Draw.BATCH and tree.total == 0.0:
-            draw = Draw.WAIT
+        if draw is SampleStatus.BATCH and tree.total == 0.0:
+            draw = SampleStatus.WAIT
         self._note_waiting(draw)
-        if draw is not Draw.BATCH:
+        if draw is not SampleStatus.BATCH:
             return Sample(draw, None, None, tree.total, progress.windows, progress.env_steps, progress.drawn_steps)
         number = progress.draws * self._shard.count + self._shard.index  # of the draw; no shard's like another's
         random = np.random.Generator(np.random.Philox(key=np.array([self._seed, number], np.uint64)))
@@ -246,9 +246,9 @@ class ReplayServer:
             self._buffers[0] = np.empty(batch_size, self.spec.dtype)
         return self._buffers[0][:batch_size]
 
-    def _note_waiting(self, draw: Draw) -> None:
+    def _note_waiting(self, draw: SampleStatus) -> None:
         warming_up = self._inserted < self._limiter.warmup_steps
-        waiting_for = ("warm-up" if warming_up else "env_steps") if draw is Draw.WAIT else ""
+        waiting_for = ("warm-up" if warming_up else "env_steps") if draw is SampleStatus.WAIT else ""
         if waiting_for != self._waiting_for:
             self._waiting_for, self._waiting_since = waiting_for, time.monotonic()
 
@@ -309,7 +309,7 @@ class ReplayServer:
 
     def waiting_for(self) -> str:
         """``windows`` from the actors where nothing may be drawn before more come, else ``draws`` by the learner."""
-        return "windows" if self._limiter.draw(self._inserted, self._drawn, 0) is Draw.WAIT else "draws"
+        return "windows" if self._limiter.draw(self._inserted, self._drawn, 0) is SampleStatus.WAIT else "draws"
 
     def checkpoint(self) -> None:
         """Make everything durable: a server opened here afterwards goes on as this one would."""

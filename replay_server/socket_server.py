@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from rmc.common.errors import AuthenticationError, ConfigError, FencedError, MessageError
-from rmc.common.replay import Draw
+from rmc.common.replay import SampleStatus
 from rmc.common.shared_batches import SharedBatches, reserve_memory, shared_bytes
 from rmc.common.window import WindowSpec
 from rmc.common.wire import Kind, proof
@@ -105,11 +105,11 @@ class SocketServer:
 
     def _end_oldest_stranger(self) -> bool:
         """Make room, so that a crowd of strangers keeps no client out; whether there was one to end."""
-        strangers = [connection for connection in self._connections if not connection.authenticated]
-        if strangers:
+        unauthenticated = [connection for connection in self._connections if not connection.authenticated]
+        if unauthenticated:
             self.refused["too-many"] += 1
-            self._end(min(strangers, key=lambda stranger: stranger.opened))
-        return bool(strangers)
+            self._end(min(unauthenticated, key=lambda stranger: stranger.opened))
+        return bool(unauthenticated)
 
     def _prepared(self, accepted: socket.socket) -> socket.socket:
         with contextlib.suppress(OSError):  # macOS refuses more than its limit, Linux takes what it allows
@@ -221,20 +221,20 @@ class SocketServer:
         if type(batch_size) is not int or not 1 <= batch_size <= self._max_batch:
             raise MessageError("batch-size", f"{batch_size!r}, want 1 to {self._max_batch}")
 
-    def _sample(self, connection: Connection, batch_size: Any, elsewhere: Any) -> None:
+    def _sample(self, connection: Connection, batch_size: Any, drawn_elsewhere_steps: Any) -> None:
         self._check_batch_size(batch_size)
-        if type(elsewhere) is not int or not 0 <= elsewhere < 2**62:
-            raise MessageError("elsewhere", f"{elsewhere!r}, want a number of steps")
+        if type(drawn_elsewhere_steps) is not int or not 0 <= drawn_elsewhere_steps < 2**62:
+            raise MessageError("elsewhere", f"{drawn_elsewhere_steps!r}, want a number of steps")
         shared = connection.shared
         if shared is None or shared.batch_size != batch_size:
             for other in self._connections:
                 other.own()  # the draw takes a buffer that another client's batch may still lie in
-            sample = self._server.sample(batch_size, elsewhere)
+            sample = self._server.sample(batch_size, drawn_elsewhere_steps)
         else:
-            sample = self._server.sample(batch_size, elsewhere, shared.rows[shared.turn])
+            sample = self._server.sample(batch_size, drawn_elsewhere_steps, shared.rows[shared.turn])
         meta = {name: getattr(sample, name) for name in ("mass", "windows", "env_steps", "drawn_steps")}
         if sample.rows is None or sample.values is None:
-            connection.send(Kind.FINISHED if sample.draw is Draw.FINISHED else Kind.WAIT, meta)
+            connection.send(Kind.FINISHED if sample.draw is SampleStatus.FINISHED else Kind.WAIT, meta)
         elif shared is None or shared.batch_size != batch_size:
             connection.send(Kind.BATCH, meta, (sample.rows.view(np.uint8).data, sample.values.data.cast("B")))
         else:

@@ -17,8 +17,8 @@ import pytest
 from xdist.scheduler import LoadScopeScheduling
 
 PATIENT = (  # tests that only compute
-    "actors/", "learner/", "studies/", "deploy/test_baselines", "deploy/test_policy", "deploy/test_readme",
-    "deploy/test_video", "integration/test_learning", "integration/test_lockstep", "integration/test_variants",
+    "actors/", "learner/", "studies/", "analysis/test_baselines", "analysis/test_policy", "docs/test_documents",
+    "analysis/test_video", "integration/test_learning", "integration/test_lockstep", "integration/test_variants",
 )  # fmt: skip
 NICENESS = 10
 SHARED_MEMORY = Path("/dev/shm")

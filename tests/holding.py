@@ -18,7 +18,7 @@ time.sleep(1)
 @contextmanager
 def held_for_a_moment(path: Path) -> Iterator[None]:
     """The lock of this file, for a second from here on."""
-    with subprocess.Popen([sys.executable, "-c", HOLD, str(path)], stdout=subprocess.PIPE) as holder:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == b"held\n"
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(path)], stdout=subprocess.PIPE) as owner:
+        assert owner.stdout is not None
+        assert owner.stdout.readline() == b"held\n"
         yield

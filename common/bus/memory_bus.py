@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-from rmc.common.bus.protocol import METRICS_KEPT, Ack, Entry, EntryId, Holder, ReplayAddress, Version
+from rmc.common.bus.protocol import METRICS_KEPT, Ack, Entry, EntryId, ReplayAddress, ReplayOwner, Version
 from rmc.common.errors import BusUnavailable, FencedError
 
 
@@ -66,11 +66,11 @@ class MemoryBus:
     def expect(self, after: Mapping[int, EntryId], count: int) -> None:
         """Nothing has to come from anywhere."""
 
-    def commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
-        self._check_replay(holder)
+    def commit(self, owner: ReplayOwner, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
+        self._check_replay(owner)
         if progress:
-            self._progress[holder.role] = progress
-        self._epochs[holder.role] = holder.epoch
+            self._progress[owner.role] = progress
+        self._epochs[owner.role] = owner.epoch
         for actor, ack in acks.items():
             self._acks[actor] = ack
             stream = self._streams.get(actor, {})
@@ -83,13 +83,13 @@ class MemoryBus:
     def set_progress(self, role: str, progress: bytes) -> None:
         self._progress.setdefault(role, progress)
 
-    def _check_replay(self, holder: Holder) -> None:
-        newest = self.current_epoch(holder.role)
-        if newest > holder.epoch:
-            raise FencedError(f"{holder.role} epoch {holder.epoch} was replaced by {newest}")
+    def _check_replay(self, owner: ReplayOwner) -> None:
+        newest = self.current_epoch(owner.role)
+        if newest > owner.epoch:
+            raise FencedError(f"{owner.role} epoch {owner.epoch} was replaced by {newest}")
 
-    def drop_stream(self, holder: Holder, actor: int) -> None:
-        self._check_replay(holder)
+    def drop_stream(self, owner: ReplayOwner, actor: int) -> None:
+        self._check_replay(owner)
         self._streams.pop(actor, None)
         self._last_ids.pop(actor, None)
 
@@ -99,8 +99,8 @@ class MemoryBus:
     def dead_letter(self, entry: Entry, reason: str) -> None:
         self.dead_letters.append((entry, reason))
 
-    def announce_replay(self, holder: Holder, address: str) -> None:
-        self._replay[holder.role] = ReplayAddress(holder.epoch, address)
+    def announce_replay(self, owner: ReplayOwner, address: str) -> None:
+        self._replay[owner.role] = ReplayAddress(owner.epoch, address)
 
     def replay_address(self, role: str) -> ReplayAddress | None:
         return self._replay.get(role)

@@ -65,7 +65,7 @@ class Version(NamedTuple):
     update: int
 
 
-class Holder(NamedTuple):
+class ReplayOwner(NamedTuple):
     """A replay server in its epoch, by which the bus knows one that was replaced."""
 
     role: str
@@ -123,7 +123,7 @@ class Bus(Protocol):
     def expect(self, after: Mapping[int, EntryId], count: int) -> None:
         """Begin to read: ``read`` past the same ids takes what has come by then, without a wait."""
 
-    def commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
+    def commit(self, owner: ReplayOwner, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
         """Publish acks and trim what they cover, unless a newer replay has come. Raises FencedError.
 
         ``progress``, where there is any, is kept for a replay server that has to begin with an empty ring.
@@ -135,7 +135,7 @@ class Bus(Protocol):
     def set_progress(self, role: str, progress: bytes) -> None:
         """Say it in its place, where Redis has nothing."""
 
-    def drop_stream(self, holder: Holder, actor: int) -> None:
+    def drop_stream(self, owner: ReplayOwner, actor: int) -> None:
         """Make an actor send everything again from its hello on, unless a newer replay has come. Raises FencedError."""
 
     def ack(self, actor: int) -> Ack | None:
@@ -144,7 +144,7 @@ class Bus(Protocol):
     def dead_letter(self, entry: Entry, reason: str) -> None:
         """Put a refused entry aside."""
 
-    def announce_replay(self, holder: Holder, address: str) -> None:
+    def announce_replay(self, owner: ReplayOwner, address: str) -> None:
         """Say where a replay server listens."""
 
     def replay_address(self, role: str) -> ReplayAddress | None:

@@ -17,8 +17,8 @@ from rmc.common.bus.protocol import (
     Ack,
     Entry,
     EntryId,
-    Holder,
     ReplayAddress,
+    ReplayOwner,
     Version,
     join_pieces,
     split_pieces,
@@ -184,40 +184,40 @@ class RedisBus:
     def _cursors(self, after: Mapping[int, EntryId]) -> dict[str, str]:
         return {self._key("windows", actor): f"{cursor.epoch}-{max(cursor.seq, 0)}" for actor, cursor in after.items()}
 
-    def commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
+    def commit(self, owner: ReplayOwner, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
         if not acks:
             return
         try:
-            self._commit(holder, acks, progress)
+            self._commit(owner, acks, progress)
         except BusFull:  # a full Redis has no room for the acks either, and only trimming makes some
-            self._trim(holder, acks)
-            self._commit(holder, acks, progress)
+            self._trim(owner, acks)
+            self._commit(owner, acks, progress)
 
-    def _trim(self, holder: Holder, acks: Mapping[int, Ack]) -> None:
+    def _trim(self, owner: ReplayOwner, acks: Mapping[int, Ack]) -> None:
         """Trim alone: a full Redis has no room for the acks, but for this."""
-        self._run(TRIM_SCRIPT, holder, list(acks), [f"{ack.id.epoch}-{ack.id.seq + 1}" for ack in acks.values()])
+        self._run(TRIM_SCRIPT, owner, list(acks), [f"{ack.id.epoch}-{ack.id.seq + 1}" for ack in acks.values()])
 
-    def _run(self, script: str, holder: Holder, actors: list[int], words: list[str]) -> None:
+    def _run(self, script: str, owner: ReplayOwner, actors: list[int], words: list[str]) -> None:
         """A script on actors' streams: a full Redis 7.0 refuses all in a MULTI; by themselves commands are not fenced.
 
         Raises FencedError where a newer replay server has come.
         """
-        keys = [self._key("epoch", holder.role), *(self._key("windows", actor) for actor in actors)]
-        if self._call(lambda: self._redis.eval(script, len(keys), *keys, str(holder.epoch), *words)) < 0:
-            raise FencedError(f"{holder.role} epoch {holder.epoch} was replaced")
+        keys = [self._key("epoch", owner.role), *(self._key("windows", actor) for actor in actors)]
+        if self._call(lambda: self._redis.eval(script, len(keys), *keys, str(owner.epoch), *words)) < 0:
+            raise FencedError(f"{owner.role} epoch {owner.epoch} was replaced")
 
-    def _commit(self, holder: Holder, acks: Mapping[int, Ack], progress: bytes) -> None:
-        key = self._key("epoch", holder.role)
+    def _commit(self, owner: ReplayOwner, acks: Mapping[int, Ack], progress: bytes) -> None:
+        key = self._key("epoch", owner.role)
 
         def transaction(pipe: Any) -> None:
-            held = self._held(pipe, holder)
+            held = self._held(pipe, owner)
             pipe.multi()
             for actor, ack in acks.items():
                 pipe.xtrim(self._key("windows", actor), minid=f"{ack.id.epoch}-{ack.id.seq + 1}", approximate=False)
-            if held < holder.epoch:  # Redis lost its data
-                pipe.set(key, holder.epoch)
+            if held < owner.epoch:  # Redis lost its data
+                pipe.set(key, owner.epoch)
             if progress:
-                pipe.hset(self._key("progress"), holder.role, progress)
+                pipe.hset(self._key("progress"), owner.role, progress)
             pipe.hset(
                 self._key("acks"),
                 mapping={
@@ -235,15 +235,15 @@ class RedisBus:
     def set_progress(self, role: str, progress: bytes) -> None:
         self._call(lambda: self._redis.hsetnx(self._key("progress"), role, progress))
 
-    def _held(self, pipe: Any, holder: Holder) -> int:
+    def _held(self, pipe: Any, owner: ReplayOwner) -> int:
         """The newest epoch of this replay server that Redis knows. Raises FencedError where it is newer than ours."""
-        held = int(pipe.get(self._key("epoch", holder.role)) or 0)
-        if held > holder.epoch:
-            raise FencedError(f"{holder.role} epoch {holder.epoch} was replaced by {held}")
+        held = int(pipe.get(self._key("epoch", owner.role)) or 0)
+        if held > owner.epoch:
+            raise FencedError(f"{owner.role} epoch {owner.epoch} was replaced by {held}")
         return held
 
-    def drop_stream(self, holder: Holder, actor: int) -> None:
-        self._run(DROP_SCRIPT, holder, [actor], [])
+    def drop_stream(self, owner: ReplayOwner, actor: int) -> None:
+        self._run(DROP_SCRIPT, owner, [actor], [])
 
     def ack(self, actor: int) -> Ack | None:
         raw = self._call(lambda: self._redis.hget(self._key("acks"), str(actor)))
@@ -259,8 +259,8 @@ class RedisBus:
         }
         self._call(lambda: self._redis.xadd(self._key("dead"), fields, maxlen=DEAD_LETTERS_KEPT))
 
-    def announce_replay(self, holder: Holder, address: str) -> None:
-        self._call(lambda: self._redis.hset(self._key("replay"), holder.role, f"{holder.epoch} {address}"))
+    def announce_replay(self, owner: ReplayOwner, address: str) -> None:
+        self._call(lambda: self._redis.hset(self._key("replay"), owner.role, f"{owner.epoch} {address}"))
 
     def replay_address(self, role: str) -> ReplayAddress | None:
         raw = self._call(lambda: self._redis.hget(self._key("replay"), role))

@@ -23,7 +23,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.wrappers import Env, Flicker, Floats, FrameStack, Noise, Partial, Standardised
+from rmc.common.env.wrappers import Env, Flicker, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
 
@@ -77,9 +77,9 @@ def _as_seen(env: gym.Env[Any, Any], config: EnvConfig) -> Env:
         env = gym.wrappers.FlattenObservation(env)
     if config.action_repeat > 1:
         env = gym.wrappers.RepeatAction(env, config.action_repeat)
-    seen: Env = Standardised(env)
+    seen: Env = RescaledEnv(env)
     if shown is not None:
-        seen = Partial(seen, shown)
+        seen = ObservationSlice(seen, shown)
     if config.noise:
         seen = Noise(seen, config.noise)
     if config.flicker:
@@ -87,7 +87,7 @@ def _as_seen(env: gym.Env[Any, Any], config: EnvConfig) -> Env:
     return FrameStack(seen, config.frame_stack) if config.frame_stack > 1 else seen
 
 
-def sound_reset(env: Env, seed: int | None) -> tuple[Floats, dict[str, Any]]:
+def checked_reset(env: Env, seed: int | None) -> tuple[Floats, dict[str, Any]]:
     """Reset. Raises ValueError where the observation is not finite."""
     observation, info = env.reset(seed=seed)
     if not np.isfinite(observation).all():
@@ -95,7 +95,7 @@ def sound_reset(env: Env, seed: int | None) -> tuple[Floats, dict[str, Any]]:
     return observation, info
 
 
-def rebuilt(env: Env, make_env: Callable[[], Env]) -> Env:
+def recreate_env(env: Env, make_env: Callable[[], Env]) -> Env:
     """Another one in the place of a broken one."""
     with suppress(Exception):
         env.close()

@@ -15,7 +15,7 @@ Floats = NDArray[np.float32]
 Env = gym.Env[Floats, Floats]
 
 
-class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
+class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
     """Observations as float32; actions in [-1, 1], stretched over the environment's own bounds.
 
     Raises ValueError where an observation is no vector of numbers of the size that its space says.
@@ -26,8 +26,8 @@ class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
         inner = env.action_space
         assert isinstance(inner, gym.spaces.Box)
         assert env.observation_space.shape is not None
-        self._low, self._high = inner.low.astype(np.float64), inner.high.astype(np.float64)
-        self._half_range = (self._high - self._low) / 2
+        self._to_bf16, self._high = inner.low.astype(np.float64), inner.high.astype(np.float64)
+        self._half_range = (self._high - self._to_bf16) / 2
         self._plain = bool((inner.low == -1.0).all() and (inner.high == 1.0).all())
         self._bounds, self._dtype, self._shape = inner, inner.dtype, env.observation_space.shape
         self.action_space = gym.spaces.Box(-1.0, 1.0, inner.shape, np.float32)
@@ -39,7 +39,7 @@ class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         if not self._plain:
-            stretched = self._low + (action + 1.0) * self._half_range
+            stretched = self._to_bf16 + (action + 1.0) * self._half_range
             action = stretched.astype(self._dtype).clip(self._bounds.low, self._bounds.high)  # rounding may pass one
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self._vector(observation), float(reward), terminated, truncated, info
@@ -51,7 +51,7 @@ class Standardised(gym.Wrapper[Floats, Floats, Any, Any]):
         return vector
 
 
-class Partial(gym.Wrapper[Floats, Floats, Floats, Floats]):
+class ObservationSlice(gym.Wrapper[Floats, Floats, Floats, Floats]):
     """Only some of the observation's dimensions."""
 
     def __init__(self, env: Env, shown: slice) -> None:
@@ -69,7 +69,7 @@ class Partial(gym.Wrapper[Floats, Floats, Floats, Floats]):
         return observation[self._shown], float(reward), terminated, truncated, info
 
 
-class Disturbed(gym.Wrapper[Floats, Floats, Floats, Floats]):
+class CorruptObservation(gym.Wrapper[Floats, Floats, Floats, Floats]):
     """Observations that chance changes; its random numbers are the episode's seed's, apart from the environment's."""
 
     stream: int  # keeps the random numbers of different disturbances apart
@@ -93,7 +93,7 @@ class Disturbed(gym.Wrapper[Floats, Floats, Floats, Floats]):
         raise NotImplementedError
 
 
-class Noise(Disturbed):
+class Noise(CorruptObservation):
     """Independent Gaussian noise on every dimension of every observation."""
 
     stream = 0x2015E
@@ -106,7 +106,7 @@ class Noise(Disturbed):
         return observation + self._deviation * self._rng.standard_normal(observation.shape, np.float32)
 
 
-class Flicker(Disturbed):
+class Flicker(CorruptObservation):
     """Whole observations become zeros, independently with probability p; ``info["blank"]`` says which."""
 
     stream = 0xF11C

@@ -6,20 +6,20 @@ import time
 log = logging.getLogger(__name__)
 
 
-class Outage:
+class OutageLog:
     """Of one process, named ``role`` in the log."""
 
     def __init__(self, role: str) -> None:
         self._role = role
         self._since: float | None = None
 
-    def note(self, error: Exception) -> None:
+    def begin(self, error: Exception) -> None:
         """Redis was away or full just now."""
         if self._since is None:
             self._since = time.monotonic()
             log.warning("%s: waiting for Redis: %s", self._role, error)
 
-    def over(self) -> None:
+    def end(self) -> None:
         """It has answered."""
         if self._since is not None:
             log.warning("%s: Redis is back after %.1f s", self._role, time.monotonic() - self._since)

@@ -16,7 +16,7 @@ PR_SET_PDEATHSIG = 1
 POLL_SECONDS = 1.0
 
 
-def die_with(parent: int) -> None:
+def exit_with_parent(parent: int) -> None:
     """From now on, end when process ``parent`` ends.
 
     SIGKILL on purpose: ring and checkpoints survive it, and a role stuck in a call ends, too. Where the kernel
@@ -37,5 +37,5 @@ def _watch(parent: int) -> None:
 
 
 if __name__ == "__main__":
-    die_with(int(sys.argv[1]))
+    exit_with_parent(int(sys.argv[1]))
     os.execv(sys.argv[2], sys.argv[2:])

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from rmc.common.bus.protocol import Bus
 from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.metrics import BusyClock
-from rmc.common.process.outage import Outage
+from rmc.common.process.outage import OutageLog
 
 METRICS_PERIOD = 1.0  # seconds between a role's metrics records, which are its heartbeat too
 STOP_PERIOD = 0.5  # seconds between looks at the bus's stop key
@@ -50,12 +50,12 @@ class StopSignal:
         self.requested = True
 
 
-class _Pulse:
+class Heartbeat:
     """What every role says and hears once in a while: its metrics, and whether the run should end."""
 
     def __init__(self, role: Role, bus: Bus, clock: BusyClock) -> None:
         self._role, self._bus, self._clock = role, bus, clock
-        self.outage = Outage(role.name)
+        self.outage = OutageLog(role.name)
         self._next_metrics = self._next_stop = 0.0
 
     def says_stop(self) -> bool:
@@ -69,9 +69,9 @@ class _Pulse:
             if now >= self._next_metrics:
                 self._next_metrics = now + METRICS_PERIOD
                 self._bus.emit(self._role.name, self.record())
-                self.outage.over()
+                self.outage.end()
         except (BusUnavailable, BusFull) as error:
-            self.outage.note(error)
+            self.outage.begin(error)
             self._clock.wait("redis")
             self._next_stop = self._next_metrics = next_try(now)
         return False
@@ -100,7 +100,7 @@ def run_role(
     Redis away or full is waited out here; every other error ends the role.
     """
     clock = BusyClock()
-    pulse = _Pulse(role, bus, clock)
+    pulse = Heartbeat(role, bus, clock)
     try:
         while not (stop.requested or finished() or pulse.says_stop()):
             beat()
@@ -112,7 +112,7 @@ def run_role(
                     clock.wait(role.waiting_for())
             except (BusUnavailable, BusFull) as error:
                 time.sleep(RECONNECT_SLEEP)
-                pulse.outage.note(error)
+                pulse.outage.begin(error)
                 clock.wait("redis")
         last = pulse.record()
     finally:

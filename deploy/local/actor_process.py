@@ -9,14 +9,14 @@ from rmc.actors.evaluator import Evaluator
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import Role, run_role
 from rmc.common.process.watchdog import Watchdog
-from rmc.deploy.local.role_process import Place, Process, wait_for_room
+from rmc.deploy.local.role_process import Process, RunConnection, wait_for_room
 from rmc.deploy.run.config import RunConfig
 from rmc.learner.initial_priority import InitialPriority
 
 EVALUATOR_NICENESS = 10  # it must not take the learner's core
 
 
-def run_actor(place: Place, index: int) -> None:
+def run_actor(place: RunConnection, index: int) -> None:
     """The process of actor ``index``."""
     process = Process(place)
     config = process.config
@@ -24,8 +24,10 @@ def run_actor(place: Place, index: int) -> None:
         raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
     wait_for_room(process.bus, f"actor-{index}", process.stop)
     torch.set_num_threads(1)
-    spec, rater = config.window_spec(), initial_priority(config, index)
-    actor = Actor(index, config.seed, process.make_env, spec, config.agent, config.actor, process.bus, rater=rater)
+    spec, priority_fn = config.window_spec(), initial_priority(config, index)
+    actor = Actor(
+        index, config.seed, process.make_env, spec, config.agent, config.actor, process.bus, priority_fn=priority_fn
+    )
     _run_watched(actor, process)
 
 
@@ -36,7 +38,7 @@ def initial_priority(config: RunConfig, index: int) -> InitialPriority | None:
     return InitialPriority(config.window_spec(), config.agent, config.update, config.seed + index)
 
 
-def run_evaluator(place: Place) -> None:
+def run_evaluator(place: RunConnection) -> None:
     """The evaluator's process."""
     process = Process(place)
     config = process.config

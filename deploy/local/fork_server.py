@@ -22,17 +22,17 @@ FAILED_STATUS = 1
 LARGEST = 65_536  # bytes of a request
 
 
-class Forked:
-    """A process that a nursery forked; what it has of ``subprocess.Popen`` does the same."""
+class ForkedProcess:
+    """A process that a fork server forked; what it has of ``subprocess.Popen`` does the same."""
 
-    def __init__(self, nursery: "Nursery", generation: int, pid: int, returncode: int | None = None) -> None:
-        self._nursery, self._generation, self.pid = nursery, generation, pid
+    def __init__(self, fork_server: "ForkServer", generation: int, pid: int, returncode: int | None = None) -> None:
+        self._fork_server, self._generation, self.pid = fork_server, generation, pid
         self.returncode = returncode
 
     def poll(self) -> int | None:
         """Its exit status, negative for a signal; None while it runs."""
         if self.returncode is None:
-            self.returncode = self._nursery.status_of(self.pid, self._generation)
+            self.returncode = self._fork_server.status_of(self.pid, self._generation)
         return self.returncode
 
     def wait(self, timeout: float) -> int:
@@ -45,7 +45,7 @@ class Forked:
         return status
 
 
-class Nursery:
+class ForkServer:
     """Started with the first role, and again if it is killed: with it go those it forked."""
 
     def __init__(self, log: Path) -> None:
@@ -54,8 +54,8 @@ class Nursery:
         self._generation = 0  # of the program
         self._ours: socket.socket | None = None
 
-    def fork(self, words: tuple[str, ...], environment: dict[str, str], log: int) -> Forked:
-        """A process of ``rmc`` and these words, its output to ``log``. Raises RoleDied where no nursery comes up.
+    def fork(self, words: tuple[str, ...], environment: dict[str, str], log: int) -> ForkedProcess:
+        """A process of ``rmc`` and these words, its output to ``log``. Raises RoleDied where no fork server comes up.
 
         Where the system has no room for a process, its log says so and it has ended already.
         """
@@ -64,11 +64,11 @@ class Nursery:
             self.start()
             pid = self._ask(request, log)
             if pid is not None:
-                return Forked(self, self._generation, pid, None if pid else FAILED_STATUS)
-        raise RoleDied(f"the nursery of roles does not start; its log is {self._log}")
+                return ForkedProcess(self, self._generation, pid, None if pid else FAILED_STATUS)
+        raise RoleDied(f"the fork server of roles does not start; its log is {self._log}")
 
     def status_of(self, pid: int, generation: int) -> int | None:
-        """The exit status of one that it forked; those of a nursery that is gone were killed with it."""
+        """The exit status of one that it forked; those of a fork server that is gone were killed with it."""
         if generation != self._generation or self._program is None or self._program.poll() is not None:
             return -signal.SIGKILL
         reply = self._ask(pid)

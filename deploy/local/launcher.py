@@ -163,9 +163,9 @@ def watch(monitor: Monitor, bus: RedisBus) -> None:
     """Let the monitor see what is new; a Redis that is away for a while costs nothing but that."""
     try:
         monitor.watch(bus)
-        monitor.outage.over()
+        monitor.outage.end()
     except (BusUnavailable, BusFull) as error:
-        monitor.outage.note(error)
+        monitor.outage.begin(error)
 
 
 def check_redis(url: str) -> None:

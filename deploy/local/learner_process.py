@@ -11,7 +11,7 @@ from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.process.role import run_role
 from rmc.common.shard import Shard
-from rmc.deploy.local.role_process import Place, Process, until_taken, wait_for_room
+from rmc.deploy.local.role_process import Process, RunConnection, until_taken, wait_for_room
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.preflight import check_device, cores
@@ -20,7 +20,7 @@ from rmc.learner.replay_client import ReplayClient
 from rmc.learner.sharded_replay import ShardedReplay
 
 
-def run_learner(place: Place, folder: Path, device: str) -> None:
+def run_learner(place: RunConnection, folder: Path, device: str) -> None:
     """The learner's process; checkpoints go to ``folder``. Its last record says ``finished`` where the run is."""
     secret, process = place.secret(), Process(place)
     config, spec, bus = process.config, process.config.window_spec(), process.bus

@@ -54,7 +54,7 @@ class Lockstep:
                 config.actor,
                 self.bus,
                 clock=lambda: float(next(ticks)),
-                rater=initial_priority(config, index),
+                priority_fn=initial_priority(config, index),
             )
             for index in range(config.actors)
         ]

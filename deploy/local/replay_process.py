@@ -5,14 +5,14 @@ from pathlib import Path
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import run_role
 from rmc.common.shard import Shard
-from rmc.deploy.local.role_process import Place, Process, wait_for_room
+from rmc.deploy.local.role_process import Process, RunConnection, wait_for_room
 from rmc.deploy.run import tls
 from rmc.replay_server.process import ReplayProcess
 from rmc.replay_server.server import ReplayServer
 from rmc.replay_server.socket_server import SocketServer
 
 
-def run_replay(place: Place, folder: Path, listen: str, index: int) -> None:
+def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> None:
     """A replay server's process; its ring lies in ``folder``, its socket at ``listen``."""
     secret, process = place.secret(), Process(place)
     config, spec = process.config, process.config.window_spec()
@@ -26,5 +26,5 @@ def run_replay(place: Place, folder: Path, listen: str, index: int) -> None:
     )  # fmt: skip
     context = tls.server_context(place.tls_folder) if place.tls_folder is not None else None
     sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size, context)
-    process.bus.announce_replay(server.holder, sockets.address)
+    process.bus.announce_replay(server.owner, sockets.address)
     run_role(ReplayProcess(server, sockets), process.bus, process.stop)

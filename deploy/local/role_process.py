@@ -13,17 +13,17 @@ from rmc.common.bus.protocol import Bus
 from rmc.common.env.make import make_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError
-from rmc.common.process.outage import Outage
+from rmc.common.process.outage import OutageLog
 from rmc.common.process.role import RECONNECT_SLEEP, StopSignal
 from rmc.deploy.local.role_environment import SECRET_VARIABLE
-from rmc.deploy.redis.connect import PATIENCE_SECONDS, PATIENCE_VARIABLE, Patience, connect
+from rmc.deploy.redis.connect import PATIENCE_SECONDS, PATIENCE_VARIABLE, Deadline, connect
 from rmc.deploy.run.config import RunConfig, from_json
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Place:
+class RunConnection:
     """Where a role finds its run."""
 
     run: str
@@ -53,21 +53,21 @@ class Place:
 class Process:
     """What every role's process has: stop signal, bus, the run's config."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: RunConnection) -> None:
         logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
         self.stop = StopSignal()
         self.stop.install()
         patience = float(os.environ.get(PATIENCE_VARIABLE, PATIENCE_SECONDS))
-        self.bus = connect(place.redis_url, place.run, Patience(patience, self.stop))
-        self.config = self._registered_config(place.run, Patience(patience, self.stop))
+        self.bus = connect(place.redis_url, place.run, Deadline(patience, self.stop))
+        self.config = self._registered_config(place.run, Deadline(patience, self.stop))
 
-    def _registered_config(self, run: str, waits: Patience) -> RunConfig:
+    def _registered_config(self, run: str, waits: Deadline) -> RunConfig:
         """The run's config; a Redis that has just come back empty gets it again within moments."""
         while True:
             with suppress(BusUnavailable):
                 if (raw := self.bus.config()) is not None:
                     return from_json(raw)
-            if not waits.on(f"run {run} to be registered in that Redis"):
+            if not waits.wait(f"run {run} to be registered in that Redis"):
                 raise ConfigError("--run", run, "no run of this name is registered in that Redis; start it first")
 
     def make_env(self) -> Env:
@@ -83,14 +83,14 @@ def wait_for_room(bus: Bus, role: str, stop: StopSignal) -> None:
 
 def until_taken(write: Callable[[], None], role: str, stop: StopSignal) -> None:
     """Write until Redis takes it, once at least, or the role is stopped."""
-    outage = Outage(role)
+    outage = OutageLog(role)
     while True:
         try:
             write()
         except (BusUnavailable, BusFull) as error:
-            outage.note(error)
+            outage.begin(error)
         else:
-            outage.over()
+            outage.end()
             return
         if stop.requested:
             return

@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from rmc.common.errors import RoleDied
 from rmc.common.process.parent_death import PARENT_VARIABLE
-from rmc.deploy.local.fork_server import Forked, Nursery
+from rmc.deploy.local.fork_server import ForkedProcess, ForkServer
 from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inherited
 
 # So many deaths of a role's own in a row, each within so long of its start, end the run.
@@ -41,15 +41,15 @@ class RoleCommand:
 
 
 class RoleProcess:
-    """One role: its process, its log, its deaths. Of a single thread, it is forked where there is a nursery."""
+    """One role: its process, its log, its deaths. Of a single thread, it is forked where there is a fork server."""
 
     def __init__(
-        self, command: RoleCommand, environment: dict[str, str], logs: Path, nursery: Nursery | None = None
+        self, command: RoleCommand, environment: dict[str, str], logs: Path, fork_server: ForkServer | None = None
     ) -> None:
         self.command, self.log, self.restarts = command, logs / f"{command.name}.log", 0
         self._environment = {**environment, **(SINGLE_THREAD if command.single_thread else {})}
-        self._nursery = nursery if command.single_thread and command.forked else None
-        self._process: subprocess.Popen[bytes] | Forked | None = None
+        self._fork_server = fork_server if command.single_thread and command.forked else None
+        self._process: subprocess.Popen[bytes] | ForkedProcess | None = None
         self.log_start = 0  # where in its log this start's words begin
         self._started_at, self._start_at = 0.0, 0.0
         self._quick_deaths, self.finished = 0, False
@@ -74,8 +74,8 @@ class RoleProcess:
         self.log_start = self.log.stat().st_size if self.log.exists() else 0
         self._started_at = time.monotonic()
         with self.log.open("ab") as log:
-            if self._nursery is not None:
-                self._process = self._nursery.fork(self.command.words, self._environment, log.fileno())
+            if self._fork_server is not None:
+                self._process = self._fork_server.fork(self.command.words, self._environment, log.fileno())
             else:
                 self._process = self._new_process(log)
 
@@ -151,15 +151,18 @@ class Supervisor:
         ``patience``, asked at the end, is how many seconds a role may need to end in order, if more than is usual.
         """
         self._patience = patience
-        self._nursery = Nursery(logs / "nursery.log") if sys.platform == "linux" else None  # elsewhere a fork may crash
+        self._fork_server = (
+            ForkServer(logs / "fork_server.log") if sys.platform == "linux" else None
+        )  # elsewhere a fork may crash
         self.roles = {
-            command.name: RoleProcess(command, environment(command.name), logs, self._nursery) for command in commands
+            command.name: RoleProcess(command, environment(command.name), logs, self._fork_server)
+            for command in commands
         }
 
     def start(self) -> None:
-        """Start every role: first those that need no nursery, which takes its time to begin."""
-        if self._nursery is not None:
-            self._nursery.start()
+        """Start every role: first those that need no fork server, which takes its time to begin."""
+        if self._fork_server is not None:
+            self._fork_server.start()
         for role in sorted(self.roles.values(), key=lambda role: role.command.single_thread):
             role.start()
 
@@ -184,8 +187,8 @@ class Supervisor:
             for role in self.roles.values():
                 role.signal(signal.SIGKILL)
                 role.reap(STOP_SECONDS)
-            if self._nursery is not None:
-                self._nursery.close()
+            if self._fork_server is not None:
+                self._fork_server.close()
 
     def _end(self, roles: list[RoleProcess], seconds: float) -> None:
         began = time.monotonic()

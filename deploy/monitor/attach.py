@@ -13,7 +13,7 @@ from rich.console import Console
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError
-from rmc.deploy.monitor.view import Board, View
+from rmc.deploy.monitor.view import RunStatus, View
 from rmc.deploy.run.folder import RunFolder, record
 
 LOOK_SECONDS = 0.2
@@ -41,7 +41,7 @@ class Tail:
 def watch(folder: RunFolder, console: Console, gone: Callable[[], bool]) -> int | None:
     """Show a run until its launcher ends, and give its exit status; None where it is ``gone`` without one."""
     config = folder.config()
-    board = Board(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
+    board = RunStatus(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
     tail, view = Tail(folder.metrics), View(board, console)
     try:
         while folder.ended() is None and not gone():
@@ -56,7 +56,7 @@ def watch(folder: RunFolder, console: Console, gone: Callable[[], bool]) -> int 
     return folder.ended()
 
 
-class Absence:
+class LauncherGone:
     """Whether no launcher has trained a run for long."""
 
     def __init__(self, folder: RunFolder) -> None:
@@ -68,7 +68,7 @@ class Absence:
         return time.monotonic() - self._seen > AWAY_SECONDS
 
 
-def trained_now(folder: RunFolder) -> int:
+def launcher_pid(folder: RunFolder) -> int:
     """The launcher's process. Raises ConfigError where nobody trains this run."""
     comes_back = (folder.path / "learner-at").exists() and folder.ended() is None  # on Ray, where it was killed
     deadline = time.monotonic() + AWAY_SECONDS * comes_back
@@ -83,7 +83,7 @@ def trained_now(folder: RunFolder) -> int:
 
 def stop(folder: RunFolder) -> int:
     """Ask the launcher to end the run in order, and wait until it has; its exit status. Raises ConfigError."""
-    trainer = trained_now(folder)
+    trainer = launcher_pid(folder)
     if (host := folder.trainer_host()) not in ("", socket.gethostname()):
         raise ConfigError("RUN", str(folder.path), f"is trained on {host}; stop it there")
     with suppress(ProcessLookupError):  # it has just ended

@@ -18,7 +18,7 @@ RETRY_SECONDS = 10.0  # until the next try after a write that failed
 log = logging.getLogger(__name__)
 
 
-class Journal:
+class MetricsLog:
     """Of one launcher. What is said while nothing can be written is not kept, which the log says once."""
 
     def __init__(self, folder: RunFolder) -> None:

@@ -10,9 +10,9 @@ from rich.console import Console
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.protocol import Bus
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.process.outage import Outage
-from rmc.deploy.monitor.metrics_log import Journal
-from rmc.deploy.monitor.view import Board, View
+from rmc.common.process.outage import OutageLog
+from rmc.deploy.monitor.metrics_log import MetricsLog
+from rmc.deploy.monitor.view import RunStatus, View
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
@@ -23,7 +23,9 @@ class Monitor:
     """Reads every role's records and shows them. ``watch`` as often as you like; ``close`` at the end."""
 
     def __init__(self, folder: RunFolder, config: RunConfig, console: Console) -> None:
-        self.board = Board(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
+        self.board = RunStatus(
+            config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio
+        )
         self.restarts: Callable[[], dict[str, int]] = dict  # how often each role was started again
         self.unplaced: Callable[[], list[str]] = list  # roles that run nowhere now
         self._checkpoints = CheckpointFolder(folder.checkpoints, config.learner.keep_checkpoints)
@@ -32,9 +34,9 @@ class Monitor:
         self._refused = 0  # records and values that could not be read
         self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
         self._next_record = 0.0
-        self._journal = Journal(folder)
+        self._metrics_log = MetricsLog(folder)
         self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
-        self.view, self.outage = View(self.board, console), Outage("launcher")
+        self.view, self.outage = View(self.board, console), OutageLog("launcher")
 
     @property
     def wall_seconds(self) -> float:
@@ -74,9 +76,9 @@ class Monitor:
         self.board.take(record)
         at = self.board.checkpoint_steps(record.get("eval_update"))  # an evaluation belongs where its checkpoint was
         if at is None:
-            self._journal.write(record, self.board.env_steps)
+            self._metrics_log.write(record, self.board.env_steps)
         else:
-            self._journal.write(record | {"eval_env_steps": at}, at)
+            self._metrics_log.write(record | {"eval_env_steps": at}, at)
         update, score = record.get("eval_update"), record.get("eval_return_mean")
         if (
             record["role"] == "evaluator" and isinstance(update, int) and is_finite(score)
@@ -106,4 +108,4 @@ class Monitor:
         """Show the last state and close the files."""
         self._record_launcher()
         self.view.close()
-        self._journal.close()
+        self._metrics_log.close()

@@ -24,7 +24,7 @@ def terminal(width: int | None = None) -> Console:
     return Console(width=width, markup=False, emoji=False, highlight=False)
 
 
-class Board:
+class RunStatus:
     """The newest value of everything, by role."""
 
     def __init__(self, env: str, preset: str, seed: int, total_steps: int, replay_ratio: float) -> None:
@@ -82,7 +82,7 @@ def number(value: Any, form: str = ",.3g") -> str:
     return NONE_YET if value is None else format(value, form)
 
 
-def _evaluation(board: Board) -> str:
+def _evaluation(board: RunStatus) -> str:
     mean, deviation, update = (
         board.get("evaluator", f"eval_{name}") for name in ("return_mean", "return_std", "update")
     )
@@ -102,7 +102,7 @@ def _staleness(learner: dict[str, Any]) -> str:
     return f"state {state}, Q {q}, age {number(learner.get('sample_age_mean'), ',.0f')} updates"
 
 
-def _facts(board: Board) -> list[tuple[str, str]]:
+def _facts(board: RunStatus) -> list[tuple[str, str]]:
     learner = board.roles.get("learner", {})
     losses = ", ".join(f"{name[:-5]} {number(learner[name])}" for name in learner if name.endswith("_loss"))
     return [
@@ -123,7 +123,7 @@ def _facts(board: Board) -> list[tuple[str, str]]:
     ]  # fmt: skip
 
 
-def _stages(board: Board) -> Table:
+def _stages(board: RunStatus) -> Table:
     stages = Table("role", "busy", "waiting", "for", "restarts", box=None, padding=(0, 2, 0, 0), title_justify="left")
     for role in sorted(role for role in board.roles if role != "launcher"):
         record = board.roles[role]
@@ -139,7 +139,7 @@ def _stages(board: Board) -> Table:
     return stages
 
 
-def table(board: Board) -> Group:
+def table(board: RunStatus) -> Group:
     """Everything, for a terminal."""
     facts = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     facts.add_column(style="bold")
@@ -154,7 +154,7 @@ def table(board: Board) -> Group:
     return Group(title, facts, _stages(board))
 
 
-def line(board: Board) -> str:
+def line(board: RunStatus) -> str:
     """The same in one line, shorter."""
     learner = board.roles.get("learner", {})
     waits = [
@@ -187,7 +187,7 @@ def line(board: Board) -> str:
 class View:
     """A board shown on a console, live where that is a terminal. ``refresh`` as often as you like."""
 
-    def __init__(self, board: Board, console: Console) -> None:
+    def __init__(self, board: RunStatus, console: Console) -> None:
         self._board, self._console, self._due = board, console, 0.0
         self._live: Live | None = None
         if console.is_terminal:

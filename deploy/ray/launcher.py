@@ -18,8 +18,8 @@ except ImportError as missing:
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.supervisor import RoleCommand
-from rmc.deploy.ray.launcher_actor import LauncherHost
-from rmc.deploy.ray.role_actor import NAMESPACE, Task, host_name, last_line
+from rmc.deploy.ray.launcher_actor import LauncherActor
+from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, last_line
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
@@ -66,8 +66,8 @@ def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, en
     words = ["launcher", str(folder.path), "--ray-address", context.gcs_address, "--device", device]
     words += ["--all-cpus"] * all_cpus + ["--tls"] * encrypted
     command = RoleCommand("launcher", tuple(words), single_thread=False, ends=True)
-    options = ray.remote(LauncherHost).options(
-        name=host_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
+    options = ray.remote(LauncherActor).options(
+        name=actor_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
         max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
     )  # fmt: skip
     task = Task(folder.name, command, {}, {}, os.getcwd())
@@ -88,7 +88,7 @@ def check_not_there(folder: RunFolder) -> None:
 def is_there(folder: RunFolder) -> bool:
     """Whether the run's launcher has a host."""
     try:
-        ray.get_actor(host_name(folder.name, "launcher"), NAMESPACE)
+        ray.get_actor(actor_name(folder.name, "launcher"), NAMESPACE)
     except ValueError:
         return False
     return True

@@ -1,4 +1,4 @@
-"""``LauncherHost``: the Ray actor that runs a run's launcher on the head."""
+"""``LauncherActor``: the Ray actor that runs a run's launcher on the head."""
 
 import time
 from contextlib import suppress
@@ -9,10 +9,10 @@ from ray.util.placement_group import remove_placement_group
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.local.supervisor import QUICK_DEATHS, QUICK_SECONDS
-from rmc.deploy.ray.role_actor import NAMESPACE, RoleHost, Task, host_name
+from rmc.deploy.ray.role_actor import NAMESPACE, RoleActor, Task, actor_name
 
 
-class LauncherHost(RoleHost):
+class LauncherActor(RoleActor):
     """The launcher's, on the head: keeps the run's checkpoints in its folder, and ends itself with the run."""
 
     def __init__(self, task: Task, folder: str, keep: int) -> None:
@@ -24,7 +24,7 @@ class LauncherHost(RoleHost):
     def log_folder(self) -> Path:
         return self._folder / "logs"
 
-    def over(self, status: int) -> bool:
+    def is_final_exit(self, status: int) -> bool:
         """Only a launcher that was killed begins again, and not for ever; any other end is the run's."""
         if status >= 0:
             return True
@@ -34,9 +34,9 @@ class LauncherHost(RoleHost):
         deaths.write_text(" ".join(map(str, [*recent, time.time()])))
         return len(recent) + 1 >= QUICK_DEATHS
 
-    def settle(self) -> None:
+    def flush_artifacts(self) -> None:
         """End all that the run still has on the cluster, whatever its launcher left, and this host."""
-        run = host_name(self._task.run, "")
+        run = actor_name(self._task.run, "")
         own = ray.get_runtime_context().current_actor
         for found in ray.util.list_named_actors(all_namespaces=True):
             if (
@@ -51,21 +51,21 @@ class LauncherHost(RoleHost):
                 remove_placement_group(ray.util.get_placement_group(name))
         ray.kill(own, no_restart=True)
 
-    def claim(self, life: str, node: str) -> bool:
+    def claim(self, incarnation: str, node: str) -> bool:
         """Be the host of the learner: no other's checkpoints are taken from now on. Whether the last was there, too."""
         before = self._claim.read_text().split() if self._claim.exists() else []
-        self._claim.write_text(f"{node} {life}")
+        self._claim.write_text(f"{node} {incarnation}")
         return before[:1] == [node]
 
-    def archive(self, life: str, number: int, files: dict[str, bytes], took: float) -> None:
+    def archive(self, incarnation: str, number: int, files: dict[str, bytes], took: float) -> None:
         """Keep a checkpoint, and how long the learner took to save, if it comes from the learner's present host."""
-        if self._holds(life):
+        if self._holds(incarnation):
             self._checkpoints.save(number, files)
             self._checkpoints.note_save(took)
 
-    def note_epoch(self, life: str, epoch: int) -> int:
+    def note_epoch(self, incarnation: str, epoch: int) -> int:
         """Keep the learner's epoch, likewise; returns what is kept."""
-        if self._holds(life):
+        if self._holds(incarnation):
             self._checkpoints.note_epoch(epoch)
         return self.last_epoch()
 
@@ -77,8 +77,8 @@ class LauncherHost(RoleHost):
         """How long the learner's took; 0.0 where there was none."""
         return self._checkpoints.last_save()
 
-    def _holds(self, life: str) -> bool:
-        return self._claim.read_text().split()[1:] == [life]
+    def _holds(self, incarnation: str) -> bool:
+        return self._claim.read_text().split()[1:] == [incarnation]
 
     def newest(self, above: int) -> tuple[int, dict[str, bytes]] | None:
         """The newest whole checkpoint, if it is newer than that."""

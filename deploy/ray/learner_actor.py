@@ -1,4 +1,4 @@
-"""``LearnerHost``: the Ray actor that runs the learner and carries its checkpoints to the head."""
+"""``LearnerActor``: the Ray actor that runs the learner and carries its checkpoints to the head."""
 
 import shutil
 import time
@@ -14,13 +14,13 @@ from rmc.deploy.ray.role_actor import (
     LOOK_SECONDS,
     NAMESPACE,
     SETTLE_SECONDS,
-    RoleHost,
-    host_name,
+    RoleActor,
+    actor_name,
     last_line,
 )
 
 
-class LearnerHost(RoleHost):
+class LearnerActor(RoleActor):
     """The learner's: brings the newest checkpoint from the head before, and takes every new one there."""
 
     def prepare(self) -> None:
@@ -51,7 +51,7 @@ class LearnerHost(RoleHost):
                 time.sleep(LOOK_SECONDS)
 
     def _launcher(self) -> Any:
-        return ray.get_actor(host_name(self._task.run, "launcher"), NAMESPACE)
+        return ray.get_actor(actor_name(self._task.run, "launcher"), NAMESPACE)
 
     def tend(self) -> None:
         try:
@@ -74,7 +74,7 @@ class LearnerHost(RoleHost):
     def patience(self) -> float:
         return self._folder.patience(role_actor.STOP_SECONDS)
 
-    def settle(self) -> None:
+    def flush_artifacts(self) -> None:
         deadline = time.monotonic() + SETTLE_SECONDS
         while time.monotonic() < deadline:
             try:

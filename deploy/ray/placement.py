@@ -9,8 +9,8 @@ import ray
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.supervisor import RoleCommand
-from rmc.deploy.ray.learner_actor import LearnerHost
-from rmc.deploy.ray.role_actor import RoleHost
+from rmc.deploy.ray.learner_actor import LearnerActor
+from rmc.deploy.ray.role_actor import RoleActor
 from rmc.deploy.run.config import RunConfig
 
 REPLAY_CPUS = EVALUATOR_CPUS = 0.5  # beside the learner
@@ -79,17 +79,17 @@ def holds(node: dict[str, Any], bundle: dict[str, float]) -> bool:
 
 
 @dataclass(frozen=True)
-class Place:
+class RolePlacement:
     """How Ray is asked for a role's host."""
 
-    kind: type[RoleHost]
+    kind: type[RoleActor]
     command: RoleCommand
     cpus: float
     gpus: float = 0.0
     group: str = ""  # of bundles that a node is found for: the learner's or the replay servers'
 
 
-def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[str, Place]:
+def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[str, RolePlacement]:
     """All roles of a run but its launcher, by name."""
     place = ("--run", run)
     secret: tuple[str, ...] = ("--secret-file", "{scratch}/secret")
@@ -98,20 +98,20 @@ def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[st
     learn = ("--folder", "{scratch}/checkpoints", "--device", device)
     found = [
         *_replays(config, (*place, *secret)),
-        Place(
-            LearnerHost, RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
+        RolePlacement(
+            LearnerActor, RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
             learner_cpus(config), float(device.startswith("cuda")), group="learner",
         ),
-        Place(RoleHost, RoleCommand("evaluator", ("evaluator", *place)), EVALUATOR_CPUS, group="learner"),
+        RolePlacement(RoleActor, RoleCommand("evaluator", ("evaluator", *place)), EVALUATOR_CPUS, group="learner"),
         *(
-            Place(RoleHost, RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))), 1.0)
+            RolePlacement(RoleActor, RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))), 1.0)
             for index in range(config.actors)
         ),
     ]  # fmt: skip
     return {place.command.name: place for place in found}
 
 
-def _replays(config: RunConfig, words: tuple[str, ...]) -> list[Place]:
+def _replays(config: RunConfig, words: tuple[str, ...]) -> list[RolePlacement]:
     """One beside the learner on a unix socket, or several anywhere on the cluster's network."""
     count = config.replay.replay_shards
     found = []
@@ -120,5 +120,5 @@ def _replays(config: RunConfig, words: tuple[str, ...]) -> list[Place]:
         rest = ("--folder", f"{{scratch}}/{shard.role}", "--listen", listen, "--shard", str(shard.index))
         command = RoleCommand(shard.role, ("replay", *words, *rest))
         cpus, group = (REPLAY_CPUS, "learner") if count == 1 else (SHARD_CPUS, "replay")
-        found.append(Place(RoleHost, command, cpus, group=group))
+        found.append(RolePlacement(RoleActor, command, cpus, group=group))
     return found

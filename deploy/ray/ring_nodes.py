@@ -11,7 +11,7 @@ from rmc.deploy.run.folder import RunFolder, write_whole
 READY_SECONDS = 5.0
 
 
-class Rings:
+class RingLocations:
     """The address of every replay server's node, kept in the run's folder."""
 
     def __init__(self, folder: RunFolder) -> None:

@@ -43,7 +43,7 @@ class Task:
 class Report:
     """How a host's role is."""
 
-    life: str
+    incarnation: str
     """Of the host, which Ray may have started again."""
     node: str
     """Its address."""
@@ -76,12 +76,12 @@ def last_line(error: BaseException) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[-1]
 
 
-def host_name(run: str, role: str) -> str:
+def actor_name(run: str, role: str) -> str:
     """The Ray actor's name of a role."""
     return f"{run}:{role}"
 
 
-class RoleHost:
+class RoleActor:
     """Holds a role. Where it dies this actor ends, too, and Ray starts both again, here or on another node."""
 
     def __init__(self, task: Task) -> None:
@@ -122,7 +122,7 @@ class RoleHost:
     def prepare(self) -> None:
         """Before the role starts."""
 
-    def settle(self) -> None:
+    def flush_artifacts(self) -> None:
         """After it has ended in order."""
 
     def tend(self) -> None:
@@ -136,7 +136,7 @@ class RoleHost:
         """Where the role's log goes."""
         return self.scratch / "logs"
 
-    def over(self, status: int) -> bool:
+    def is_final_exit(self, status: int) -> bool:
         """Whether such an end is the last one; after any other, all starts again."""
         ended = status == ENDED_IN_ORDER and (self._task.command.ends or self._run_ends)
         return ended or status == EXIT_CONFIG
@@ -155,17 +155,17 @@ class RoleHost:
         assert status is not None
         if self._replaced:
             return
-        if self.over(status):
-            self.settle()
+        if self.is_final_exit(status):
+            self.flush_artifacts()
             self._status = status
         else:
             self._status = status
             time.sleep(LAST_WORDS_SECONDS)
             os._exit(1)
 
-    def report(self, life: str, log_start: int) -> Report:
+    def report(self, incarnation: str, log_start: int) -> Report:
         """How the role is, and its log from there on; of another life's, from this one's start on."""
-        start = log_start if life == self._life else self._role.log_start
+        start = log_start if incarnation == self._life else self._role.log_start
         log = b""
         with suppress(FileNotFoundError), self._role.log.open("rb") as file:
             file.seek(start)
@@ -180,7 +180,7 @@ class RoleHost:
         """Remove what the run keeps on this node."""
         shutil.rmtree(self.scratch, ignore_errors=True)
 
-    def again(self) -> None:
+    def restart(self) -> None:
         """End the role in order and start it again, because the run's config has changed."""
         self._replaced = True
         self._end()
@@ -199,7 +199,7 @@ class RoleHost:
         if self._status is None:
             self._replaced = True
             self._end()
-            self.settle()
+            self.flush_artifacts()
 
 
 def _write_private(path: Path, content: bytes) -> None:

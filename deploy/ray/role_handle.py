@@ -16,7 +16,7 @@ POLL_SECONDS = 0.5  # between questions to each host
 log = logging.getLogger(__name__)
 
 
-class Hosted:
+class RoleHandle:
     """A role's host as the launcher sees it: asked how it is again and again, without waiting for it."""
 
     def __init__(self, name: str, handle: Any, cpus: float) -> None:
@@ -54,8 +54,8 @@ class Hosted:
         if self._question is None:
             if time.monotonic() >= self._asked_at + POLL_SECONDS:
                 self._asked_at = time.monotonic()
-                life, end = (self.report.life, self.report.log_end) if self.report else ("", 0)
-                self._question = self.handle.report.remote(life, end)
+                incarnation, end = (self.report.incarnation, self.report.log_end) if self.report else ("", 0)
+                self._question = self.handle.report.remote(incarnation, end)
             return
         if not ray.wait([self._question], timeout=0)[0]:
             return
@@ -69,7 +69,7 @@ class Hosted:
             self.report = dataclasses.replace(self.report, pid=None) if self.report else None
 
     def _hear(self, report: Report, logs: Path) -> None:
-        if self.report is None or report.life != self.report.life:
+        if self.report is None or report.incarnation != self.report.incarnation:
             self.restarts += self._began_at > 0
             self._began_at = time.monotonic()
         if self.running and report.pid is None:
@@ -80,8 +80,8 @@ class Hosted:
         if report.log or not (logs / f"{self.name}.log").exists():
             with (logs / f"{self.name}.log").open("ab") as file:
                 file.write(report.log)
-        if report.status and self._mourned != report.life:
-            self._mourned = report.life
+        if report.status and self._mourned != report.incarnation:
+            self._mourned = report.incarnation
             self._note_death(report)
 
     def _note_death(self, report: Report) -> None:

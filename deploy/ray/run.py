@@ -38,7 +38,7 @@ from rmc.deploy.local.supervisor import QUICK_DEATHS
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.ray.placement import (
     SHARD_CPUS,
-    Place,
+    RolePlacement,
     bundle,
     cpus,
     free_cpus,
@@ -47,9 +47,9 @@ from rmc.deploy.ray.placement import (
     reserved_cpus,
     whole_shares,
 )
-from rmc.deploy.ray.ring_nodes import Rings
-from rmc.deploy.ray.role_actor import NAMESPACE, Task, host_name
-from rmc.deploy.ray.role_handle import Hosted
+from rmc.deploy.ray.ring_nodes import RingLocations
+from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name
+from rmc.deploy.ray.role_handle import RoleHandle
 from rmc.deploy.redis.connect import PATIENCE_VARIABLE, connect
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.server import Port, RedisServer
@@ -73,7 +73,7 @@ class ClusterRun:
 
     def __init__(self, config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> None:
         self.config, self._folder, self._device, self._all_cpus = config, folder, device, all_cpus
-        self._encrypted, self._rings = encrypted, Rings(folder)
+        self._encrypted, self._ring_locations = encrypted, RingLocations(folder)
         self._leave = ExitStack()
         sweep()
         sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))
@@ -91,7 +91,7 @@ class ClusterRun:
         except BaseException:
             self._leave.close()
             raise
-        self._hosts: dict[str, Hosted] = {}
+        self._hosts: dict[str, RoleHandle] = {}
         self._groups: dict[str, Any] = {}
         self._bundles: dict[str, int] = {}  # of the replay servers' group
         self._lost: dict[str, list[float]] = {}  # when hosts died for good, by role
@@ -104,19 +104,19 @@ class ClusterRun:
     # -- placing --------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Place every role, or find again those that an earlier launcher of the run has placed."""
+        """RolePlacement every role, or find again those that an earlier launcher of the run has placed."""
         if self._moved:
             self._end_left_hosts()
-        near = self._rings.node(WHOLE.role)
+        near = self._ring_locations.node(WHOLE.role)
         self._groups["learner"] = self._group("learner", [bundle(self.config, self._device)], "STRICT_PACK", near)
         if self.config.replay.replay_shards > 1:  # a ring stays on its node: so does its server
             roles = [shard.role for shard in self.config.shards()]
             self._groups["replay"] = self._group("replay", [{"CPU": SHARD_CPUS}] * len(roles), "SPREAD")
-            self._bundles = self._rings.bundles(self._groups["replay"], roles)
+            self._bundles = self._ring_locations.bundles(self._groups["replay"], roles)
         self._place_all()
 
     def _group(self, name: str, bundles: list[dict[str, float]], strategy: str, near: str | None = None) -> Any:
-        name = host_name(self._folder.name, name)
+        name = actor_name(self._folder.name, name)
         try:
             return ray.util.get_placement_group(name)
         except ValueError:
@@ -128,22 +128,22 @@ class ClusterRun:
         """Those of an earlier launcher, where Redis could not have its port again: they would never find it."""
         for name in places(self.config, self._folder.name, self._device, self._encrypted):
             with suppress(ValueError):
-                ray.kill(ray.get_actor(host_name(self._folder.name, name), NAMESPACE), no_restart=True)
+                ray.kill(ray.get_actor(actor_name(self._folder.name, name), NAMESPACE), no_restart=True)
 
     def _place_all(self) -> None:
         for name, place in places(self.config, self._folder.name, self._device, self._encrypted).items():
             if name not in self._hosts:
-                self._hosts[name] = Hosted(name, self._create(name, place), place.cpus)
+                self._hosts[name] = RoleHandle(name, self._create(name, place), place.cpus)
                 self._hosts[name].handle.stopping.remote(False)  # one that was found may have heard otherwise
 
-    def _create(self, name: str, place: Place) -> Any:
+    def _create(self, name: str, place: RolePlacement) -> Any:
         strategy: Any = "SPREAD"
         if place.group:
             strategy = PlacementGroupSchedulingStrategy(
                 self._groups[place.group], placement_group_bundle_index=self._bundles.get(name, 0)
             )
         options = ray.remote(place.kind).options(
-            name=host_name(self._folder.name, name), namespace=NAMESPACE, lifetime="detached", get_if_exists=True,
+            name=actor_name(self._folder.name, name), namespace=NAMESPACE, lifetime="detached", get_if_exists=True,
             max_restarts=-1, num_cpus=place.cpus, num_gpus=place.gpus, scheduling_strategy=strategy,
         )  # fmt: skip
         url = self._server.network_url(name, f"{{scratch}}/{tls.CERTIFICATE}")
@@ -164,25 +164,25 @@ class ClusterRun:
             log.warning("the embedded Redis died; starting it again")
             self._server.start()
         self._registration.tend()
-        for hosted in list(self._hosts.values()):
-            hosted.ask(self._folder.logs)
-            if hosted.dead:
-                self._mourn(hosted)
-            elif hosted.name.startswith("replay") and hosted.running:
-                self._rings.note(hosted.name, hosted.node)
+        for role_handle in list(self._hosts.values()):
+            role_handle.ask(self._folder.logs)
+            if role_handle.dead:
+                self._forget_dead(role_handle)
+            elif role_handle.name.startswith("replay") and role_handle.running:
+                self._ring_locations.note(role_handle.name, role_handle.node)
         if time.monotonic() >= self._look_at:
             self._look_at = time.monotonic() + NODES_SECONDS
             self._look_at_nodes()
 
-    def _mourn(self, hosted: Hosted) -> None:
+    def _forget_dead(self, role_handle: RoleHandle) -> None:
         """Let go of a host that Ray does not start again; the next look at the nodes makes another."""
-        log.warning("the host of %s is gone: %s", hosted.name, hosted.dead)
-        del self._hosts[hosted.name]
+        log.warning("the host of %s is gone: %s", role_handle.name, role_handle.dead)
+        del self._hosts[role_handle.name]
         now = time.monotonic()
-        lost = [when for when in self._lost.get(hosted.name, []) if now - when < LOST_SECONDS]
-        self._lost[hosted.name] = [*lost, now]
+        lost = [when for when in self._lost.get(role_handle.name, []) if now - when < LOST_SECONDS]
+        self._lost[role_handle.name] = [*lost, now]
         if len(lost) + 1 >= QUICK_DEATHS:
-            raise RoleDied(f"the host of {hosted.name} could not be held:\n{hosted.dead}")
+            raise RoleDied(f"the host of {role_handle.name} could not be held:\n{role_handle.dead}")
 
     def _look_at_nodes(self) -> None:
         if not self._at_home():
@@ -197,15 +197,15 @@ class ClusterRun:
         if cpus() >= reserved_cpus(self.config) + self.config.actors:  # they are only being started again
             return
         actors = [self._hosts[name] for name in self._hosts if name.startswith("actor-")]
-        actors.sort(key=lambda hosted: int(hosted.name.removeprefix("actor-")))
+        actors.sort(key=lambda role_handle: int(role_handle.name.removeprefix("actor-")))
         waiting = [one for one in actors if not one.running and time.monotonic() > one.waits_since + HOMELESS_SECONDS]
         if waiting and actors[-1].running:
             log.warning("%s waits for a CPU; %s gives it its own", waiting[0].name, actors[-1].name)
             self._end_host(actors[-1])
 
-    def _end_host(self, hosted: Hosted) -> None:
-        ray.kill(hosted.handle, no_restart=True)
-        self._hosts.pop(hosted.name)
+    def _end_host(self, role_handle: RoleHandle) -> None:
+        ray.kill(role_handle.handle, no_restart=True)
+        self._hosts.pop(role_handle.name)
 
     def _at_home(self) -> bool:
         """Whether the learner has a node; where it has none for long, actors make room for it."""
@@ -229,13 +229,19 @@ class ClusterRun:
         if node is None:
             log.warning("no node is large enough for the learner, which needs %s", need)
             return
-        actors = [hosted for name, hosted in self._hosts.items() if name.startswith("actor-")]
-        there = [hosted for hosted in actors if hosted.running and hosted.node == node["NodeManagerAddress"]]
+        actors = [role_handle for name, role_handle in self._hosts.items() if name.startswith("actor-")]
+        there = [
+            role_handle
+            for role_handle in actors
+            if role_handle.running and role_handle.node == node["NodeManagerAddress"]
+        ]
         taken = sum(one.cpus for one in self._hosts.values() if one.running and one.node == node["NodeManagerAddress"])
         short = need["CPU"] - (node["Resources"]["CPU"] - taken)
-        going = [hosted for hosted in actors if not hosted.running] + (there[-ceil(short) :] if short > 0 else [])
-        for hosted in going:
-            self._end_host(hosted)
+        going = [role_handle for role_handle in actors if not role_handle.running] + (
+            there[-ceil(short) :] if short > 0 else []
+        )
+        for role_handle in going:
+            self._end_host(role_handle)
         log.warning("no node has room for the learner; ended for it: %s", ", ".join(one.name for one in going))
 
     def _grow(self) -> None:
@@ -252,17 +258,17 @@ class ClusterRun:
         self.config = grown
         self._server.admit(self._users())
         self._folder.write_config(grown)
-        for name, hosted in self._hosts.items():
+        for name, role_handle in self._hosts.items():
             if name.startswith("replay"):
-                hosted.handle.again.remote()
+                role_handle.handle.restart.remote()
 
     def restarts(self) -> dict[str, int]:
         """How often each role was started again."""
-        return {name: hosted.restarts for name, hosted in self._hosts.items()}
+        return {name: role_handle.restarts for name, role_handle in self._hosts.items()}
 
     def waiting(self) -> list[str]:
         """Roles that run nowhere now."""
-        return [name for name, hosted in self._hosts.items() if not hosted.running]
+        return [name for name, role_handle in self._hosts.items() if not role_handle.running]
 
     def finished(self) -> bool:
         """Whether the learner has ended in order, and its last checkpoint is on the head."""
@@ -273,16 +279,16 @@ class ClusterRun:
 
     def stop(self, reason: str) -> None:
         """Ask every role to end, and wait until the learner's last checkpoint is on the head."""
-        told = [hosted.handle.stopping.remote(True) for hosted in self._hosts.values() if hosted.running]
+        told = [role_handle.handle.stopping.remote(True) for role_handle in self._hosts.values() if role_handle.running]
         if told:
             ray.wait(told, num_returns=len(told), timeout=TOLD_SECONDS)
         with suppress(BusUnavailable, BusFull):
             self.bus.request_stop(reason)
         deadline = time.monotonic() + STOP_SECONDS + self._saving()
-        while time.monotonic() < deadline and any(hosted.awaited for hosted in self._hosts.values()):
-            for hosted in self._hosts.values():
+        while time.monotonic() < deadline and any(role_handle.awaited for role_handle in self._hosts.values()):
+            for role_handle in self._hosts.values():
                 with suppress(RoleDied):
-                    hosted.ask(self._folder.logs)
+                    role_handle.ask(self._folder.logs)
             time.sleep(TICK_SECONDS)
         self._registration.keep()
 
@@ -292,24 +298,26 @@ class ClusterRun:
 
     def _kept_elsewhere(self) -> bool:
         """Whether something of the run is on a node alone, where its hosts share a folder."""
-        troubled = [hosted for hosted in self._hosts.values() if hosted.trouble]
-        for hosted in troubled:
-            log.warning("what %s left stays on %s: %s", hosted.name, hosted.node, hosted.trouble)
+        troubled = [role_handle for role_handle in self._hosts.values() if role_handle.trouble]
+        for role_handle in troubled:
+            log.warning("what %s left stays on %s: %s", role_handle.name, role_handle.node, role_handle.trouble)
         return bool(troubled)
 
     def close(self, over: bool) -> None:
         """End everything; nothing is left but the run's folder and, on its node, the ring of a run that may go on."""
         try:
-            closing = [hosted.handle.close.remote() for hosted in self._hosts.values() if hosted.awaited]
+            closing = [role_handle.handle.close.remote() for role_handle in self._hosts.values() if role_handle.awaited]
             if closing:
                 ray.wait(closing, num_returns=len(closing), timeout=STOP_SECONDS / 2 + self._saving())
             if over and not self._kept_elsewhere():
                 clearing = [
-                    hosted.handle.clear.remote() for hosted in self._hosts.values() if hosted.report is not None
+                    role_handle.handle.clear.remote()
+                    for role_handle in self._hosts.values()
+                    if role_handle.report is not None
                 ]
                 ray.wait(clearing, num_returns=len(clearing), timeout=STOP_SECONDS / 4)
-            for hosted in self._hosts.values():
-                ray.kill(hosted.handle, no_restart=True)
+            for role_handle in self._hosts.values():
+                ray.kill(role_handle.handle, no_restart=True)
             for group in self._groups.values():
                 remove_placement_group(group)
         finally:

@@ -15,7 +15,7 @@ PATIENCE_VARIABLE = "RMC_PATIENCE"  # seconds that a role which starts while Red
 PATIENCE_SECONDS = "30"  # of one that is started by hand, at the same time as its run perhaps
 
 
-class Patience:
+class Deadline:
     """So many seconds for something that is about to come, less where a stop is asked for.
 
     The log says once what is waited for.
@@ -26,7 +26,7 @@ class Patience:
         self._stop = stop
         self._said = False
 
-    def on(self, awaited: str) -> bool:
+    def wait(self, awaited: str) -> bool:
         """Wait a moment; False once there is none left."""
         if self._stop.requested or time.monotonic() >= self._deadline:
             return False
@@ -37,7 +37,7 @@ class Patience:
         return True
 
 
-def connect(url: str, run: str, waits: Patience | None = None) -> RedisBus:
+def connect(url: str, run: str, waits: Deadline | None = None) -> RedisBus:
     """A bus whose Redis answers, at once or within that patience; ``file:PATH`` holds the URL. Raises ConfigError."""
     if url.startswith("file:"):
         url = _in_file(Path(url.removeprefix("file:")))
@@ -48,7 +48,7 @@ def connect(url: str, run: str, waits: Patience | None = None) -> RedisBus:
                 bus.ping()
             return bus
         except BusUnavailable as error:
-            if waits is None or not waits.on(f"the Redis at {shown(url)}: {error}"):
+            if waits is None or not waits.wait(f"the Redis at {shown(url)}: {error}"):
                 raise ConfigError("--redis-url", shown(url), f"no Redis answers there ({error})") from None
 
 

@@ -15,7 +15,7 @@ KEEP_SECONDS = 10.0
 log = logging.getLogger(__name__)
 
 
-class Counters:
+class ProgressBackup:
     """Copies of what the replay servers publish with every commit."""
 
     def __init__(self, folder: RunFolder, shards: int) -> None:

@@ -5,7 +5,7 @@ from contextlib import suppress
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusFull, BusUnavailable
-from rmc.deploy.redis.progress_backup import Counters
+from rmc.deploy.redis.progress_backup import ProgressBackup
 from rmc.deploy.run.config import RunConfig, to_json
 from rmc.deploy.run.folder import RunFolder
 
@@ -18,7 +18,7 @@ class Registration:
     def __init__(self, config: RunConfig, folder: RunFolder, bus: RedisBus) -> None:
         """Make the run known, afresh. Raises BusUnavailable, BusFull."""
         self._config, self._bus = to_json(config).encode(), bus
-        self._counters = Counters(folder, config.replay.replay_shards)
+        self._progress_backup = ProgressBackup(folder, config.replay.replay_shards)
         self._look_at = 0.0
         bus.expire(None)
         bus.clear_stop()  # before the config, which roles that are started by hand may wait for
@@ -37,13 +37,13 @@ class Registration:
             with suppress(BusUnavailable, BusFull):
                 if self._bus.config() is None:
                     self._tell()
-        self._counters.keep(self._bus)
+        self._progress_backup.keep(self._bus)
 
     def keep(self) -> None:
         """Copy what is counted, at once."""
-        self._counters.keep(self._bus, at_once=True)
+        self._progress_backup.keep(self._bus, at_once=True)
 
     def _tell(self) -> None:
         """The counters first: a replay server that finds the config goes on from them."""
-        self._counters.restore(self._bus)
+        self._progress_backup.restore(self._bus)
         self._bus.set_config(self._config)

@@ -11,9 +11,9 @@ from rmc.cli import options, training
 from rmc.common.bus.redis_url import has_password, shown
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.role_environment import SECRET_VARIABLE, URL_VARIABLE
-from rmc.deploy.local.role_process import Place
+from rmc.deploy.local.role_process import RunConnection
 from rmc.deploy.monitor import attach as attachment
-from rmc.deploy.monitor.view import Board, table, terminal
+from rmc.deploy.monitor.view import RunStatus, table, terminal
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 
@@ -23,7 +23,7 @@ Role = options.ActorRole | options.ReplayRole | options.LearnerRole | options.Ev
 
 def execute(command: options.Command) -> int:
     """Run a parsed command; its exit status. Raises RmcError."""
-    given = Given()
+    given = RoleSecrets()
     if isinstance(command, options.Train | Role):
         _warn_of_password(command.redis_url or "")
     if isinstance(command, Role):
@@ -41,7 +41,7 @@ def _warn_of_password(url: str) -> None:
         log.warning("--redis-url=%r: everybody here can read its password in ps; %s", shown(url), fix)
 
 
-class Given:
+class RoleSecrets:
     """What the environment told this process alone: taken out of it, before anything is started that would inherit."""
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ def train(command: options.Train) -> int:
     return training.train(command.config(), command.launch_options(), terminal())
 
 
-def run_role(command: Role, given: Given) -> int:
+def run_role(command: Role, given: RoleSecrets) -> int:
     """Be one role of a run until it ends."""
     url = command.redis_url or given.redis_url
     if not url:
@@ -62,13 +62,13 @@ def run_role(command: Role, given: Given) -> int:
     if isinstance(command, options.ActorRole | options.EvaluatorRole):
         from rmc.deploy.local import actor_process
 
-        place = Place(command.run, url)
+        place = RunConnection(command.run, url)
         if isinstance(command, options.ActorRole):
             actor_process.run_actor(place, command.index)
         else:
             actor_process.run_evaluator(place)
         return 0
-    place = Place(command.run, url, given.secret, command.secret_file, command.tls_folder)
+    place = RunConnection(command.run, url, given.secret, command.secret_file, command.tls_folder)
     if isinstance(command, options.ReplayRole):
         from rmc.deploy.local import replay_process
 
@@ -84,7 +84,7 @@ def stats(command: options.Stats) -> int:
     """Print the newest metrics of a run, and its result if it has one."""
     folder = RunFolder(command.run)
     config, result, console = folder.config(), folder.result(), terminal()
-    board = Board(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
+    board = RunStatus(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
     for record in folder.records():
         board.take(record)
     if not board.roles:
@@ -98,9 +98,9 @@ def stats(command: options.Stats) -> int:
 def attach(command: options.Attach) -> int:
     """Watch a run until it ends, or until Ctrl-C."""
     folder, console = RunFolder(command.run), terminal()
-    attachment.trained_now(folder)
+    attachment.launcher_pid(folder)
     try:
-        attachment.watch(folder, console, attachment.Absence(folder))
+        attachment.watch(folder, console, attachment.LauncherGone(folder))
     except KeyboardInterrupt:
         console.print(f"it goes on; rmc stop {command.run} ends it", soft_wrap=True)
         return 0

@@ -41,7 +41,7 @@ def serve(requests: socket.socket) -> None:
 
 def _forked(requests: socket.socket, request: dict[str, Any], log: int) -> int:
     """The process number of a new role; 0 where there is no room for one."""
-    nursery = os.getpid()
+    fork_server = os.getpid()
     try:
         pid = os.fork()
     except OSError as error:
@@ -49,7 +49,7 @@ def _forked(requests: socket.socket, request: dict[str, Any], log: int) -> int:
         return 0
     if pid == 0:
         requests.close()
-        _be(request["words"], {**request["environment"], parent_death.PARENT_VARIABLE: str(nursery)}, log)
+        _be(request["words"], {**request["environment"], parent_death.PARENT_VARIABLE: str(fork_server)}, log)
     _lead_group(pid)  # here, too: who hears of it may signal its group at once
     return pid
 
@@ -98,7 +98,7 @@ def _lead_group(pid: int) -> None:
 
 
 if __name__ == "__main__":
-    parent_death.die_with(int(os.environ.pop(parent_death.PARENT_VARIABLE)))
+    parent_death.exit_with_parent(int(os.environ.pop(parent_death.PARENT_VARIABLE)))
     for number in (signal.SIGINT, signal.SIGTERM):  # roles end in order first
         signal.signal(number, signal.SIG_IGN)
     try:

@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 
-from rmc.common.process.parent_death import PARENT_VARIABLE, die_with
+from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
 ROLES = SINGLE_THREADED | {"learner", "launcher"}
@@ -34,7 +34,7 @@ def run(words: list[str]) -> int:
         return _say_version()
     parent = os.environ.pop(PARENT_VARIABLE, None)
     if parent is not None:  # before the slow imports, so that there is no time in which a role could be left behind
-        die_with(int(parent))
+        exit_with_parent(int(parent))
     if words and words[0] in SINGLE_THREADED:  # before numpy and torch are imported, which read these once
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")

@@ -16,7 +16,7 @@ from rmc.actors.config import ActorConfig
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.memory_bus import MemoryBus
-from rmc.common.bus.protocol import Ack, Bus, Entry, EntryId, Holder, Version
+from rmc.common.bus.protocol import Ack, Bus, Entry, EntryId, ReplayOwner, Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
@@ -55,7 +55,7 @@ class Reader:
     """Reads and acknowledges as a replay server does, and keeps what it read."""
 
     def __init__(self, bus: Bus) -> None:
-        self._bus, self.holder = bus, Holder("replay", bus.take_epoch("replay"))
+        self._bus, self.owner = bus, ReplayOwner("replay", bus.take_epoch("replay"))
         self._cursors: dict[int, EntryId] = {}
         self.entries: list[Entry] = []
 
@@ -66,7 +66,7 @@ class Reader:
             self.entries.append(entry)
             self._cursors[entry.actor] = entry.id
         acks = {actor: Ack(cursor, granted_steps, final) for actor, cursor in self._cursors.items()}
-        self._bus.commit(self.holder, acks)
+        self._bus.commit(self.owner, acks)
 
     def rows(self) -> Rows:
         return join_rows([decode_rows(entry.payload, SPEC) for entry in self.entries], SPEC)
@@ -395,7 +395,7 @@ def test_epochs_that_redis_forgot_do_not_strand_the_actor(bus: Bus) -> None:
     """The ring remembers entry 1-7 of this actor; a Redis that came back empty hands out epoch 1 again."""
     publish(bus, 3)
     actor = make_actor(bus)
-    replay = Holder("replay", bus.take_epoch("replay"))
+    replay = ReplayOwner("replay", bus.take_epoch("replay"))
     bus.commit(replay, {0: Ack(EntryId(1, 7), 400)})
     step_until_blocked(actor)
     assert bus.current_epoch("actor-0") == 2
@@ -432,7 +432,7 @@ def test_a_redis_that_is_back_as_it_was_ends_no_life(bus: Bus) -> None:
     newest = bus.ack(0)
     assert newest is not None
     for said in (old, newest, old):
-        bus.commit(reader.holder, {0: said})
+        bus.commit(reader.owner, {0: said})
         actor.step()
         assert actor.waiting_for() == "credit"
     assert bus.current_epoch("actor-0") == 1

@@ -9,7 +9,7 @@ import pytest
 from safetensors.torch import save
 
 from rmc.actors.config import EvaluatorConfig
-from rmc.actors.evaluator import Evaluator, Match, first_start, play_episodes
+from rmc.actors.evaluator import Evaluator, Rollout, first_start, play_episodes
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
@@ -17,7 +17,7 @@ from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import Bus, Version
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
-from rmc.common.env.wrappers import Env, Standardised
+from rmc.common.env.wrappers import Env, RescaledEnv
 from rmc.common.errors import ConfigError, RmcError
 from tests.counting_env import ACTION_DIM, OBS_DIM
 
@@ -57,11 +57,11 @@ def test_an_episode_without_end_is_judged_by_its_start(monkeypatch: pytest.Monke
     def endless() -> Env:
         pendulum = gym.make("Pendulum-v1").unwrapped
         pendulum.spec = None
-        return Standardised(pendulum)
+        return RescaledEnv(pendulum)
 
     monkeypatch.setattr("rmc.actors.evaluator.LONGEST_EPISODE", 30)
     envs = [endless() for _ in range(2)]
-    match = Match(runner_for(Agent(3, 1, AGENT), 2), envs, seed=0)
+    match = Rollout(runner_for(Agent(3, 1, AGENT), 2), envs, seed=0)
     rounds = next(count for count in itertools.count(1) if not match.step())
     assert (rounds, match.steps) == (30, 60)
 

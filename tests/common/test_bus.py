@@ -12,7 +12,17 @@ import pytest
 import redis
 
 from rmc.common.bus.memory_bus import MemoryBus
-from rmc.common.bus.protocol import METRICS_KEPT, PIECE_BYTES, Ack, Bus, Entry, EntryId, Holder, ReplayAddress, Version
+from rmc.common.bus.protocol import (
+    METRICS_KEPT,
+    PIECE_BYTES,
+    Ack,
+    Bus,
+    Entry,
+    EntryId,
+    ReplayAddress,
+    ReplayOwner,
+    Version,
+)
 from rmc.common.bus.redis_bus import RECORDS_READ, UNPUBLISHED_SECONDS, RedisBus
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from rmc.deploy.redis.server import RedisServer
@@ -41,12 +51,12 @@ def test_epochs_rise_past_the_floor(bus):
 
 
 def test_entries_are_read_in_order_and_trimmed_by_commit(bus):
-    holder = Holder("replay", bus.take_epoch("replay"))
+    owner = ReplayOwner("replay", bus.take_epoch("replay"))
     for seq in range(5):
         bus.append(3, EntryId(1, seq), b"%d" % seq)
     assert bus.actors() == [3]
     assert bus.read({3: EntryId(0, 0)}, 2) == [Entry(3, EntryId(1, 0), b"0"), Entry(3, EntryId(1, 1), b"1")]
-    bus.commit(holder, {3: Ack(EntryId(1, 2), 77, True)})
+    bus.commit(owner, {3: Ack(EntryId(1, 2), 77, True)})
     assert [entry.id.seq for entry in bus.read({3: EntryId(0, 0)}, 10)] == [3, 4]
     assert bus.ack(3) == Ack(EntryId(1, 2), 77, True)
     assert bus.ack(4) is None
@@ -124,21 +134,23 @@ def test_an_older_epoch_is_fenced(bus):
 
 
 def test_a_replaced_replay_server_cannot_trim(bus):
-    old = Holder("replay", bus.take_epoch("replay"))
+    old = ReplayOwner("replay", bus.take_epoch("replay"))
     bus.append(0, EntryId(1, 0), b"")
     bus.take_epoch("replay")
     with pytest.raises(FencedError):
         bus.commit(old, {0: Ack(EntryId(1, 0), 0)})
     assert len(bus.read({0: EntryId(0, 0)}, 10)) == 1
-    bus.commit(Holder("replay-1", bus.take_epoch("replay-1")), {0: Ack(EntryId(1, 0), 0)})  # another shard's epochs
+    bus.commit(
+        ReplayOwner("replay-1", bus.take_epoch("replay-1")), {0: Ack(EntryId(1, 0), 0)}
+    )  # another shard's epochs
     assert bus.read({0: EntryId(0, 0)}, 10) == []
 
 
 def test_a_dropped_stream_is_sent_again_from_its_hello(bus):
-    holder = Holder("replay", bus.take_epoch("replay"))
+    owner = ReplayOwner("replay", bus.take_epoch("replay"))
     for seq in (0, 1, 3):
         bus.append(0, EntryId(1, seq), b"%d" % seq)
-    bus.drop_stream(holder, 0)
+    bus.drop_stream(owner, 0)
     with pytest.raises(BusUnavailable, match="gone"):
         bus.append(0, EntryId(1, 4), b"4")
     for seq in (0, 2, 3):
@@ -146,18 +158,18 @@ def test_a_dropped_stream_is_sent_again_from_its_hello(bus):
     assert [entry.id.seq for entry in bus.read({0: EntryId(1, 1)}, 10)] == [2, 3]
     bus.take_epoch("replay")
     with pytest.raises(FencedError):
-        bus.drop_stream(holder, 0)
+        bus.drop_stream(owner, 0)
 
 
 @pytest.mark.parametrize("seq", [0, 1])
 def test_a_stream_that_is_dropped_while_it_refuses_is_gone(redis_url, monkeypatch, seq):
     bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
-    holder, ask = Holder("replay", bus.take_epoch("replay")), bus._redis.xinfo_stream
+    owner, ask = ReplayOwner("replay", bus.take_epoch("replay")), bus._redis.xinfo_stream
     for number in range(2):
         bus.append(0, EntryId(1, number), b"x")
 
     def drop_and_ask(stream):
-        bus.drop_stream(holder, 0)
+        bus.drop_stream(owner, 0)
         return ask(stream)
 
     monkeypatch.setattr(bus._redis, "xinfo_stream", drop_and_ask)
@@ -304,16 +316,16 @@ def test_a_full_redis_is_emptied_by_commits():
     try:
         with RedisServer(folder, maxmemory=8 << 20) as server:
             bus = RedisBus(server.url(), "full")
-            holder, seq = Holder("replay", bus.take_epoch("replay")), fill(bus)
+            owner, seq = ReplayOwner("replay", bus.take_epoch("replay")), fill(bus)
             assert seq > 10
-            bus.commit(holder, {0: Ack(EntryId(1, seq - 1), 5)})
+            bus.commit(owner, {0: Ack(EntryId(1, seq - 1), 5)})
             assert bus.ack(0) == Ack(EntryId(1, seq - 1), 5)
             bus.append(0, EntryId(1, seq), b"and on it goes")
             assert len(bus.read({0: EntryId(0, 0)}, 1000)) == 1
             fill(bus, seq + 1)
             bus.take_epoch("replay")
             with pytest.raises(FencedError):
-                bus.commit(holder, {0: Ack(EntryId(1, seq), 5)})  # replaced, and nothing is trimmed
+                bus.commit(owner, {0: Ack(EntryId(1, seq), 5)})  # replaced, and nothing is trimmed
             assert len(bus.read({0: EntryId(0, 0)}, 1000)) > 10
             with pytest.raises(BusUnavailable, match="out of range"):
                 RedisBus(f"{server.url()}?db=99", "full").ping()
@@ -334,10 +346,10 @@ def test_a_full_redis_trims_in_no_transaction_that_says_acks():
         with pytest.raises(redis.exceptions.OutOfMemoryError):
             pipe.execute()
         assert bus._redis.xlen(bus._key("windows", 0)) == 20
-        bus.commit(Holder("replay", 1), {0: Ack(EntryId(1, 18), 5)})
+        bus.commit(ReplayOwner("replay", 1), {0: Ack(EntryId(1, 18), 5)})
         assert bus._redis.xlen(bus._key("windows", 0)) == 1
         bus._redis.config_set("maxmemory", 1)
-        bus.drop_stream(Holder("replay", 1), 0)
+        bus.drop_stream(ReplayOwner("replay", 1), 0)
         assert not bus._redis.exists(bus._key("windows", 0))
 
 
@@ -353,7 +365,7 @@ def fill(bus: Bus, start: int = 0) -> int:
 
 def test_replay_address(bus):
     assert bus.replay_address("replay") is None
-    bus.announce_replay(Holder("replay", 2), "unix:/tmp/a b")
+    bus.announce_replay(ReplayOwner("replay", 2), "unix:/tmp/a b")
     assert bus.replay_address("replay") == ReplayAddress(2, "unix:/tmp/a b")
     assert bus.replay_address("replay-0") is None
 

@@ -4,18 +4,18 @@ import logging
 
 import pytest
 
-from rmc.common.process.outage import Outage
+from rmc.common.process.outage import OutageLog
 
 
 def test_once_each(caplog: pytest.LogCaptureFixture) -> None:
-    outage = Outage("actor-0")
+    outage = OutageLog("actor-0")
     with caplog.at_level(logging.WARNING):
-        outage.over()
+        outage.end()
         for _ in range(3):
-            outage.note(OSError("no answer"))
-        outage.over()
-        outage.over()
-        outage.note(OSError("again"))
+            outage.begin(OSError("no answer"))
+        outage.end()
+        outage.end()
+        outage.begin(OSError("again"))
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == 3
     assert said[0] == "actor-0: waiting for Redis: no answer"

@@ -16,7 +16,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local import learner_process
 from rmc.deploy.local.learner_process import run_learner
-from rmc.deploy.local.role_process import Place
+from rmc.deploy.local.role_process import RunConnection
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.server import RedisServer
 from rmc.deploy.run.folder import RunFolder
@@ -40,7 +40,7 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.fixture
-def place(server: RedisServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Place:
+def place(server: RedisServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunConnection:
     """Of a run whose Redis goes away as soon as its learner has finished."""
 
     def finish(learner: Any, bus: RedisBus, stop: StopSignal, finished: Any) -> None:
@@ -50,11 +50,13 @@ def place(server: RedisServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(learner_process, "run_role", finish)
     Registration(debug(EnvConfig("Pendulum-v1")), RunFolder(tmp_path), RedisBus(server.url(), "run"))
-    return Place("run", server.url(), "of the run")
+    return RunConnection("run", server.url(), "of the run")
 
 
 @pytest.mark.usefixtures("handlers")
-def test_that_it_has_finished_is_said_once_redis_is_back(place: Place, server: RedisServer, tmp_path: Path) -> None:
+def test_that_it_has_finished_is_said_once_redis_is_back(
+    place: RunConnection, server: RedisServer, tmp_path: Path
+) -> None:
     over = threading.Event()
 
     def back() -> None:
@@ -76,7 +78,7 @@ def test_that_it_has_finished_is_said_once_redis_is_back(place: Place, server: R
 
 
 @pytest.mark.usefixtures("handlers")
-def test_where_redis_stays_away_it_ends_when_it_is_told_to(place: Place, tmp_path: Path) -> None:
+def test_where_redis_stays_away_it_ends_when_it_is_told_to(place: RunConnection, tmp_path: Path) -> None:
     began = time.monotonic()
     told = threading.Timer(2.0, signal.raise_signal, (signal.SIGTERM,))
     told.start()

@@ -16,7 +16,7 @@ from rmc.common.bus.metrics_record import decode_record, encode_record
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.monitor import Monitor
-from rmc.deploy.monitor.view import MOST_NAMES, Board, _evaluation, line, table, terminal
+from rmc.deploy.monitor.view import MOST_NAMES, RunStatus, _evaluation, line, table, terminal
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder, open_run
 from rmc.deploy.run.presets import debug
@@ -64,7 +64,7 @@ def test_any_number_is_shown(monitor: Monitor, value: float) -> None:
 
 def test_names_are_shown_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """And not taken for a console's markup, which would swallow or refuse them."""
-    board = Board("mine:[red]Env[/x]-v0", "debug", 0, 100, 32.0)
+    board = RunStatus("mine:[red]Env[/x]-v0", "debug", 0, 100, 32.0)
     terminal(200).print(table(board), "run folder /runs/[words] :tada: [/]")
     shown = capsys.readouterr().out
     assert "mine:[red]Env[/x]-v0 · debug" in shown

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import redis
 
-from rmc.common.bus.protocol import Ack, EntryId, Holder, Version
+from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner, Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusUnavailable, ConfigError
 from rmc.common.shard import Shard
@@ -82,17 +82,17 @@ def test_every_role_can_do_its_work(server: RedisServer) -> None:
     actor.append(0, EntryId(5, 0), b"hello")
     for _ in range(2):  # the second is refused by its id, and looked up
         actor.append(0, EntryId(5, 1), b"windows")
-    holder = Holder("replay", 5)
+    owner = ReplayOwner("replay", 5)
     assert replay.progress("replay") == b"counted"
     assert replay.actors() == [0]
     replay.expect({0: EntryId(0, 0)}, 10)
     assert len(replay.read({0: EntryId(0, 0)}, 10)) <= 2
     (_, entry) = replay.read({0: EntryId(4, 0)}, 10)
     replay.dead_letter(entry, "a test")
-    replay.announce_replay(holder, "unix:/nowhere")
+    replay.announce_replay(owner, "unix:/nowhere")
     assert replay.current_epoch("learner") == 5
-    replay.commit(holder, {0: Ack(EntryId(5, 1), 100)}, b"more")
-    replay._trim(holder, {0: Ack(EntryId(5, 1), 100)})
+    replay.commit(owner, {0: Ack(EntryId(5, 1), 100)}, b"more")
+    replay._trim(owner, {0: Ack(EntryId(5, 1), 100)})
     assert learner.replay_address("replay") is not None
     for update in (1, 2, 3):
         for evaluate in (False, True):
@@ -102,7 +102,7 @@ def test_every_role_can_do_its_work(server: RedisServer) -> None:
     for bus, evaluate in ((actor, False), (evaluator, True)):
         assert bus.latest_version(evaluate) == Version(5, 3)
         assert bus.weights(evaluate) == (Version(5, 3), b"w" * 600_000)
-    replay.drop_stream(holder, 0)
+    replay.drop_stream(owner, 0)
     assert launcher.progress("replay") == b"more"
     records, _ = launcher.records(dict.fromkeys(USERS.roles, "0"))
     assert [record["role"] for record in records] == ["learner", "evaluator", "replay", "actor-0"]
@@ -125,13 +125,13 @@ def test_shards_have_their_own_actors_streams() -> None:
     with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=SHARDED) as server:
         for own, other in ((0, 1), (1, 0)):
             bus = RedisBus(server.url(f"replay-{own}"), USERS.run)
-            holder = Holder(f"replay-{own}", bus.take_epoch(f"replay-{own}"))
+            owner = ReplayOwner(f"replay-{own}", bus.take_epoch(f"replay-{own}"))
             acks = {actor + own: Ack(EntryId(1, 1), 0) for actor in (0, 8, 10, 98, 100, 4094)}
-            bus.commit(holder, acks, b"counted")
-            bus._trim(holder, acks)
-            bus.drop_stream(holder, own)
+            bus.commit(owner, acks, b"counted")
+            bus._trim(owner, acks)
+            bus.drop_stream(owner, own)
             forbidden = FORBIDDEN_TO_SHARDS.replace("OTHER", str(other)).replace("OWN", str(own))
-            with redis.Redis.from_url(server.url(holder.role)) as client:
+            with redis.Redis.from_url(server.url(owner.role)) as client:
                 for words in split_commands(forbidden):
                     assert "permission" in answer(client, words), words
 

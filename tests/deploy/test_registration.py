@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import redis
 
-from rmc.common.bus.protocol import Ack, EntryId, Holder
+from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusUnavailable
@@ -26,7 +26,7 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_redis_that_forgot_is_told_again_what_it_must_know(tmp_path: Path, redis_url: str, run_name: str) -> None:
     bus = RedisBus(redis_url, run_name)
     registered = Registration(CONFIG, RunFolder(tmp_path), bus)
-    bus.commit(Holder("replay", bus.take_epoch("replay")), {0: Ack(EntryId(1, 0), 0)}, b"counted")
+    bus.commit(ReplayOwner("replay", bus.take_epoch("replay")), {0: Ack(EntryId(1, 0), 0)}, b"counted")
     registered.keep()
     _forget(redis_url, run_name)
     assert bus.config() is None

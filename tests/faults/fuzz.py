@@ -37,7 +37,7 @@ from rmc.common.wire import (
 )
 from rmc.deploy.run.config import from_json, to_json
 from rmc.deploy.run.presets import robust
-from rmc.replay_server.record import Progress, decode_published
+from rmc.replay_server.commit_record import Progress, decode_published
 from tests.faults.asked import LAWFUL_PROOF, Asked
 from tests.faults.row import Row, at_length
 from tests.replay_server.support import SPEC, make_rows

@@ -98,12 +98,12 @@ class Loaded(Training):
             time.sleep(0.005)
 
     def process_of(self, role: str) -> psutil.Process:
-        """The process of ``actor-1``, ``learner``, ``replay``, ``redis``, the ``nursery`` or the ``launcher``."""
+        """The process of ``actor-1``, ``learner``, ``replay``, ``redis``, the ``fork_server`` or the ``launcher``."""
         if role == "launcher":
             return self.launcher
         word, _, index = role.partition("-")
-        others = {"redis": "unixsocket", "nursery": r"deploy\.nursery"}
-        pattern = others.get(role, rf"deploy\.cli {word} .*{f'--index {index}' if index else ''}")
+        others = {"redis": "unixsocket", "fork server": r"rmc\.cli\.fork_server"}
+        pattern = others.get(role, rf"rmc\.cli\.main {word} .*{f'--index {index}' if index else ''}")
         found: list[psutil.Process] = []
 
         def there() -> bool:
@@ -161,7 +161,7 @@ class Loaded(Training):
 
     def held(self) -> dict[str, tuple[float, int]]:
         """Of each process, and of an embedded Redis: memory that is no file's, so not the ring's, in MB; open files."""
-        roles = ["launcher", "nursery", "replay", "learner", "evaluator"]
+        roles = ["launcher", "fork server", "replay", "learner", "evaluator"]
         roles += [f"actor-{actor}" for actor in range(ACTORS)] + ["redis"] * (not self._redis_url)
         processes = {role: self.process_of(role) for role in roles}
         return {role: (_anonymous_mb(process.pid), process.num_fds()) for role, process in processes.items()}

@@ -19,7 +19,7 @@ from rmc.analysis.evaluation import initial_policy
 from rmc.common.bus.protocol import Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
-from rmc.common.replay import Draw
+from rmc.common.replay import SampleStatus
 from rmc.deploy.run.config import to_json
 from rmc.deploy.run.presets import debug
 from rmc.learner.replay_client import ReplayClient
@@ -62,7 +62,7 @@ def client(bus: RedisBus, redis_url: str, run_name: str, tmp_path: Path) -> Iter
     roles = [["replay", *place, *listen], *(["actor", *place, "--index", str(index)] for index in range(CONFIG.actors))]
     processes = [subprocess.Popen([sys.executable, "-m", "rmc.cli.main", *words], env=os.environ) for words in roles]
     found = ReplayClient(lambda: f"unix:{tmp_path}/s", b"every hop", CONFIG.window_spec(), BATCH)
-    found.introduce(bus.current_epoch("learner"))  # only the newest learner is served
+    found.register_learner(bus.current_epoch("learner"))  # only the newest learner is served
     yield found
     found.close()
     bus.request_stop("the test is over")
@@ -75,7 +75,7 @@ def draw_everything(client: ReplayClient, steps: int) -> np.ndarray:
     deadline = time.monotonic() + SECONDS
     while time.monotonic() < deadline:
         sample = client.sample(BATCH)
-        if sample.draw is not Draw.BATCH:
+        if sample.draw is not SampleStatus.BATCH:
             time.sleep(0.01)
             continue
         assert sample.rows is not None

@@ -68,8 +68,8 @@ def test_a_second_launcher_is_refused(endless: Training) -> None:
 
 def test_ctrl_c_saves_and_leaves_nothing(endless: Training) -> None:
     processes = endless.launcher.children(recursive=True)
-    nursery = sys.platform == "linux"  # that three roles come from
-    assert len(processes) == 5 + nursery  # four roles and Redis
+    fork_server = sys.platform == "linux"  # that three roles come from
+    assert len(processes) == 5 + fork_server  # four roles and Redis
     sockets = endless.sockets()
     assert sockets
     checkpoints = {path.name for path in (endless.folder / "checkpoints").glob("0*")}

@@ -81,14 +81,14 @@ class PlainUpdate:
 
     def unroll(self, memory: Memory, row: np.void) -> dict[int, Known]:
         """By observation, from the first trained one on; the burn-in without gradient."""
-        h, known, filled = torch.tensor(row["state"])[: memory.gru.hidden_size], {}, self.filled(row)
+        h, known, impute = torch.tensor(row["state"])[: memory.gru.hidden_size], {}, self.impute(row)
         for t in range(int(row["first"]), int(row["last"]) + 1):
             if t == self.burn_in:
                 h = h.detach()
             previous = row["prev_action"] if t == row["first"] else row["action"][t - 1]
-            e = self.embedded(memory, row, t, filled[t], torch.tensor(previous))
+            e = self.embedded(memory, row, t, impute[t], torch.tensor(previous))
             h = torch.zeros_like(h) if self.agent.config.head_input == "observation" else gru(memory, e, h)
-            known[t] = Known(h, e, filled[t])
+            known[t] = Known(h, e, impute[t])
         return {t: known[t] for t in range(self.burn_in, int(row["last"]) + 1)}
 
     def embedded(self, memory: Memory, row: np.void, t: int, o: Tensor, previous: Tensor) -> Tensor:
@@ -96,7 +96,7 @@ class PlainUpdate:
         return memory.embed(torch.cat([o, previous, *flag]))
 
     @torch.no_grad()
-    def filled(self, row: np.void) -> dict[int, Tensor]:
+    def impute(self, row: np.void) -> dict[int, Tensor]:
         """By observation, what the memory is given: for a blank one what the model expects, where it is asked."""
         memory, found = self.agent.memory, {}
         h, last = torch.tensor(row["state"]).tensor_split([self.agent.config.hidden])

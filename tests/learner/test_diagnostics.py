@@ -91,7 +91,7 @@ def test_where_nothing_is_blank_the_state_is_that_of_the_step_by_step_way():
     o, action = torch.randn(2, 6, SPEC.obs_dim), torch.rand(2, 6, SPEC.action_dim)
     sequence = (o, torch.zeros(2, 6, dtype=torch.bool), action, state)
     with torch.no_grad():
-        _, seen, after = agent.remember(*sequence)
+        _, seen, after = agent.unroll(*sequence)
         torch.testing.assert_close(after, agent.fill(*sequence)[1])
     assert torch.equal(seen, o)
 

@@ -125,7 +125,7 @@ def test_parameters_keep_their_names_and_values(pair):
 FILLING = AgentConfig(hidden=24, embedding=20, heads=(40, 28), fill_blanks=True)
 
 
-def filled(config, low, scale=1.0):
+def impute(config, low, scale=1.0):
     """By a plain and a fused agent, and the observations and which of them were blank."""
     torch.manual_seed(0)
     plain = Agent(3, 2, config)
@@ -144,7 +144,7 @@ def filled(config, low, scale=1.0):
 
 @pytest.mark.parametrize("flag", [False, True])
 def test_blanks_are_filled_to_the_precision_of_bfloat16_and_nothing_else_is_touched(flag):
-    (plain, plain_after), (fused, after), o, blank = filled(dataclasses.replace(FILLING, blank_flag=flag), low=True)
+    (plain, plain_after), (fused, after), o, blank = impute(dataclasses.replace(FILLING, blank_flag=flag), low=True)
     assert torch.equal(fused[~blank], o[~blank])
     gap = (fused - plain)[blank].norm() / plain[blank].norm()
     assert 1e-5 < gap < 0.01
@@ -153,13 +153,13 @@ def test_blanks_are_filled_to_the_precision_of_bfloat16_and_nothing_else_is_touc
 
 
 def test_what_fills_a_blank_stays_where_observations_are():
-    for found, _ in filled(FILLING, low=True, scale=1e6)[:2]:
+    for found, _ in impute(FILLING, low=True, scale=1e6)[:2]:
         assert found.abs().max() == 10.0
 
 
 @pytest.mark.parametrize("changed", [{"embedding": 0}, {"layer_norm": True}, {"head_input": "observation"}, {}])
 def test_where_the_fused_way_does_not_fit_blanks_are_filled_the_plain_way_to_the_bit(changed):
-    plain, fused, o, blank = filled(dataclasses.replace(FILLING, **changed), low=bool(changed))
+    plain, fused, o, blank = impute(dataclasses.replace(FILLING, **changed), low=bool(changed))
     assert all(map(torch.equal, plain, fused))
     assert not torch.equal(plain[0][blank], o[blank])
 

@@ -33,12 +33,12 @@ def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput, fil
         agent.log_alpha.fill_(-1.0)
     update = UpdateConfig(n_step=n_step, gamma=0.9, eta=0.6)
     spec = dataclasses.replace(SPEC, state=config.state_size(SPEC.obs_dim))
-    rater = InitialPriority(spec, config, update, seed=3)
-    rater.load(safetensors.torch.save(agent.broadcast_weights()))
+    priority_fn = InitialPriority(spec, config, update, seed=3)
+    priority_fn.load(safetensors.torch.save(agent.broadcast_weights()))
     rows = random_rows(6, spec=spec)
     learner = make_update(agent, SPEC.burn_in, update, seed=3)
     expected = learner.forward(to_batch(rows, spec), torch.zeros(()))[1].priorities
-    np.testing.assert_allclose(rater(rows), expected, rtol=1e-5)
+    np.testing.assert_allclose(priority_fn(rows), expected, rtol=1e-5)
 
 
 def test_critics_are_broadcast_only_where_they_are_needed() -> None:
@@ -51,7 +51,7 @@ def test_critics_are_broadcast_only_where_they_are_needed() -> None:
 
 
 def test_weights_never_execute_code(tmp_path: Path) -> None:
-    rater = InitialPriority(SPEC, AgentConfig(hidden=SPEC.state, heads=(5, 5)), UpdateConfig(), seed=3)
+    priority_fn = InitialPriority(SPEC, AgentConfig(hidden=SPEC.state, heads=(5, 5)), UpdateConfig(), seed=3)
     with pytest.raises(MessageError, match="not of this run"):
-        rater.load(hostile_state(tmp_path / "owned"))
+        priority_fn.load(hostile_state(tmp_path / "owned"))
     assert not (tmp_path / "owned").exists()

@@ -13,7 +13,7 @@ from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.learner import losses
 from rmc.learner.config import UpdateConfig
-from rmc.learner.unroll import remember
+from rmc.learner.unroll import unroll
 from rmc.learner.update import TRAINS_MEMORY, JointUpdate, make_update
 from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
 
@@ -154,7 +154,7 @@ def test_padded_burn_in_starts_from_the_stored_state():
     rows["first"] = SPEC.burn_in
     rows["observation"][:, : SPEC.burn_in] = 0.0
     batch, update = to_batch(rows), make(PAPER)
-    found = remember(update.agent.memory, batch.observation, batch, SPEC.burn_in).hidden
+    found = unroll(update.agent.memory, batch.observation, batch, SPEC.burn_in).hidden
     n = SPEC.burn_in
     o, blank, previous = batch.observation[:, n:], batch.blank[:, n:], batch.prev_action[:, n:]
     alone = update.agent.memory(o, blank, previous, batch.state).hidden
@@ -166,7 +166,7 @@ def test_burn_in_gets_no_gradient():
     rows["first"] = 0
     batch, update = to_batch(rows), make(PAPER)
     o = batch.observation.clone().requires_grad_()
-    remember(update.agent.memory, o, batch, SPEC.burn_in).hidden.sum().backward()
+    unroll(update.agent.memory, o, batch, SPEC.burn_in).hidden.sum().backward()
     assert o.grad is not None
     assert not o.grad[:, : SPEC.burn_in].any()
     assert o.grad[:, SPEC.burn_in :].any()
@@ -219,7 +219,7 @@ def test_the_policys_average_is_over_the_last_tenth_and_then_over_so_many():
         with torch.no_grad():
             for value in update.agent.parameters():
                 value.add_(torch.randn_like(value))
-        update.follow_average(updates)
+        update.update_ema(updates)
         share = 1.0 if updates <= 100 else max(0.25, 100 / updates)  # ten updates of those it is over
         acting = dict(update.agent.named_parameters())
         expected = {name: (1 - share) * mean + share * acting[name].double() for name, mean in expected.items()}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.process.role import StopSignal, run_role
-from rmc.replay_server import intake
+from rmc.replay_server import stream_reader
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.process import ReplayProcess
 from rmc.replay_server.server import ReplayServer
@@ -18,7 +18,7 @@ ACTORS = 2
 
 def main(url: str, run: str, folder: Path, capacity: int) -> None:
     """Serve until SIGTERM."""
-    intake.MAX_ENTRIES = 8  # many small rounds, so that a kill falls amid them
+    stream_reader.MAX_ENTRIES = 8  # many small rounds, so that a kill falls amid them
     bus = RedisBus(url, run)
     config = ReplayConfig(capacity=capacity, replay_ratio=1e6, warmup_steps=0)
     server = ReplayServer(SPEC, config, folder / "replay", 1, 10**9, ACTORS, 10**6, bus)

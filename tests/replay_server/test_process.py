@@ -13,7 +13,7 @@ import pytest
 from rmc.common.bus.redis_bus import TIMEOUT_SECONDS, RedisBus
 from rmc.common.errors import BusUnavailable, FencedError
 from rmc.common.process.role import StopSignal, run_role
-from rmc.common.replay import Draw
+from rmc.common.replay import SampleStatus
 from rmc.deploy.redis.server import RedisServer
 from rmc.learner.replay_client import ReplayClient
 from rmc.replay_server import process
@@ -53,7 +53,7 @@ def client_of(bus: RedisBus, epoch: int = 0) -> ReplayClient:
     address = bus.replay_address("replay")
     assert address is not None
     client = ReplayClient(lambda: address.address, SECRET, SPEC, 16)
-    client.introduce(epoch)
+    client.register_learner(epoch)
     return client
 
 
@@ -63,11 +63,11 @@ def test_windows_in_batches_out_and_metrics(redis_url: str, run_name: str, tmp_p
     try:
         until(lambda: bus.replay_address("replay") is not None)
         sender, client = Sender(bus), client_of(bus)
-        assert client.sample(16).draw is Draw.WAIT
+        assert client.sample(16).draw is SampleStatus.WAIT
         for _ in range(10):
             sender.send(5)
         until(lambda: running.server.stats()["windows"] == 50)
-        until(lambda: client.sample(16).draw is Draw.BATCH)
+        until(lambda: client.sample(16).draw is SampleStatus.BATCH)
         sample = client.sample(16)
         assert sample.rows is not None
         assert (sample.rows["reward"][:, 0] == sample.rows["serial"]).all()
@@ -98,10 +98,10 @@ def test_a_replaced_learner_that_comes_first_is_not_served(
         metrics = running.process.metrics()
         assert (metrics["refused_clients"], metrics["refused_clients_fenced"]) == (1, 1)
         client = client_of(bus, epoch)
-        assert client.sample(16).draw is Draw.WAIT
+        assert client.sample(16).draw is SampleStatus.WAIT
         bus.take_epoch("learner")  # by a third, which has not come yet
         with pytest.raises(FencedError):
-            until(lambda: client.sample(16).draw is Draw.BATCH)
+            until(lambda: client.sample(16).draw is SampleStatus.BATCH)
         client.close()
     finally:
         running.end()
@@ -119,14 +119,14 @@ def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_
         until(lambda: bus.replay_address("replay") is not None)
         sender, client = Sender(bus), client_of(bus)
         sender.send(40)
-        until(lambda: client.sample(16).draw is Draw.BATCH)
+        until(lambda: client.sample(16).draw is SampleStatus.BATCH)
         redis_server.close()
         with pytest.raises(BusUnavailable):
             bus.ack(0)
         until(lambda: running.process.waiting_for() == "redis")
         started = time.monotonic()
         for _ in range(40):  # past several looks at the bus that is away
-            assert client.sample(16).draw is Draw.BATCH
+            assert client.sample(16).draw is SampleStatus.BATCH
             time.sleep(0.05)
         assert time.monotonic() - started < 10.0
         redis_server.start()  # empty: it keeps no files
@@ -135,7 +135,7 @@ def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_
         os.kill(redis_server.process.pid, signal.SIGSTOP)  # it does not answer, either
         began, served = time.monotonic(), 0
         while (now := time.monotonic()) < began + 2.5 * TIMEOUT_SECONDS:
-            assert client.sample(16).draw is Draw.BATCH
+            assert client.sample(16).draw is SampleStatus.BATCH
             served += time.monotonic() - now < 1.0
         os.kill(redis_server.process.pid, signal.SIGCONT)
         assert served > 40

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rmc.common.replay import Draw
+from rmc.common.replay import SampleStatus
 from rmc.replay_server.rate_limiter import RateLimiter
 
 TRAIN = 5
@@ -32,21 +32,21 @@ def test_bounds(ratio: float, warmup: int, total: int, slack: int, inserted: int
     assert limiter.is_final(drawn) == (limiter.limit(drawn) == total)
     draw = limiter.draw(inserted, drawn, 64)
     if inserted < min(warmup, total):
-        assert draw is Draw.WAIT
-    if draw is Draw.BATCH:
+        assert draw is SampleStatus.WAIT
+    if draw is SampleStatus.BATCH:
         assert drawn <= (inserted - warmup + slack) * ratio + 1e-6
-    if draw is Draw.WAIT:  # then the actors have at least the slack, or the rest of the run
+    if draw is SampleStatus.WAIT:  # then the actors have at least the slack, or the rest of the run
         assert limiter.limit(drawn) - inserted >= min(slack, total - inserted) - 1
-    if draw is Draw.FINISHED:
+    if draw is SampleStatus.FINISHED:
         assert inserted >= total
         assert drawn + 64 > (inserted - warmup) * ratio
 
 
 def test_final_debt_is_drawn_without_tolerance() -> None:
     limiter = RateLimiter(10.0, 100, 1000, 50)
-    assert limiter.draw(1000, 9000 - 64, 64) is Draw.BATCH
-    assert limiter.draw(1000, 9001 - 64, 64) is Draw.FINISHED
-    assert limiter.draw(999, 9001 - 64, 64) is Draw.BATCH
+    assert limiter.draw(1000, 9000 - 64, 64) is SampleStatus.BATCH
+    assert limiter.draw(1000, 9001 - 64, 64) is SampleStatus.FINISHED
+    assert limiter.draw(999, 9001 - 64, 64) is SampleStatus.BATCH
     assert limiter.ratio(1000, 9000) == 10.0
 
 
@@ -101,9 +101,9 @@ def test_never_deadlocks(data: st.DataObject) -> None:
         for index in order.sample(range(-1, len(actors)), len(actors) + 1):
             if index < 0:
                 draw = limiter.draw(inserted, drawn, batch)
-                drawn += (batch - order.randrange(TRAIN)) * (draw is Draw.BATCH)  # short windows count less
-                finished |= draw is Draw.FINISHED
-                moved |= draw is not Draw.WAIT
+                drawn += (batch - order.randrange(TRAIN)) * (draw is SampleStatus.BATCH)  # short windows count less
+                finished |= draw is SampleStatus.FINISHED
+                moved |= draw is not SampleStatus.WAIT
                 continue
             if order.random() < 0.01:
                 actors[index].restart()

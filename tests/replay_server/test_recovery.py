@@ -13,7 +13,7 @@ import pytest
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import ConfigError
-from rmc.common.replay import Draw
+from rmc.common.replay import SampleStatus
 from rmc.learner.replay_client import ReplayClient
 from rmc.replay_server.recovery import ReplayStore, open_store, valid_leaves
 from rmc.replay_server.sum_tree import SumTree
@@ -64,12 +64,12 @@ def check(store: ReplayStore, acked: list[int], sent: list[int]) -> None:
         if len(own):
             expected = make_rows(len(own), marks[0])
             assert np.array_equal(own["observation"], expected["observation"])
-    rebuilt = SumTree(CAPACITY)
+    recreate_env = SumTree(CAPACITY)
     leaves = np.zeros(CAPACITY)
     leaves[serials % CAPACITY] = store.priorities[serials % CAPACITY].astype(float) ** 0.6
-    rebuilt.rebuild(leaves)
-    assert np.array_equal(store.tree._nodes, rebuilt._nodes)
-    assert np.isclose(rebuilt.total, leaves.sum())
+    recreate_env.rebuild(leaves)
+    assert np.array_equal(store.tree._nodes, recreate_env._nodes)
+    assert np.isclose(recreate_env.total, leaves.sum())
 
 
 def draw_until(client: ReplayClient, end: float, rng: np.random.Generator) -> int:
@@ -80,7 +80,7 @@ def draw_until(client: ReplayClient, end: float, rng: np.random.Generator) -> in
         if sample.rows is None:
             time.sleep(0.001)
             continue
-        draws += sample.draw is Draw.BATCH
+        draws += sample.draw is SampleStatus.BATCH
         client.update_priorities(sample.rows["serial"].copy(), rng.exponential(size=32).astype(np.float32))
     return draws
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rmc.common.bus.protocol import EntryId
 from rmc.common.errors import ConfigError
 from rmc.common.window import WindowSpec
-from rmc.replay_server.record import Progress, StreamPosition, decode_progress, record_bytes
+from rmc.replay_server.commit_record import Progress, StreamPosition, decode_progress, record_bytes
 from rmc.replay_server.ring import Ring
 from tests.replay_server.support import SPEC, make_rows
 

@@ -11,7 +11,7 @@ from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import Bus, EntryId, Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusUnavailable, FencedError
-from rmc.common.replay import Draw
+from rmc.common.replay import SampleStatus
 from rmc.common.wire import encode_windows
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.observation_sums import observation_sums
@@ -193,7 +193,7 @@ def test_the_limiter_holds_draws_and_credit(make: Make, bus: MemoryBus) -> None:
     server, senders = make(config, total=200, slack=16), [Sender(bus, 0), Sender(bus, 1)]
     drain(server)
     assert [sender.granted() for sender in senders] == [28, 28]  # (40 + 16) / 2 each
-    assert server.sample(4).draw is Draw.WAIT
+    assert server.sample(4).draw is SampleStatus.WAIT
     assert (server.stats()["learner_waiting_for"], server.waiting_for()) == ("warm-up", "windows")
     senders[0].send(5)
     drain(server)
@@ -203,7 +203,7 @@ def test_the_limiter_holds_draws_and_credit(make: Make, bus: MemoryBus) -> None:
     assert [sender.granted() for sender in senders] == [20, 36]  # 56 of 56 are in
     assert server.waiting_for() == "draws"
     draws = 0
-    while server.sample(4).draw is Draw.BATCH:
+    while server.sample(4).draw is SampleStatus.BATCH:
         draws += 1
     assert draws == (16 * 2 + 16 * 2 + 16) // 16  # the steps past the warm-up, the slack's worth, one batch
     assert (server.stats()["learner_waiting_for"], server.waiting_for()) == ("env_steps", "windows")
@@ -222,7 +222,7 @@ def test_small_credit_is_published_late_but_at_once_where_the_learner_waits(make
         server.sample(64)
     sender.send(1)
     drain(server)  # this publishes all of it; from here on only every hundred steps or so
-    while server.sample(64).draw is Draw.BATCH:
+    while server.sample(64).draw is SampleStatus.BATCH:
         published.add(sender.granted())
         draws += 1
         server.step()
@@ -242,9 +242,9 @@ def test_the_end_is_announced_and_reached(make: Make, bus: MemoryBus) -> None:
     assert ack is not None
     assert not ack.final
     sent, outcomes = 2, []
-    while (draw := server.sample(4).draw) is not Draw.FINISHED:
+    while (draw := server.sample(4).draw) is not SampleStatus.FINISHED:
         outcomes.append(draw)
-        if draw is Draw.WAIT:
+        if draw is SampleStatus.WAIT:
             drain(server)
             assert sender.granted() > sent * SPEC.train
             sender.send(1)
@@ -255,12 +255,12 @@ def test_the_end_is_announced_and_reached(make: Make, bus: MemoryBus) -> None:
     assert ack.final
     assert ack.granted_steps == server.stats()["env_steps"] == 400
     owed, tolerance = (400 - 8) * 2 // 16, (16 * 2 + 16) // 16
-    assert owed <= outcomes.count(Draw.BATCH) <= owed + tolerance
-    assert server.stats()["replay_ratio"] == outcomes.count(Draw.BATCH) * 16 / (400 - 8)
+    assert owed <= outcomes.count(SampleStatus.BATCH) <= owed + tolerance
+    assert server.stats()["replay_ratio"] == outcomes.count(SampleStatus.BATCH) * 16 / (400 - 8)
 
 
 def test_an_empty_ring_makes_the_learner_wait(make: Make) -> None:
-    assert make().sample(4).draw is Draw.WAIT
+    assert make().sample(4).draw is SampleStatus.WAIT
 
 
 def test_a_new_life_counts_from_zero(make: Make, bus: MemoryBus) -> None:

@@ -18,7 +18,7 @@ import pytest
 
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.errors import AuthenticationError, ConfigError, FencedError, MessageError, RmcError
-from rmc.common.replay import Draw, Sample
+from rmc.common.replay import Sample, SampleStatus
 from rmc.common.shared_batches import TURNS
 from rmc.common.wire import HEADER, MAGIC, VERSION, Kind, decode_header, decode_meta, encode_frame, proof
 from rmc.learner.replay_client import Connection, ReplayClient
@@ -65,7 +65,7 @@ class Served:
     def client(self, epoch: int) -> ReplayClient:
         """A learner's end."""
         client = ReplayClient(lambda: self.address, SECRET, SPEC, 8)
-        client.introduce(epoch)
+        client.register_learner(epoch)
         return client
 
     def stranger(self) -> socket.socket:
@@ -287,41 +287,41 @@ def test_who_proves_nothing_ends_no_learner(
 
     addresses = [impostor(frame)]
     client = ReplayClient(lambda: addresses[-1], SECRET, SPEC, 8)
-    assert [client.sample(8).draw for _ in range(3)] == [Draw.WAIT] * 3
+    assert [client.sample(8).draw for _ in range(3)] == [SampleStatus.WAIT] * 3
     assert len([record for record in caplog.records if "is away: it said" in record.message]) == 1
     assert client.statistics().count == 0
     assert client.episode(0) is None
     addresses.append(serve().address)
-    assert client.sample(8).draw is Draw.BATCH
+    assert client.sample(8).draw is SampleStatus.BATCH
     client.close()
 
 
 @pytest.mark.parametrize("mass", ["x", None, [], True, float("nan"), float("inf"), -1.0])
 def test_a_draw_of_no_mass_is_an_outage(serve: Serve, mass: Any, caplog: pytest.LogCaptureFixture) -> None:
-    away_for(serve(), Sample(Draw.WAIT, None, None, mass, 3, 12, 0), "mass", caplog)
+    away_for(serve(), Sample(SampleStatus.WAIT, None, None, mass, 3, 12, 0), "mass", caplog)
 
 
 @pytest.mark.parametrize("count", ["3", None, {}, True, float("nan"), float("inf"), 1.5, -1])
 def test_a_draw_of_no_counters_is_an_outage(serve: Serve, count: Any, caplog: pytest.LogCaptureFixture) -> None:
-    away_for(serve(), Sample(Draw.WAIT, None, None, 1.0, 3, count, 0), "env_steps", caplog)
+    away_for(serve(), Sample(SampleStatus.WAIT, None, None, 1.0, 3, count, 0), "env_steps", caplog)
 
 
 def away_for(served: Served, sample: Sample, reason: str, caplog: pytest.LogCaptureFixture) -> None:
     """The client waits, and says once why."""
     lawful, client = served.replay.sample, served.client(0)
     served.replay.sample = lambda *_: sample  # type: ignore[method-assign]
-    assert [client.sample(8).draw for _ in range(3)] == [Draw.WAIT] * 3
+    assert [client.sample(8).draw for _ in range(3)] == [SampleStatus.WAIT] * 3
     (said,) = [record.message for record in caplog.records if "is away" in record.message]
     assert f"is away: {reason}: " in said
     served.replay.sample = lawful  # type: ignore[method-assign]
-    assert client.sample(8).draw is Draw.BATCH
+    assert client.sample(8).draw is SampleStatus.BATCH
     client.close()
 
 
 @pytest.mark.parametrize("address", ["tcp:127.0.0.1:no", "tcp:127.0.0.1:99999", "unix:a\0b", "tcp:" + "x" * 99 + ":1"])
 def test_an_address_that_is_none_is_an_outage(address: str) -> None:
     client = ReplayClient(lambda: address, SECRET, SPEC, 8)
-    assert client.sample(8).draw is Draw.WAIT
+    assert client.sample(8).draw is SampleStatus.WAIT
     assert client.statistics().count == 0
     with pytest.raises(RmcError, match="is away"):
         client.stats()
@@ -449,14 +449,14 @@ def test_a_client_that_does_not_read_keeps_nobody_waiting_and_gets_its_own_batch
 def test_strangers_are_sent_away_and_cannot_fill_the_server(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket_server, "AUTHENTICATION_SECONDS", 0.3)
     served = serve()
-    strangers = []
+    unauthenticated = []
     for _ in range(socket_server.MAX_CONNECTIONS):
-        strangers.append(served.stranger())
+        unauthenticated.append(served.stranger())
     works(served)  # the oldest stranger makes room for it
     assert served.sockets.refused["too-many"] == 1
-    assert strangers[0].recv(1) == b""
+    assert unauthenticated[0].recv(1) == b""
     served.refused("silent")
-    for raw in strangers:
+    for raw in unauthenticated:
         raw.close()
 
 
@@ -507,12 +507,12 @@ def test_a_client_of_other_windows_is_told(serve: Serve) -> None:
 def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> None:
     addresses: list[str] = []
     client = ReplayClient(lambda: addresses[-1] if addresses else None, SECRET, SPEC, 16)
-    assert client.sample(16).draw is Draw.WAIT
+    assert client.sample(16).draw is SampleStatus.WAIT
     for _ in range(2):
         served = serve()
         addresses.append(served.address)
         draws = [client.sample(16) for _ in range(6)]
-        assert [sample.draw for sample in draws[2:]] == [Draw.BATCH] * 4
+        assert [sample.draw for sample in draws[2:]] == [SampleStatus.BATCH] * 4
         assert draws[-1].env_steps == 200 * SPEC.train
         client.update_priorities(np.arange(16), np.full(16, 3.0, np.float32))
         assert client.statistics().count == 200 * SPEC.train
@@ -522,7 +522,7 @@ def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> Non
         assert client.episode(999) is None
         served.close()
         served.close = lambda: None  # type: ignore[method-assign]
-    assert client.sample(16).draw in (Draw.WAIT, Draw.BATCH)
+    assert client.sample(16).draw in (SampleStatus.WAIT, SampleStatus.BATCH)
     client.close()
 
 

@@ -10,7 +10,7 @@ from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import Bus, EntryId
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import ConfigError, FencedError
-from rmc.common.replay import Draw
+from rmc.common.replay import SampleStatus
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.recovery import valid_leaves
 from tests.replay_server.support import Make, Sender, close, drain, make_rows, stored
@@ -36,7 +36,7 @@ def test_a_lost_ring_takes_no_counter_back(make: Make, kind: str, redis_url: str
     sender.send(12)
     drain(server)
     for _ in range(4):
-        assert server.sample(2).draw is Draw.BATCH
+        assert server.sample(2).draw is SampleStatus.BATCH
     server.update_priorities(np.array([3]), np.array([9.0], np.float32))
     sender.send(1)
     drain(server)  # the commit publishes what was drawn before it
@@ -52,7 +52,7 @@ def test_a_lost_ring_takes_no_counter_back(make: Make, kind: str, redis_url: str
     assert after["entry_gaps"] == 0
     np.testing.assert_array_equal(server.statistics().total, statistics.total)
     assert server.statistics().count == statistics.count
-    assert server.holder.epoch == 2
+    assert server.owner.epoch == 2
     server.update_priorities(np.array([3]), np.array([5.0], np.float32))
     assert server.stats()["evicted_priorities"] == before["evicted_priorities"] + 1
 
@@ -60,7 +60,7 @@ def test_a_lost_ring_takes_no_counter_back(make: Make, kind: str, redis_url: str
     assert sender.granted() == 52 + 20 + 16  # a warm-up and the slack beyond what was in
     sender.send(4)
     drain(server)
-    assert server.sample(2).draw is Draw.WAIT  # 16 of 20 steps
+    assert server.sample(2).draw is SampleStatus.WAIT  # 16 of 20 steps
     sender.send(1)
     drain(server)
     sample = server.sample(2)
@@ -100,7 +100,7 @@ def test_lost_redis_data_neither_doubles_nor_goes_back(make: Make, bus: MemoryBu
     close(server)
     empty = MemoryBus()
     server = make(on=empty)
-    assert server.holder.epoch == 2  # above the one in the ring, though this bus has never seen a replay server
+    assert server.owner.epoch == 2  # above the one in the ring, though this bus has never seen a replay server
     sender.bus, sender.seq = empty, 0
     sender.greet()
     sender.send_rows(make_rows(4))  # seq 1 again: the ack was lost with the data, so the actor sends it again
@@ -157,7 +157,7 @@ def test_what_was_published_in_another_redis_is_older_than_the_next_server(make:
     empty = MemoryBus()
     empty.set_progress("replay", published)
     new = make(folder="new", on=empty)
-    assert new.holder.epoch == 5
+    assert new.owner.epoch == 5
     assert new.stats()["windows"] == 3
 
 
@@ -184,10 +184,10 @@ def test_what_another_redis_held_is_read_once_the_older_server_is_fenced(
     monkeypatch.setattr(bus, "progress", progress)
     new = make(folder="new")
     drain(new)
-    assert new.holder.epoch == 5
+    assert new.owner.epoch == 5
     assert new.stats()["windows"] == 5
     with pytest.raises(FencedError):
-        old.bus.commit(old.holder, old._acks())
+        old.bus.commit(old.owner, old._acks())
 
 
 def test_a_power_cut_loses_the_end_of_a_ring_alone(make: Make, bus: MemoryBus, tmp_path: Path) -> None:
@@ -225,7 +225,7 @@ def test_a_ring_of_which_nothing_is_left_begins_empty(make: Make, bus: MemoryBus
     drain(server)
     assert (server.stats()["windows"], server.stats()["ring_fill"]) == (12, 0)
     assert sender.granted() == 48 + 20 + 16  # or everyone would wait for the other
-    assert server.sample(2).draw is Draw.WAIT
+    assert server.sample(2).draw is SampleStatus.WAIT
 
 
 def test_a_ring_that_is_ahead_of_another_that_came_after_it_goes(make: Make, bus: MemoryBus) -> None:

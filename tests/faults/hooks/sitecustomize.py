@@ -58,15 +58,15 @@ def after(owner: Any, method: str, fault: str) -> None:
 def replay_server() -> None:
     """Every point between a read and its ack."""
     from rmc.common.bus.redis_bus import RedisBus
-    from rmc.replay_server.intake import Intake
-    from rmc.replay_server.record import _HEADER, RecordPair
+    from rmc.replay_server.commit_record import _HEADER, RecordPair
     from rmc.replay_server.recovery import ReplayStore, valid_leaves
     from rmc.replay_server.ring import Ring
     from rmc.replay_server.server import ReplayServer
+    from rmc.replay_server.stream_reader import StreamReader
     from rmc.replay_server.sum_tree import SumTree
 
     write, commit, record = Ring.write, Ring.commit, RecordPair.write
-    step, read = ReplayServer.step, Intake.read
+    step, read = ReplayServer.step, StreamReader.read
     taking_in = [""]  # ``written`` amid an append's step (a), ``committed`` amid its step (c): draws commit, too
 
     def half_the_rows(self: Any, rows: Any) -> Any:
@@ -107,14 +107,14 @@ def replay_server() -> None:
 
     def compared(self: Any) -> bool:
         if strikes("compare-tree"):
-            rebuilt = SumTree(self._store.ring.capacity)
-            rebuilt.rebuild(valid_leaves(self._store))
-            say("tree", same=bool((rebuilt._nodes == self._store.tree._nodes).all()))
+            recreate_env = SumTree(self._store.ring.capacity)
+            recreate_env.rebuild(valid_leaves(self._store))
+            say("tree", same=bool((recreate_env._nodes == self._store.tree._nodes).all()))
         return bool(step(self))
 
     Ring.write, Ring.commit, RecordPair.write = half_the_rows, committed, half_a_record  # type: ignore[method-assign]
-    ReplayServer.step, Intake.read = compared, all_there  # type: ignore[method-assign]
-    after(Intake, "read", "read")
+    ReplayServer.step, StreamReader.read = compared, all_there  # type: ignore[method-assign]
+    after(StreamReader, "read", "read")
     after(Ring, "write", "rows")
     after(ReplayStore, "set_priorities", "priorities")
     after(RedisBus, "commit", "acknowledged")

@@ -13,7 +13,7 @@ from rmc.common.errors import BusFull, BusUnavailable, MessageError
 from rmc.common.shard import WHOLE, Shard
 from rmc.common.window import Rows, WindowSpec, first_fault
 from rmc.common.wire import check_rows, decode_rows, max_entry_bytes
-from rmc.replay_server.record import StreamPosition
+from rmc.replay_server.commit_record import StreamPosition
 
 ROUND_BYTES = 4 << 20  # read at most about this much in a round, so that the learner is served in between
 MAX_ENTRIES = 256  # of one actor in a round
@@ -23,7 +23,7 @@ LARGEST = EntryId(2**31 - 1, 2**53)  # of each number; past one of them a row ca
 
 
 @dataclass(frozen=True)
-class Round:
+class IngestBatch:
     """What one read gave."""
 
     rows: Rows  # (n,) writable, all but the serial as it will stand in the ring
@@ -31,7 +31,7 @@ class Round:
     broken: dict[int, EntryId]  # actors whose stream lacks an entry, and the one before: nothing past it was taken
 
 
-class Intake:
+class StreamReader:
     """Reads every actor's stream past where the ring is. Refused entries go to the dead letters, counted."""
 
     def __init__(self, spec: WindowSpec, bus: Bus, actors: int, shard: Shard = WHOLE) -> None:
@@ -43,7 +43,7 @@ class Intake:
         self._rounds = 0
         self._entry_bytes = ROUND_BYTES  # the largest entry of the last round that had any
 
-    def read(self, positions: Mapping[int, StreamPosition]) -> Round | None:
+    def read(self, positions: Mapping[int, StreamPosition]) -> IngestBatch | None:
         """The next entries of all streams, or None where there are none; those after them are expected already."""
         if self._rounds % DISCOVERY_ROUNDS == 0:
             self._actors.update(filter(self._shard.owns, self.bus.actors()), positions)
@@ -71,7 +71,7 @@ class Intake:
         """Entries of each stream."""
         return min(max(ROUND_BYTES // (self._entry_bytes * len(self._actors)), 1), MAX_ENTRIES)
 
-    def _round(self, entries: list[Entry], positions: dict[int, StreamPosition]) -> Round:
+    def _round(self, entries: list[Entry], positions: dict[int, StreamPosition]) -> IngestBatch:
         entries, broken = self._in_order(entries, positions)
         bodies = [self._decode(entry) for entry in entries]
         rows = self._stamped(entries, bodies)
@@ -83,7 +83,7 @@ class Intake:
             settled = before.settled_steps if entry.id.epoch == before.id.epoch else 0  # an actor's new life
             settled += self._lost_steps(entry) if body is None else steps
             positions[entry.actor] = StreamPosition(entry.id, settled)
-        return Round(rows, positions, broken)
+        return IngestBatch(rows, positions, broken)
 
     def _in_order(
         self, entries: list[Entry], positions: Mapping[int, StreamPosition]

@@ -1,4 +1,4 @@
-"""Roles forked from a nursery: as their own processes would be, and gone with it."""
+"""Roles forked from a fork server: as their own processes would be, and gone with it."""
 
 import errno
 import os
@@ -15,14 +15,14 @@ import pytest
 
 from rmc.cli import fork_server
 from rmc.common.errors import RoleDied
-from rmc.deploy.local.fork_server import FAILED_STATUS, IMPORT_SECONDS, Forked, Nursery
+from rmc.deploy.local.fork_server import FAILED_STATUS, IMPORT_SECONDS, ForkedProcess, ForkServer
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nursery]:
-    one = Nursery(tmp_path_factory.mktemp("nursery") / "nursery.log")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ForkServer]:
+    one = ForkServer(tmp_path_factory.mktemp("fork_server") / "fork_server.log")
     one.start()
     yield one
     one.close()
@@ -30,15 +30,15 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nursery]:
 
 @pytest.fixture(autouse=True)
 def leaves_nothing_behind() -> None:
-    """Not after each of these tests, which share a nursery."""
+    """Not after each of these tests, which share a fork server."""
 
 
-def fork(shared: Nursery, log: Path, *words: str, **environment: str) -> Forked:
+def fork(shared: ForkServer, log: Path, *words: str, **environment: str) -> ForkedProcess:
     with log.open("ab") as file:
         return shared.fork(words, environment, file.fileno())
 
 
-def test_it_is_rmc_with_its_words(shared: Nursery, tmp_path: Path) -> None:
+def test_it_is_rmc_with_its_words(shared: ForkServer, tmp_path: Path) -> None:
     role = fork(
         shared,
         tmp_path / "log",
@@ -55,7 +55,7 @@ def test_it_is_rmc_with_its_words(shared: Nursery, tmp_path: Path) -> None:
     assert role.poll() == 2  # it is still known
 
 
-def test_it_leads_a_group_has_its_title_and_dies_of_a_signal(shared: Nursery, tmp_path: Path) -> None:
+def test_it_leads_a_group_has_its_title_and_dies_of_a_signal(shared: ForkServer, tmp_path: Path) -> None:
     role = fork(
         shared, tmp_path / "log", "actor", "--run", "x", "--index", "7", RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99"
     )
@@ -68,7 +68,7 @@ def test_it_leads_a_group_has_its_title_and_dies_of_a_signal(shared: Nursery, tm
     assert role.wait(5) == -signal.SIGKILL
 
 
-def test_with_the_nursery_go_those_it_forked_and_another_begins(shared: Nursery, tmp_path: Path) -> None:
+def test_with_the_fork_server_go_those_it_forked_and_another_begins(shared: ForkServer, tmp_path: Path) -> None:
     words = ("actor", "--run", "x", "--index", "0")
     role = fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99")
     process = psutil.Process(role.pid)
@@ -87,15 +87,15 @@ def test_one_that_does_not_start_says_where_to_look(tmp_path: Path, monkeypatch:
     broken.write_text("#!/bin/sh\necho no torch here\nexit 1\n")
     broken.chmod(0o700)
     monkeypatch.setattr(fork_server.sys, "executable", str(broken))
-    one = Nursery(tmp_path / "nursery.log")
-    with pytest.raises(RoleDied, match=r"does not start; its log is .*nursery\.log"):
+    one = ForkServer(tmp_path / "fork_server.log")
+    with pytest.raises(RoleDied, match=r"does not start; its log is .*fork_server\.log"):
         fork(one, tmp_path / "log", "actor")
     one.close()
-    assert (tmp_path / "nursery.log").read_text() == "no torch here\n" * 2
+    assert (tmp_path / "fork_server.log").read_text() == "no torch here\n" * 2
 
 
 def test_one_that_hangs_is_given_up_for_another(
-    shared: Nursery, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    shared: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fork_server, "REPLY_SECONDS", 0.3)
     words = ("actor", "--run", "x", "--index", "0")
@@ -121,19 +121,19 @@ def test_a_system_without_room_for_a_process_is_said(tmp_path: Path, monkeypatch
     with ours, theirs, (tmp_path / "log").open("ab") as log:
         assert fork_server._forked(theirs, {"words": [], "environment": {}}, log.fileno()) == 0
     assert (tmp_path / "log").read_text() == "no process can be forked: Resource temporarily unavailable\n"
-    ended = Forked(Nursery(tmp_path / "nursery.log"), 0, 0, FAILED_STATUS)
+    ended = ForkedProcess(ForkServer(tmp_path / "fork_server.log"), 0, 0, FAILED_STATUS)
     assert ended.poll() == FAILED_STATUS
 
 
 FORKS_THAT_DRAW = """
 import os, socket, sys, types
 import numpy as np
-import deploy
-from deploy import nursery
+from rmc import cli
+from rmc.cli import fork_server
 
 np.random.seed(0)
-deploy.cli = sys.modules["rmc.cli.main"] = types.ModuleType("rmc.cli.main")
-deploy.cli.main = lambda: print(np.random.random(), flush=True)
+cli.main = sys.modules["rmc.cli.main"] = types.ModuleType("rmc.cli.main")
+cli.main.main = lambda: print(np.random.random(), flush=True)
 for _ in range(2):
     pid = fork_server._forked(socket.socket(), {"words": [], "environment": {}}, os.dup(1))
     os.waitpid(pid, 0)

@@ -16,8 +16,8 @@ from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
-from rmc.deploy.local.role_process import Place, Process, wait_for_room
-from rmc.deploy.redis.connect import Patience, connect
+from rmc.deploy.local.role_process import Process, RunConnection, wait_for_room
+from rmc.deploy.redis.connect import Deadline, connect
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.server import RedisServer
 from rmc.deploy.redis.users import RedisUsers
@@ -37,7 +37,7 @@ def test_a_role_waits_for_a_redis_that_is_coming_back(short: Path, caplog: pytes
     with pytest.raises(ConfigError, match="no Redis answers"):
         connect(url, "run")
     with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(connect, url, "run", Patience(20.0, StopSignal()))
+        waiting = pool.submit(connect, url, "run", Deadline(20.0, StopSignal()))
         time.sleep(0.7)
         with server:
             waiting.result().ping()
@@ -59,7 +59,7 @@ def test_a_role_waits_for_its_run(
     redis_url: str, run_name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RMC_PATIENCE", "0.3")
-    place = Place(run_name, redis_url)
+    place = RunConnection(run_name, redis_url)
     with pytest.raises(ConfigError, match=f"--run='{run_name}': no run of this name is registered"):
         Process(place)
     assert caplog.messages == [f"waiting up to 0.3 s for run {run_name} to be registered in that Redis"]
@@ -75,7 +75,7 @@ def test_a_role_waits_for_its_run(
 def test_who_is_told_to_stop_waits_no_longer(short: Path) -> None:
     stop = StopSignal()
     with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(connect, f"unix://{short}/redis.sock", "run", Patience(60.0, stop))
+        waiting = pool.submit(connect, f"unix://{short}/redis.sock", "run", Deadline(60.0, stop))
         time.sleep(0.3)
         stop.request()
         with pytest.raises(ConfigError, match="no Redis answers"):

@@ -10,7 +10,7 @@ import pytest
 
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.monitor.attach import Tail, stop, trained_now
+from rmc.deploy.monitor.attach import Tail, launcher_pid, stop
 from rmc.deploy.run.folder import RunFolder, open_run
 from rmc.deploy.run.presets import debug
 
@@ -36,24 +36,24 @@ def folder(tmp_path: Path) -> RunFolder:
 def test_a_trainer_is_known_until_it_ends(folder: RunFolder) -> None:
     assert (folder.trainer(), folder.ended()) == (None, None)
     words = [sys.executable, "-c", HOLDER, str(folder.path), "130"]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout is not None
-        holder.stdout.readline()
-        assert folder.trainer() == holder.pid == trained_now(folder)
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as owner:
+        assert owner.stdout is not None
+        owner.stdout.readline()
+        assert folder.trainer() == owner.pid == launcher_pid(folder)
         with pytest.raises(ConfigError, match="this run is being trained; stop it first"):
             folder.lock()
-        assert folder.trainer() == holder.pid  # who was refused has changed nothing
+        assert folder.trainer() == owner.pid  # who was refused has changed nothing
         assert folder.ended() is None
-        holder.communicate("\n")
+        owner.communicate("\n")
     assert (folder.trainer(), folder.ended()) == (None, 130)
 
 
 def test_a_trainer_that_was_killed_has_not_ended(folder: RunFolder) -> None:
     words = [sys.executable, "-c", HOLDER, str(folder.path), "0"]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout is not None
-        holder.stdout.readline()
-        holder.kill()
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as owner:
+        assert owner.stdout is not None
+        owner.stdout.readline()
+        owner.kill()
     assert (folder.trainer(), folder.ended()) == (None, None)
     folder.lock()
     assert folder.trainer() == os.getpid()

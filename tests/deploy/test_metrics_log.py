@@ -10,8 +10,8 @@ from rich.console import Console
 
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.monitor import metrics_log
-from rmc.deploy.monitor.metrics_log import Journal
-from rmc.deploy.monitor.view import Board, View
+from rmc.deploy.monitor.metrics_log import MetricsLog
+from rmc.deploy.monitor.view import RunStatus, View
 from rmc.deploy.run.folder import RunFolder, open_run
 from rmc.deploy.run.presets import debug
 
@@ -31,7 +31,7 @@ def test_a_full_disk_is_told_once_and_over_once(
     folder: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(metrics_log, "RETRY_SECONDS", 0.0)
-    kept = Journal(folder)
+    kept = MetricsLog(folder)
     kept.write({"role": "learner", "x": 1}, 0)
     there = kept._lines
     with open("/dev/full", "ab", buffering=0) as full, caplog.at_level(logging.WARNING):
@@ -50,7 +50,7 @@ def test_a_full_disk_is_told_once_and_over_once(
 
 
 def test_no_half_of_a_line_is_left(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept, write = Journal(folder), metrics_log.os.write
+    kept, write = MetricsLog(folder), metrics_log.os.write
     kept.write({"role": "learner", "x": 1}, 0)
 
     def short(file: int, line: bytes) -> int:
@@ -64,7 +64,7 @@ def test_no_half_of_a_line_is_left(folder: RunFolder, monkeypatch: pytest.Monkey
 
 
 def test_a_view_that_cannot_be_written_ends_nothing() -> None:
-    board = Board("Pendulum-v1", "debug", 0, 100, 4.0)
+    board = RunStatus("Pendulum-v1", "debug", 0, 100, 4.0)
     with open("/dev/full", "wb", buffering=0) as raw:
         full = io.TextIOWrapper(raw, write_through=True)
         View(board, Console(file=full, force_terminal=False)).refresh()

@@ -15,7 +15,7 @@ class _Kept(NamedTuple):
     steps: int  # new environment steps in it
 
 
-class Outbox:
+class UnackedEntries:
     """The stream of one actor in one epoch.
 
     An entry is put in first and sent then, so that a failed ``send`` loses nothing: the next one goes on,

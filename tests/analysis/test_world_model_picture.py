@@ -20,7 +20,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder, open_run
 from rmc.deploy.run.presets import debug
-from tests.deploy.test_policy import AGENTS
+from tests.analysis.test_policy import AGENTS
 from tests.hostile import hostile_state
 
 
@@ -61,8 +61,8 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
         step = agent.world_model(agent.features(seen), action)
         frame = frame + step.observation_change
         embedding = agent.memory.embed(torch.cat([frame, action], -1))
-        beside = {"hidden": frame[..., :0], "hidden+embedding": embedding}.get(agent.config.head_input, frame)
-        seen = seen._replace(hidden=seen.hidden + step.hidden_change, beside=beside)
+        skip = {"hidden": frame[..., :0], "hidden+embedding": embedding}.get(agent.config.head_input, frame)
+        seen = seen._replace(hidden=seen.hidden + step.hidden_change, skip=skip)
     return frame[0, 0]
 
 

@@ -12,7 +12,7 @@ from rmc.analysis.video import _follow
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
-from tests.deploy.test_policy import AGENTS, make_run
+from tests.analysis.test_policy import AGENTS, make_run
 
 
 def evaluate(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:

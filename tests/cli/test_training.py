@@ -9,7 +9,7 @@ from rmc.cli import training
 from rmc.cli.training import conduct
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.run.launch_options import LaunchOptions
-from tests.deploy.test_policy import AGENTS, make_run
+from tests.analysis.test_policy import AGENTS, make_run
 
 
 def test_the_last_evaluation_judges_and_does_not_choose(tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from rmc.deploy.ray import ring_nodes
-from rmc.deploy.ray.ring_nodes import Rings
+from rmc.deploy.ray.ring_nodes import RingLocations
 from rmc.deploy.run.folder import RunFolder
 
 ROLES = ["replay-0", "replay-1", "replay-2"]
@@ -30,8 +30,8 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_ring_is_where_it_was_noted_while_that_node_lives(tmp_path: Path) -> None:
-    Rings(RunFolder(tmp_path)).note("replay", "10.0.0.b")
-    again = Rings(RunFolder(tmp_path))
+    RingLocations(RunFolder(tmp_path)).note("replay", "10.0.0.b")
+    again = RingLocations(RunFolder(tmp_path))
     assert (again.node("replay"), again.node("replay-1")) == ("b", None)
     again.note("replay", "10.0.0.c")
     assert again.node("replay") is None
@@ -40,14 +40,14 @@ def test_a_ring_is_where_it_was_noted_while_that_node_lives(tmp_path: Path) -> N
 @pytest.mark.parametrize("cut", [b"", b'{"replay": "10'])
 def test_a_note_that_is_cut_short_is_none(tmp_path: Path, cut: bytes) -> None:
     (tmp_path / "rings-at").write_bytes(cut)
-    noted = Rings(RunFolder(tmp_path))
+    noted = RingLocations(RunFolder(tmp_path))
     assert noted.node("replay") is None
     noted.note("replay", "10.0.0.b")
-    assert Rings(RunFolder(tmp_path)).node("replay") == "b"
+    assert RingLocations(RunFolder(tmp_path)).node("replay") == "b"
 
 
 def test_shards_take_the_bundles_of_their_nodes_and_the_others_what_is_left(tmp_path: Path) -> None:
-    noted = Rings(RunFolder(tmp_path))
+    noted = RingLocations(RunFolder(tmp_path))
     assert noted.bundles(Group(), ROLES) == {"replay-0": 0, "replay-1": 1, "replay-2": 2}
     noted.note("replay-0", "10.0.0.c")  # gone
     noted.note("replay-1", "10.0.0.a")

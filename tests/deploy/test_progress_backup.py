@@ -7,8 +7,8 @@ import msgpack
 import pytest
 
 from rmc.common.bus.memory_bus import MemoryBus
-from rmc.common.bus.protocol import Ack, EntryId, Holder
-from rmc.deploy.redis.progress_backup import Counters
+from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner
+from rmc.deploy.redis.progress_backup import ProgressBackup
 from rmc.deploy.run.folder import RunFolder
 
 WHOLE = msgpack.packb({"replay": b"counted"})
@@ -20,22 +20,22 @@ DAMAGED = {
 
 
 def commit(bus: MemoryBus, role: str, progress: bytes) -> None:
-    bus.commit(Holder(role, bus.take_epoch(role)), {0: Ack(EntryId(1, 0), 0)}, progress)
+    bus.commit(ReplayOwner(role, bus.take_epoch(role)), {0: Ack(EntryId(1, 0), 0)}, progress)
 
 
 def test_what_was_published_is_said_again_where_nothing_is(tmp_path: Path) -> None:
-    counters, before = Counters(RunFolder(tmp_path), shards=2), MemoryBus()
+    counters, before = ProgressBackup(RunFolder(tmp_path), shards=2), MemoryBus()
     commit(before, "replay-0", b"first")
     commit(before, "replay-1", b"second")
     counters.keep(before)
     after = MemoryBus()
     commit(after, "replay-1", b"newer")
-    Counters(RunFolder(tmp_path), shards=2).restore(after)
+    ProgressBackup(RunFolder(tmp_path), shards=2).restore(after)
     assert (after.progress("replay-0"), after.progress("replay-1")) == (b"first", b"newer")
 
 
 def test_an_empty_redis_does_not_take_the_copy_away(tmp_path: Path) -> None:
-    counters, bus = Counters(RunFolder(tmp_path), shards=1), MemoryBus()
+    counters, bus = ProgressBackup(RunFolder(tmp_path), shards=1), MemoryBus()
     counters.restore(bus)
     assert bus.progress("replay") is None
     commit(bus, "replay", b"counted")
@@ -49,7 +49,7 @@ def test_an_empty_redis_does_not_take_the_copy_away(tmp_path: Path) -> None:
 def test_a_damaged_copy_is_told_and_the_run_goes_on(
     tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
-    counters, bus = Counters(RunFolder(tmp_path), shards=1), MemoryBus()
+    counters, bus = ProgressBackup(RunFolder(tmp_path), shards=1), MemoryBus()
     (tmp_path / "replay-counters").write_bytes(content)
     counters.restore(bus)
     assert bus.progress("replay") is None
@@ -71,7 +71,7 @@ def test_a_copy_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatc
         synchronised.append((content, (tmp_path / "replay-counters").exists()))
 
     monkeypatch.setattr(os, "fsync", watched)
-    counters, bus = Counters(RunFolder(tmp_path), shards=1), MemoryBus()
+    counters, bus = ProgressBackup(RunFolder(tmp_path), shards=1), MemoryBus()
     commit(bus, "replay", b"counted")
     counters.keep(bus)
     assert synchronised == [(WHOLE, False)]

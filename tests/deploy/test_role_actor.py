@@ -14,8 +14,8 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.local import supervisor
 from rmc.deploy.local.supervisor import RoleCommand
 from rmc.deploy.ray import role_actor
-from rmc.deploy.ray.learner_actor import LearnerHost
-from rmc.deploy.ray.role_actor import RoleHost, Task
+from rmc.deploy.ray.learner_actor import LearnerActor
+from rmc.deploy.ray.role_actor import RoleActor, Task
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def host(program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[RoleHost]:
+def host(program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[RoleActor]:
     """Its watcher is slow to see an end."""
     assert program.exists()
     reap = supervisor.RoleProcess.reap
@@ -53,7 +53,7 @@ def host(program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
         return ended
 
     monkeypatch.setattr(supervisor.RoleProcess, "reap", slow_for_watchers)
-    made = RoleHost(Task("test-run", RoleCommand("replay", ("replay",)), {}, {}, str(tmp_path)))
+    made = RoleActor(Task("test-run", RoleCommand("replay", ("replay",)), {}, {}, str(tmp_path)))
     yield made
     made.close()
     made.clear()
@@ -67,9 +67,9 @@ def wait_for(watched: list[int], seconds: float) -> list[int]:
 
 
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_role_that_is_replaced_does_not_end_its_host(host: RoleHost, ends: list[int]) -> None:
+def test_a_role_that_is_replaced_does_not_end_its_host(host: RoleActor, ends: list[int]) -> None:
     before = host.report("", 0).pid
-    host.again()
+    host.restart()
     after = host.report("", 0)
     assert after.pid not in (None, before)
     assert wait_for(ends, 1.5) == []  # nor does the new one, which is watched, too:
@@ -78,7 +78,7 @@ def test_a_role_that_is_replaced_does_not_end_its_host(host: RoleHost, ends: lis
     assert wait_for(ends, 10.0) == [1]
 
 
-class Learner(LearnerHost):
+class Learner(LearnerActor):
     """With a folder, and no launcher that it would bring checkpoints to."""
 
     def prepare(self) -> None:
@@ -86,7 +86,7 @@ class Learner(LearnerHost):
         self._folder.folder.mkdir()
         self._folder.note_save(2.0)
 
-    def settle(self) -> None:
+    def flush_artifacts(self) -> None:
         pass
 
     def tend(self) -> None:
