@@ -97,7 +97,7 @@ def test_one_that_does_not_start_says_where_to_look(tmp_path: Path, monkeypatch:
 def test_one_that_hangs_is_given_up_for_another(
     shared: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fork_server, "REPLY_SECONDS", 0.3)
+    monkeypatch.setattr("rmc.deploy.local.fork_server.REPLY_SECONDS", 0.3)
     words = ("actor", "--run", "x", "--index", "0")
     role = fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99")
     process, hung = psutil.Process(role.pid), shared._program
