@@ -160,7 +160,7 @@ class Bus(Protocol):
         """The newest policy, or the newest to evaluate. None if there is none or it was just replaced."""
 
     def emit(self, role: str, record: Mapping[str, Any]) -> None:
-        """Append a metrics record, see ``common/record.py``."""
+        """Append a metrics record, see ``common/bus/metrics_record.py``."""
 
     def records(self, after: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, str]]:
         """Records of each role past its cursor ("0" = all that is kept), with a ``role``, and the next cursors.

@@ -1,4 +1,4 @@
-"""The bus over Redis: unix socket, TCP or TLS; the keys stand in ``common/bus.py``."""
+"""The bus over Redis: unix socket, TCP or TLS; the keys stand in ``common/bus/protocol.py``."""
 
 import re
 from collections import Counter

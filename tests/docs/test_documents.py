@@ -16,19 +16,19 @@ from rmc.learner import diagnostics, losses, update
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
-PACKAGES = ("common", "actors", "replay_server", "learner", "deploy")
 
 
-def test_its_tree_names_every_file() -> None:
-    block = README[README.index("## What is where") :]
-    found, folder = set(), ""
-    for row in block.splitlines():
-        top, leaf = re.match(r"(\w+)/", row), re.match(r"[├└]── (\w+\.py)", row)
-        folder = top[1] if top else folder
-        if leaf:
-            found.add(f"{folder}/{leaf[1]}")
-    there = {f"{package}/{path.name}" for package in PACKAGES for path in (ROOT / package).glob("*.py")}
-    assert found == {path for path in there if not path.endswith("__init__.py")}
+def test_its_table_names_every_folder() -> None:
+    block = README[README.index("## Folders") :].split("\n## ")[0]
+    named = set(re.findall(r"^\| `(\w+)/` \|", block, re.MULTILINE))
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    folders = {name.split("/")[0] for name in listed.splitlines() if "/" in name}
+    assert named == {name for name in folders if not name.startswith(".")}
+
+
+def test_it_is_short() -> None:
+    assert len(README.splitlines()) <= 130
+    assert len((ROOT / "docs" / "results.md").read_text().splitlines()) <= 150
 
 
 def test_the_faults_that_were_run_are_in_their_page() -> None:
@@ -80,6 +80,21 @@ def test_its_commands_run(tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stderr) == (0, ""), done.stderr
+
+
+@pytest.mark.timeout(300)
+def test_the_python_api_runs(tmp_path: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python-api.md").read_text(), re.DOTALL)
+    assert {name for block in blocks for name in re.findall(r"import (.*)", block)} >= {
+        "EnvConfig, presets", "EnvConfig, presets, train", "evaluate", "load_policy",
+    }  # fmt: skip
+    assert all(len(block.strip().splitlines()) <= 6 for block in blocks)
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(blocks)], cwd=tmp_path, capture_output=True, text=True, timeout=280
+    )
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
+    assert "'eval_return_mean'" in done.stdout
+    assert re.search(r"^[-\d.]+ ± [\d.]+$", done.stdout, re.MULTILINE)
 
 
 @pytest.mark.timeout(300)
