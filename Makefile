@@ -85,7 +85,7 @@ wheel: $(STAMP)
 
 # The documents as a site in build/site; every link is checked.
 site: $(STAMP)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # Hours. Interrupt it as you like: the same command goes on from there.
 results: $(STAMP)
