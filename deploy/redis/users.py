@@ -1,7 +1,7 @@
 """Who may do what in a run's Redis: a user for every role, with the commands and keys that the role needs.
 
-R stands for ``rmc:{run}``, as in ``common/bus/protocol.py``. A rule in parentheses is a selector: its commands on its keys
-alone, which takes Redis 7 or Valkey.
+R stands for ``rmc:{run}``, as in ``common/bus/protocol.py``. A rule in parentheses is a selector: its commands on its
+keys alone, which takes Redis 7 or Valkey.
 OWN stands for the actors whose streams a replay server reads.
 The user ``default`` is off. Passwords follow from the run's secret, one for each user, and give nothing else away;
 the server is told their hashes.

@@ -18,6 +18,13 @@ from rmc.deploy.ray.learner_actor import LearnerActor
 from rmc.deploy.ray.role_actor import RoleActor, Task
 
 
+@pytest.fixture(autouse=True)
+def _own_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A host changes its process's folder and variables: both are as before after the test."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OMP_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "1"))
+
+
 @pytest.fixture
 def ends(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """With what status hosts have ended themselves."""

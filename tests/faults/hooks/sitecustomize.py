@@ -175,7 +175,7 @@ def _same(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
-if "rmc.cli.fork_server" in sys.orig_argv:
+if "replay" in sys.orig_argv:
     replay_server()
 elif "learner" in sys.orig_argv:
     learner()
