@@ -59,8 +59,11 @@ def _import_all() -> None:
     import gymnasium.envs.mujoco.mujoco_env
 
     import rmc.cli.commands
+    import rmc.deploy.local.actor_process
 
-    assert rmc.cli.commands, gymnasium.envs.mujoco.mujoco_env
+    assert rmc.cli.commands
+    assert rmc.deploy.local.actor_process
+    assert gymnasium.envs.mujoco.mujoco_env
     gc.collect()
     gc.freeze()  # the collector does not write to these pages, so that they stay shared
 
