@@ -36,7 +36,7 @@ class Connection:
         self._inbox = bytearray()
         self._unacked: deque[memoryview] = deque()
         self.shared: SharedBatches | None = None  # where its batches lie, if not in the socket
-        self._zero_copy = False  # the outbox may hold views of the sender's buffers
+        self._zero_copy = False  # unsent frames may hold views of the sender's buffers
 
     @property
     def sending(self) -> bool:

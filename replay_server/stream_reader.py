@@ -1,4 +1,4 @@
-"""The intake: a bounded round of stream entries, checked, stamped with their origin, as one array of rows."""
+"""Reads the actors' streams: a bounded batch of entries, checked, stamped with their origin, as one array of rows."""
 
 from collections import Counter
 from collections.abc import Mapping

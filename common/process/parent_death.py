@@ -1,7 +1,7 @@
 """Processes that die with their parent, so that nothing outlives a supervisor, even one killed by force.
 
 Run as a script it ties itself to its parent and becomes another program:
-``python lifeline.py PARENT_PID PROGRAM ARGUMENTS…``. It imports nothing but the standard library.
+``python parent_death.py PARENT_PID PROGRAM ARGUMENTS…``. It imports nothing but the standard library.
 """
 
 import ctypes
