@@ -104,6 +104,10 @@ def test_roles_by_hand_over_tcp(told: str, redis_url: str, run_name: str, tmp_pa
 def test_every_metric_is_in_the_glossary(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with Training(folder, "--total-steps", "1200", "--checkpoint-steps", "600", "--curiosity", "0.1") as training:
+        training.wait_for(lambda: training.role("replay") and training.newest("replay", "windows") > 0)
+        replay = training.role("replay")
+        assert replay is not None
+        assert "libtorch" not in Path(f"/proc/{replay.pid}/maps").read_text()  # it is not forked from what has torch
         assert training.finish(170) == 0, training.text() + training.logs()
     glossary = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text()
     explained = set(re.findall(r"`([a-z_]+)`", glossary))
