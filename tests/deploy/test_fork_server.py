@@ -148,6 +148,6 @@ def test_forks_do_not_draw_the_same_numbers() -> None:
 
 def test_what_its_roles_import_is_there_before_it_forks() -> None:
     """Else each role has a copy of its own: some 100 MB, and seconds at every start."""
-    ask = "import sys; from rmc.cli.fork_server import _import_all as all; all(); print('rmc.actors.actor' in sys.modules)"
+    ask = "import sys; from rmc.cli import fork_server as one; one._import_all(); print(*sys.modules)"
     said = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True).stdout
-    assert said == "True\n"
+    assert "rmc.actors.actor" in said.split()
