@@ -82,7 +82,7 @@ class Actor:
         self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, n)
         self._observation = np.zeros((n, spec.obs_dim), np.float32)
         self._reward = np.zeros(n, np.float32)
-        self._blank, self._terminated, self._truncated = (np.zeros(n, np.bool_) for _ in range(3))
+        self._missing, self._terminated, self._truncated = (np.zeros(n, np.bool_) for _ in range(3))
         self._means, self._rate, self._episodes, self._resends = Means(), Rate(), 0, 0
         self._refused_weights = 0
         self._total_steps = 0
@@ -260,7 +260,7 @@ class Actor:
             self._steps -= self._builder.forget(i) + 1
         ended = self._builder.add(
             action, state, self._version.update, self._config.reward_scale * self._reward, self._observation,
-            self._blank, self._terminated, self._truncated,
+            self._missing, self._terminated, self._truncated,
         )  # fmt: skip
         self._next_poll = float("-inf")
         self._steps += n
@@ -274,7 +274,7 @@ class Actor:
 
     def _step_environment(self, i: int, action: Floats) -> None:
         observation, reward, terminated, truncated, info = self._envs[i].step(action)
-        self._observation[i], self._reward[i], self._blank[i] = observation, reward, info.get("blank", False)
+        self._observation[i], self._reward[i], self._missing[i] = observation, reward, info.get("missing", False)
         self._terminated[i], self._truncated[i] = terminated, truncated
 
     def _mark_non_finite(self) -> None:
@@ -319,7 +319,7 @@ class Actor:
             self._broken += 1
             self._envs[env] = recreate_env(self._envs[env], self._make_env)
             observation, info = checked_reset(self._envs[env], self._new_seed(env))
-        self._builder.begin(env, observation, info.get("blank", False))
+        self._builder.begin(env, observation, info.get("missing", False))
         self._returns[env] = self._lengths[env] = 0
 
     def _cut_episodes(self) -> None:

@@ -46,7 +46,7 @@ class PolicyLike(Protocol):
         self,
         observation: Floats,
         prev_action: Floats,
-        blank: NDArray[np.bool_],
+        missing: NDArray[np.bool_],
         state: Floats,
         noise: Floats | None,
         /,
@@ -67,7 +67,7 @@ class Rollout:
         self._observation = np.zeros((len(envs), *(shape or ())), np.float32)
         self._prev_action, self._state = runner.start()
         self._playing = np.ones(len(envs), np.bool_)
-        self._blank, self.broken = np.zeros((2, len(envs)), np.bool_)
+        self._missing, self.broken = np.zeros((2, len(envs)), np.bool_)
         self._returns = np.zeros(len(envs))
         self.steps = self._rounds = 0
         for i in range(len(envs)):
@@ -78,7 +78,7 @@ class Rollout:
     def step(self) -> bool:
         """One step of every episode that goes on; whether any does."""
         self._rounds += 1
-        action, state = self._runner.act(self._observation, self._prev_action, self._blank, self._state, None)
+        action, state = self._runner.act(self._observation, self._prev_action, self._missing, self._state, None)
         self._prev_action, self._state[:] = action, state
         for i in np.flatnonzero(self._playing).tolist():
             self._guarded(i, self._step_environment, action[i])
@@ -95,13 +95,13 @@ class Rollout:
 
     def _reset(self, i: int, seed: int) -> None:
         self._observation[i], info = checked_reset(self._envs[i], seed)
-        self._blank[i] = info.get("blank", False)
+        self._missing[i] = info.get("missing", False)
 
     def _step_environment(self, i: int, action: Floats) -> None:
         self._observation[i], reward, terminated, truncated, info = self._envs[i].step(action)
         if not (np.isfinite(self._observation[i]).all() and math.isfinite(reward)):
             raise ValueError("its observation or reward is not finite")
-        self._blank[i] = info.get("blank", False)
+        self._missing[i] = info.get("missing", False)
         self._returns[i] += float(reward)
         self.steps += 1
         self._playing[i] = not (terminated or truncated or self._rounds >= self._longest)

@@ -147,16 +147,16 @@ class PolicyRunner:
         return copies + [partial(mine.copy_, _of_shape(weights, name, mine)) for name, mine in plain.items()]
 
     def act(
-        self, observation: Floats, prev_action: Floats, blank: BoolArray, state: Floats, noise: Floats | None
+        self, observation: Floats, prev_action: Floats, missing: BoolArray, state: Floats, noise: Floats | None
     ) -> tuple[Floats, Floats]:
         """(N, O) raw, (N, A), (N,), (N, S), and (N, A) standard normal noise -> (N, A) in [-1, 1], (N, S).
 
         a = tanh(mean + std * noise); without noise, tanh(mean). The state returned is a buffer that
         the next call may overwrite; none of the arguments is changed.
         """
-        seen, hidden = self._seen(observation, prev_action, blank), state[:, : self._config.hidden]
-        if self._next_frame and blank.any():
-            self._input[blank, : self._obs_dim] = self._expected(state, prev_action)[blank]
+        seen, hidden = self._seen(observation, prev_action, missing), state[:, : self._config.hidden]
+        if self._next_frame and missing.any():
+            self._input[missing, : self._obs_dim] = self._expected(state, prev_action)[missing]
         if self._config.head_input == "observation":
             x, new_hidden = seen[:, : self._obs_dim], self._gru.out.zero_()
         else:
@@ -172,7 +172,7 @@ class PolicyRunner:
             new_state = np.concatenate([new_state, self._input[:, : self._obs_dim]], 1)
         return self._action(x.numpy(), noise), new_state
 
-    def _seen(self, observation: Floats, prev_action: Floats, blank: BoolArray) -> Tensor:
+    def _seen(self, observation: Floats, prev_action: Floats, missing: BoolArray) -> Tensor:
         x = self._input
         normalized = x[:, : self._obs_dim]
         if self._config.normalize_observations:
@@ -182,14 +182,14 @@ class PolicyRunner:
             np.maximum(normalized, -NORMALIZED_CLIP, out=normalized)
         else:
             normalized[:] = observation
-        normalized[blank] = 0.0
+        normalized[missing] = 0.0
         x[:, self._obs_dim : self._obs_dim + self._action_dim] = prev_action
         if self._config.blank_flag:
-            x[:, -1] = blank
+            x[:, -1] = missing
         return torch.from_numpy(x)
 
     def _expected(self, state: Floats, prev_action: Floats) -> Floats:
-        """(N, S), (N, A) -> (N, O), the normalised observation that fills a blank."""
+        """(N, S), (N, A) -> (N, O), the normalised observation that fills a missing frame."""
         x = torch.from_numpy(np.concatenate([state, prev_action], 1))
         for layer in self._next_frame:
             x = layer(x)

@@ -22,7 +22,7 @@ class Now(NamedTuple):
 
     observation: Floats  # (N, O)
     prev_action: Floats  # (N, A)
-    blank: BoolArray  # (N,)
+    missing: BoolArray  # (N,)
     state: Floats  # (N, S), the state before ``observation``
 
 
@@ -45,7 +45,7 @@ class WindowBuilder:
         self._spec, self._stride, self._envs, self._store_states = spec, stride, envs, store_states
         self._slots = slots = spec.observations
         self._observation = np.zeros((slots, envs, spec.obs_dim), np.float32)
-        self._blank = np.zeros((slots, envs), np.bool_)
+        self._missing = np.zeros((slots, envs), np.bool_)
         self._prev_action = np.zeros((slots, envs, spec.action_dim), np.float32)
         self._reward = np.zeros((slots, envs), np.float32)
         self._state = np.zeros((slots, envs, spec.state), np.float32)
@@ -75,13 +75,13 @@ class WindowBuilder:
     def now(self) -> Now:
         """The newest observations, and the memory before them."""
         slot = self._time % self._slots
-        return Now(self._observation[slot], self._prev_action[slot], self._blank[slot], self._state[slot])
+        return Now(self._observation[slot], self._prev_action[slot], self._missing[slot], self._state[slot])
 
-    def begin(self, env: int, observation: Floats, blank: bool) -> None:
+    def begin(self, env: int, observation: Floats, missing: bool) -> None:
         """A new episode: (O,) its first observation; what was open of the one before is forgotten."""
         slot = self._time % self._slots
         self._observation[slot, env] = observation
-        self._blank[slot, env] = blank
+        self._missing[slot, env] = missing
         self._prev_action[slot, env] = 0.0
         self._state[slot, env] = 0.0
         self._start[env] = self._time
@@ -104,7 +104,7 @@ class WindowBuilder:
         update: int,
         reward: Floats,
         observation: Floats,
-        blank: BoolArray,
+        missing: BoolArray,
         terminated: BoolArray,
         truncated: BoolArray,
     ) -> BoolArray:
@@ -120,7 +120,7 @@ class WindowBuilder:
         self._update[slot] = update
         self._reward[slot] = reward
         self._observation[slot] = observation
-        self._blank[slot] = blank
+        self._missing[slot] = missing
         ended = terminated | truncated
         steps = self._time - self._start
         for env in np.flatnonzero(ended | (steps - self._block == self._spec.train)).tolist():
@@ -155,7 +155,7 @@ class WindowBuilder:
         fields["env"][row], fields["episode_step"][row] = env, block
         fields["weights_update"][row] = self._update[(self._time - last + burn_in + 1) % self._slots]
         fields["observation"][row, first : last + 1] = self._observation[slots, env]
-        fields["blank"][row, first : last + 1] = self._blank[slots, env]
+        fields["blank"][row, first : last + 1] = self._missing[slots, env]
         fields["action"][row, first:last] = self._prev_action[slots[1:], env]
         fields["reward"][row, first:last] = self._reward[slots[1:], env]
         fields["prev_action"][row] = self._prev_action[slots[0], env]

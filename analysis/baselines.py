@@ -143,7 +143,7 @@ class SB3Adapter:
         return actions, nothing
 
     def act(
-        self, observation: Floats, _prev_action: Floats, _blank: NDArray[np.bool_], state: Floats, _: Floats | None
+        self, observation: Floats, _prev_action: Floats, _missing: NDArray[np.bool_], state: Floats, _: Floats | None
     ) -> tuple[Floats, Floats]:
         """(N, O) -> (N, A), as ``PolicyRunner.act``; of the rest nothing is used."""
         seen = self._scaled(observation)

@@ -1,6 +1,6 @@
 """A policy as an ONNX file, for programs without torch.
 
-Inputs: observation (N, O) raw, previous_action (N, A), blank (N,) bool, state (N, S), zeros at an episode's start.
+Inputs: observation (N, O) raw, previous_action (N, A), missing (N,) bool, state (N, S), zeros at an episode's start.
 Outputs: action (N, A) in [-1, 1], the policy's mean, and next_state (N, S).
 """
 
@@ -22,7 +22,7 @@ from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
 from rmc.deploy.run.folder import RunFolder, check_writable
 
-INPUTS, OUTPUTS = ("observation", "previous_action", "blank", "state"), ("action", "next_state")
+INPUTS, OUTPUTS = ("observation", "previous_action", "missing", "state"), ("action", "next_state")
 NEEDED = ("onnx", "onnxscript")
 
 
@@ -34,11 +34,11 @@ class _Step(nn.Module):
         self.agent = agent
 
     def forward(
-        self, observation: Tensor, previous_action: Tensor, blank: Tensor, state: Tensor
+        self, observation: Tensor, previous_action: Tensor, missing: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor]:
         """See the module's docstring."""
-        seen = self.agent.normalizer(observation, blank).unsqueeze(1)
-        now = blank.unsqueeze(1), previous_action.unsqueeze(1), state
+        seen = self.agent.normalizer(observation, missing).unsqueeze(1)
+        now = missing.unsqueeze(1), previous_action.unsqueeze(1), state
         remembered, _, state = self.agent.unroll(seen, *now)
         mean, _ = self.agent.policy(self.agent.features(remembered).squeeze(1))
         return torch.tanh(mean), state

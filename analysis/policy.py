@@ -4,7 +4,7 @@
     env = policy.make_env()
     observation, info = env.reset()
     policy.reset()
-    action = policy.act(observation, info.get("blank", False))
+    action = policy.act(observation, info.get("missing", False))
     observation, reward, terminated, truncated, info = env.step(action)
 
 Shapes: O observation, A action, S state.
@@ -50,14 +50,14 @@ class Policy:
         """Forget: a new episode begins."""
         self._prev_action, self._state = self._runner.start()
 
-    def act(self, observation: Floats, blank: bool = False, explore: bool = False) -> Floats:
+    def act(self, observation: Floats, missing: bool = False, explore: bool = False) -> Floats:
         """(O,) -> (A,) in [-1, 1]: the policy's mean, or a sample of it.
 
-        ``blank`` says that the frame is missing (``info["blank"]`` under flicker).
+        ``missing`` says that the frame is missing (``info["missing"]`` under flicker).
         """
         noise = self._rng.standard_normal(self._prev_action.shape, np.float32) if explore else None
         seen = np.asarray(observation, np.float32)[None]
-        action, state = self._runner.act(seen, self._prev_action, np.array([blank]), self._state, noise)
+        action, state = self._runner.act(seen, self._prev_action, np.array([missing]), self._state, noise)
         self._prev_action, self._state[:] = action, state
         found: Floats = action[0].copy()
         return found

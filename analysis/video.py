@@ -42,7 +42,7 @@ def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path) -> float
     total = 0.0
     for _ in range(LONGEST_EPISODE):
         video.send(_frame(env).tobytes())
-        action = policy.act(observation, bool(info.get("blank", False)))
+        action = policy.act(observation, bool(info.get("missing", False)))
         observation, reward, terminated, truncated, info = env.step(action)
         total += float(reward)
         if terminated or truncated:

@@ -40,12 +40,12 @@ class Episode:
     observation: Tensor  # (1, T + 1, O)
     action: Tensor  # (1, T, A)
     reward: Tensor  # (T,), scaled as for training
-    blank: Tensor  # (1, T + 1) bool
+    missing: Tensor  # (1, T + 1) bool
 
     @property
     def seen(self) -> Tensor:
-        """(T,) bool: neither the step's frame nor the next one is blank."""
-        return ~(self.blank[0, 1:] | self.blank[0, :-1])
+        """(T,) bool: neither the step's frame nor the next one is missing."""
+        return ~(self.missing[0, 1:] | self.missing[0, :-1])
 
 
 @dataclass(frozen=True)
@@ -82,22 +82,22 @@ def play(folder: RunFolder, agent: Agent, config: RunConfig, checkpoint: str) ->
     env = policy.make_env()
     observation, info = env.reset(seed=config.seed)
     policy.reset()
-    observations, blanks, actions, rewards = [observation], [bool(info.get("blank", False))], [], []
+    observations, missed, actions, rewards = [observation], [bool(info.get("missing", False))], [], []
     for _ in range(LONGEST_EPISODE):
-        actions.append(policy.act(observation, blanks[-1]))
+        actions.append(policy.act(observation, missed[-1]))
         observation, reward, terminated, truncated, info = env.step(actions[-1])
         observations.append(observation)
-        blanks.append(bool(info.get("blank", False)))
+        missed.append(bool(info.get("missing", False)))
         rewards.append(config.actor.reward_scale * float(reward))
         if terminated or truncated:
             break
     env.close()
-    raw, blank = torch.from_numpy(np.stack(observations)), torch.tensor(blanks)
+    raw, missing = torch.from_numpy(np.stack(observations)), torch.tensor(missed)
     return Episode(
-        agent.normalizer(raw, blank).unsqueeze(0),
+        agent.normalizer(raw, missing).unsqueeze(0),
         torch.from_numpy(np.stack(actions)).unsqueeze(0),
         torch.tensor(rewards),
-        blank.unsqueeze(0),
+        missing.unsqueeze(0),
     )
 
 
@@ -109,7 +109,7 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     """
     previous = torch.cat([torch.zeros_like(episode.action[:, :1]), episode.action], 1)
     start = torch.zeros(1, agent.config.state_size(agent.obs_dim))
-    memory, seen, _ = agent.unroll(episode.observation, episode.blank, previous, start)
+    memory, seen, _ = agent.unroll(episode.observation, episode.missing, previous, start)
     prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
     latent_change = memory.hidden[0].diff(dim=0)
     real = episode.observation[0, 1:]

@@ -17,7 +17,7 @@ STD_FLOOR = 1e-2  # a constant dimension is not blown up
 
 
 class Normalizer(nn.Module):
-    """(o - mean) / std with frozen statistics, or o itself where that is off; a blank frame stays zero."""
+    """(o - mean) / std with frozen statistics, or o itself where that is off; a missing frame stays zero."""
 
     mean: Tensor
     std: Tensor
@@ -28,12 +28,12 @@ class Normalizer(nn.Module):
         self.register_buffer("mean", torch.zeros(obs_dim))
         self.register_buffer("std", torch.ones(obs_dim))
 
-    def forward(self, observation: Tensor, blank: Tensor) -> Tensor:
+    def forward(self, observation: Tensor, missing: Tensor) -> Tensor:
         """(..., O) raw and (...) bool -> (..., O)."""
         normalized = observation
         if self.enabled:
             normalized = ((observation - self.mean) / self.std).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
-        return torch.where(blank.unsqueeze(-1), 0.0, normalized)
+        return torch.where(missing.unsqueeze(-1), 0.0, normalized)
 
     def freeze(self, count: int, total: Tensor, total_square: Tensor) -> None:
         """Take new statistics from sums over ``count`` observations; (O,) float64 each."""
@@ -55,7 +55,7 @@ class MemoryOutput(NamedTuple):
 class Memory(nn.Module):
     """Eq. 6: h_t = GRU(h_{t-1}, e_t), e_t = ReLU(Linear([o_t, a_{t-1}])) or the raw input.
 
-    Where asked, with a blank flag beside o_t.
+    Where asked, with a missing flag beside o_t.
     """
 
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
@@ -72,36 +72,36 @@ class Memory(nn.Module):
         self.skip_dim = {"hidden": 0, "hidden+embedding": embedding}.get(config.head_input, obs_dim)
         self.gru = nn.GRU(embedding, config.hidden, batch_first=True)
 
-    def forward(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> MemoryOutput:
+    def forward(self, observation: Tensor, missing: Tensor, prev_action: Tensor, hidden: Tensor) -> MemoryOutput:
         """(B, T, O) normalised, (B, T) bool, (B, T, A), (B, S) the state before the first step, which begins with h."""
         if self.head_input == "observation":
             return MemoryOutput(observation.new_zeros(*observation.shape[:2], self.gru.hidden_size), observation)
-        embedding = self._embedded(observation, blank, prev_action)
+        embedding = self._embedded(observation, missing, prev_action)
         hidden = self._unroll(embedding, hidden[:, : self.gru.hidden_size].unsqueeze(0).contiguous())
         return MemoryOutput(hidden, self._skip(observation, embedding))
 
-    def step(self, observation: Tensor, blank: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
+    def step(self, observation: Tensor, missing: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
         """One step of it: (B, O) normalised, (B,) bool, (B, A), (B, H) -> (B, H) float32."""
         if self.head_input == "observation":
             return torch.zeros_like(hidden)
-        embedding = self._embedded(observation, blank, prev_action)
+        embedding = self._embedded(observation, missing, prev_action)
         return torch.gru_cell(embedding, hidden, *self.gru.all_weights[0])
 
-    def skip(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
+    def skip(self, observation: Tensor, missing: Tensor, prev_action: Tensor) -> Tensor:
         """What the heads read beside h: (..., O) normalised, (...) bool, (..., A) -> (..., ·)."""
-        return self._skip(observation, self._embedded(observation, blank, prev_action))
+        return self._skip(observation, self._embedded(observation, missing, prev_action))
 
-    def inputs(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
+    def inputs(self, observation: Tensor, missing: Tensor, prev_action: Tensor) -> Tensor:
         """What is embedded: (..., O) normalised, (...) bool, (..., A) -> (..., O + A), or one more with the flag."""
-        flag = [blank.unsqueeze(-1).to(observation.dtype)] if self.blank_flag else []
+        flag = [missing.unsqueeze(-1).to(observation.dtype)] if self.blank_flag else []
         return torch.cat([observation, prev_action, *flag], dim=-1)
 
     def _skip(self, observation: Tensor, embedding: Tensor) -> Tensor:
         return (embedding if self.head_input == "hidden+embedding" else observation)[..., : self.skip_dim]
 
-    def _embedded(self, observation: Tensor, blank: Tensor, prev_action: Tensor) -> Tensor:
+    def _embedded(self, observation: Tensor, missing: Tensor, prev_action: Tensor) -> Tensor:
         """(..., O) normalised, (...) bool, (..., A) -> (..., E)."""
-        embedding: Tensor = self.embed(self.inputs(observation, blank, prev_action))
+        embedding: Tensor = self.embed(self.inputs(observation, missing, prev_action))
         return embedding
 
     def _unroll(self, embedding: Tensor, hidden: Tensor) -> Tensor:
@@ -151,7 +151,7 @@ class WorldModel(nn.Module):
 
 
 class ObservationImputer(nn.Module):
-    """g(h_t, o_t, a_t): the normalised o_{t+1} that fills a blank. It trains nothing but itself.
+    """g(h_t, o_t, a_t): the normalised o_{t+1} that fills a missing frame. It trains nothing but itself.
 
     It reads o_t, which the world model does not: where that one did, returns fell (``studies/notebook.md``).
     """
@@ -229,8 +229,11 @@ def squashed_sample(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tenso
 
 
 class Agent(nn.Module):
-    """All of it. Actors use ``normalizer``, ``memory`` and ``policy``; ``next_frame`` where blanks are filled, and
-    ``critic`` where they rate their windows; the learner everything."""
+    """The complete agent: memory, world model, critics, policy, temperature.
+
+    Actors use ``normalizer``, ``memory`` and ``policy``; ``next_frame`` where missing frames are filled, and
+    ``critic`` where they rate their windows.
+    """
 
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
@@ -254,8 +257,8 @@ class Agent(nn.Module):
         return torch.cat(remembered, dim=-1)
 
     @torch.no_grad()
-    def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """A blank o_t becomes what is expected from (h_{t-1}, o_{t-1}, a_{t-1}), o_{t-1} filled itself.
+    def fill(self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """A missing o_t becomes what is expected from (h_{t-1}, o_{t-1}, a_{t-1}), o_{t-1} filled itself.
 
         (B, T, O) normalised, (B, T) bool, (B, T, A), (B, S) the state before the first step -> (B, T, O) and the state
         after the last. No gradient.
@@ -264,37 +267,37 @@ class Agent(nn.Module):
         hidden, seen = state[:, : self.config.hidden], state[:, self.config.hidden :]
         frames = [observation[:, :0]]
         with torch.autocast(observation.device.type, enabled=False):  # at a step at a time the casts outweigh the rest
-            for o, was_blank, a in zip(observation.unbind(1), blank.unbind(1), prev_action.unbind(1), strict=True):
+            for o, was_missing, a in zip(observation.unbind(1), missing.unbind(1), prev_action.unbind(1), strict=True):
                 expected = self.next_frame(hidden, seen, a).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
-                seen = torch.where(was_blank.unsqueeze(1), expected, o)
-                hidden = self.memory.step(seen, was_blank, a, hidden)
+                seen = torch.where(was_missing.unsqueeze(1), expected, o)
+                hidden = self.memory.step(seen, was_missing, a, hidden)
                 frames.append(seen.unsqueeze(1))
         return torch.cat(frames, 1), torch.cat([hidden, seen], 1)
 
     def unroll(
-        self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor
+        self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor
     ) -> tuple[MemoryOutput, Tensor, Tensor]:
-        """The memory along a sequence; what it was given, (B, T, O), blanks filled; and the state after, (B, S)."""
+        """The memory along a sequence; its observations, (B, T, O), missing ones filled; and the state after, (B, S)."""
         seen = observation
-        if self.fills(blank):
-            seen, after = self.fill(observation, blank, prev_action, state)
-        remembered: MemoryOutput = self.memory(seen, blank, prev_action, state)
+        if self.fills(missing):
+            seen, after = self.fill(observation, missing, prev_action, state)
+        remembered: MemoryOutput = self.memory(seen, missing, prev_action, state)
         if seen is observation:
             last_seen = seen[:, -1, : state.shape[1] - self.config.hidden]
             after = torch.cat([remembered.hidden[:, -1], last_seen], 1)
         return remembered, seen, after
 
-    def fills(self, blank: Tensor) -> bool:
+    def fills(self, missing: Tensor) -> bool:
         """Whether there may be anything to fill; a GPU would have to wait to be asked, an export cannot ask."""
-        cannot_ask = blank.device.type != "cpu" or torch.compiler.is_exporting()
-        return self.config.fill_blanks and (cannot_ask or bool(blank.any()))
+        cannot_ask = missing.device.type != "cpu" or torch.compiler.is_exporting()
+        return self.config.fill_blanks and (cannot_ask or bool(missing.any()))
 
     def acting(self) -> dict[str, nn.Parameter]:
         """The parameters that it takes to act, by name."""
         return {name: value for name, value in self.named_parameters() if name.startswith(self._acting())}
 
     def policy_weights(self) -> dict[str, Tensor]:
-        """What it takes to act, detached, on the CPU: what fills blanks, too, where they are filled."""
+        """What it takes to act, detached, on the CPU: what fills missing frames, too, where they are filled."""
         return self._weights(self._acting())
 
     def broadcast_weights(self) -> dict[str, Tensor]:

@@ -7,7 +7,7 @@ LOG_STD_RANGE = (-20.0, 2.0)  # of the policy's Gaussian before the tanh
 NORMALIZED_CLIP = 10.0  # standard deviations
 HeadInput = Literal["hidden", "hidden+embedding", "hidden+observation", "observation"]
 POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what it takes to act
-FILL_PARTS = ("next_frame.",)  # what else it takes where blanks are filled
+FILL_PARTS = ("next_frame.",)  # what else it takes where missing frames are filled
 CRITIC_PARTS = ("critic.", "log_alpha")  # what else it takes to rate a window
 
 
@@ -33,10 +33,10 @@ class AgentConfig:
     grounding: bool = True
     """The world model also predicts the next observation's change and the reward."""
     blank_flag: bool = False
-    """The memory has one more input, which says whether the observation is blank (flickered out)."""
+    """The memory has one more input, which says whether the observation is missing (flickered out)."""
     fill_blanks: bool = False
-    """A blank observation is replaced, before the memory reads it, by what a small network of its own predicts from the
-    observation before (filled itself if it was blank), the memory and the last action. The stored state then is h and
+    """A missing observation is replaced, before the memory reads it, by what a small network predicts from the
+    observation before (filled itself if it was missing), the memory and the last action. The stored state then is h and
     that observation. Needs normalized observations."""
     initial_priority: Literal["max", "actor"] = "max"
     """Priority that a window enters a prioritized replay with: the largest seen, or the TD error that its actor

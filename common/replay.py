@@ -42,7 +42,7 @@ EMPTY_SAMPLE = Sample(SampleStatus.WAIT, None, None, 0.0, 0, 0, 0)  # of a serve
 
 @dataclass(frozen=True)
 class ObservationStatistics:
-    """Sums over every real, non-blank observation inserted once; ``total`` and ``total_square`` (O,) float64."""
+    """Sums over every real, non-missing observation inserted once; ``total`` and ``total_square`` (O,) float64."""
 
     count: int
     total: NDArray[np.float64]

@@ -61,7 +61,7 @@ WHEN = {
     "critic_norm": "rarely: it cost return in a trial (`studies/notebook.md`)",
     "normalize_observations": "off, with `--no-fill-blanks`, where they are scaled and their statistics keep moving",
     "grounding": "off for the paper's model, with `--scheme 1`; with scheme 3 it keeps the memory from collapsing",
-    "fill_blanks": "rarely: without it blank frames cost far more return, see [results](results.md)",
+    "fill_blanks": "rarely: without it missing frames cost far more return, see [results](results.md)",
     "blank_flag": "with flicker, to see what the flag is worth; the paper has none",
     "initial_priority": "`actor` where new windows should not all be drawn soon; it costs the actors a forward pass",
     "envs_per_actor": "up where actors are the bottleneck: they share one forward pass",

@@ -24,7 +24,7 @@ class Batch:
     reward: Tensor  # (B, T)
     terminated: Tensor  # (B, T), d_t: 1 at a true termination
     state: Tensor  # (B, S), the state before the first real observation
-    blank: Tensor  # (B, T + 1) bool
+    missing: Tensor  # (B, T + 1) bool
     observation_valid: Tensor  # (B, T + 1) bool
     step_valid: Tensor  # (B, T) bool
     burned_in: Tensor  # (B,) bool: the burn-in is real
@@ -93,7 +93,7 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec) -> Batch:
         reward=field(floats, "reward"),
         terminated=ends.float(),
         state=field(floats, "state"),
-        blank=field(raw, "blank") > 0,
+        missing=field(raw, "blank") > 0,
         observation_valid=observation_valid,
         step_valid=step_valid,
         burned_in=first == 0,

@@ -89,15 +89,15 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
     the stored state (…_stored) or are those trained, after the burn-in (…_burned, where there is one).
     """
     device = agent.log_alpha.device
-    observation, blank, action = (torch.from_numpy(x).to(device).unsqueeze(0) for x in _joined(episode, spec))
+    observation, missing, action = (torch.from_numpy(x).to(device).unsqueeze(0) for x in _joined(episode, spec))
     stored = torch.from_numpy(episode["state"][-1:].copy()).to(device)
-    o, start = agent.normalizer(observation, blank), torch.zeros_like(stored)
+    o, start = agent.normalizer(observation, missing), torch.zeros_like(stored)
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
     window = slice(-spec.steps - 1, -1)  # its steps; the bootstrap observation starts none
     past = slice(None, -spec.steps - 1)
-    _, _, before = agent.unroll(o[:, past], blank[:, past], prev_action[:, past], start)
+    _, _, before = agent.unroll(o[:, past], missing[:, past], prev_action[:, past], start)
     replayed, recomputed = (
-        agent.unroll(o[:, window], blank[:, window], prev_action[:, window], state)[0] for state in (stored, before)
+        agent.unroll(o[:, window], missing[:, window], prev_action[:, window], state)[0] for state in (stored, before)
     )
     q, q_replayed = (
         agent.critic(agent.features(remembered), action[:, -spec.steps :]).mean(0).squeeze(0)
@@ -125,14 +125,14 @@ def _distance(replayed: Tensor, recomputed: Tensor) -> Tensor:
 
 
 def _joined(episode: Rows, spec: WindowSpec) -> tuple[Floats, BoolArray, Floats]:
-    """Observations (n + 1, O), which of them are blank (n + 1,), and actions (n, A) of overlapping windows in order."""
+    """Observations (n + 1, O), those missing (n + 1,), and actions (n, A) of overlapping windows in order."""
     starts = episode["episode_step"] - spec.burn_in  # of the window's first slot, in steps of the episode
     n = int(starts[-1] + episode["last"][-1])
     observation = np.zeros((n + 1, spec.obs_dim), np.float32)
-    blank, action = np.zeros(n + 1, np.bool_), np.zeros((n, spec.action_dim), np.float32)
+    missing, action = np.zeros(n + 1, np.bool_), np.zeros((n, spec.action_dim), np.float32)
     for row, start in zip(episode, starts.tolist(), strict=True):
         first, last = int(row["first"]), int(row["last"])
         observation[start + first : start + last + 1] = row["observation"][first : last + 1]
-        blank[start + first : start + last + 1] = row["blank"][first : last + 1]
+        missing[start + first : start + last + 1] = row["blank"][first : last + 1]
         action[start + first : start + last] = row["action"][first:last]
-    return observation, blank, action
+    return observation, missing, action

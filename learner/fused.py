@@ -44,16 +44,16 @@ def _applies(x: Tensor) -> bool:
 
 
 class FusedAgent(Agent):
-    """Fills blanks with every weight rounded once for all steps, not once a step."""
+    """Fills missing frames with every weight rounded once for all steps, not once a step."""
 
     @torch.no_grad()
-    def fill(self, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    def fill(self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """As ``Agent.fill``, which it is without a memory, or where the embedding has no plain layer."""
         c = self.config
         if not (c.embedding and _applies(observation)) or c.layer_norm or c.head_input == "observation":
-            return super().fill(observation, blank, prev_action, state)
+            return super().fill(observation, missing, prev_action, state)
         with torch.autocast("cpu", enabled=False):
-            return _fill(self, observation, blank, prev_action, state)
+            return _fill(self, observation, missing, prev_action, state)
 
 
 class FusedGRU(nn.GRU):
@@ -110,7 +110,7 @@ def _bits(x: Tensor) -> NDArray[np.uint16]:
 
 
 def _fill(
-    agent: Agent, observation: Tensor, blank: Tensor, prev_action: Tensor, state: Tensor
+    agent: Agent, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor
 ) -> tuple[Tensor, Tensor]:
     """(B, T, O), (B, T), (B, T, A), (B, S) -> (B, T, O), (B, S)."""
     assert agent.next_frame is not None
@@ -120,18 +120,18 @@ def _fill(
     w1, w2, w3, w_embed, wi, wh = (w.to(BF16).t() for w in (*(x.weight for x in linear), *gru.all_weights[0][:2]))
     b1, b2, b3, b_embed = (x.bias for x in linear)
     bi, bh = (b.numpy() for b in gru.all_weights[0][2:])
-    inputs = agent.memory.inputs(observation, blank, prev_action).to(BF16)
+    inputs = agent.memory.inputs(observation, missing, prev_action).to(BF16)
     h, low, gate_cache = (
         state[:, :size].clone().numpy(),
         state[:, :size].to(BF16),
         np.empty((len(state), 4 * size), np.float32),
     )
     seen, before = observation.clone(), state[:, size:]
-    by_step = (x.transpose(0, 1) for x in (seen, blank.unsqueeze(2), prev_action.to(BF16), inputs))
-    for o, was_blank, a, x in zip(*by_step, strict=True):
+    by_step = (x.transpose(0, 1) for x in (seen, missing.unsqueeze(2), prev_action.to(BF16), inputs))
+    for o, was_missing, a, x in zip(*by_step, strict=True):
         second = _layer(_layer(torch.cat([low, before.to(BF16), a], 1), w1, b1), w2, b2)
         expected = torch.mm(second, w3).float().add_(b3).add_(before)
-        torch.where(was_blank, expected.clamp_(-NORMALIZED_CLIP, NORMALIZED_CLIP), o, out=o)
+        torch.where(was_missing, expected.clamp_(-NORMALIZED_CLIP, NORMALIZED_CLIP), o, out=o)
         x[:, : agent.obs_dim] = o
         gi, gh = torch.mm(_layer(x.contiguous(), w_embed, b_embed), wi), torch.mm(low, wh)
         kernels.gru_step(_bits(gi), _bits(gh), bi, bh, h, gate_cache, h, _bits(low))

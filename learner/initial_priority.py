@@ -42,7 +42,7 @@ class InitialPriority:
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
         batch = view_batch(raw, torch.ones(len(rows)), self._spec)
         m = batch.step_valid[:, steps].float()
-        o = agent.normalizer(batch.observation, batch.blank)
+        o = agent.normalizer(batch.observation, batch.missing)
         o = impute(agent, o, batch, self._spec.burn_in)
         z = agent.features(unroll(agent.memory, o, batch, self._spec.burn_in))
         mean, log_std = agent.policy(z)

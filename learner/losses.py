@@ -93,13 +93,13 @@ def temperature_loss(log_alpha: Tensor, log_pi: Tensor, target_entropy: float, m
 def grounding_loss(
     predicted: Tensor, observation: Tensor, predicted_reward: Tensor, r: Tensor, seen: Tensor, m: Tensor
 ) -> Tensor:
-    """L1 of o_{t+1} (mean over O), where ``seen``: it was no blank, nor o_t unless that was filled; plus L1 of r_t."""
+    """L1 of o_{t+1} (mean over O) where ``seen``: not missing, nor o_t unless that was filled; plus L1 of r_t."""
     error = masked_mean((predicted - observation).abs().mean(-1), m * seen)
     return error + masked_mean((predicted_reward - r).abs(), m)
 
 
 def fill_loss(expected: Tensor, observation: Tensor, seen: Tensor, m: Tensor) -> Tensor:
-    """L1 of o_{t+1} (mean over O) that is to fill a blank, where ``seen``: it was none."""
+    """L1 of o_{t+1} (mean over O) that is to fill a missing frame, where ``seen``: it was none."""
     return masked_mean((expected - observation).abs().mean(-1), m * seen)
 
 

@@ -13,7 +13,7 @@ from rmc.learner.batch import Batch
 def unroll(memory: Memory, o: Tensor, batch: Batch, burn_in: int) -> MemoryOutput:
     """(B, L_t + 1, ·) from the stored state, which starts the trained part itself where the burn-in is padding."""
     n, hidden = burn_in, _burned_in(memory, o, batch, burn_in)
-    remembered: MemoryOutput = memory(o[:, n:], batch.blank[:, n:], batch.prev_action[:, n:], hidden)
+    remembered: MemoryOutput = memory(o[:, n:], batch.missing[:, n:], batch.prev_action[:, n:], hidden)
     return remembered
 
 
@@ -23,18 +23,18 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
     if not n:
         return batch.state
     hidden = batch.state[:, : memory.gru.hidden_size]
-    burned = memory(o[:, :n], batch.blank[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
+    burned = memory(o[:, :n], batch.missing[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
     torch.clear_autocast_cache()  # older torch would go on with these casts, which carry no gradient
     return torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
 
 
 def impute(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
-    """(B, L + 1, O) with blank frames filled where configured, along the states that ``unroll`` goes through."""
-    if not agent.fills(batch.blank):
+    """(B, L + 1, O) with missing frames filled where configured, along the states that ``unroll`` goes through."""
+    if not agent.fills(batch.missing):
         return o
 
     def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:
-        return agent.fill(o[:, steps], batch.blank[:, steps], batch.prev_action[:, steps], state)
+        return agent.fill(o[:, steps], batch.missing[:, steps], batch.prev_action[:, steps], state)
 
     past, state = part(slice(burn_in), batch.state)
     state = torch.where(batch.burned_in.unsqueeze(1), state, batch.state)

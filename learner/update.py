@@ -79,7 +79,7 @@ class JointUpdate:
         m = batch.step_valid[:, steps].float()
         alpha = agent.log_alpha.exp().detach()
         with torch.no_grad():
-            o = agent.normalizer(batch.observation, batch.blank)
+            o = agent.normalizer(batch.observation, batch.missing)
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
             o = impute(agent, o, batch, self.burn_in)
@@ -306,5 +306,5 @@ def _adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
 
 
 def _seen(batch: Batch) -> Tensor:
-    """(B, T + 1) float: the observation is real, and not blank."""
-    return (batch.observation_valid & ~batch.blank).float()
+    """(B, T + 1) float: the observation is real, and not missing."""
+    return (batch.observation_valid & ~batch.missing).float()

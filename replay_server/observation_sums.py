@@ -15,7 +15,7 @@ from rmc.common.window import Rows, WindowSpec
 def _add_up(
     floats: NDArray[np.float32],
     offset: int,
-    blank: NDArray[np.uint8],
+    missing: NDArray[np.uint8],
     new: NDArray[np.int32],
     last: NDArray[np.int32],
     total: NDArray[np.float64],
@@ -25,7 +25,7 @@ def _add_up(
     count, size = 0, total.shape[0]
     for row in range(floats.shape[0]):
         for t in range(last[row] - new[row] + 1, last[row] + 1):
-            if blank[row, t] == 0:
+            if missing[row, t] == 0:
                 count += 1
                 start = offset + t * size
                 for o in range(size):
@@ -36,7 +36,7 @@ def _add_up(
 
 
 def observation_sums(rows: Rows, spec: WindowSpec) -> ObservationStatistics:
-    """Over the observations that no earlier window carried and that are not blank; padding is never read."""
+    """Over the observations that no earlier window carried and that are not missing; padding is never read."""
     total, total_square = np.zeros(spec.obs_dim), np.zeros(spec.obs_dim)
     assert spec.dtype.fields is not None
     offset = spec.dtype.fields["observation"][1] // 4

@@ -17,7 +17,7 @@ class EnvConfig:
     noise: float = 0.0
     """Standard deviation of Gaussian noise on every observation, in the observation's own units."""
     frame_stack: int = 1
-    """Newest observations that make one, oldest first; a blank frame among them is an ordinary one."""
+    """Newest observations that make one, oldest first; a missing frame among them is an ordinary one."""
     action_repeat: int = 1
     """Steps of the environment for one of the agent's; rewards are added up. Other options count the agent's steps."""
     time_limit: int = 0

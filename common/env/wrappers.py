@@ -3,8 +3,10 @@
 Shapes: O observation, A action.
 """
 
+import logging
 import math
 from collections import deque
+from functools import cache
 from typing import Any
 
 import gymnasium as gym
@@ -13,11 +15,13 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 Env = gym.Env[Floats, Floats]
+log = logging.getLogger(__name__)
 
 
 class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
     """Observations as float32; actions in [-1, 1], stretched over the environment's own bounds.
 
+    ``info["missing"]`` says that a frame is missing; ``info["blank"]``, its old name, is understood with one warning.
     Raises ValueError where an observation is no vector of numbers of the size that its space says.
     """
 
@@ -26,8 +30,8 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
         inner = env.action_space
         assert isinstance(inner, gym.spaces.Box)
         assert env.observation_space.shape is not None
-        self._to_bf16, self._high = inner.low.astype(np.float64), inner.high.astype(np.float64)
-        self._half_range = (self._high - self._to_bf16) / 2
+        self._low, self._high = inner.low.astype(np.float64), inner.high.astype(np.float64)
+        self._half_range = (self._high - self._low) / 2
         self._plain = bool((inner.low == -1.0).all() and (inner.high == 1.0).all())
         self._bounds, self._dtype, self._shape = inner, inner.dtype, env.observation_space.shape
         self.action_space = gym.spaces.Box(-1.0, 1.0, inner.shape, np.float32)
@@ -35,20 +39,33 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
-        return self._vector(observation), info
+        return self._vector(observation), _renamed(info)
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         if not self._plain:
-            stretched = self._to_bf16 + (action + 1.0) * self._half_range
+            stretched = self._low + (action + 1.0) * self._half_range
             action = stretched.astype(self._dtype).clip(self._bounds.low, self._bounds.high)  # rounding may pass one
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._vector(observation), float(reward), terminated, truncated, info
+        return self._vector(observation), float(reward), terminated, truncated, _renamed(info)
 
     def _vector(self, observation: Any) -> Floats:
         vector = np.array(observation, np.float32)  # a copy: some environments write into the same one again
         if vector.shape != self._shape:
             raise ValueError(f"its observation has shape {vector.shape}, its space says {self._shape}")
         return vector
+
+
+def _renamed(info: dict[str, Any]) -> dict[str, Any]:
+    """``info`` with the key that a missing frame had until 0.2 under today's name."""
+    if "blank" not in info or "missing" in info:
+        return info
+    _warn_of_old_name()
+    return {"missing" if name == "blank" else name: value for name, value in info.items()}
+
+
+@cache
+def _warn_of_old_name() -> None:
+    log.warning('the environment gives info["blank"]; call it info["missing"], the old name goes in the next version')
 
 
 class ObservationSlice(gym.Wrapper[Floats, Floats, Floats, Floats]):
@@ -107,7 +124,7 @@ class Noise(CorruptObservation):
 
 
 class Flicker(CorruptObservation):
-    """Whole observations become zeros, independently with probability p; ``info["blank"]`` says which."""
+    """Whole observations become zeros, independently with probability p; ``info["missing"]`` says which."""
 
     stream = 0xF11C
 
@@ -116,8 +133,8 @@ class Flicker(CorruptObservation):
         self._probability = probability
 
     def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
-        info["blank"] = bool(self._rng.random() < self._probability)
-        return np.zeros_like(observation) if info["blank"] else observation
+        info["missing"] = bool(self._rng.random() < self._probability)
+        return np.zeros_like(observation) if info["missing"] else observation
 
 
 class FrameStack(gym.Wrapper[Floats, Floats, Floats, Floats]):
@@ -132,12 +149,12 @@ class FrameStack(gym.Wrapper[Floats, Floats, Floats, Floats]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
         self._frames.extend([observation] * (self._frames.maxlen or 1))
-        return np.concatenate(self._frames), info | {"blank": False}
+        return np.concatenate(self._frames), info | {"missing": False}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._frames.append(observation)
-        return np.concatenate(self._frames), float(reward), terminated, truncated, info | {"blank": False}
+        return np.concatenate(self._frames), float(reward), terminated, truncated, info | {"missing": False}
 
 
 def _box(size: int) -> gym.Space[Floats]:

@@ -83,7 +83,7 @@ def validate(config: RunConfig) -> None:
     if config.agent.blank_flag and config.env.frame_stack > 1:
         raise ConfigError("--blank-flag", True, "a stack of frames has no flag; leave it, or use --frame-stack 1")
     if config.agent.fill_blanks and not config.agent.normalize_observations:
-        fix = "it takes --normalize-observations; or leave blanks as they are: --no-fill-blanks"
+        fix = "it takes --normalize-observations; or leave missing frames as they are: --no-fill-blanks"
         raise ConfigError("--fill-blanks", True, fix)
     if not config.update.policy_through_q and config.update.scheme < 4:
         raise ConfigError("--policy-through-q", False, "schemes 1 to 3 have no such way; take --scheme 4, 5 or 6")

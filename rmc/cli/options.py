@@ -102,7 +102,7 @@ class Evaluate:
     episodes: int = 10
     """Episodes to play."""
     flicker: tuple[float, ...] = ()
-    """Probabilities of a blank observation, each of which is played; by default the run's own."""
+    """Probabilities of a missing observation, each of which is played; by default the run's own."""
     checkpoint: str = "latest"
     """latest, best of those evaluated while it trained, or the number of a checkpoint."""
     video: Path | None = None

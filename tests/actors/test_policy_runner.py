@@ -41,15 +41,15 @@ def make_runner(agent: Agent, envs: int = ENVS) -> PolicyRunner:
 
 @torch.no_grad()
 def reference(
-    agent: Agent, observation: torch.Tensor, prev_action: torch.Tensor, blank: torch.Tensor, state: torch.Tensor,
+    agent: Agent, observation: torch.Tensor, prev_action: torch.Tensor, missing: torch.Tensor, state: torch.Tensor,
     noise: torch.Tensor | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
-    normalized = agent.normalizer(observation, blank)
+    normalized = agent.normalizer(observation, missing)
     hidden, last = state[:, : agent.config.hidden], state[:, agent.config.hidden :]
     if agent.config.fill_blanks:
         expected = agent.next_frame(hidden, last, prev_action).clamp(-10.0, 10.0)
-        normalized = torch.where(blank.unsqueeze(1), expected, normalized)
-    remembered = agent.memory(normalized.unsqueeze(1), blank.unsqueeze(1), prev_action.unsqueeze(1), hidden)
+        normalized = torch.where(missing.unsqueeze(1), expected, normalized)
+    remembered = agent.memory(normalized.unsqueeze(1), missing.unsqueeze(1), prev_action.unsqueeze(1), hidden)
     mean, log_std = agent.policy(agent.features(remembered).squeeze(1))
     action = torch.tanh(mean) if noise is None else squashed_sample(mean, log_std, noise)[0]
     after = remembered.hidden.squeeze(1)
@@ -78,9 +78,9 @@ def test_agrees_with_the_agent(
     assert not hidden.any()
     for step in range(30):
         observation = rng.normal(0, 8, (ENVS, OBS_DIM)).astype(np.float32)  # some are clipped
-        blank = rng.random(ENVS) < 0.3
+        missing = rng.random(ENVS) < 0.3
         noise = None if step % 3 == 0 else rng.standard_normal((ENVS, ACTION_DIM), np.float32)
-        given = [observation, prev_action, blank, hidden]
+        given = [observation, prev_action, missing, hidden]
         kept = [x.copy() for x in given]
         tensors = [torch.from_numpy(x.copy()) for x in given]
         action, new_hidden = runner.act(*given, noise)
@@ -103,9 +103,9 @@ def test_both_ways_to_multiply_agree_with_the_agent(envs: int) -> None:
     observation, prev_action, hidden, noise = (
         rng.uniform(-1, 1, (envs, size)).astype(np.float32) for size in (OBS_DIM, ACTION_DIM, 256, ACTION_DIM)
     )
-    blank = np.zeros(envs, np.bool_)
-    action, new_hidden = make_runner(agent, envs).act(observation, prev_action, blank, hidden, noise)
-    tensors = [torch.from_numpy(x) for x in (observation, prev_action, blank, hidden, noise)]
+    missing = np.zeros(envs, np.bool_)
+    action, new_hidden = make_runner(agent, envs).act(observation, prev_action, missing, hidden, noise)
+    tensors = [torch.from_numpy(x) for x in (observation, prev_action, missing, hidden, noise)]
     expected = reference(agent, *tensors)
     np.testing.assert_allclose(action, expected[0], atol=1e-5)
     np.testing.assert_allclose(new_hidden, expected[1], atol=1e-5)

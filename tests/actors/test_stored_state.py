@@ -54,17 +54,17 @@ def play(
         return observation
 
     for env, observation in enumerate(observe(0)):
-        builder.begin(env, observation, blank=False)
+        builder.begin(env, observation, missing=False)
     for time in range(1, 3 * max(lengths) + 1):
         action, hidden = runner.act(*builder.now(), rng.standard_normal((envs, ACTION_DIM), np.float32))
         states.append(hidden[:, :HIDDEN].copy())
         done, terminates = np.array([time % length == 0 for length in lengths]), rng.random(envs) < 0.5
-        blank = rng.random(envs) < 0.2
+        missing = rng.random(envs) < 0.2
         ended = builder.add(
-            action, hidden, 1, np.zeros(envs, np.float32), observe(time), blank, done & terminates, done & ~terminates
+            action, hidden, 1, np.zeros(envs, np.float32), observe(time), missing, done & terminates, done & ~terminates
         )
         for env in np.flatnonzero(ended).tolist():
-            builder.begin(env, observe(time)[env], blank=False)
+            builder.begin(env, observe(time)[env], missing=False)
         rows.append(builder.take().copy())
     return join_rows(rows, spec), states
 
@@ -75,7 +75,7 @@ def relearned(agent_name: str, rows: Rows, spec: WindowSpec) -> tuple[Batch, tor
     agent = AGENTS[agent_name]
     raw = torch.from_numpy(rows.view(np.uint8).reshape(len(rows), -1))
     batch = view_batch(raw, torch.ones(len(rows)), spec)
-    o = impute(agent, agent.normalizer(batch.observation, batch.blank), batch, spec.burn_in)
+    o = impute(agent, agent.normalizer(batch.observation, batch.missing), batch, spec.burn_in)
     return batch, unroll(agent.memory, o, batch, spec.burn_in).hidden
 
 

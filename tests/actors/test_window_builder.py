@@ -49,7 +49,7 @@ def run(play: Play, steps: int, cut: bool = True, store_states: bool = True) -> 
     builder = WindowBuilder(play.spec, play.stride, envs, capacity=envs, store_states=store_states)
     episode, k = np.zeros(envs, int), np.zeros(envs, int)
     for env in range(envs):
-        builder.begin(env, name(env, 0, 0), blank=_is_blank(0))
+        builder.begin(env, name(env, 0, 0), missing=_is_missing(0))
     taken = []
     for time in range(steps):
         now = builder.now()
@@ -62,12 +62,12 @@ def run(play: Play, steps: int, cut: bool = True, store_states: bool = True) -> 
         done = np.array([k[env] == play.length(env, episode[env]) for env in range(envs)])
         ended = builder.add(
             action=-here, state=then, update=time, reward=k.astype(np.float32), observation=then,
-            blank=k % 5 == 3, terminated=done & (k % 2 == 0), truncated=done & (k % 2 == 1),
+            missing=k % 5 == 3, terminated=done & (k % 2 == 0), truncated=done & (k % 2 == 1),
         )  # fmt: skip
         np.testing.assert_array_equal(ended, done)
         for env in np.flatnonzero(ended).tolist():
             episode[env], k[env] = episode[env] + 1, 0
-            builder.begin(env, name(env, episode[env], 0), blank=_is_blank(0))
+            builder.begin(env, name(env, episode[env], 0), missing=_is_missing(0))
         taken.append(builder.take().copy())
     if cut:
         builder.cut()
@@ -76,7 +76,7 @@ def run(play: Play, steps: int, cut: bool = True, store_states: bool = True) -> 
     return join_rows(taken, play.spec), episode.tolist()
 
 
-def _is_blank(k: int) -> bool:
+def _is_missing(k: int) -> bool:
     return k % 5 == 3
 
 
@@ -108,7 +108,7 @@ def test_windows(play: Play, steps: int) -> None:
         np.testing.assert_array_equal(row["observation"][first : last + 1], expected)
         np.testing.assert_array_equal(row["action"][first:last], -expected[:-1])
         np.testing.assert_array_equal(row["reward"][first:last], expected[1:, 2])
-        assert row["blank"][first : last + 1].tolist() == [_is_blank(k0 + i) for i in range(last - first + 1)]
+        assert row["blank"][first : last + 1].tolist() == [_is_missing(k0 + i) for i in range(last - first + 1)]
         # the stored state is the one before the first real observation
         np.testing.assert_array_equal(row["state"], expected[0] if k0 else 0 * expected[0])
         np.testing.assert_array_equal(row["prev_action"], -(expected[0] - [0, 0, 1]) if k0 else 0 * expected[0])
@@ -176,10 +176,10 @@ def test_begin_forgets_an_open_window() -> None:
     spec = WindowSpec(OBS_DIM, ACTION_DIM, HIDDEN, burn_in=2, train=4)
     builder = WindowBuilder(spec, 4, envs=1, capacity=1)
     zeros, no = np.zeros((1, 3), np.float32), np.zeros(1, np.bool_)
-    builder.begin(0, name(0, 0, 0), blank=False)
+    builder.begin(0, name(0, 0, 0), missing=False)
     builder.add(zeros, zeros, 0, zeros[:, 0], zeros, no, no, no)
     assert builder.open
-    builder.begin(0, name(0, 1, 0), blank=False)
+    builder.begin(0, name(0, 1, 0), missing=False)
     assert not builder.open
     builder.cut()
     assert builder.count == 0

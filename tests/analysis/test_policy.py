@@ -63,7 +63,7 @@ def test_a_loop_of_ones_own_gives_what_an_evaluation_gives(run: RunFolder) -> No
         policy.reset()
         total, ended = 0.0, False
         while not ended:
-            action = policy.act(observation, info["blank"])
+            action = policy.act(observation, info["missing"])
             assert action.shape == (1,)
             observation, reward, terminated, truncated, info = env.step(action)
             total, ended = total + float(reward), terminated or truncated
@@ -96,7 +96,7 @@ def test_exploring_actions_vary_and_are_seeded(run: RunFolder) -> None:
 def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "policy.onnx"
     assert main.run(["export", str(run.path), "--out", str(file)]) == 0
-    assert "inputs observation, previous_action, blank, state" in capsys.readouterr().out
+    assert "inputs observation, previous_action, missing, state" in capsys.readouterr().out
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     rng, policy = np.random.default_rng(0), load_policy(run.path)
     feed = {
@@ -104,9 +104,9 @@ def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureF
         "state": np.zeros((3, run.config().window_spec().state), np.float32),
     }
     for step in range(20):  # three rows, though it was traced with two; the first one beside the policy
-        observation, blank = rng.normal(size=(3, 3)).astype(np.float32), np.array([step % 5 == 2, False, True])
-        action, state = session.run(None, {"observation": observation, "blank": blank, **feed})
-        np.testing.assert_allclose(action[0], policy.act(observation[0], bool(blank[0])), atol=1e-5)
+        observation, missing = rng.normal(size=(3, 3)).astype(np.float32), np.array([step % 5 == 2, False, True])
+        action, state = session.run(None, {"observation": observation, "missing": missing, **feed})
+        np.testing.assert_allclose(action[0], policy.act(observation[0], bool(missing[0])), atol=1e-5)
         feed = {"previous_action": action, "state": state}
 
 

@@ -80,7 +80,7 @@ def test_a_grid_of_flicker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 3
     assert "blank" not in lines[0]
-    assert "with 50% of the frames blank: return" in lines[1]
-    assert "with 100% of the frames blank: return" in lines[2]
+    assert "with 50% of the frames missing: return" in lines[1]
+    assert "with 100% of the frames missing: return" in lines[2]
     assert main.run(["evaluate", folder, "--flicker", "0", "2"]) == 2
     assert "--flicker=2.0" in capsys.readouterr().err

@@ -51,10 +51,10 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
     hidden, previous = torch.zeros(1, agent.config.hidden), torch.zeros(1, 1, agent.action_dim)
     frame = torch.zeros(1, 1, agent.obs_dim)
     for t in range(start + 1):
-        last, frame, blank = frame, episode.observation[:, t : t + 1], episode.blank[:, t : t + 1]
-        if agent.config.fill_blanks and blank:
+        last, frame, missing = frame, episode.observation[:, t : t + 1], episode.missing[:, t : t + 1]
+        if agent.config.fill_blanks and missing:
             frame = agent.next_frame(hidden.unsqueeze(1), last, previous)
-        seen = agent.memory(frame, blank, previous, hidden)
+        seen = agent.memory(frame, missing, previous, hidden)
         hidden, previous = seen.hidden[:, 0], episode.action[:, t : t + 1]
     for t in range(start, start + horizon):
         action = episode.action[:, t : t + 1]

@@ -37,7 +37,7 @@ def test_a_task_is_an_environment_like_others(env_id: str) -> None:
         assert np.isfinite(observation).all()
         assert np.isfinite(reward)
         assert not terminated
-        assert info["blank"] == (not observation.any())
+        assert info["missing"] == (not observation.any())
     assert steps == 1000
     env.close()
 

@@ -50,7 +50,7 @@ def test_mujoco_environment() -> None:
     env = make_env(EnvConfig("HalfCheetah-v5"))
     observation, info = env.reset(seed=3)
     assert observation.dtype == np.float32
-    assert "blank" not in info
+    assert "missing" not in info
     reference = gym.make("HalfCheetah-v5")
     expected, _ = reference.reset(seed=3)
     np.testing.assert_allclose(observation, expected, rtol=1e-6)
@@ -198,13 +198,13 @@ def test_flicker() -> None:
     env.reset(seed=5)
     for _ in range(700):
         observation, info = env.reset()
-        resets.append(info["blank"])
+        resets.append(info["missing"])
         ended = False
         while not ended:
-            assert info["blank"] == (not observation.any()) or not info["blank"]
+            assert info["missing"] == (not observation.any()) or not info["missing"]
             observation, _, ended, _, info = env.step(np.zeros(1, np.float32))
-            assert not (info["blank"] and observation.any())
-            frames.append(info["blank"])
+            assert not (info["missing"] and observation.any())
+            frames.append(info["missing"])
     assert all(type(flag) is bool for flag in frames)
     assert np.mean(frames) == pytest.approx(0.3, abs=4 * math.sqrt(0.21 / len(frames)))
     assert np.mean(resets) == pytest.approx(0.3, abs=4 * math.sqrt(0.21 / len(resets)))
@@ -221,17 +221,17 @@ def test_flicker_hides_the_whole_observation_and_nothing_else() -> None:
     for _ in range(50):
         seen, reward, _, _, info = flickering.step(action)
         truth, true_reward, *_ = clear.step(action)
-        np.testing.assert_array_equal(seen, 0.0 * truth if info["blank"] else truth)
+        np.testing.assert_array_equal(seen, 0.0 * truth if info["missing"] else truth)
         assert reward == true_reward
-        blanks.append(info["blank"])
+        blanks.append(info["missing"])
     assert 0 < sum(blanks) < 50
 
 
 def test_flicker_is_seeded() -> None:
     def blanks(seed: int) -> list[bool]:
         env = make_env(EnvConfig("tests.memory_env:Memory40-v0", flicker=0.5))
-        first = env.reset(seed=seed)[1]["blank"]
-        return [first] + [env.step(np.zeros(1, np.float32))[4]["blank"] for _ in range(40)]
+        first = env.reset(seed=seed)[1]["missing"]
+        return [first] + [env.step(np.zeros(1, np.float32))[4]["missing"] for _ in range(40)]
 
     assert blanks(1) == blanks(1)
     assert blanks(1) != blanks(2)

@@ -6,8 +6,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from rmc.common.env import wrappers
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import env_spaces, make_env
+from rmc.common.env.wrappers import RescaledEnv
 
 CHEETAH, ACTION = "HalfCheetah-v5", np.linspace(-1, 1, 6, dtype=np.float32)
 
@@ -53,10 +55,10 @@ def test_noise_is_gaussian_independent_and_seeded() -> None:
     assert not np.array_equal(noisy, played(EnvConfig(CHEETAH, noise=0.5), 300, seed=2)[0])
 
 
-def test_a_blank_frame_has_no_noise() -> None:
+def test_a_missing_frame_has_no_noise() -> None:
     seen, _, infos = played(EnvConfig(CHEETAH, noise=0.5, flicker=0.5))
     for observation, info in zip(seen, infos, strict=True):
-        assert observation.any() == (not info["blank"])
+        assert observation.any() == (not info["missing"])
 
 
 def test_stacked_frames_are_the_newest_oldest_first() -> None:
@@ -65,16 +67,16 @@ def test_stacked_frames_are_the_newest_oldest_first() -> None:
     for t, observation in enumerate(stacked):
         wanted = np.concatenate([clear[max(0, t - 2)], clear[max(0, t - 1)], clear[t]])
         np.testing.assert_array_equal(observation, wanted)
-    assert not any(info["blank"] for info in infos)
+    assert not any(info["missing"] for info in infos)
 
 
-def test_a_stack_holds_blank_frames_as_they_are() -> None:
-    blank = [info["blank"] for info in played(EnvConfig(CHEETAH, flicker=0.5))[2]]
+def test_a_stack_holds_missing_frames_as_they_are() -> None:
+    missing = [info["missing"] for info in played(EnvConfig(CHEETAH, flicker=0.5))[2]]
     stacked, _, infos = played(EnvConfig(CHEETAH, flicker=0.5, frame_stack=2))
     for t in range(1, len(stacked)):
         older, newest = stacked[t, :17], stacked[t, 17:]
-        assert (not older.any(), not newest.any()) == (blank[t - 1], blank[t])
-        assert infos[t]["blank"] is False
+        assert (not older.any(), not newest.any()) == (missing[t - 1], missing[t])
+        assert infos[t]["missing"] is False
 
 
 def test_repeated_actions_add_their_rewards() -> None:
@@ -139,3 +141,26 @@ def test_a_dict_of_boxes_is_flattened() -> None:
     assert env_spaces(config) == (5, 1, None)
     observation, _ = make_env(config).reset(seed=0)
     assert observation.tolist() == [1, 2, 3, 4, 5]
+
+
+class OldName(gym.Env[np.ndarray, np.ndarray]):
+    """Says that a frame is missing as environments of version 0.1 did."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, **_: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        return np.zeros(2, np.float32), {"blank": True}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        return np.zeros(2, np.float32), 0.0, False, False, {"blank": False, "goal": 3}
+
+
+def test_the_old_name_of_a_missing_frame_is_understood_with_one_warning(caplog: pytest.LogCaptureFixture) -> None:
+    wrappers._warn_of_old_name.cache_clear()
+    env = RescaledEnv(OldName())
+    assert env.reset()[1] == {"missing": True}
+    assert [env.step(ACTION[:1])[4] for _ in range(3)] == [{"missing": False, "goal": 3}] * 3
+    assert [record.message for record in caplog.records if "info" in record.message] == [
+        'the environment gives info["blank"]; call it info["missing"], the old name goes in the next version'
+    ]

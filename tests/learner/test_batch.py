@@ -15,7 +15,7 @@ def test_fields_match_the_rows():
             assert bool(batch.observation_valid[b, t]) == real
             wanted = row["observation"][t] if real else np.zeros(3)
             np.testing.assert_array_equal(batch.observation[b, t], wanted)
-            assert bool(batch.blank[b, t]) == bool(real and row["blank"][t])
+            assert bool(batch.missing[b, t]) == bool(real and row["blank"][t])
         for t in range(SPEC.steps):
             real = row["first"] <= t < row["last"]
             assert bool(batch.step_valid[b, t]) == real

@@ -31,14 +31,14 @@ def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray,
     found, (state, last) = [], torch.from_numpy(hidden).reshape(1, -1).tensor_split([AGENT.hidden], dim=1)
     for k in range(start, stop):
         before = episode["action"][k - 1] if k else np.zeros(SPEC.action_dim, np.float32)
-        o, blank, a, previous = (
+        o, missing, a, previous = (
             torch.from_numpy(np.asarray(x))[None, None]
             for x in (episode["observation"][k], episode["blank"][k], episode["action"][k], before)
         )
-        seen = agent.normalizer(o, blank)
-        if agent.config.fill_blanks and blank:
+        seen = agent.normalizer(o, missing)
+        if agent.config.fill_blanks and missing:
             seen = agent.next_frame(state, last, previous[0]).unsqueeze(1)
-        step = agent.memory(seen, blank, previous, state)
+        step = agent.memory(seen, missing, previous, state)
         state, last = step.hidden[:, 0], seen[:, 0] if agent.config.fill_blanks else last
         carried = torch.cat([state, last], 1)[0].numpy()
         found.append((carried, float(agent.critic(agent.features(step), a).mean())))

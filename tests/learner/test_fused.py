@@ -135,21 +135,21 @@ def impute(config, low, scale=1.0):
     fuse(fused)
     generator = torch.Generator().manual_seed(3)
     o, action, state = (torch.randn(shape, generator=generator) for shape in ((B, T, 3), (B, T, 2), (B, 27)))
-    blank = torch.rand(B, T, generator=generator) < 0.5
-    o[blank] = 0.0
+    missing = torch.rand(B, T, generator=generator) < 0.5
+    o[missing] = 0.0
     with torch.autocast("cpu", torch.bfloat16, enabled=low):
-        found = [agent.fill(o, blank, action, state) for agent in (plain, fused)]
-    return *found, o, blank
+        found = [agent.fill(o, missing, action, state) for agent in (plain, fused)]
+    return *found, o, missing
 
 
 @pytest.mark.parametrize("flag", [False, True])
 def test_blanks_are_filled_to_the_precision_of_bfloat16_and_nothing_else_is_touched(flag):
-    (plain, plain_after), (fused, after), o, blank = impute(dataclasses.replace(FILLING, blank_flag=flag), low=True)
-    assert torch.equal(fused[~blank], o[~blank])
-    gap = (fused - plain)[blank].norm() / plain[blank].norm()
+    (plain, plain_after), (fused, after), o, missing = impute(dataclasses.replace(FILLING, blank_flag=flag), low=True)
+    assert torch.equal(fused[~missing], o[~missing])
+    gap = (fused - plain)[missing].norm() / plain[missing].norm()
     assert 1e-5 < gap < 0.01
     assert 1e-5 < (after - plain_after).norm() / plain_after.norm() < 0.01
-    assert (plain - o)[blank].norm() > 0.1
+    assert (plain - o)[missing].norm() > 0.1
 
 
 def test_what_fills_a_blank_stays_where_observations_are():
@@ -159,9 +159,9 @@ def test_what_fills_a_blank_stays_where_observations_are():
 
 @pytest.mark.parametrize("changed", [{"embedding": 0}, {"layer_norm": True}, {"head_input": "observation"}, {}])
 def test_where_the_fused_way_does_not_fit_blanks_are_filled_the_plain_way_to_the_bit(changed):
-    plain, fused, o, blank = impute(dataclasses.replace(FILLING, **changed), low=bool(changed))
+    plain, fused, o, missing = impute(dataclasses.replace(FILLING, **changed), low=bool(changed))
     assert all(map(torch.equal, plain, fused))
-    assert not torch.equal(plain[0][blank], o[blank])
+    assert not torch.equal(plain[0][missing], o[missing])
 
 
 @pytest.mark.parametrize("asked", ["features", "action", "neither"])

@@ -156,8 +156,8 @@ def test_padded_burn_in_starts_from_the_stored_state():
     batch, update = to_batch(rows), make(PAPER)
     found = unroll(update.agent.memory, batch.observation, batch, SPEC.burn_in).hidden
     n = SPEC.burn_in
-    o, blank, previous = batch.observation[:, n:], batch.blank[:, n:], batch.prev_action[:, n:]
-    alone = update.agent.memory(o, blank, previous, batch.state).hidden
+    o, missing, previous = batch.observation[:, n:], batch.missing[:, n:], batch.prev_action[:, n:]
+    alone = update.agent.memory(o, missing, previous, batch.state).hidden
     assert torch.equal(found, alone)
 
 
