@@ -97,7 +97,10 @@ class ReplayServer:
 
     def _read_published(self) -> Progress | None:
         published = self.bus.progress(self.name)
-        return decode_published(published, self.spec.obs_dim) if published else None
+        newest = decode_published(published, self.spec.obs_dim) if published else None
+        if published and newest is None:
+            log.warning("%s: the counters that were published are damaged; going on from the ring's", self.name)
+        return newest
 
     def _go_on_from(self, newest: Progress) -> None:
         """Of counters that were published and those of this ring, take the later.
@@ -199,12 +202,12 @@ class ReplayServer:
         """
         if not self._published or time.monotonic() >= self._republish_at:
             self._republish_at = time.monotonic() + REPUBLISH_PERIOD
-            self.bus.commit(self.owner, self._published or self._acks(), self._store.ring.progress.encode())
+            self.bus.commit(self.owner, self._published or self._acks(), self._store.ring.progress.publish())
         acks = {actor: ack for actor, ack in self._acks().items() if self._published.get(actor) != ack}
         quantum = max(1, self._slack_steps // (8 * len(self._own_actors)))
         at_once = at_once or bool(self._waiting_for)
         if acks and (at_once or any(self._grown(actor, ack) >= quantum for actor, ack in acks.items())):
-            self.bus.commit(self.owner, acks, self._store.ring.progress.encode())
+            self.bus.commit(self.owner, acks, self._store.ring.progress.publish())
             self._published.update(acks)
 
     def _grown(self, actor: int, ack: Ack) -> int:
@@ -309,6 +312,7 @@ class ReplayServer:
             "draws": progress.draws,
             "drawn_steps": progress.drawn_steps,
             "replay_ratio": limiter.ratio(self._inserted, self._drawn) * self._share,
+            "replay_ratio_off": int(not limiter.is_held(self._inserted, self._drawn)),
             "credit_steps": max(0, limiter.limit(self._drawn) - self._inserted),
             "learner_waiting_for": self._waiting_for,
             "learner_waiting_s": time.monotonic() - self._waiting_since if self._waiting_for else 0.0,

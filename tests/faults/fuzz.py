@@ -159,7 +159,7 @@ KINDS: dict[str, tuple[bytes, Reader]] = {
     "share": (_request(Kind.SHARE, {"batch_size": 4}), request),
     "record": (encode_record({"time": 1.5, "updates": 7, "waiting_for": "credit"}), decode_record),
     "config": (to_json(robust(EnvConfig("HalfCheetah-v5"))).encode(), config),
-    "counters": (Progress(SPEC.obs_dim).encode(), published),
+    "counters": (Progress(SPEC.obs_dim).publish(), published),
 }
 
 
