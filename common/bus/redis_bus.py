@@ -23,6 +23,7 @@ from rmc.common.bus.protocol import (
     join_pieces,
     split_pieces,
 )
+from rmc.common.bus.redis_client import RedisClient, refusal
 from rmc.common.bus.redis_url import shown
 from rmc.common.checksum import crc32
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
@@ -61,7 +62,7 @@ class RedisBus:
         lost = (redis.exceptions.ConnectionError,)  # one that hangs would keep the role once more
         retry = Retry(ExponentialBackoff(cap=0.1, base=0.01), retries=3, supported_errors=lost)
         try:
-            self._redis: Any = redis.Redis.from_url(  # Any: its annotations do not know decode_responses
+            self._redis: Any = RedisClient.from_url(  # Any: its annotations do not know decode_responses
                 url, retry=retry, socket_timeout=TIMEOUT_SECONDS
             )
         except ValueError:  # its words quote parts of the URL, which may be a password's
@@ -79,12 +80,8 @@ class RedisBus:
         try:
             with self.around():
                 return action(*args)
-        except redis.exceptions.OutOfMemoryError as error:
-            raise BusFull(str(error)) from None
         except redis.exceptions.ResponseError as error:
-            if "MISCONF" in str(error):  # it cannot write its append-only file: no room, most often
-                raise BusFull(str(error)) from None
-            raise
+            raise refusal(error, self.url) from None
         except (redis.exceptions.ConnectionError, redis.exceptions.TimeoutError, OSError) as error:
             raise BusUnavailable(str(error)) from None
 
@@ -92,8 +89,8 @@ class RedisBus:
         """Raises BusUnavailable where no Redis answers, or one that will not have us."""
         try:
             self._call(self._redis.ping)
-        except redis.exceptions.ResponseError as error:
-            raise BusUnavailable(str(error)) from None
+        except ConfigError as error:
+            raise BusUnavailable(error.fix) from None
 
     def expire(self, seconds: int | None) -> None:
         """Let all that this run has in Redis vanish after so many seconds; None takes that back."""
@@ -125,13 +122,13 @@ class RedisBus:
         self._call(lambda: self._redis.incrby(self._key("epoch", role), 0))  # a write that changes nothing
 
     def current_epoch(self, role: str) -> int:
-        return int(self._call(lambda: self._redis.get(self._key("epoch", role))) or 0)
+        return self._number(self._call(lambda: self._redis.get(self._key("epoch", role))))
 
     def append(self, actor: int, entry_id: EntryId, payload: bytes) -> None:
         stream = self._key("windows", actor)
         try:
             self._call(lambda: self._add_entry(actor, stream, entry_id, payload))
-        except redis.exceptions.ResponseError as error:
+        except ConfigError as error:
             if "equal or smaller" not in str(error):
                 raise
             self._check_not_fenced(actor, stream, entry_id)
@@ -149,7 +146,7 @@ class RedisBus:
         """A refused id is ours, stored by a retried call, unless a larger epoch wrote since."""
         try:
             last = _entry_id(self._call(lambda: self._redis.xinfo_stream(stream))["last-generated-id"])
-        except redis.exceptions.ResponseError as error:
+        except ConfigError as error:
             if "no such key" not in str(error):
                 raise
             raise _gone(stream) from None  # it was dropped after it had refused the id
@@ -237,7 +234,7 @@ class RedisBus:
 
     def _held(self, pipe: Any, owner: ReplayOwner) -> int:
         """The newest epoch of this replay server that Redis knows. Raises FencedError where it is newer than ours."""
-        held = int(pipe.get(self._key("epoch", owner.role)) or 0)
+        held = self._number(pipe.get(self._key("epoch", owner.role)))
         if held > owner.epoch:
             raise FencedError(f"{owner.role} epoch {owner.epoch} was replaced by {held}")
         return held
@@ -283,7 +280,7 @@ class RedisBus:
         epoch_key = self._key("epoch", "learner")
 
         def transaction(pipe: Any) -> None:
-            held = int(pipe.get(epoch_key) or 0)
+            held = self._number(pipe.get(epoch_key))
             if held > version.epoch:
                 raise FencedError(f"learner epoch {version.epoch} was replaced by {held}")
             if pipe.exists(*pieces) < len(pieces):
@@ -304,6 +301,10 @@ class RedisBus:
             return [int(word) for word in words]
         self.refused["control"] += bool(raw)
         return None
+
+    def _number(self, raw: bytes | None) -> int:
+        """A number as it stands in a value; 0 where there is none."""
+        return (self._integers(raw, 1) or [0])[0]
 
     def _head(self, evaluate: bool) -> tuple[Version, int, int] | None:
         raw = self._call(lambda: self._redis.get(self._key(KINDS[evaluate])))
@@ -369,7 +370,7 @@ class RedisBus:
 
     def stop_requested(self) -> str | None:
         raw: bytes | None = self._call(lambda: self._redis.get(self._key("stop")))
-        return raw.decode() if raw is not None else None
+        return raw.decode(errors="replace") if raw is not None else None
 
     def clear_stop(self) -> None:
         self._call(lambda: self._redis.delete(self._key("stop")))
