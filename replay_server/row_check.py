@@ -33,7 +33,7 @@ TINY = np.float32(1e-6)  # times all floats of a row, their sum is finite where 
 def _judge(
     words: NDArray[np.int32],
     priorities: NDArray[np.float32],
-    at: tuple[int, int, int, int, int, int],
+    at: tuple[int, ...],
     burn_in: int,
     steps: int,
     faults: NDArray[np.uint8],

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rmc.common.bus.protocol import Bus, Entry, EntryId
+from rmc.common.bus.protocol import LIVES, Bus, Entry, EntryId, actor_role
 from rmc.common.errors import BusFull, BusUnavailable, MessageError
 from rmc.common.shard import WHOLE, Shard
 from rmc.common.window import Rows, WindowSpec
@@ -20,7 +20,8 @@ ROUND_BYTES = 4 << 20  # read at most about this much in a round, so that the le
 MAX_ENTRIES = 256  # of one actor in a round
 DISCOVERY_ROUNDS = 100  # rounds between looks for actors beyond those the run was started with
 BEFORE_ALL = EntryId(0, -1)
-LARGEST = EntryId(2**31 - 1, 2**53)  # of each number; past one of them a row cannot say it, and the stream is dropped
+LARGEST = EntryId(2**31 - 1, 2**40)  # of each number; a row can say no larger epoch, and no life sends more entries
+SKIPPED = 1 << 20  # entries of a life that Redis can have lost at once
 
 
 @dataclass(frozen=True)
@@ -92,14 +93,22 @@ class StreamReader:
     ) -> tuple[list[Entry], dict[int, EntryId]]:
         """Entries up to the first gap of each stream that can be filled, and of those with one what was before it."""
         last = {actor: position.id for actor, position in positions.items()}
+        newest = {entry.actor: entry.id.epoch for entry in entries}
+        taken_epochs = {
+            actor: self.bus.current_epoch(actor_role(actor))
+            for actor, epoch in newest.items()
+            if epoch > last.get(actor, BEFORE_ALL).epoch
+        }
         taken: list[Entry] = []
         broken: dict[int, EntryId] = {}
         for entry in entries:
             before = last.get(entry.actor, BEFORE_ALL)
             if entry.actor in broken:
                 continue
-            if entry.id.epoch > LARGEST.epoch or entry.id.seq > LARGEST.seq:
-                self._refuse(entry, MessageError("id", f"{entry.id.epoch}-{entry.id.seq}, past all others"))
+            if not _is_possible(entry.id, before, taken_epochs.get(entry.actor, 0)):
+                self._refuse(
+                    entry, MessageError("id", f"{entry.id.epoch}-{entry.id.seq}, which no life can have reached")
+                )
                 broken[entry.actor] = before
                 continue
             if self._lacks_entries(before, entry):
@@ -173,3 +182,10 @@ class StreamReader:
         """At most how many steps a refused entry carried: its actor counts them, so they must not eat its credit."""
         size = min(len(entry.payload), max_entry_bytes(self.spec))
         return size // self.spec.dtype.itemsize * self.spec.train
+
+
+def _is_possible(new: EntryId, before: EntryId, newest_epoch: int) -> bool:
+    """Whether a life can have reached an id, where ``before`` was taken last and its actor has taken so many epochs."""
+    if new.epoch == before.epoch:
+        return new.seq <= min(before.seq + SKIPPED, LARGEST.seq)
+    return new.epoch <= min(newest_epoch, before.epoch + LIVES, LARGEST.epoch) and new.seq <= LARGEST.seq

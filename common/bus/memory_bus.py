@@ -4,7 +4,17 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-from rmc.common.bus.protocol import METRICS_KEPT, Ack, Entry, EntryId, ReplayAddress, ReplayOwner, Version
+from rmc.common.bus.protocol import (
+    LIVES,
+    METRICS_KEPT,
+    Ack,
+    Entry,
+    EntryId,
+    ReplayAddress,
+    ReplayOwner,
+    Version,
+    actor_role,
+)
 from rmc.common.errors import BusUnavailable, FencedError
 
 
@@ -33,7 +43,8 @@ class MemoryBus:
         return self._config
 
     def take_epoch(self, role: str, floor: int = 0) -> int:
-        self._epochs[role] = max(self._epochs.get(role, 0), floor) + 1
+        held = self._epochs.get(role, 0)
+        self._epochs[role] = (held if floor <= held < floor + LIVES else floor) + 1
         return self._epochs[role]
 
     def check_room(self, role: str) -> None:
@@ -44,7 +55,11 @@ class MemoryBus:
 
     def append(self, actor: int, entry_id: EntryId, payload: bytes) -> None:
         last = self._last_ids.get(actor, EntryId(0, -1))
+        if entry_id.seq == 0:
+            self._epochs[actor_role(actor)] = max(self.current_epoch(actor_role(actor)), entry_id.epoch)
         if entry_id <= last:
+            if last.epoch > min(self.current_epoch(actor_role(actor)), entry_id.epoch + LIVES):
+                raise BusUnavailable(f"actor {actor}: there is an entry of epoch {last.epoch}, which nobody has taken")
             if last.epoch > entry_id.epoch:
                 raise FencedError(f"actor {actor}: epoch {last.epoch} has replaced epoch {entry_id.epoch}")
             return

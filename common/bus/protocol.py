@@ -28,6 +28,7 @@ from typing import Any, NamedTuple, Protocol
 from rmc.common.checksum import crc32
 from rmc.common.errors import MessageError
 
+LIVES = 1 << 16  # epochs that a role can take at most beyond the last one that is known of it
 METRICS_KEPT = 300  # records of a role, at least: five minutes
 
 
@@ -36,6 +37,11 @@ class EntryId(NamedTuple):
 
     epoch: int
     seq: int
+
+
+def actor_role(actor: int) -> str:
+    """The role by which an actor takes epochs and says metrics."""
+    return f"actor-{actor}"
 
 
 class Entry(NamedTuple):
@@ -96,7 +102,10 @@ class Bus(Protocol):
         """The run's config, or None where no run of this name is registered."""
 
     def take_epoch(self, role: str, floor: int = 0) -> int:
-        """A new epoch of this role, larger than ``floor`` and than any taken before."""
+        """A new epoch of this role, larger than ``floor`` and than any taken before.
+
+        At most ``LIVES`` above ``floor``: where more are counted, somebody has changed the counter, and it is mended.
+        """
 
     def check_room(self, role: str) -> None:
         """Raises BusFull or BusUnavailable where what this role writes would not be taken now."""
@@ -107,6 +116,8 @@ class Bus(Protocol):
     def append(self, actor: int, entry_id: EntryId, payload: bytes) -> None:
         """Add an entry; one that is stored already is left as it is. Raises FencedError.
 
+        A hello makes its epoch known where Redis has lost it: an entry of a larger one that nobody has taken fences
+        nobody. BusUnavailable then says so until the replay server has dropped it.
         Only a hello makes a stream: where it is gone, BusUnavailable says that Redis has lost its data,
         and everything from the hello on is to be added again.
         """

@@ -13,6 +13,7 @@ from redis.retry import Retry
 from rmc.common.bus.metrics_record import decode_record, encode_record
 from rmc.common.bus.pending_read import PendingRead
 from rmc.common.bus.protocol import (
+    LIVES,
     METRICS_KEPT,
     Ack,
     Entry,
@@ -20,6 +21,7 @@ from rmc.common.bus.protocol import (
     ReplayAddress,
     ReplayOwner,
     Version,
+    actor_role,
     join_pieces,
     split_pieces,
 )
@@ -113,10 +115,19 @@ class RedisBus:
 
     def take_epoch(self, role: str, floor: int = 0) -> int:
         key = self._key("epoch", role)
-        epoch = int(self._call(lambda: self._redis.incr(key)))
-        if epoch <= floor:  # Redis lost its data: catch up with what the ring has seen
-            epoch = int(self._call(lambda: self._redis.incrby(key, floor + 1 - epoch)))
+        while not floor < (epoch := self._next_epoch(key, floor)) <= floor + LIVES:
+            # Redis lost its data, or somebody changed them; two lives that catch up at once still get one each.
+            self._call(self._redis.incrby, key, floor - epoch)
         return epoch
+
+    def _next_epoch(self, key: str, floor: int) -> int:
+        try:
+            return int(self._call(lambda: self._redis.incr(key)))
+        except ConfigError as error:
+            if not re.search("not an integer|overflow", str(error)):
+                raise
+            self._call(lambda: self._redis.set(key, floor))
+            return floor
 
     def check_room(self, role: str) -> None:
         self._call(lambda: self._redis.incrby(self._key("epoch", role), 0))  # a write that changes nothing
@@ -129,12 +140,14 @@ class RedisBus:
         try:
             self._call(lambda: self._add_entry(actor, stream, entry_id, payload))
         except ConfigError as error:
-            if "equal or smaller" not in str(error):
+            if not re.search("equal or smaller|exhausted the last possible ID", str(error)):
                 raise
             self._check_not_fenced(actor, stream, entry_id)
 
     def _add_entry(self, actor: int, stream: str, entry_id: EntryId, payload: bytes) -> None:
         if entry_id.seq == 0:
+            if self._number(self._redis.get(epoch := self._key("epoch", actor_role(actor)))) < entry_id.epoch:
+                self._redis.set(epoch, entry_id.epoch)
             self._redis.sadd(self._key("actors"), actor)
         stored = self._redis.xadd(
             stream, {"p": payload}, id=f"{entry_id.epoch}-{entry_id.seq}", nomkstream=entry_id.seq > 0
@@ -143,15 +156,18 @@ class RedisBus:
             raise _gone(stream)
 
     def _check_not_fenced(self, actor: int, stream: str, entry_id: EntryId) -> None:
-        """A refused id is ours, stored by a retried call, unless a larger epoch wrote since."""
+        """A refused id is ours, stored by a retried call, unless a larger epoch that was taken wrote since."""
         try:
             last = _entry_id(self._call(lambda: self._redis.xinfo_stream(stream))["last-generated-id"])
         except ConfigError as error:
             if "no such key" not in str(error):
                 raise
             raise _gone(stream) from None  # it was dropped after it had refused the id
-        if last.epoch != entry_id.epoch:
-            raise FencedError(f"actor {actor}: epoch {last.epoch} has replaced epoch {entry_id.epoch}")
+        if last.epoch == entry_id.epoch:
+            return
+        if last.epoch > min(self.current_epoch(actor_role(actor)), entry_id.epoch + LIVES):
+            raise BusUnavailable(f"{stream} has an entry of epoch {last.epoch}, which nobody has taken")
+        raise FencedError(f"actor {actor}: epoch {last.epoch} has replaced epoch {entry_id.epoch}")
 
     def actors(self) -> list[int]:
         said = self._call(lambda: self._redis.smembers(self._key("actors")))

@@ -45,7 +45,7 @@ def _name(error: ResponseError, command: tuple[Any, ...]) -> None:
 class _Pipeline(Pipeline):
     def immediate_execute_command(self, *args: Any, **options: Any) -> Any:
         try:
-            return super().immediate_execute_command(*args, **options)
+            return super().immediate_execute_command(*args, **options)  # type: ignore[no-untyped-call]
         except ResponseError as error:
             _name(error, args)
             raise
@@ -62,7 +62,7 @@ class RedisClient(redis.Redis):
 
     def execute_command(self, *args: Any, **options: Any) -> Any:
         try:
-            return super().execute_command(*args, **options)
+            return super().execute_command(*args, **options)  # type: ignore[no-untyped-call]
         except ResponseError as error:
             _name(error, args)
             raise

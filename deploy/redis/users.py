@@ -21,7 +21,7 @@ LAUNCHER = "launcher"
 CONNECTS = "+ping +hello"
 EVERYONE = (
     "(+get %R~R:config %R~R:stop)",
-    "(+get +incr +incrby ~R:epoch:ROLE)",
+    "(+get +set +incr +incrby ~R:epoch:ROLE)",
     "(+xadd %W~R:metrics:ROLE)",
 )
 ACTOR = (
@@ -36,15 +36,15 @@ LEARNER = (
     "+watch +unwatch +multi +exec",
     "(+get +set ~R:weights ~R:evaluate)",
     "(+set +expire +exists +persist ~R:weights:* ~R:evaluate:*)",
-    "(+set +watch ~R:epoch:ROLE)",
+    "(+watch ~R:epoch:ROLE)",
     "(+hget %R~R:replay)",
 )
 REPLAY = (
     "+watch +unwatch +multi +exec",
-    "(+get %R~R:weights %R~R:epoch:learner)",
+    "(+get %R~R:weights %R~R:epoch:learner %R~R:epoch:actor-*)",
     "(+smembers %R~R:actors)",
     "(+xread +xtrim ~R:windows:OWN)",
-    "(+set +watch ~R:epoch:ROLE)",
+    "(+watch ~R:epoch:ROLE)",
     "(+hset ~R:acks)",
     "(+hget +hset +hsetnx ~R:progress)",
     "(+hset %W~R:replay)",

@@ -13,6 +13,7 @@ import redis
 
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import (
+    LIVES,
     METRICS_KEPT,
     PIECE_BYTES,
     Ack,
@@ -131,6 +132,42 @@ def test_an_older_epoch_is_fenced(bus):
     bus.append(0, EntryId(2, 0), b"")
     with pytest.raises(FencedError):
         bus.append(0, EntryId(1, 1), b"late")
+
+
+@pytest.mark.parametrize("forged", [(2**64 - 1, 2**64 - 1), (2**64 - 1, 0), (2**31 - 1, 2**53), (2**20, 0), (3, 0)])
+@pytest.mark.parametrize("counted", [2, 2**40])
+def test_an_entry_of_an_epoch_that_nobody_can_have_taken_fences_nobody(redis_url, forged, counted):
+    bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
+    owner = ReplayOwner("replay", bus.take_epoch("replay"))
+    epoch = [bus.take_epoch("actor-0") for _ in range(2)][-1]
+    for seq in range(2):
+        bus.append(0, EntryId(epoch, seq), b"%d" % seq)
+    bus._redis.xadd(bus._key("windows", 0), {"p": b"x"}, id="%d-%d" % forged)
+    bus._redis.set(bus._key("epoch", "actor-0"), counted)
+    is_lawful = forged[0] == 3 and counted > 2  # a life that was begun
+    for seq in (0, 2):
+        with pytest.raises(FencedError if is_lawful else BusUnavailable, match="epoch"):
+            bus.append(0, EntryId(epoch, seq), b"%d" % seq)
+    bus.drop_stream(owner, 0)
+    for seq in range(3):
+        bus.append(0, EntryId(epoch, seq), b"%d" % seq)
+    assert [entry.id for entry in bus.read({0: EntryId(0, 0)}, 10)] == [EntryId(epoch, seq) for seq in range(3)]
+
+
+def test_a_hello_makes_its_epoch_known_again(bus):
+    """Where Redis lost the counter alone, or all; an older life is fenced then, too."""
+    bus.append(0, EntryId(5, 0), b"hello")
+    assert bus.current_epoch("actor-0") == 5
+    with pytest.raises(FencedError):
+        bus.append(0, EntryId(4, 0), b"hello")
+    assert bus.current_epoch("actor-0") == 5
+    assert bus.take_epoch("actor-0") == 6
+
+
+def test_epochs_far_beyond_the_floor_are_not_believed(bus):
+    bus.append(0, EntryId(LIVES + 10, 0), b"hello")
+    assert bus.take_epoch("actor-0", floor=3) == 4
+    assert bus.take_epoch("actor-0", floor=LIVES + 7) == LIVES + 8
 
 
 def test_a_replaced_replay_server_cannot_trim(bus):

@@ -110,6 +110,26 @@ def test_every_role_can_do_its_work(server: RedisServer) -> None:
     launcher.expire(60)
 
 
+@pytest.mark.parametrize("more", [2**20, 2**50, 2**62])
+def test_an_actors_login_retires_no_life(server: RedisServer, more: int) -> None:
+    """Neither by its stream nor by its counter: its next life goes on, and the present one is not fenced."""
+    actor, replay = bus_of(server, "actor-1"), bus_of(server, "replay")
+    owner = ReplayOwner("replay", replay.take_epoch("replay"))
+    replay.drop_stream(owner, 1)
+    epoch = actor.take_epoch("actor-1")
+    actor.append(1, EntryId(epoch, 0), b"hello")
+    with redis.Redis.from_url(server.url("actor-1")) as client:
+        prefix = f"rmc:{USERS.run}"
+        client.incrby(f"{prefix}:epoch:actor-1", more)
+        client.xadd(f"{prefix}:windows:1", {"p": b"x"}, id=f"{2**64 - 1}-{2**64 - 1}")
+    with pytest.raises(BusUnavailable, match="nobody has taken"):
+        actor.append(1, EntryId(epoch, 1), b"windows")
+    replay.drop_stream(owner, 1)
+    for seq in range(2):
+        actor.append(1, EntryId(epoch, seq), b"windows")
+    assert actor.take_epoch("actor-1", floor=epoch) == epoch + 1
+
+
 SHARDED = RedisUsers(USERS.run, SECRET, ("replay-0", "replay-1", "actor-0", "actor-1"))
 FORBIDDEN_TO_SHARDS = """
     DEL R:windows:OTHER|XTRIM R:windows:OTHER MAXLEN 0|XREAD STREAMS R:windows:OTHER 0|XADD R:windows:OTHER * p x

@@ -342,6 +342,58 @@ def test_what_a_stream_lacks_is_sent_again(make: Make, kind: str, redis_url: str
     assert sender.granted() > 0
 
 
+def forge(bus: RedisBus, entry_id: EntryId) -> None:
+    """An entry as whoever has the actor's login can add one."""
+    bus._redis.xadd(f"{bus._prefix}:windows:0", {"p": encode_windows(make_rows(1), SPEC)}, id="%d-%d" % entry_id)
+
+
+FORGED = [
+    (2**64 - 1, 2**64 - 1),
+    (2**31 - 1, 2**53),
+    (2**31 - 1, 0),
+    (2**20, 0),
+    (2, 0),
+    (1, 2**53),
+    (1, 2**41),
+    (1, 2**21),
+]
+
+
+@pytest.mark.parametrize("forged", FORGED)
+@pytest.mark.parametrize("counted", [1, 2**40])
+def test_an_id_that_no_life_can_have_reached_is_refused_and_the_actor_goes_on(
+    make: Make, redis_url: str, run_name: str, forged: tuple[int, int], counted: int
+) -> None:
+    bus = RedisBus(redis_url, run_name)
+    server, sender = make(on=bus), Sender(bus)
+    sender.send(2)
+    drain(server)
+    sender.send(1)
+    for _ in range(2):  # as often as somebody does it
+        bus._redis.set(f"{bus._prefix}:epoch:actor-0", counted)
+        forge(bus, EntryId(*forged))
+        if forged == (2, 0) and counted > 1:
+            return  # that is a life which was begun
+        drain(server)
+        sender.greet()
+        sender.seq = 2
+        sender.send(1)  # what was sent since is kept, and sent again
+    drain(server)
+    stats = server.stats()
+    assert stats["dead_letters_id"] == 2
+    assert stored(server)["reward"][:, 0].tolist() == [0, 1, 2, 3]
+    assert bus.ack(0) is not None
+    close(server)
+
+    fresh = MemoryBus()  # a resume with an empty Redis, and the actor's next life
+    again, sender = make(on=fresh), Sender(fresh)
+    sender.epoch = fresh.take_epoch("actor-0", floor=server._store.ring.progress.streams[0].id.epoch)
+    sender.greet()
+    sender.send_rows(make_rows(1, 9))
+    drain(again)
+    assert stored(again)["reward"][-1, 0] == 9
+
+
 class Failing(MemoryBus):
     """One call of the named methods fails."""
 
