@@ -63,9 +63,6 @@ class MemoryBus:
             found += [Entry(actor, key, stream[key]) for key in stream if key > cursor][:count]
         return found
 
-    def expect(self, after: Mapping[int, EntryId], count: int) -> None:
-        """Nothing has to come from anywhere."""
-
     def commit(self, owner: ReplayOwner, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
         self._check_replay(owner)
         if progress:

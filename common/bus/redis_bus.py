@@ -11,7 +11,6 @@ from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
 from rmc.common.bus.metrics_record import decode_record, encode_record
-from rmc.common.bus.pending_read import PendingRead
 from rmc.common.bus.protocol import (
     METRICS_KEPT,
     Ack,
@@ -69,7 +68,6 @@ class RedisBus:
             raise ConfigError("--redis-url", shown(url), fix) from None
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
-        self._pending = PendingRead(self._redis.connection_pool)
         self.around: Callable[[], AbstractContextManager[None]] = nullcontext
 
     def _key(self, *parts: object) -> str:
@@ -163,23 +161,7 @@ class RedisBus:
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
         if not after:
             return []
-        asked = self._pending.asked
-        if asked is not None and asked.items() <= after.items():
-            return self._take_pending()
-        if asked is not None:
-            self._pending.drop()
         return _entries(self._call(lambda: self._redis.xread(self._cursors(after), count=count)))
-
-    def _take_pending(self) -> list[Entry]:
-        try:
-            return _entries(self._call(self._pending.take)) if self._call(self._pending.ready) else []
-        except BusUnavailable:
-            self._pending.drop()
-            raise
-
-    def expect(self, after: Mapping[int, EntryId], count: int) -> None:
-        if after and self._pending.asked is None:
-            self._call(lambda: self._pending.send(dict(after), self._cursors(after), count))
 
     def _cursors(self, after: Mapping[int, EntryId]) -> dict[str, str]:
         return {self._key("windows", actor): f"{cursor.epoch}-{max(cursor.seq, 0)}" for actor, cursor in after.items()}

@@ -85,8 +85,7 @@ def test_every_role_can_do_its_work(server: RedisServer) -> None:
     owner = ReplayOwner("replay", 5)
     assert replay.progress("replay") == b"counted"
     assert replay.actors() == [0]
-    replay.expect({0: EntryId(0, 0)}, 10)
-    assert len(replay.read({0: EntryId(0, 0)}, 10)) <= 2
+    assert len(replay.read({0: EntryId(0, 0)}, 10)) == 2
     (_, entry) = replay.read({0: EntryId(4, 0)}, 10)
     replay.dead_letter(entry, "a test")
     replay.announce_replay(owner, "unix:/nowhere")
