@@ -123,11 +123,11 @@ class Learner:
         return True
 
     def _learn(self, sample: Sample) -> None:
-        rows, values = sample.rows, sample.values
+        rows, values = sample.rows, sample.weights
         assert rows is not None
         assert values is not None
         clear_padding(rows, self.spec)
-        weights = importance_weights(values, sample.mass, sample.windows, self.config.importance_exponent)
+        weights = importance_weights(values, sample.total_weight, sample.windows, self.config.importance_exponent)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
         updated = self._updated(raw, torch.from_numpy(weights), self.update.config.beta(self.env_steps))
         self.updates += 1
@@ -250,12 +250,12 @@ class Learner:
     def _resume(self) -> int:
         """Go on from the newest valid checkpoint; returns the epoch it was written in."""
         self._next_checkpoint = self.config.checkpoint_steps
-        found = self.checkpoints.latest()
-        if found is None:
+        newest = self.checkpoints.latest()
+        if newest is None:
             if self.checkpoints.numbers():
                 raise CheckpointError(f"{self.checkpoints.folder}: no checkpoint is valid; move the folder away")
             return 0
-        number, files = found
+        number, files = newest
         try:
             state = torch.load(io.BytesIO(files[STATE]), map_location=self.device, weights_only=True)
             self.update.load_state_dict(state)

@@ -228,17 +228,17 @@ class SocketServer:
         shared = connection.shared
         if shared is None or shared.batch_size != batch_size:
             for other in self._connections:
-                other.own()  # the draw takes a buffer that another client's batch may still lie in
+                other.copy_pending()  # the draw takes a buffer that another client's batch may still lie in
             sample = self._server.sample(batch_size, drawn_elsewhere_steps)
         else:
             sample = self._server.sample(batch_size, drawn_elsewhere_steps, shared.rows[shared.turn])
-        meta = {name: getattr(sample, name) for name in ("mass", "windows", "env_steps", "drawn_steps")}
-        if sample.rows is None or sample.values is None:
+        meta = {name: getattr(sample, name) for name in ("total_weight", "windows", "env_steps", "drawn_steps")}
+        if sample.rows is None or sample.weights is None:
             connection.send(Kind.FINISHED if sample.draw is SampleStatus.FINISHED else Kind.WAIT, meta)
         elif shared is None or shared.batch_size != batch_size:
-            connection.send(Kind.BATCH, meta, (sample.rows.view(np.uint8).data, sample.values.data.cast("B")))
+            connection.send(Kind.BATCH, meta, (sample.rows.view(np.uint8).data, sample.weights.data.cast("B")))
         else:
-            connection.send(Kind.SHARED, meta | shared.put(sample.values))
+            connection.send(Kind.SHARED, meta | shared.put(sample.weights))
 
     def _episode(self, connection: Connection, serial: Any) -> None:
         if type(serial) is not int:

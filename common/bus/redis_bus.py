@@ -1,6 +1,7 @@
 """The bus over Redis: unix socket, TCP or TLS; the keys stand in ``common/bus/protocol.py``."""
 
 import re
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -68,12 +69,15 @@ class RedisBus:
             raise ConfigError("--redis-url", shown(url), fix) from None
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
+        self._rests_until = 0.0  # by the monotonic clock: a Redis that hangs is left alone for as long as it took
         self.around: Callable[[], AbstractContextManager[None]] = nullcontext
 
     def _key(self, *parts: object) -> str:
         return ":".join([self._prefix, *map(str, parts)])
 
     def _call(self, action: Callable[..., T], *args: Any) -> T:
+        if time.monotonic() < self._rests_until:
+            raise BusUnavailable("Redis did not answer in time")
         try:
             with self.around():
                 return action(*args)
@@ -83,7 +87,10 @@ class RedisBus:
             if "MISCONF" in str(error):  # it cannot write its append-only file: no room, most often
                 raise BusFull(str(error)) from None
             raise
-        except (redis.exceptions.ConnectionError, redis.exceptions.TimeoutError, OSError) as error:
+        except redis.exceptions.TimeoutError as error:
+            self._rests_until = time.monotonic() + TIMEOUT_SECONDS  # half of the time is for what needs no Redis
+            raise BusUnavailable(str(error)) from None
+        except (redis.exceptions.ConnectionError, OSError) as error:
             raise BusUnavailable(str(error)) from None
 
     def ping(self) -> None:

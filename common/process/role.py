@@ -73,19 +73,13 @@ class Heartbeat:
         except (BusUnavailable, BusFull) as error:
             self.outage.begin(error)
             self._clock.wait("redis")
-            self._next_stop = self._next_metrics = next_try(now)
+            self._next_stop = self._next_metrics = time.monotonic() + RECONNECT_SLEEP
         return False
 
     def record(self) -> dict[str, Any]:
         """What the role has to say now."""
         refused = {"refused_values": self._bus.refused.total()}
         return {"time": time.time(), **self._role.metrics(), **refused, **self._clock.shares()}
-
-
-def next_try(began: float) -> float:
-    """When to try again what failed: where Redis hangs, half of the time is for what needs none."""
-    now = time.monotonic()
-    return now + max(RECONNECT_SLEEP, now - began)
 
 
 def run_role(

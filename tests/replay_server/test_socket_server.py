@@ -137,7 +137,7 @@ def test_pipelined_draws_are_what_a_server_in_the_same_thread_gives(serve: Serve
         assert kind is Kind.BATCH
         assert sample.rows is not None
         assert rows.tobytes() == sample.rows.tobytes()
-        assert np.array_equal(values, sample.values)
+        assert np.array_equal(values, sample.weights)
     connection.close()
 
 
@@ -152,7 +152,7 @@ def test_the_learners_client_gets_the_same_draws_however_they_come(serve: Serve,
         sample, expected = client.sample(64), twin.replay.sample(64)
         assert sample.rows is not None
         assert expected.rows is not None
-        assert np.array_equal(sample.values, expected.values)
+        assert np.array_equal(sample.weights, expected.weights)
         if before is not None:  # a batch stays what it is until the next draw but one
             assert before[0].tobytes() == before[1]
         before = sample.rows, expected.rows.tobytes()
@@ -296,9 +296,9 @@ def test_who_proves_nothing_ends_no_learner(
     client.close()
 
 
-@pytest.mark.parametrize("mass", ["x", None, [], True, float("nan"), float("inf"), -1.0])
-def test_a_draw_of_no_mass_is_an_outage(serve: Serve, mass: Any, caplog: pytest.LogCaptureFixture) -> None:
-    away_for(serve(), Sample(SampleStatus.WAIT, None, None, mass, 3, 12, 0), "mass", caplog)
+@pytest.mark.parametrize("total_weight", ["x", None, [], True, float("nan"), float("inf"), -1.0])
+def test_a_draw_of_no_mass_is_an_outage(serve: Serve, total_weight: Any, caplog: pytest.LogCaptureFixture) -> None:
+    away_for(serve(), Sample(SampleStatus.WAIT, None, None, total_weight, 3, 12, 0), "total_weight", caplog)
 
 
 @pytest.mark.parametrize("count", ["3", None, {}, True, float("nan"), float("inf"), 1.5, -1])
