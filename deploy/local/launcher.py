@@ -166,8 +166,3 @@ def watch(monitor: Monitor, bus: RedisBus) -> None:
         monitor.outage.end()
     except (BusUnavailable, BusFull) as error:
         monitor.outage.begin(error)
-
-
-def check_redis(url: str) -> None:
-    """Raises ConfigError where no Redis answers."""
-    connect(url, "check")

@@ -13,7 +13,8 @@ import numpy as np
 from rmc.analysis import curves, env_check, export, history, video, world_model_picture
 from rmc.analysis.evaluation import evaluate_checkpoint
 from rmc.analysis.policy import load_policy
-from rmc.cli import options, training
+from rmc.cli import options
+from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
 from rmc.deploy.monitor.view import terminal
@@ -103,7 +104,7 @@ def baseline(command: options.Baseline) -> int:
     _check_baselines(command.algorithm)
     from rmc.analysis import baselines  # an extra, and slow to import
 
-    with training.signals_caught() as stop:
+    with signals_caught() as stop:
         return baselines.train(command.config(), command.run_dir, terminal(), stop)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rmc.cli import main, options
-from rmc.cli.training import prepare
+from rmc.cli.training import open_folder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import to_json
@@ -153,7 +153,7 @@ def test_a_redis_beside_ray_is_refused_without_its_password() -> None:
     """Where the check is made: to get there from the command line takes a cluster."""
     placement = LaunchOptions(None, "fail", "ray", "cpu", "redis://user:hush@localhost:1")
     with pytest.raises(ConfigError, match="--redis-url='redis://localhost:1': a run on Ray"):
-        prepare(debug(EnvConfig(PENDULUM)), placement)
+        open_folder(debug(EnvConfig(PENDULUM)), placement)
 
 
 def test_a_full_disk_is_one_line(
