@@ -33,7 +33,8 @@ from rmc.common.env.make import first_env, make_env
 from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
-from rmc.deploy.run.folder import RunFolder, make, read_object, write_whole
+from rmc.common.whole_file import write_whole
+from rmc.deploy.run.folder import RunFolder, make, read_object
 
 CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
 STOPPED = 130  # exit status after Ctrl-C, as shells have it

@@ -9,7 +9,8 @@ import msgpack
 from rmc.common.bus.protocol import Bus
 from rmc.common.errors import BusUnavailable
 from rmc.common.shard import Shard
-from rmc.deploy.run.folder import RunFolder, write_whole
+from rmc.common.whole_file import write_whole
+from rmc.deploy.run.folder import RunFolder
 
 KEEP_SECONDS = 10.0
 log = logging.getLogger(__name__)

@@ -20,6 +20,7 @@ from typing import Any, Literal
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import CheckpointError, ConfigError
+from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import RunConfig, from_json, option, to_json
 
 SECRET_LENGTH = 64  # hexadecimal characters
@@ -198,16 +199,6 @@ class RunFolder:
         except FileNotFoundError:
             return None
         return int(number) if word == "ended" else None
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a small file whole or not at all: what is in it is on the disk before it has its name."""
-    temporary = path.with_name(f".{path.name}")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.rename(path)
 
 
 def _locked(handle: int, kind: int) -> bool:
