@@ -123,5 +123,13 @@ class Stumbles(Slide):
         return np.linalg.inv(np.zeros((2, 2)))  # the line that must be named
 
 
-for _kind in (Slide, InPlace, Gives, CannotClose, Shaped, Wants, Stumbles):
+class Untyped(Slide):
+    """Its rewards are words."""
+
+    def step(self, action: Any) -> Any:
+        seen, _, *others = super().step(action)
+        return (seen, "much", *others)
+
+
+for _kind in (Slide, InPlace, Gives, CannotClose, Shaped, Wants, Stumbles, Untyped):
     gym.register(f"{_kind.__name__}-v0", entry_point=_kind)
