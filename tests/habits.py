@@ -131,5 +131,34 @@ class Untyped(Slide):
         return (seen, "much", *others)
 
 
-for _kind in (Slide, InPlace, Gives, CannotClose, Shaped, Wants, Stumbles, Untyped):
+class TakesNoMode(Slide):
+    """Says that it draws, but cannot be asked to."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(self) -> None: ...
+
+
+PICTURES = {
+    "sound": np.zeros((33, 40, 3), np.uint8),
+    "none": None,
+    "floats": np.zeros((32, 40, 3)),
+    "list": [np.zeros((32, 40, 3), np.uint8)],
+    "with alpha": np.zeros((32, 40, 4), np.uint8),
+}
+
+
+class Draws(Slide):
+    """Gives a picture of some kind."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, picture: str, render_mode: str | None = None) -> None:
+        self.picture, self.render_mode = picture, render_mode
+
+    def render(self) -> Any:
+        return PICTURES[self.picture]
+
+
+for _kind in (Slide, InPlace, Gives, CannotClose, Shaped, Wants, Stumbles, Untyped, TakesNoMode, Draws):
     gym.register(f"{_kind.__name__}-v0", entry_point=_kind)
