@@ -5,7 +5,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rmc.common.errors import EnvFault
 
@@ -15,10 +15,10 @@ STANDARD_LIBRARY = sysconfig.get_path("stdlib")
 ResultT = TypeVar("ResultT")
 
 
-def asked(what: str, call: Callable[[], ResultT]) -> ResultT:
+def asked(what: str, call: Callable[..., ResultT], *given: Any) -> ResultT:
     """What a method of the environment's gives. Raises EnvFault with the error's place where it raises."""
     try:
-        return call()
+        return call(*given)
     except EnvFault:
         raise
     except RAISED as error:

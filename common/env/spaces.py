@@ -50,7 +50,7 @@ def _numbers(box: gym.Space[Any], value: Any) -> NDArray[np.float32]:
         )
     if found.shape != box.shape and _sides(found.shape) != _sides(box.shape or ()):
         raise EnvFault(f"the environment's observation has shape {found.shape}, its space says {box.shape}")
-    return found.astype(np.float32).ravel()
+    return np.array(found, np.float32).ravel()  # a copy: some environments write into the same one again
 
 
 def _sides(shape: tuple[int, ...]) -> list[int]:

@@ -7,8 +7,7 @@ import logging
 import math
 import reprlib
 from collections import deque
-from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import gymnasium as gym
@@ -22,6 +21,8 @@ from rmc.common.errors import EnvFault
 Floats = NDArray[np.float32]
 Env = gym.Env[Floats, Floats]
 log = logging.getLogger(__name__)
+RESET, STEP = ("observation", "info"), ("observation", "reward", "terminated", "truncated", "info")
+PLAIN = (float, int)  # numbers of Python's own, and numpy's float64
 
 
 class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
@@ -36,20 +37,21 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
         self._given, self._taken = env.observation_space, env.action_space
         self._low, self._high = bounds(env.action_space)
         self._half_range = (self._high - self._low) / 2
+        self._vectors = isinstance(env.action_space, gym.spaces.Box) and len(env.action_space.shape) == 1
         self._plain = bool((self._low == -1.0).all() and (self._high == 1.0).all())
         self.action_space = gym.spaces.Box(-1.0, 1.0, self._low.shape, np.float32)
         self.observation_space = _box(gym.spaces.flatdim(env.observation_space))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        found = asked("reset", lambda: self.env.reset(seed=seed, options=options))
-        observation, info = _values("reset", found, "(observation, info)")
+        found = asked("reset", partial(self.env.reset, seed=seed, options=options))
+        observation, info = _values("reset", found, RESET)
         return vector(self._given, observation), _own(info)
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        found = asked("step", lambda: self.env.step(self._stretched(action)))
-        observation, reward, *ends, info = _values("step", found, "(observation, reward, terminated, truncated, info)")
-        terminated, truncated = (bool(_number("end", end)) for end in ends)
-        return vector(self._given, observation), _number("reward", reward), terminated, truncated, _own(info)
+        found = asked("step", self.env.step, self._stretched(action))
+        observation, reward, terminated, truncated, info = _values("step", found, STEP)
+        ends = _bool("terminated", terminated), _bool("truncated", truncated)
+        return vector(self._given, observation), _number("reward", reward), *ends, _own(info)
 
     def render(self) -> Any:
         return asked("render", self.env.render)
@@ -63,24 +65,23 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
 
     def _stretched(self, action: Floats) -> Any:
         """(A,) in [-1, 1] -> an action of the environment's own space, which it may change as it likes."""
-        if self._plain:
-            own = np.array(action, np.float64)
-        else:
-            own = (self._low + (action + 1.0) * self._half_range).clip(self._low, self._high)
-        return gym.spaces.unflatten(self._taken, own)
+        if not self._plain:
+            action = (self._low + (action + 1.0) * self._half_range).clip(self._low, self._high)
+        if self._vectors:
+            return np.array(action, self._taken.dtype)
+        return gym.spaces.unflatten(self._taken, action.astype(np.float64))
 
 
-def _values(method: str, found: Any, wanted: str) -> tuple[Any, ...]:
-    count = wanted.count(",") + 1
-    if isinstance(found, tuple) and len(found) == count:
+def _values(method: str, found: Any, wanted: tuple[str, ...]) -> tuple[Any, ...]:
+    if isinstance(found, tuple) and len(found) == len(wanted):
         return found
     given = f"{len(found)} values" if isinstance(found, tuple) else f"a {type(found).__name__}"
-    raise EnvFault(f"the environment's {method} gives {given}; return {wanted}")
+    raise EnvFault(f"the environment's {method} gives {given}; return ({', '.join(wanted)})")
 
 
 def _number(name: str, value: Any) -> float:
     """A number, also as an array of one."""
-    if isinstance(value, float | int):
+    if isinstance(value, PLAIN):
         return float(value)
     found = np.asarray(value)
     if found.size != 1 or found.dtype.kind not in NUMBERS:
@@ -88,18 +89,22 @@ def _number(name: str, value: Any) -> float:
     return float(found.item())
 
 
+def _bool(name: str, value: Any) -> bool:
+    return value if isinstance(value, bool) else bool(_number(name, value))
+
+
 def _own(info: Any) -> dict[str, Any]:
     """A copy of ``info``, its missing frame as a bool, also under the name that it had until 0.2."""
-    if not isinstance(info, Mapping):
+    if not isinstance(info, dict):
         raise EnvFault(f"the environment's info is {reprlib.repr(info)}, not a dict; return {{}} if it says nothing")
-    own = dict(info)
+    own = info.copy()
     if "blank" in own and "missing" not in own:
         _warn_once(
             'the environment gives info["blank"]; call it info["missing"], the old name goes in the next version'
         )
         own["missing"] = own.pop("blank")
     if "missing" in own:
-        own["missing"] = bool(_number('info["missing"]', own["missing"]))
+        own["missing"] = _bool('info["missing"]', own["missing"])
     return own
 
 

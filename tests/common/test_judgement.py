@@ -62,7 +62,7 @@ WRONG = [
     (1, "1", "the environment's reward is '1', not a number"),
     (1, None, "the environment's reward is None, not a number"),
     (1, [1.0, 2.0], "the environment's reward is [1.0, 2.0], not a number"),
-    (2, "False", "the environment's end is 'False', not a number"),
+    (2, "False", "the environment's terminated is 'False', not a number"),
     (4, None, "the environment's info is None, not a dict; return {} if it says nothing"),
     (4, {"missing": "no"}, "the environment's info[\"missing\"] is 'no', not a number"),
 ]
