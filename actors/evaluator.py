@@ -21,7 +21,7 @@ from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Bus, Version
 from rmc.common.env.make import checked_reset, recreate_env
 from rmc.common.env.wrappers import Env, Floats
-from rmc.common.errors import BusFull, BusUnavailable, ConfigError, MessageError, RmcError
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError, EnvFault, MessageError
 
 log = logging.getLogger(__name__)
 POLL_SECONDS = 0.1  # between looks for a policy to play
@@ -68,6 +68,7 @@ class Rollout:
         self._prev_action, self._state = runner.start()
         self._playing = np.ones(len(envs), np.bool_)
         self._missing, self.broken = np.zeros((2, len(envs)), np.bool_)
+        self.fault: Exception | None = None  # what an environment broke in last
         self._returns = np.zeros(len(envs))
         self.steps = self._rounds = 0
         for i in range(len(envs)):
@@ -89,7 +90,9 @@ class Rollout:
         try:
             action(i, argument)
         except Exception as error:
-            log.warning("environment %d of an evaluation broke: %r", i, error)
+            if str(error) != str(self.fault):  # once, however many break alike
+                log.warning("environment %d of an evaluation broke: %s", i, error)
+            self.fault = error
             self._playing[i], self.broken[i] = False, True
             self._observation[i] = 0.0
 
@@ -100,7 +103,7 @@ class Rollout:
     def _step_environment(self, i: int, action: Floats) -> None:
         self._observation[i], reward, terminated, truncated, info = self._envs[i].step(action)
         if not (np.isfinite(self._observation[i]).all() and math.isfinite(reward)):
-            raise ValueError("its observation or reward is not finite")
+            raise EnvFault("the environment's observation or reward is not finite")
         self._missing[i] = info.get("missing", False)
         self._returns[i] += float(reward)
         self.steps += 1
@@ -115,7 +118,7 @@ class Rollout:
 def play_episodes(runner: PolicyLike, make_env: Callable[[], Env], episodes: int, seed: int) -> list[float]:
     """Returns of so many deterministic episodes, played as one batch; ``runner`` is for as many environments.
 
-    Those in which the environment broke are left out. Raises RmcError where none is left.
+    Those in which the environment broke are left out. Raises EnvFault where none is left.
     """
     envs = [make_env() for _ in range(episodes)]
     try:
@@ -126,7 +129,7 @@ def play_episodes(runner: PolicyLike, make_env: Callable[[], Env], episodes: int
         for env in envs:
             env.close()
     if not match.returns.size:
-        raise RmcError(f"the environment broke in each of {episodes} episodes; see what is said above")
+        raise EnvFault(f"the environment broke in each of {episodes} episodes: {match.fault}")
     return [float(value) for value in match.returns]
 
 

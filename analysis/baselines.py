@@ -29,7 +29,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from rmc.actors.evaluator import first_start, play_episodes
 from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, read, validate
 from rmc.analysis.evaluation import FINAL_EPISODES
-from rmc.common.env.make import first_env, make_env
+from rmc.common.env.make import env_spaces, make_env
 from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
@@ -46,8 +46,8 @@ MODEL, BUFFER, SCALES, PROGRESS = "model.zip", "replay_buffer.pkl", "scales.pkl"
 def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: StopSignal) -> int:
     """Train to the end, or to a stop signal; the exit status. Raises ConfigError before anything is written."""
     validate(config)
-    first_env(config.env).close()
-    folder = _open_folder(config, run_dir)
+    sizes = _sizes(config)
+    folder = _open_folder(config, run_dir, sizes)
     try:
         _set_torch(config)
         console.print(f"run folder {folder.path}", soft_wrap=True)
@@ -76,7 +76,13 @@ def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: 
     return 0
 
 
-def _open_folder(config: BaselineConfig, run_dir: Path | None) -> RunFolder:
+def _sizes(config: BaselineConfig) -> dict[str, int]:
+    """What its networks are made for. Raises ConfigError."""
+    observations, actions, _ = env_spaces(config.env)
+    return {"observations": observations, "actions": actions}
+
+
+def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, int]) -> RunFolder:
     """Make or take up a run's folder, locked, as ``open_run``. Raises ConfigError."""
     env = config.env.id.replace(":", "_").replace("/", "_")
     name = f"{env}__{config.algorithm}-{config.settings}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
@@ -88,12 +94,14 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None) -> RunFolder:
             if key not in ("total_steps", "threads") and was.get(key) != now[key]:
                 fix = f"the run in {folder.path} has {was.get(key)!r}; use that, or another --run-dir"
                 raise ConfigError(f"--{key.replace('_', '-')}", now[key], fix)
+        folder.check_sizes(config.env.id, sizes)
     elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no baseline's; give another one")
     make(folder)
     folder.lock()
     folder.reopen(config.total_steps)
     write_whole(about, f"{json.dumps(now, indent=2)}\n".encode())
+    folder.write_sizes(sizes)
     for left in set(folder.checkpoints.glob("[0-9]*")) - set(_states(folder)):  # by a crash amid a save
         shutil.rmtree(left)
     return folder
@@ -309,6 +317,7 @@ def evaluate(folder: RunFolder, episodes: int, flicker: float | None = None) -> 
     config, states = read(folder), _states(folder)
     if not states:
         raise ConfigError("RUN", str(folder.path), "it has no checkpoint yet; train it for longer")
+    folder.check_sizes(config.env.id, _sizes(config))
     _set_torch(config)
     progress = read_object(states[-1] / PROGRESS, "env_steps", "updates")
     env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from rmc.common.env.config import EnvConfig
+from rmc.common.env.faults import RAISED, told
 from rmc.common.env.make import first_env
 from rmc.common.env.wrappers import Env, Floats
+from rmc.common.errors import EnvFault
 
 BESIDE_THE_POINT = ("is -infinity", "is infinity", "symmetric and normalized")  # of vectors and stretched actions
 REPEATED_STEPS = 50  # played twice from one seed
@@ -88,8 +90,10 @@ def _guarded(action: Callable[[], None]) -> Iterator[str]:
         warnings.simplefilter("always")
         try:
             action()
-        except Exception as error:  # whatever a user's environment raises is a finding
-            yield f"fault: {type(error).__name__}: {' '.join(str(error).split())}"
+        except EnvFault as fault:
+            yield f"fault: {fault}"
+        except RAISED as error:  # whatever a user's environment raises is a finding
+            yield f"fault: {told(error)}"
     for text in dict.fromkeys(_plain(str(warning.message)) for warning in caught):
         yield f"note: {text}"
 

@@ -71,6 +71,7 @@ def load_checkpoint(folder: RunFolder, config: RunConfig, checkpoint: str) -> tu
     The best is of those that were evaluated while it trained, which the last one need not be.
     """
     files, spec = _load(folder, checkpoint), config.window_spec()
+    folder.check_sizes(config.env.id, config.sizes())
     try:
         PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, envs=1).load(files[POLICY])
     except MessageError as error:

@@ -54,7 +54,7 @@ class RunFolder:
         self.checkpoints, self.replay, self.logs = self.path / "checkpoints", self.path / "replay", self.path / "logs"
         self.metrics, self.events = self.path / "metrics.jsonl", self.path / "events"
         self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
-        self.initial_file = self.path / "initial.json"
+        self.initial_file, self.sizes_file = self.path / "initial.json", self.path / "sizes.json"
         self._lock: int | None = None
 
     @property
@@ -108,6 +108,21 @@ class RunFolder:
     def write_initial(self, played: dict[str, Any]) -> None:
         """Write ``initial.json``, whole or not at all."""
         write_whole(self.initial_file, f"{json.dumps(played, indent=2)}\n".encode())
+
+    def check_sizes(self, env_id: str, sizes: dict[str, int]) -> None:
+        """Raises ConfigError where the environment has other ``sizes`` than when the run began."""
+        try:
+            before = read_object(self.sizes_file, *sizes)
+        except (OSError, ConfigError):  # damaged, it is as none
+            return
+        for name, now in sizes.items():
+            if before[name] != now:
+                fault = f"the environment now has {now} {name}, the run was trained with {before[name]}"
+                raise ConfigError("ENV", env_id, f"{fault}; undo that, or train another run")
+
+    def write_sizes(self, sizes: dict[str, int]) -> None:
+        """Write ``sizes.json``, whole or not at all."""
+        write_whole(self.sizes_file, f"{json.dumps(sizes)}\n".encode())
 
     def reopen(self, total_steps: int) -> None:
         """Drop the result where steps are missing: what it says is no longer the end. Raises ConfigError."""
@@ -245,6 +260,7 @@ def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> Ru
     folder.lock()
     folder.reopen(config.total_steps)
     folder.write_config(config)
+    folder.write_sizes(config.sizes())
     folder.secret()
     return folder
 
@@ -281,6 +297,7 @@ def _check_resumable(folder: RunFolder, config: RunConfig) -> None:
             name = "ENV" if path == "env.id" else option(path)
             fix = f"the run in {folder.path} has {was[path]!r}; use that, or another --run-dir"
             raise ConfigError(name, now[path], fix)
+    folder.check_sizes(config.env.id, config.sizes())
     check_checkpoints(folder)
 
 

@@ -33,6 +33,8 @@ def evaluate(command: options.Evaluate) -> int:
     folder, console = RunFolder(command.run), terminal()
     if command.video is not None and folder.is_baseline():
         raise ConfigError("--video", str(command.video), "only runs of rmc train are filmed; leave it")
+    if command.video is not None:
+        video.prepare(folder.config().env, command.video)
     for probability in command.flicker or (None,):
         played = _played(folder, command, probability)
         text = json.dumps(played) if command.json else _said(played)

@@ -2,24 +2,33 @@
 
 import dataclasses
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional
+from tyro.constructors import PrimitiveConstructorSpec
 
 from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.analysis.baseline_settings import Algorithm, BaselineConfig
 from rmc.analysis.curves import Axis
 from rmc.common.agent_config import AgentConfig
-from rmc.common.env.config import EnvConfig
+from rmc.common.env.config import EnvConfig, read_kwargs, write_kwargs
 from rmc.deploy.run.config import Preset, RunConfig, WindowConfig
 from rmc.deploy.run.folder import IfExists
 from rmc.deploy.run.launch_options import Launcher, LaunchOptions
 from rmc.deploy.run.presets import preset
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
+
+KEYWORDS = PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="NAME=VALUE",
+    instance_from_str=read_kwargs,
+    is_instance=lambda value: isinstance(value, dict),
+    str_from_instance=write_kwargs,
+)
 
 
 @dataclass(frozen=True)
@@ -28,6 +37,8 @@ class EnvOptions(EnvConfig):
 
     id: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
     """Gymnasium id, like HalfCheetah-v5 or dm_control/walker-walk-v0, or module:EnvId-v0 for your own."""
+    env_kwargs: Annotated[dict[str, Any], KEYWORDS] = field(default_factory=dict)
+    """Keywords that the environment is made with, like goal=1.5 map=maze pose=[0,1]: numbers, words, JSON."""
 
     def config(self) -> EnvConfig:
         """The same, as the roles know it."""

@@ -65,10 +65,13 @@ def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("raise", "fault: RuntimeError: the simulation is unstable"),
+        (
+            "raise",
+            "fault: the environment's step raises RuntimeError: the simulation is unstable (broken_env.py, line ",
+        ),
         ("nan", "fault: observations are not finite"),
         ("reward", "fault: rewards are not finite"),
-        ("shape", "fault: ValueError: its observation has shape (3,), its space says (4,)"),
+        ("shape", "fault: the environment's observation has shape (3,), its space says (4,)"),
     ],
 )
 def test_faults_are_named(fault, words, capsys):

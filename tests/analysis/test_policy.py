@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -40,9 +41,12 @@ def run(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
     return make_run(tmp_path / "run", AGENTS[request.param], "Pendulum-v1", flicker=0.2)
 
 
-def make_run(path: Path, agent_config: AgentConfig, env: str, flicker: float = 0.0) -> RunFolder:
+def make_run(
+    path: Path, agent_config: AgentConfig, env: str, flicker: float = 0.0, env_kwargs: dict[str, Any] | None = None
+) -> RunFolder:
     """A run's folder with one checkpoint of an agent that was never trained."""
-    config = dataclasses.replace(debug(EnvConfig(env, flicker=flicker)), agent=agent_config)
+    env_config = EnvConfig(env, flicker=flicker, env_kwargs=env_kwargs or {})
+    config = dataclasses.replace(debug(env_config), agent=agent_config)
     folder, spec = open_run(config, path, "fail"), config.window_spec()
     folder.unlock()
     torch.manual_seed(0)

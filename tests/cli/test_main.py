@@ -25,7 +25,7 @@ DEBUG = ["train", PENDULUM, "--preset", "debug"]
 # Whoever changes this list changes what users have in their scripts.
 TRAIN_FLAGS = """
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
-    --env-timeout --run-dir --if-exists --launcher --device --redis-url
+    --env-timeout --env-kwargs --run-dir --if-exists --launcher --device --redis-url
     --ray-address --all-cpus --tls
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
@@ -39,7 +39,7 @@ TRAIN_FLAGS = """
     --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads
     --episodes
 """.split()  # noqa: SIM905
-ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit --env-timeout".split()  # noqa: SIM905
+ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit --env-timeout --env-kwargs".split()  # noqa: SIM905
 OTHER_FLAGS = {
     "evaluate": ["--episodes", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
