@@ -85,26 +85,3 @@ class WindowSpec:
     def trained_steps(self, rows: Rows) -> int:
         """Real trained steps in all rows, what a draw spends of the replay ratio."""
         return int((rows["last"] - self.burn_in).sum())
-
-
-def first_fault(rows: Rows, spec: WindowSpec) -> str | None:
-    """Why these rows cannot be windows of this run, or None. Checks indices and finiteness."""
-    first, last = rows["first"], rows["last"]
-    if not ((first == 0) | (first == spec.burn_in)).all():
-        return "first is neither 0 nor burn_in"
-    if not ((last > spec.burn_in) & (last <= spec.steps)).all():
-        return "last is outside (burn_in, T]"
-    if not ((rows["new_steps"] >= 0) & (rows["new_steps"] <= last - spec.burn_in)).all():
-        return "new_steps exceeds the trained steps"
-    if ((first == 0) & (rows["episode_step"] < spec.burn_in)).any():
-        return "a burn-in before its episode's start"
-    new = rows["new_observations"]
-    if not ((new >= rows["new_steps"]) & (new <= rows["new_steps"] + 1)).all():
-        return "new_observations is neither new_steps nor one more"
-    for name in ("observation", "action", "prev_action", "reward", "state", "initial_priority"):
-        if not np.isfinite(rows[name]).all():
-            return f"{name} is not finite"
-    for name in ("initial_priority", "env", "episode_step"):
-        if (rows[name] < 0).any():
-            return f"{name} is negative"
-    return None

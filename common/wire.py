@@ -20,7 +20,7 @@ import numpy as np
 
 from rmc.common.checksum import crc32
 from rmc.common.errors import MessageError
-from rmc.common.window import Rows, WindowSpec, first_fault
+from rmc.common.window import Rows, WindowSpec
 
 VERSION = 1
 MAGIC = b"RMC1"
@@ -76,15 +76,8 @@ def max_entry_bytes(spec: WindowSpec) -> int:
     return max(MAX_ENTRY_BYTES, spec.dtype.itemsize) + 128
 
 
-def check_rows(rows: Rows, spec: WindowSpec) -> None:
-    """Raises MessageError where one of them can be no window of this run."""
-    fault = first_fault(rows, spec)
-    if fault is not None:
-        raise MessageError("window", fault)
-
-
 def decode_rows(payload: bytes, spec: WindowSpec) -> Rows:
-    """Rows of an entry; a hello has none. ``check_rows`` is still to come, quicker for many entries at once.
+    """Rows of an entry, which are still to be judged; a hello has none.
 
     Raises MessageError with a countable reason; never anything else, whatever the bytes.
     """

@@ -20,6 +20,7 @@ MAX_STREAMS = 4096
 _HEADER = struct.Struct("<QII")
 _COUNTERS = struct.Struct("<10qdqq")  # the integers of Progress in order, largest priority, statistics count, streams
 _STREAM_BYTES = 4 * 8
+_CRC = struct.Struct("<I")
 
 
 class StreamPosition(NamedTuple):
@@ -77,6 +78,16 @@ class Progress:
         streams = np.array(rows, np.int64).tobytes()
         return counters + self.total.tobytes() + self.total_square.tobytes() + streams
 
+    def publish(self) -> bytes:
+        """The same for a bus and for files, with a CRC-32 in front."""
+        payload = self.encode()
+        return _CRC.pack(zlib.crc32(payload)) + payload
+
+
+def is_whole(published: bytes) -> bool:
+    """Whether this is as ``Progress.publish`` made it."""
+    return published[: _CRC.size] == _CRC.pack(zlib.crc32(published[_CRC.size :]))
+
 
 def decode_progress(payload: bytes, obs_dim: int) -> Progress:
     """The inverse of ``Progress.encode``, for bytes whose CRC was right."""
@@ -89,14 +100,15 @@ def decode_progress(payload: bytes, obs_dim: int) -> Progress:
     return progress
 
 
-def decode_published(raw: bytes, obs_dim: int) -> Progress | None:
-    """``Progress.encode`` as a bus has kept it; None where it is not one of such observations."""
-    if len(raw) < _COUNTERS.size:
+def decode_published(published: bytes, obs_dim: int) -> Progress | None:
+    """``Progress.publish`` as a bus has kept it; None where it is damaged or not of such observations."""
+    payload = published[_CRC.size :]
+    if not is_whole(published) or len(payload) < _COUNTERS.size:
         return None
-    streams = _COUNTERS.unpack_from(raw)[-1]
-    if len(raw) != _COUNTERS.size + 16 * obs_dim + streams * _STREAM_BYTES:
+    streams = _COUNTERS.unpack_from(payload)[-1]
+    if len(payload) != _COUNTERS.size + 16 * obs_dim + streams * _STREAM_BYTES:
         return None
-    return decode_progress(raw, obs_dim)
+    return decode_progress(payload, obs_dim)
 
 
 def record_bytes(obs_dim: int) -> int:

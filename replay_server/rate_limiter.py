@@ -47,6 +47,11 @@ class RateLimiter:
         each, rest = divmod(max(0, self.limit(drawn) - inserted), actors)
         return [each + (actor < rest) for actor in range(actors)]
 
+    def is_held(self, inserted: int, drawn: int) -> bool:
+        """Whether the ratio is within half and twice its target, but for the slack; else a counter is damaged."""
+        due, slack = (inserted - self.warmup_steps) * self.replay_ratio, 2 * self.slack_steps * self.replay_ratio
+        return due / 2 - slack <= drawn <= 2 * max(due, 0.0) + slack
+
     def ratio(self, inserted: int, drawn: int) -> float:
         """The ratio held so far, counted from the end of the warm-up."""
         return drawn / max(1, inserted - self.warmup_steps)

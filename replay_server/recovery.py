@@ -40,6 +40,11 @@ class ReplayStore:
         self.priorities[slots] = priorities
         self.tree.set(slots, self.leaf_values(priorities))
 
+    def forget(self, slots: NDArray[np.int64]) -> None:
+        """Let (B,) slots hold no windows: none is drawn from them, now or after a restart."""
+        self.ring.forget(slots)
+        self.tree.set(slots, np.zeros(len(slots)))
+
     def flush(self) -> None:
         """Hand everything to the disk."""
         self.ring.flush()
@@ -89,9 +94,9 @@ def _lock(folder: Path) -> int:
 
 
 def _warn_of_torn_rows(torn: int) -> None:
-    """A committed row without its serial was lost to a power cut."""
+    """A committed row without its serial was lost to a power cut, or found damaged when it was drawn."""
     if torn:
-        log.warning("replay ring: a crash of the machine tore it; %d windows are never drawn", torn)
+        log.warning("replay ring: %d windows were damaged or torn by a crash; they are never drawn", torn)
 
 
 def _map_priorities(path: Path, ring: Ring) -> NDArray[np.float32]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rmc.common.errors import ConfigError
 from rmc.common.window import Rows, WindowSpec
 from rmc.replay_server.commit_record import Progress, RecordPair, record_bytes
+from rmc.replay_server.row_check import row_faults
 
 _IDENTITY = struct.Struct("<8s16sQQ")  # magic, fingerprint, capacity, row bytes; then its CRC
 _IDENTITY_BYTES = 4096
@@ -85,9 +86,17 @@ class Ring:
         found: NDArray[np.bool_] = known & (self.rows["serial"][serials % self.capacity] == serials)
         return found
 
-    def gather(self, slots: Slots, out: Rows) -> None:
-        """Copy whole rows (B,) into ``out``."""
+    def gather(self, slots: Slots, out: Rows) -> NDArray[np.bool_]:
+        """Copy whole rows (B,) into ``out``; which of them are still windows, in their place."""
         np.take(self._blocks, slots, out=out.view(self._blocks.dtype), mode="clip")  # clip: unbuffered
+        serials = out["serial"]
+        known = (serials >= self.progress.valid_from) & (serials < self.progress.next_serial)
+        sound: NDArray[np.bool_] = known & (serials % self.capacity == slots) & (row_faults(out, self.spec) == 0)
+        return sound
+
+    def forget(self, slots: Slots) -> None:
+        """Hold no windows there any more."""
+        self.rows["serial"][slots] = -1
 
     def flush_commit(self) -> None:
         """Hand the last commit to the disk, though perhaps not its rows."""

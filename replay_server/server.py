@@ -22,6 +22,7 @@ from rmc.replay_server.episode import find_episode
 from rmc.replay_server.observation_sums import observation_sums
 from rmc.replay_server.rate_limiter import RateLimiter
 from rmc.replay_server.recovery import open_store, valid_leaves
+from rmc.replay_server.ring import Slots
 from rmc.replay_server.stream_reader import IngestBatch, StreamReader
 
 log = logging.getLogger(__name__)
@@ -77,7 +78,7 @@ class ReplayServer:
         self._owes_acks = False  # of what was taken in when Redis went away
         self._buffers = [np.empty(0, spec.dtype)] * 2
         self._waiting_for, self._waiting_since = "", 0.0  # the learner, at the limiter
-        self._refused_priorities = 0
+        self._refused_priorities = self._damaged_windows = 0
         self._newest: Version | None = None  # of the weights, when last looked at
         self._look_at = 0.0
         self._means, self._rates = Means(), {name: Rate() for name in ("env_steps", "windows", "draws")}
@@ -96,7 +97,10 @@ class ReplayServer:
 
     def _read_published(self) -> Progress | None:
         published = self.bus.progress(self.name)
-        return decode_published(published, self.spec.obs_dim) if published else None
+        newest = decode_published(published, self.spec.obs_dim) if published else None
+        if published and newest is None:
+            log.warning("%s: the counters that were published are damaged; going on from the ring's", self.name)
+        return newest
 
     def _go_on_from(self, newest: Progress) -> None:
         """Of counters that were published and those of this ring, take the later.
@@ -198,12 +202,12 @@ class ReplayServer:
         """
         if not self._published or time.monotonic() >= self._republish_at:
             self._republish_at = time.monotonic() + REPUBLISH_PERIOD
-            self.bus.commit(self.owner, self._published or self._acks(), self._store.ring.progress.encode())
+            self.bus.commit(self.owner, self._published or self._acks(), self._store.ring.progress.publish())
         acks = {actor: ack for actor, ack in self._acks().items() if self._published.get(actor) != ack}
         quantum = max(1, self._slack_steps // (8 * len(self._own_actors)))
         at_once = at_once or bool(self._waiting_for)
         if acks and (at_once or any(self._grown(actor, ack) >= quantum for actor, ack in acks.items())):
-            self.bus.commit(self.owner, acks, self._store.ring.progress.encode())
+            self.bus.commit(self.owner, acks, self._store.ring.progress.publish())
             self._published.update(acks)
 
     def _grown(self, actor: int, ack: Ack) -> int:
@@ -229,16 +233,36 @@ class ReplayServer:
         self._note_waiting(draw)
         if draw is not SampleStatus.BATCH:
             return Sample(draw, None, None, tree.total, progress.windows, progress.env_steps, progress.drawn_steps)
-        number = progress.draws * self._shard.count + self._shard.index  # of the draw; no shard's like another's
-        random = np.random.Generator(np.random.Philox(key=np.array([self._seed, number], np.uint64)))
-        slots = tree.sample(batch_size, random)
         rows = self._buffer(batch_size) if out is None else out
-        self._store.ring.gather(slots, rows)
+        slots = self._draw_into(rows)
+        if slots is None:
+            return self.sample(batch_size, drawn_elsewhere_steps, out)  # which waits
         progress.draws += 1
         progress.drawn_steps += self.spec.trained_steps(rows)
         self._store.ring.commit()
         values = tree.values(slots)
         return Sample(draw, rows, values, tree.total, progress.windows, progress.env_steps, progress.drawn_steps)
+
+    def _draw_into(self, rows: Rows) -> Slots | None:
+        """Fill (B,) rows with sound windows and give their slots; None where none are left."""
+        number = self._store.ring.progress.draws * self._shard.count + self._shard.index  # no shard's like another's
+        random = np.random.Generator(np.random.Philox(key=np.array([self._seed, number], np.uint64)))
+        while self._store.tree.total > 0.0:
+            slots = self._store.tree.sample(len(rows), random)
+            if self._gather(slots, rows):
+                return slots
+        return None
+
+    def _gather(self, slots: Slots, rows: Rows) -> bool:
+        """Copy windows; whether all are sound. What is not, which a disk has changed, is never drawn again."""
+        sound = self._store.ring.gather(slots, rows)
+        if sound.all():
+            return True
+        damaged = np.unique(slots[~sound])
+        self._store.forget(damaged)
+        self._damaged_windows += len(damaged)
+        log.warning("%s: %d windows of the ring are damaged; they are never drawn again", self.name, len(damaged))
+        return False
 
     def _buffer(self, batch_size: int) -> Rows:
         self._buffers.reverse()
@@ -270,13 +294,11 @@ class ReplayServer:
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode from its start to that one; None where not all are there."""
-        ring, itemsize = self._store.ring, self.spec.dtype.itemsize
-        slots = find_episode(ring, serial, max(1, EPISODE_BYTES // itemsize))
+        slots = find_episode(self._store.ring, serial, max(1, EPISODE_BYTES // self.spec.dtype.itemsize))
         if slots is None:
             return None
         rows: Rows = np.empty(len(slots), self.spec.dtype)
-        ring.gather(slots, rows)
-        return rows
+        return rows if self._gather(slots, rows) else None
 
     # -- about ------------------------------------------------------------------------------------------
 
@@ -290,12 +312,14 @@ class ReplayServer:
             "draws": progress.draws,
             "drawn_steps": progress.drawn_steps,
             "replay_ratio": limiter.ratio(self._inserted, self._drawn) * self._share,
+            "replay_ratio_off": int(not limiter.is_held(self._inserted, self._drawn)),
             "credit_steps": max(0, limiter.limit(self._drawn) - self._inserted),
             "learner_waiting_for": self._waiting_for,
             "learner_waiting_s": time.monotonic() - self._waiting_since if self._waiting_for else 0.0,
             "max_priority": progress.max_priority,
             "evicted_priorities": progress.evicted_priorities,
             "refused_priorities": self._refused_priorities,
+            "damaged_windows": self._damaged_windows,
             "entry_gaps": self._reader.gaps,
             "dead_letters": self._reader.refused.total(),
             **{f"dead_letters_{reason}": count for reason, count in self._reader.refused.items()},

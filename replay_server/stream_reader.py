@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from rmc.common.bus.protocol import Bus, Entry, EntryId
 from rmc.common.errors import BusFull, MessageError
 from rmc.common.shard import WHOLE, Shard
-from rmc.common.window import Rows, WindowSpec, first_fault
-from rmc.common.wire import check_rows, decode_rows, max_entry_bytes
+from rmc.common.window import Rows, WindowSpec
+from rmc.common.wire import decode_rows, max_entry_bytes
 from rmc.replay_server.commit_record import StreamPosition
+from rmc.replay_server.row_check import FAULTS, row_faults
 
 ROUND_BYTES = 4 << 20  # read at most about this much in a round, so that the learner is served in between
 MAX_ENTRIES = 256  # of one actor in a round
@@ -70,8 +71,9 @@ class StreamReader:
         entries, broken = self._in_order(entries, positions)
         bodies = [self._decode(entry) for entry in entries]
         rows = self._stamped(entries, bodies)
-        if first_fault(rows, self.spec) is not None:  # of all at once; whose fault it is only now
-            bodies = [self._checked(entry, body) for entry, body in zip(entries, bodies, strict=True)]
+        faults = row_faults(rows, self.spec)
+        if faults.any():
+            bodies = self._without_faults(entries, bodies, faults)
             rows = self._stamped(entries, bodies)
         for entry, body, steps in zip(entries, bodies, self._steps(bodies, rows["new_steps"]), strict=True):
             before = positions.get(entry.actor, StreamPosition(BEFORE_ALL, 0))
@@ -123,14 +125,17 @@ class StreamReader:
             self._refuse(entry, error)
             return None
 
-    def _checked(self, entry: Entry, body: Rows | None) -> Rows | None:
-        try:
-            if body is not None:
-                check_rows(body, self.spec)
-        except MessageError as error:
-            self._refuse(entry, error)
-            return None
-        return body
+    def _without_faults(
+        self, entries: list[Entry], bodies: list[Rows | None], faults: NDArray[np.uint8]
+    ) -> list[Rows | None]:
+        """The bodies, but for those with a faulty row, which are refused."""
+        ends = np.cumsum([0 if body is None else len(body) for body in bodies])
+        kept = list(bodies)
+        for index, found in enumerate(np.split(faults, ends[:-1])):
+            if found.any():
+                self._refuse(entries[index], MessageError("window", FAULTS[found[found > 0][0]]))
+                kept[index] = None
+        return kept
 
     def _refuse(self, entry: Entry, error: MessageError) -> None:
         with suppress(BusFull):  # no room for it; the round that frees some must not wait for that

@@ -11,11 +11,13 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from rmc.common.bus.metrics_record import is_finite
+
 NONE_YET = "-"
 REFRESH_SECONDS = 0.5  # of a live view
 LINE_SECONDS = 10.0  # between plain lines
 MOST_NAMES = 1000
-LARGEST_STEP = 2**53
+LARGEST_STEP = 2**63 - 1  # that TensorBoard takes
 SILENT_SECONDS = 5.0  # after which a role's silence is shown
 
 
@@ -46,13 +48,13 @@ class RunStatus:
     def env_steps(self) -> int:
         """Environment steps committed to the ring."""
         steps = self.replay("env_steps", sum) or self.get("learner", "env_steps") or 0
-        return int(steps) if 0 <= steps < LARGEST_STEP else 0  # and so not NaN
+        return _steps(steps) or 0
 
     def checkpoint_steps(self, update: int | None) -> int | None:
         """Environment steps at the checkpoint of that update, or None where the learner has said them of another."""
         steps = self.get("learner", "checkpoint_env_steps")
         known = update is not None and update == self.get("learner", "checkpoint_update")
-        return int(steps) if known and steps is not None and 0 <= steps < LARGEST_STEP else None
+        return _steps(steps) if known else None
 
     def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:
         """The sum or mean ``over`` all replay servers, or None."""
@@ -75,6 +77,11 @@ class RunStatus:
         """The episodes' return, and how many the environment's own faults have ended."""
         broken = sum(record.get("broken_episodes", 0) for record in self.roles.values())
         return number(self.episode_return, ",.1f") + (f", {broken} broken" if broken else "")
+
+
+def _steps(value: Any) -> int | None:
+    """Steps out of a record; None where they can be none."""
+    return min(int(value), LARGEST_STEP) if is_finite(value) and value >= 0 else None
 
 
 def number(value: Any, form: str = ",.3g") -> str:

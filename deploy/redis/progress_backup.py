@@ -11,6 +11,7 @@ from rmc.common.errors import BusUnavailable
 from rmc.common.shard import Shard
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.folder import RunFolder
+from rmc.replay_server.commit_record import is_whole
 
 KEEP_SECONDS = 10.0
 log = logging.getLogger(__name__)
@@ -31,7 +32,7 @@ class ProgressBackup:
         self._keep_at = time.monotonic() + KEEP_SECONDS
         with suppress(BusUnavailable, OSError):  # the disk is full: those before stay
             found = {role: raw for role in self._roles if (raw := bus.progress(role)) is not None}
-            if found:
+            if found and all(map(is_whole, found.values())):
                 write_whole(self._path, msgpack.packb(found))
 
     def restore(self, bus: Bus) -> None:
@@ -53,7 +54,7 @@ class ProgressBackup:
             return {}
         found = msgpack.unpackb(self._path.read_bytes())
         if not isinstance(found, dict) or not all(
-            role in self._roles and isinstance(raw, bytes) for role, raw in found.items()
+            role in self._roles and isinstance(raw, bytes) and is_whole(raw) for role, raw in found.items()
         ):
-            raise ValueError("no counters of this run's replay servers")
+            raise ValueError("damaged, or no counters of this run's replay servers")
         return found

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmc.actors.window_builder import WindowBuilder
-from rmc.common.window import Rows, WindowSpec, first_fault
+from rmc.common.window import Rows, WindowSpec
+from rmc.replay_server.row_check import row_faults
 from tests.actors.support import join_rows
 
 OBS_DIM, ACTION_DIM, HIDDEN = 3, 3, 3
@@ -93,7 +94,7 @@ def test_windows(play: Play, steps: int) -> None:
     """The whole promise of a row, against the names that its observations carry."""
     spec = play.spec
     rows, _ = run(play, steps)
-    assert first_fault(rows, spec) is None
+    assert not row_faults(rows, spec).any()
     trained: dict[tuple[int, int], Counter[int]] = defaultdict(Counter)
     last_start: dict[tuple[int, int], int] = {}
     for row in rows:

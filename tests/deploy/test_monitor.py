@@ -58,7 +58,19 @@ def test_any_number_is_shown(monitor: Monitor, value: float) -> None:
     monitor.watch(bus)
     assert "credit" in line(monitor.board) or not value > 0.5
     Console(quiet=True).print(table(monitor.board))
-    assert monitor.board.env_steps == (value if value == 0 else 0) or value == 1.5
+    monitor.close()
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [(2**53, 2**53), (2**53 + 1, 2**53 + 1), (1e300, 2**63 - 1), (1.5, 1), (-1, 0), (math.nan, 0), (math.inf, 0)],
+)
+def test_steps_beyond_what_a_float_counts_are_shown(monitor: Monitor, said: float, shown: int) -> None:
+    monitor.record({"role": "replay", "env_steps": said})
+    monitor.record({"role": "learner", "checkpoint_update": 3, "checkpoint_env_steps": said})
+    assert monitor.board.env_steps == shown
+    assert monitor.board.checkpoint_steps(3) == (shown or None)
+    assert f"steps {shown}/" in line(monitor.board)
     monitor.close()
 
 

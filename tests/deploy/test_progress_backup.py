@@ -10,10 +10,13 @@ from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner
 from rmc.deploy.redis.progress_backup import ProgressBackup
 from rmc.deploy.run.folder import RunFolder
+from rmc.replay_server.commit_record import Progress
 
-WHOLE = msgpack.packb({"replay": b"counted"})
+COUNTED, FIRST, SECOND, NEWER = (Progress(3, env_steps=steps).publish() for steps in (7, 1, 2, 9))
+WHOLE = msgpack.packb({"replay": COUNTED})
 OTHERS = ([1], {"replay": 5}, {"replay": {}}, {"another": b"x"}, {None: b"x"})
 DAMAGED = {
+    "two bits": WHOLE[:30] + bytes([WHOLE[30] ^ 0x40]) + WHOLE[31:-9] + bytes([WHOLE[-9] ^ 1]) + WHOLE[-8:],
     "empty": b"", "cut": WHOLE[:-3], "zeros": bytes(len(WHOLE)), "doubled": WHOLE * 2, "no msgpack": b"\xc1",
     **{str(found): msgpack.packb(found) for found in OTHERS},
 }  # fmt: skip
@@ -25,24 +28,24 @@ def commit(bus: MemoryBus, role: str, progress: bytes) -> None:
 
 def test_what_was_published_is_said_again_where_nothing_is(tmp_path: Path) -> None:
     counters, before = ProgressBackup(RunFolder(tmp_path), shards=2), MemoryBus()
-    commit(before, "replay-0", b"first")
-    commit(before, "replay-1", b"second")
+    commit(before, "replay-0", FIRST)
+    commit(before, "replay-1", SECOND)
     counters.keep(before)
     after = MemoryBus()
-    commit(after, "replay-1", b"newer")
+    commit(after, "replay-1", NEWER)
     ProgressBackup(RunFolder(tmp_path), shards=2).restore(after)
-    assert (after.progress("replay-0"), after.progress("replay-1")) == (b"first", b"newer")
+    assert (after.progress("replay-0"), after.progress("replay-1")) == (FIRST, NEWER)
 
 
 def test_an_empty_redis_does_not_take_the_copy_away(tmp_path: Path) -> None:
     counters, bus = ProgressBackup(RunFolder(tmp_path), shards=1), MemoryBus()
     counters.restore(bus)
     assert bus.progress("replay") is None
-    commit(bus, "replay", b"counted")
+    commit(bus, "replay", COUNTED)
     counters.keep(bus)
     counters.keep(MemoryBus(), at_once=True)
     counters.restore(again := MemoryBus())
-    assert again.progress("replay") == b"counted"
+    assert again.progress("replay") == COUNTED
 
 
 @pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
@@ -54,11 +57,21 @@ def test_a_damaged_copy_is_told_and_the_run_goes_on(
     counters.restore(bus)
     assert bus.progress("replay") is None
     assert [record.getMessage().count("replay-counters: cannot be read") for record in caplog.records] == [1]
-    commit(bus, "replay", b"newer")
+    commit(bus, "replay", NEWER)
     counters.keep(bus)
     counters.restore(again := MemoryBus())
-    assert again.progress("replay") == b"newer"
+    assert again.progress("replay") == NEWER
     assert len(caplog.records) == 1
+
+
+def test_a_damaged_value_in_redis_is_not_copied_over_a_whole_one(tmp_path: Path) -> None:
+    counters, bus = ProgressBackup(RunFolder(tmp_path), shards=1), MemoryBus()
+    commit(bus, "replay", COUNTED)
+    counters.keep(bus)
+    commit(bus, "replay", NEWER[:-1] + b"x")
+    counters.keep(bus, at_once=True)
+    counters.restore(again := MemoryBus())
+    assert again.progress("replay") == COUNTED
 
 
 def test_a_copy_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,7 +85,7 @@ def test_a_copy_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatc
 
     monkeypatch.setattr(os, "fsync", watched)
     counters, bus = ProgressBackup(RunFolder(tmp_path), shards=1), MemoryBus()
-    commit(bus, "replay", b"counted")
+    commit(bus, "replay", COUNTED)
     counters.keep(bus)
     assert synchronised == [(WHOLE, False)]
     assert (tmp_path / "replay-counters").read_bytes() == WHOLE

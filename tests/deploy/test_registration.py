@@ -14,8 +14,10 @@ from rmc.deploy.redis.registration import Registration
 from rmc.deploy.run.config import from_json
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import debug
+from rmc.replay_server.commit_record import Progress
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
+COUNTED = Progress(3, env_steps=7).publish()
 
 
 @pytest.fixture(autouse=True)
@@ -26,13 +28,13 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_redis_that_forgot_is_told_again_what_it_must_know(tmp_path: Path, redis_url: str, run_name: str) -> None:
     bus = RedisBus(redis_url, run_name)
     registered = Registration(CONFIG, RunFolder(tmp_path), bus)
-    bus.commit(ReplayOwner("replay", bus.take_epoch("replay")), {0: Ack(EntryId(1, 0), 0)}, b"counted")
+    bus.commit(ReplayOwner("replay", bus.take_epoch("replay")), {0: Ack(EntryId(1, 0), 0)}, COUNTED)
     registered.keep()
     _forget(redis_url, run_name)
     assert bus.config() is None
     registered.tend()
     assert from_json(bus.config() or b"") == CONFIG
-    assert bus.progress("replay") == b"counted"
+    assert bus.progress("replay") == COUNTED
     bus.request_stop("so it shall be")  # which is no reason to begin afresh
     registered.tend()
     assert bus.stop_requested() == "so it shall be"

@@ -28,10 +28,8 @@ from rmc.common.errors import ConfigError, MessageError
 from rmc.common.wire import (
     HEADER,
     Kind,
-    check_rows,
     decode_header,
     decode_meta,
-    decode_rows,
     encode_frame,
     encode_windows,
 )
@@ -40,7 +38,7 @@ from rmc.deploy.run.presets import robust
 from rmc.replay_server.commit_record import Progress, decode_published
 from tests.faults.asked import LAWFUL_PROOF, Asked
 from tests.faults.row import Row, at_length
-from tests.replay_server.support import SPEC, make_rows
+from tests.replay_server.support import SPEC, lawful_rows, make_rows
 
 SLOWEST_S, MOST_MB = 0.010, 64
 TAKEN = "taken"
@@ -91,7 +89,7 @@ def odd(raw: bytes, rng: random.Random) -> bytes:
 
 def window(payload: bytes) -> None:
     """As the replay server's intake reads an entry."""
-    check_rows(decode_rows(payload, SPEC), SPEC)
+    lawful_rows(payload)
 
 
 def honest_window(body: bytes) -> None:
@@ -161,7 +159,7 @@ KINDS: dict[str, tuple[bytes, Reader]] = {
     "share": (_request(Kind.SHARE, {"batch_size": 4}), request),
     "record": (encode_record({"time": 1.5, "updates": 7, "waiting_for": "credit"}), decode_record),
     "config": (to_json(robust(EnvConfig("HalfCheetah-v5"))).encode(), config),
-    "counters": (Progress(SPEC.obs_dim).encode(), published),
+    "counters": (Progress(SPEC.obs_dim).publish(), published),
 }
 
 

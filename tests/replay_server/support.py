@@ -5,9 +5,11 @@ from collections.abc import Callable
 import numpy as np
 
 from rmc.common.bus.protocol import Bus, EntryId
+from rmc.common.errors import MessageError
 from rmc.common.window import Rows, WindowSpec
-from rmc.common.wire import encode_hello, encode_windows
+from rmc.common.wire import decode_rows, encode_hello, encode_windows
 from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.row_check import FAULTS, row_faults
 from rmc.replay_server.server import ReplayServer
 
 Make = Callable[..., ReplayServer]
@@ -24,6 +26,15 @@ def make_rows(count: int, first_mark: int = 0, spec: WindowSpec = SPEC) -> Rows:
     phase = np.arange(spec.observations * spec.obs_dim).reshape(spec.observations, spec.obs_dim)
     rows["observation"] = np.sin(marks[:, None, None] + phase)
     rows["reward"][:, 0] = marks
+    return rows
+
+
+def lawful_rows(payload: bytes, spec: WindowSpec = SPEC) -> Rows:
+    """Rows of an entry as intake reads and judges them. Raises MessageError."""
+    rows = decode_rows(payload, spec).copy()
+    faults = row_faults(rows, spec)
+    if faults.any():
+        raise MessageError("window", FAULTS[faults.max()])
     return rows
 
 

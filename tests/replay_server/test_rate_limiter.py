@@ -37,6 +37,8 @@ def test_bounds(ratio: float, warmup: int, total: int, slack: int, inserted: int
         assert drawn <= (inserted - warmup + slack) * ratio + 1e-6
     if draw is SampleStatus.WAIT:  # then the actors have at least the slack, or the rest of the run
         assert limiter.limit(drawn) - inserted >= min(slack, total - inserted) - 1
+    if draw is SampleStatus.BATCH and limiter.limit(drawn) >= inserted:  # as in a run whose counters are whole
+        assert limiter.is_held(inserted, drawn)
     if draw is SampleStatus.FINISHED:
         assert inserted >= total
         assert drawn + 64 > (inserted - warmup) * ratio
@@ -118,3 +120,13 @@ def test_never_deadlocks(data: st.DataObject) -> None:
     if total > warmup:
         assert drawn > (total - warmup) * limiter.replay_ratio - batch
         assert drawn <= (inserted - warmup + slack) * limiter.replay_ratio + batch
+
+
+def test_a_ratio_far_from_its_target_is_not_held() -> None:
+    limiter = RateLimiter(2.0, 1000, 10**6, 160)
+    assert limiter.is_held(0, 0)
+    assert limiter.is_held(1160, 0)  # the warm-up is in, the first draw not made
+    assert limiter.is_held(5000, 8000)
+    assert not limiter.is_held(5000, 2**30)  # what one row's damaged size once added
+    assert not limiter.is_held(5000, 0)
+    assert not limiter.is_held(2**40, 8000)

@@ -93,6 +93,23 @@ def test_published_counters_that_make_no_sense_are_passed_over(make: Make, bus: 
     assert make().stats()["env_steps"] == 0
 
 
+@pytest.mark.parametrize("place", range(0, 120, 5))
+def test_published_counters_with_two_bits_flipped_are_passed_over(
+    make: Make, bus: MemoryBus, place: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whatever they count then: serials of terabytes, epochs that no later one passes."""
+    server, sender = make(folder="lost"), Sender(bus)
+    sender.send(4)
+    drain(server)
+    published = bytearray(bus.progress("replay") or b"")
+    published[place] ^= 0x40
+    published[place + 4] ^= 0x01
+    (other := MemoryBus()).set_progress("replay", bytes(published))
+    again = make(folder="empty", on=other)
+    assert (again.stats()["env_steps"], again.stats()["windows"], again.owner.epoch) == (0, 0, 1)
+    assert "published are damaged" in caplog.text
+
+
 def test_lost_redis_data_neither_doubles_nor_goes_back(make: Make, bus: MemoryBus) -> None:
     server, sender = make(), Sender(bus)
     sender.send(4)

@@ -1,0 +1,128 @@
+"""Rows that a disk has changed are judged when they are drawn: neither the learner nor a counter sees them."""
+
+import logging
+
+import numpy as np
+import pytest
+
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.replay import SampleStatus
+from rmc.common.window import Rows
+from rmc.replay_server.row_check import FAULTS, FLOATS, row_faults
+from rmc.replay_server.server import ReplayServer
+from tests.replay_server.support import SPEC, Make, Sender, close, drain, make_rows
+
+WORDS = {  # field, value, and why a row with it can be none
+    "last": (2**30 + 6, "last is outside (burn_in, T]"),
+    "first": (1, "first is neither 0 nor burn_in"),
+    "new_steps": (-5, "new_steps exceeds the trained steps"),
+    "new_observations": (2**31 - 1, "new_observations is neither new_steps nor one more"),
+    "episode_step": (-(2**31), "episode_step is negative"),
+    "env": (-1, "env is negative"),
+    "initial_priority": (-1.0, "initial_priority is negative"),
+}
+DAMAGE = [(name, value) for name, (value, _) in WORDS.items()]
+DAMAGE += [(name, value) for name in FLOATS for value in (np.nan, np.inf, -np.inf)]
+DAMAGE += [("serial", 2**40), ("serial", -1), ("serial", 4)]
+
+
+def filled(make: Make, bus: MemoryBus, windows: int = 20) -> ReplayServer:
+    server, sender = make(), Sender(bus)
+    sender.send(windows)
+    drain(server)
+    return server
+
+
+@pytest.mark.parametrize(("name", "value"), DAMAGE)
+def test_a_damaged_row_is_never_drawn(
+    make: Make, bus: MemoryBus, name: str, value: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    server = filled(make, bus)
+    field = server._store.ring.rows[name]
+    (field if field.ndim == 1 else field.reshape(len(field), -1)[:, -1])[3] = value
+    with caplog.at_level(logging.WARNING):
+        for number in range(1, 11):
+            rows = server.sample(64).rows
+            assert rows is not None
+            assert not row_faults(rows, SPEC).any()
+            assert sorted(set(rows["serial"].tolist())) == [serial for serial in range(20) if serial != 3]
+            assert server.stats()["drawn_steps"] == number * 64 * SPEC.train
+    assert server.stats()["damaged_windows"] == 1
+    assert [record.getMessage().count("1 windows of the ring are damaged") for record in caplog.records] == [1]
+    server.update_priorities(np.array([3]), np.array([1e9], np.float32))  # as drawn before it was damaged
+    close(server)
+    again = make()  # not after a restart either, though its priority is the largest
+    assert again._store.tree.values(np.array([3])).tolist() == [0.0]
+
+
+def test_a_ring_of_damaged_rows_alone_makes_the_learner_wait(make: Make, bus: MemoryBus) -> None:
+    server = filled(make, bus)
+    server._store.ring.rows["last"] = 10**9
+    assert server.sample(8).draw is SampleStatus.WAIT
+    assert (server.stats()["drawn_steps"], server.stats()["draws"]) == (0, 0)
+    assert server.stats()["damaged_windows"] == 20
+    server.update_priorities(np.arange(20), np.ones(20, np.float32))
+    assert server.sample(8).draw is SampleStatus.WAIT
+
+
+def test_an_episode_with_a_damaged_row_is_none(make: Make, bus: MemoryBus) -> None:
+    server = filled(make, bus)
+    assert server.episode(5) is not None
+    server._store.ring.rows["reward"][5, 1] = np.nan
+    assert server.episode(5) is None
+    assert server.stats()["damaged_windows"] == 1
+
+
+def test_draws_of_sound_rows_are_as_they_were(make: Make, bus: MemoryBus) -> None:
+    """What is damaged elsewhere changes no draw that does not meet it."""
+    server = filled(make, bus)
+    first = server.sample(4).rows
+    assert first is not None
+    drawn, rest = first["serial"].tolist(), None
+    close(server)
+    again = make(folder="other", on=(other := MemoryBus()))
+    Sender(other).send(20)
+    drain(again)
+    rest = next(serial for serial in range(20) if serial not in drawn)
+    again._store.ring.rows["last"][rest] = -1
+    rows = again.sample(4).rows
+    assert rows is not None
+    assert rows["serial"].tolist() == drawn
+
+
+def slow_faults(rows: Rows) -> list[str]:
+    """The same judgement, row by row and as it is said."""
+    found = []
+    for row in rows:
+        first, last, new, seen = (int(row[name]) for name in ("first", "last", "new_steps", "new_observations"))
+        faults = {
+            FAULTS[1]: first not in (0, SPEC.burn_in),
+            FAULTS[2]: not SPEC.burn_in < last <= SPEC.steps,
+            FAULTS[3]: not 0 <= new <= last - SPEC.burn_in,
+            FAULTS[4]: first == 0 and row["episode_step"] < SPEC.burn_in,
+            FAULTS[5]: seen not in (new, new + 1),
+            FAULTS[6]: row["env"] < 0,
+            FAULTS[7]: row["episode_step"] < 0,
+            FAULTS[8]: row["initial_priority"] < 0,
+            **{f"{name} is not finite": not np.isfinite(row[name]).all() for name in FLOATS},
+        }
+        found.append(next((fault for fault, is_so in faults.items() if is_so), ""))
+    return found
+
+
+def test_flipped_bits_are_judged_as_a_loop_judges_them() -> None:
+    random, rows = np.random.default_rng(3), make_rows(4000)
+    rows["observation"][::7] = 3e38  # large, and finite
+    raw = rows.view(np.uint8).reshape(len(rows), -1)
+    raw[np.arange(4000), random.integers(raw.shape[1], size=4000)] ^= 1 << random.integers(8, size=4000).astype(
+        np.uint8
+    )
+    assert [FAULTS[fault] for fault in row_faults(rows, SPEC)] == slow_faults(rows)
+    assert 100 < np.count_nonzero(row_faults(rows, SPEC)) < 3000
+
+
+@pytest.mark.parametrize(("name", "value", "fault"), [(name, *found) for name, found in WORDS.items()])
+def test_a_fault_has_its_name(name: str, value: float, fault: str) -> None:
+    rows = make_rows(5)
+    rows[name][2] = value
+    assert [FAULTS[found] for found in row_faults(rows, SPEC)] == ["", "", fault, "", ""]
