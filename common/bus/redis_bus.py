@@ -69,7 +69,9 @@ class RedisBus:
             pool = self._redis.connection_pool
             pool.connection_class(**pool.connection_kwargs)  # knows what may stand behind the question mark
         except (ValueError, TypeError, redis.exceptions.RedisError):  # whose words may quote a password
-            raise ConfigError("--redis-url", shown(url), "its options are not redis-py's; mend what follows ?") from None
+            raise ConfigError(
+                "--redis-url", shown(url), "its options are not redis-py's; mend what follows ?"
+            ) from None
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
         self._pending = PendingRead(self._redis.connection_pool)
