@@ -34,7 +34,7 @@ from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.folder import RunFolder, make, read_object
+from rmc.deploy.run.folder import RunFolder, make, new_folder, read_object
 
 CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
 STOPPED = 130  # exit status after Ctrl-C, as shells have it
@@ -86,7 +86,7 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
     """Make or take up a run's folder, locked, as ``open_run``. Raises ConfigError."""
     env = config.env.id.replace(":", "_").replace("/", "_")
     name = f"{env}__{config.algorithm}-{config.settings}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
-    folder = RunFolder(run_dir or Path("runs") / name)
+    folder = RunFolder(run_dir) if run_dir is not None else new_folder(Path("runs").resolve() / name)
     about, now = folder.path / "config.json", json.loads(json.dumps(asdict(config)))
     if about.exists() and folder.is_baseline():
         was = folder.settings()

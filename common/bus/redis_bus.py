@@ -23,7 +23,7 @@ from rmc.common.bus.protocol import (
     join_pieces,
     split_pieces,
 )
-from rmc.common.bus.redis_url import shown
+from rmc.common.bus.redis_url import HIDDEN, fault, shown
 from rmc.common.checksum import crc32
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
 
@@ -60,13 +60,18 @@ class RedisBus:
         """``url``: ``unix:///path``, ``redis://host:port`` or ``rediss://…``. Raises ConfigError."""
         lost = (redis.exceptions.ConnectionError,)  # one that hangs would keep the role once more
         retry = Retry(ExponentialBackoff(cap=0.1, base=0.01), retries=3, supported_errors=lost)
+        if fix := fault(url):
+            raise ConfigError("--redis-url", shown(url), fix)
         try:
             self._redis: Any = redis.Redis.from_url(  # Any: its annotations do not know decode_responses
                 url, retry=retry, socket_timeout=TIMEOUT_SECONDS
             )
-        except ValueError:  # its words quote parts of the URL, which may be a password's
-            fix = "not a Redis URL; give unix:///path, redis://host:port or rediss://…; in a password, %2F is /"
-            raise ConfigError("--redis-url", shown(url), fix) from None
+            pool = self._redis.connection_pool
+            pool.connection_class(**pool.connection_kwargs)  # knows what may stand behind the question mark
+        except (ValueError, TypeError, redis.exceptions.RedisError):  # whose words may quote a password
+            raise ConfigError(
+                "--redis-url", shown(url), "its options are not redis-py's; mend what follows ?"
+            ) from None
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
         self._rests_until = 0.0  # by the monotonic clock: a Redis that hangs is left alone for as long as it took
@@ -97,8 +102,9 @@ class RedisBus:
         """Raises BusUnavailable where no Redis answers, or one that will not have us."""
         try:
             self._call(self._redis.ping)
-        except redis.exceptions.ResponseError as error:
-            raise BusUnavailable(str(error)) from None
+        except redis.exceptions.ResponseError as error:  # one that knows no login repeats it
+            password = self._redis.connection_pool.connection_kwargs.get("password")
+            raise BusUnavailable(str(error).replace(password or HIDDEN, HIDDEN)) from None
 
     def expire(self, seconds: int | None) -> None:
         """Let all that this run has in Redis vanish after so many seconds; None takes that back."""

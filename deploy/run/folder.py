@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
@@ -248,8 +249,8 @@ def record(line: bytes) -> dict[str, Any] | None:
 def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> RunFolder:
     """Make or take up a run's folder, locked. Raises ConfigError before anything is written where it may not be."""
     folder = RunFolder(run_dir or Path("runs") / _new_name(config))
-    if if_exists == "new":
-        folder = _unused(folder)
+    if run_dir is None or if_exists == "new":
+        folder = new_folder(folder.path)
     if (folder.path / "config.json").exists():
         if if_exists == "fail":
             raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")
@@ -270,12 +271,22 @@ def _new_name(config: RunConfig) -> str:
     return f"{env}__{config.preset}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
 
 
-def _unused(folder: RunFolder) -> RunFolder:
-    number, candidate = 1, folder
-    while candidate.path.exists():
-        number += 1
-        candidate = RunFolder(folder.path.with_name(f"{folder.path.name}-{number}"))
-    return candidate
+def new_folder(path: Path) -> RunFolder:
+    """A folder of that name that was not there, or beside it: two starts in the same second get one each."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for number in count(1):
+            with suppress(FileExistsError):
+                folder = RunFolder(path if number == 1 else path.with_name(f"{path.name}-{number}"))
+                folder.path.mkdir(0o700)
+                break
+    except OSError as error:
+        raise _cannot_be_made(path, error) from None
+    return folder
+
+
+def _cannot_be_made(path: Path, error: OSError) -> ConfigError:
+    return ConfigError("--run-dir", str(path), f"cannot be made ({error.strerror}); give another")
 
 
 def make(folder: RunFolder) -> None:
@@ -287,7 +298,7 @@ def make(folder: RunFolder) -> None:
         for path in (folder.checkpoints, folder.logs):
             path.mkdir(exist_ok=True)
     except OSError as error:
-        raise ConfigError("--run-dir", str(folder.path), f"cannot be made ({error.strerror}); give another") from None
+        raise _cannot_be_made(folder.path, error) from None
 
 
 def _check_resumable(folder: RunFolder, config: RunConfig) -> None:
