@@ -19,6 +19,8 @@ from rmc.common.env.wrappers import Env, Floats
 BESIDE_THE_POINT = ("is -infinity", "is infinity", "symmetric and normalized")  # of vectors and stretched actions
 REPEATED_STEPS = 50  # played twice from one seed
 LARGE_REWARD = 100.0  # mean size of a step's reward from which the critics start far from their target
+LARGEST_REWARD = 1e4  # of one step, from which it outweighs all others in a batch
+SMALL_REWARD = 1e-3  # largest size of a step's reward up to which the critics see nothing of it
 LISTED = 20  # dimensions named in a note
 LARGE_OBSERVATION = 1e4  # from which float32 and a running mean lose precision
 
@@ -117,6 +119,9 @@ def _nonsense(played: Played) -> Iterator[str]:
     for name, values in (("observation", observations), ("reward", np.array(played.rewards))):
         if not np.isfinite(values).all():
             yield f"fault: {name}s are not finite; such an episode is dropped and its environment made anew"
+    largest = max(map(abs, played.rewards), default=0.0)
+    if float(np.finfo(np.float32).max) < largest < np.inf:
+        yield f"fault: rewards reach {largest:.3g}, past what float32 holds (3e+38); scale them in the environment"
 
 
 def _hints(env: Env, played: Played) -> Iterator[str]:
@@ -126,15 +131,22 @@ def _hints(env: Env, played: Played) -> Iterator[str]:
         yield f"note: observations {_listed(still)} never changed"
     if np.abs(observations).max() > LARGE_OBSERVATION:
         yield f"note: observations reach {np.abs(observations).max():.3g}; scale them in the environment"
-    if np.abs(rewards).mean() > LARGE_REWARD:
-        scale = 1.0 / np.abs(rewards).mean()
-        yield f"note: rewards are large; try --reward-scale {scale:.1g}"
+    yield from _reward_notes(np.abs(rewards))
     if not rewards.any():
         yield "note: no random step was rewarded; learning will need luck, or curiosity (--curiosity)"
     if not played.lengths:
         yield "note: no episode ended; without a time limit an evaluation stops at 10 000 steps (--time-limit)"
     if not np.array_equal(_again(env), _again(env)):
         yield "note: the same seed and actions gave other observations; runs will not be repeatable"
+
+
+def _reward_notes(sizes: NDArray[np.float64]) -> Iterator[str]:
+    """After the scale that is proposed, the mean size is 1 at most, and the largest a hundred."""
+    scale = min(1.0 / max(sizes.mean(), 1e-300), LARGE_REWARD / max(sizes.max(), 1e-300))
+    if sizes.mean() > LARGE_REWARD or sizes.max() > LARGEST_REWARD:
+        yield f"note: rewards are large, up to {sizes.max():.3g} a step; try --reward-scale {scale:.1g}"
+    if 0.0 < sizes.max() < SMALL_REWARD:
+        yield f"note: rewards are small, {sizes.max():.3g} a step at most; try --reward-scale {scale:.1g}"
 
 
 def _listed(numbers: list[int]) -> str:
