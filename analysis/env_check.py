@@ -14,9 +14,12 @@ from rich.console import Console
 
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import first_env
+from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Floats
 
-BESIDE_THE_POINT = ("is -infinity", "is infinity", "symmetric and normalized")  # of vectors and stretched actions
+BESIDE_THE_POINT = (  # of vectors, stretched actions, and what watches the environment
+    "is -infinity", "is infinity", "symmetric and normalized", "different from the unwrapped version",
+)  # fmt: skip
 REPEATED_STEPS = 50  # played twice from one seed
 LARGE_REWARD = 100.0  # mean size of a step's reward from which the critics start far from their target
 LARGEST_REWARD = 1e4  # of one step, from which it outweighs all others in a batch
@@ -57,7 +60,7 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
     """Print facts, notes and faults; 0 where there is no fault, else 1. Raises ConfigError as ``rmc train`` would."""
     env, played = first_env(config), Played()
     stages: list[Callable[[], Iterable[str]]] = [
-        lambda: _gymnasiums_notes(env),
+        lambda: _gymnasiums_notes(WatchedEnv(env.unwrapped, config.id, config.env_timeout)),
         lambda: _guarded(lambda: played.play(env, steps, seed=0)),
         lambda: _nonsense(played),
         lambda: _hints(env, played),
@@ -77,9 +80,9 @@ def _faults(found: list[str]) -> list[str]:
     return [text for text in found if text.startswith("fault: ")]
 
 
-def _gymnasiums_notes(env: Env) -> Iterator[str]:
+def _gymnasiums_notes(env: gym.Env[Any, Any]) -> Iterator[str]:
     """What gymnasium's own checks find: worth a look, but what counts is whether it can be played."""
-    for text in _guarded(lambda: gymnasiums_checks(env.unwrapped, skip_render_check=True, skip_close_check=True)):
+    for text in _guarded(lambda: gymnasiums_checks(env, skip_render_check=True, skip_close_check=True)):
         if not any(words in text for words in BESIDE_THE_POINT):
             yield "note: gymnasium says: " + text.partition(": ")[2]
 

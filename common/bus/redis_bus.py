@@ -3,7 +3,6 @@
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 import redis
@@ -53,7 +52,7 @@ class RedisBus:
     """All roles of one run over one Redis. Not thread-safe: one per thread.
 
     Redis's own retries are short (a lost reply is repeated, which explicit ids make harmless);
-    an outage longer than that raises BusUnavailable and the role's loop waits. ``around`` is entered for every call.
+    an outage longer than that raises BusUnavailable and the role's loop waits.
     """
 
     def __init__(self, url: str, run: str) -> None:
@@ -70,15 +69,13 @@ class RedisBus:
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
         self._pending = PendingRead(self._redis.connection_pool)
-        self.around: Callable[[], AbstractContextManager[None]] = nullcontext
 
     def _key(self, *parts: object) -> str:
         return ":".join([self._prefix, *map(str, parts)])
 
     def _call(self, action: Callable[..., T], *args: Any) -> T:
         try:
-            with self.around():
-                return action(*args)
+            return action(*args)
         except redis.exceptions.OutOfMemoryError as error:
             raise BusFull(str(error)) from None
         except redis.exceptions.ResponseError as error:
