@@ -104,6 +104,7 @@ WHEN = {
     "keep_checkpoints": "up to go back further; the best is always kept",
     "precision": "`fp32` to rule rounding out, at half the speed where the CPU has bfloat16",
     "threads": "rarely: on a CPU two threads help only where nothing else runs",
+    "evaluation_seconds": "up where an episode takes minutes",
     "episodes": "up for less noise in what is called the best checkpoint",
 }
 

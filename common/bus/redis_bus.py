@@ -4,7 +4,6 @@ import re
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 import redis
@@ -53,7 +52,7 @@ class RedisBus:
     """All roles of one run over one Redis. Not thread-safe: one per thread.
 
     Redis's own retries are short (a lost reply is repeated, which explicit ids make harmless);
-    an outage longer than that raises BusUnavailable and the role's loop waits. ``around`` is entered for every call.
+    an outage longer than that raises BusUnavailable and the role's loop waits.
     """
 
     def __init__(self, url: str, run: str) -> None:
@@ -75,7 +74,6 @@ class RedisBus:
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
         self._rests_until = 0.0  # by the monotonic clock: a Redis that hangs is left alone for as long as it took
-        self.around: Callable[[], AbstractContextManager[None]] = nullcontext
 
     def _key(self, *parts: object) -> str:
         return ":".join([self._prefix, *map(str, parts)])
@@ -84,8 +82,7 @@ class RedisBus:
         if time.monotonic() < self._rests_until:
             raise BusUnavailable("Redis did not answer in time")
         try:
-            with self.around():
-                return action(*args)
+            return action(*args)
         except redis.exceptions.OutOfMemoryError as error:
             raise BusFull(str(error)) from None
         except redis.exceptions.ResponseError as error:

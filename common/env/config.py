@@ -29,7 +29,8 @@ class EnvConfig:
     time_limit: int = 0
     """Steps of the environment after which an episode is cut off; 0 keeps the environment's own limit."""
     env_timeout: float = 60.0
-    """Seconds in a step or reset after which an environment hangs: its process is ended and started again."""
+    """Seconds after which a call into an environment hangs: its making, reset, step, render or close. Its process ends;
+    a role's is started again."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keywords that the environment is made with, like goal=1.5 map=maze pose=[0,1]: numbers, words, JSON."""
 

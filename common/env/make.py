@@ -24,12 +24,15 @@ from gymnasium.envs.registration import EnvSpec
 from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.env.faults import RAISED, one_line, told
 from rmc.common.env.spaces import space_fault
+from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Flicker, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
 from rmc.common.errors import ConfigError, EnvFault
 from rmc.common.extra import how_to_install
+from rmc.common.process.watchdog import EnvCall
 
 log = logging.getLogger(__name__)
 DM_CONTROL = "dm_control/"
+SHORTEST_TIMEOUT = 0.1  # seconds
 
 
 def make_env(config: EnvConfig, render: bool = False) -> Env:
@@ -40,7 +43,8 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
     """
     _check_options(config)
     _redirect_mujoco_warnings()
-    made = _make(config, render)
+    with EnvCall(config.id, "make", config.env_timeout):
+        made: gym.Env[Any, Any] = WatchedEnv(_make(config, render), config.id, config.env_timeout)
     fault = space_fault(made.observation_space, made.action_space)
     if fault is None and config.hide != "nothing" and not _structure(made):
         fault = f"it does not say which observations are {config.hide}; --hide is for MuJoCo's bodies, like Ant-v5"
@@ -156,6 +160,8 @@ def _check_options(config: EnvConfig) -> None:
         raise ConfigError("--flicker", config.flicker, "a probability from 0 to 1")
     if not 0.0 <= config.noise < math.inf:
         raise ConfigError("--noise", config.noise, "a standard deviation, 0 or more")
+    if not config.env_timeout >= SHORTEST_TIMEOUT:
+        raise ConfigError("--env-timeout", config.env_timeout, f"{SHORTEST_TIMEOUT} seconds or more")
     for name, least in (("frame_stack", 1), ("action_repeat", 1), ("time_limit", 0)):
         if getattr(config, name) < least:
             raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), f"{least} or more")

@@ -87,9 +87,8 @@ def run_role(
     bus: Bus,
     stop: StopSignal,
     finished: Callable[[], bool] = lambda: False,
-    beat: Callable[[], None] = lambda: None,
 ) -> None:
-    """Step a role until it is stopped, fenced or finished; always closes it. ``beat`` is called before every step.
+    """Step a role until it is stopped, fenced or finished; always closes it.
 
     Redis away or full is waited out here; every other error ends the role.
     """
@@ -97,7 +96,6 @@ def run_role(
     pulse = Heartbeat(role, bus, clock)
     try:
         while not (stop.requested or finished() or pulse.says_stop()):
-            beat()
             try:
                 if role.step():
                     clock.busy()

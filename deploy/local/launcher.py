@@ -37,11 +37,15 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
     place = ("--run", folder.name)
     secret = ("--secret-file", str(folder.secret_file))
     learn = ("--folder", str(folder.checkpoints), "--device", device)
-    actors = [RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))) for index in range(config.actors)]
+    timeout = config.env.env_timeout
+    actors = [
+        RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index)), env_timeout=timeout)
+        for index in range(config.actors)
+    ]
     return [
         *(_replay_command(shard, folder, sockets, (*place, *secret)) for shard in config.shards()),
         RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
-        RoleCommand("evaluator", ("evaluator", *place)),
+        RoleCommand("evaluator", ("evaluator", *place), env_timeout=timeout),
         *actors,
     ]
 

@@ -44,6 +44,7 @@ MAY_CHANGE = {
     "learner.threads",
     "learner.keep_checkpoints",
     "learner.checkpoint_steps",
+    "evaluator.evaluation_seconds",
 }
 
 

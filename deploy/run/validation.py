@@ -22,7 +22,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "agent.hidden": (1, 65_536),
     "agent.embedding": (0, 65_536),
     "actor.envs_per_actor": (1, 4096),
-    "actor.reward_scale": (1e-12, 1e12),
+    "actor.reward_scale": (1e-37, 1e37),
     "actor.refresh_steps": (1, 2**31),
     "actor.chunk_windows": (1, 65_536),
     "actor.chunk_seconds": (1e-3, 3600),
@@ -51,6 +51,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "learner.keep_checkpoints": (1, 1_000_000),
     "learner.threads": (0, 1024),
     "evaluator.episodes": (1, 10_000),
+    "evaluator.evaluation_seconds": (0, 1e9),
 }
 
 

@@ -29,8 +29,15 @@ def say_end(folder: RunFolder, console: Console) -> int:
 
 
 def format_evaluation(evaluation: dict[str, Any]) -> str:
+    """Mean and deviation of the returns, and how many there are."""
     mean, deviation = evaluation["eval_return_mean"], evaluation["eval_return_std"]
-    return f"return {mean:,.1f} ± {deviation:,.1f} over {evaluation['eval_episodes']} deterministic episodes"
+    over = f"over {evaluation['eval_episodes']} deterministic episodes{cut_note(evaluation)}"
+    return f"return {mean:,.1f} ± {deviation:,.1f} {over}"
+
+
+def cut_note(evaluation: dict[str, Any]) -> str:
+    """What to say where an evaluation was cut; empty where it was not."""
+    return ", cut when its seconds were over" if evaluation.get("eval_cut") else ""
 
 
 def say_stopped(folder: RunFolder, config: RunConfig, env_steps: int, console: Console) -> int:

@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 
+from rmc.common.process import watchdog
 from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
@@ -21,6 +22,7 @@ def main() -> None:
     Leaves without Python's own clearing up: all is closed by then, and with torch loaded that takes seconds,
     which a user waits for after Ctrl-C.
     """
+    watchdog.start()
     status = run(sys.argv[1:])
     logging.shutdown()
     sys.stdout.flush()

@@ -112,6 +112,9 @@ class Evaluate:
     """The run's folder."""
     episodes: int = 10
     """Episodes to play."""
+    seconds: float = 0.0
+    """Seconds after which no more are played: those that are over count, or else the first as far as it came. 0 plays
+    all."""
     flicker: tuple[float, ...] = ()
     """Probabilities of a missing observation, each of which is played; by default the run's own."""
     checkpoint: str = "latest"

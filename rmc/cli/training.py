@@ -45,7 +45,7 @@ def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, consol
     status = 1
     try:
         console.print(f"run folder {folder.path}", soft_wrap=True)
-        before = _before(config, folder)
+        before = _before(config, folder, console)
         console.print(f"before training: {format_evaluation(before)}")
         monitor = Monitor(folder, config, console)
         if options.launcher == "manual":
@@ -58,7 +58,7 @@ def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, consol
         if not finished:
             status = STOPPED
             return say_stopped(folder, config, monitor.board.env_steps, console)
-        result = _result(config, folder, monitor, before)
+        result = _result(config, folder, monitor, before, console)
         folder.write_result(result)
         status = 0
     except ConfigError:
@@ -100,22 +100,27 @@ def _launch(config: RunConfig, folder: RunFolder, options: LaunchOptions, monito
     return not stop.requested
 
 
-def _before(config: RunConfig, folder: RunFolder) -> dict[str, Any]:
+def _before(config: RunConfig, folder: RunFolder, console: Console) -> dict[str, Any]:
     """How the untrained policy plays: at a run's first start it does so, later ones read it."""
     kept = folder.initial()
     if kept is not None:
         return kept
     from rmc.analysis import evaluation  # imports torch
 
-    played = evaluation.evaluate_blob(config, evaluation.initial_policy(config), evaluation.FINAL_EPISODES)
+    policy, seconds = evaluation.initial_policy(config), config.evaluator.evaluation_seconds
+    progress = evaluation.Progress(console, "before training")
+    played = evaluation.evaluate_blob(config, policy, evaluation.FINAL_EPISODES, None, seconds, progress)
     folder.write_initial(played)
     return played
 
 
-def _result(config: RunConfig, folder: RunFolder, monitor: Monitor, before: dict[str, Any]) -> dict[str, Any]:
-    from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_checkpoint
+def _result(
+    config: RunConfig, folder: RunFolder, monitor: Monitor, before: dict[str, Any], console: Console
+) -> dict[str, Any]:
+    from rmc.analysis.evaluation import FINAL_EPISODES, Progress, evaluate_checkpoint
 
-    after = evaluate_checkpoint(folder, config, "latest", FINAL_EPISODES)
+    progress, seconds = Progress(console, "after training"), config.evaluator.evaluation_seconds
+    after = evaluate_checkpoint(folder, config, "latest", FINAL_EPISODES, None, seconds, progress)
     return {
         **after,
         "initial_return_mean": before["eval_return_mean"],
