@@ -81,6 +81,7 @@ class Rollout:
         self.broken = self.steps = 0
         self.fault: Exception | None = None  # what an environment broke in last
         self.cut = False
+        self._prev_action, self._state = runner.start()
         self._length = -1  # of the episode; it has not begun
 
     @property

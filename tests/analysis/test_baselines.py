@@ -164,7 +164,7 @@ def test_files_that_are_cut_are_named(tmp_path):
                     run(config(total_steps=200), folder)
             if path.name in ("progress.json", "model.zip", "config.json"):
                 with pytest.raises(ConfigError, match=rf"{folder}.*{fault}"):
-                    evaluate(RunFolder(folder), 1)
+                    evaluate(RunFolder(folder), 1, None, 0.0, lambda _: None)
         path.write_bytes(whole)
 
 

@@ -26,7 +26,7 @@ class Endless(CountingEnv):
         return super().step(action)
 
 
-gym.register("Endless-v0", entry_point=Endless)
+gym.register("NeverEnding-v0", entry_point=Endless)
 
 
 def test_the_last_evaluation_judges_and_does_not_choose(tmp_path, monkeypatch):
@@ -75,7 +75,7 @@ def test_the_untrained_policy_is_played_once(tmp_path, monkeypatch):
 
 
 def test_an_evaluation_without_end_shows_that_it_goes_on_and_is_cut(tmp_path, monkeypatch, capsys):
-    folder = make_run(tmp_path / "run", AGENTS["robust"], "Endless-v0")
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "NeverEnding-v0")
     monkeypatch.setattr(training, "_launch", lambda *_: True)
     monkeypatch.setattr(evaluation, "SAY_SECONDS", 0.1)
     config, said, began = folder.config(), io.StringIO(), time.monotonic()
