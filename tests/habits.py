@@ -139,6 +139,25 @@ class TakesNoMode(Slide):
     def __init__(self) -> None: ...
 
 
+class LateSpaces(gym.Env[Any, Any]):
+    """Knows its spaces only after a reset."""
+
+
+class NoRobot(Slide):
+    """Asks hardware for its space."""
+
+    @property
+    def observation_space(self) -> Any:  # type: ignore[override]
+        raise RuntimeError("no robot answers")
+
+
+class Mistyped(Slide):
+    """Its making has a fault of the kind that a wrong keyword gives, too."""
+
+    def __init__(self) -> None:
+        self.name = "slide" + 1  # type: ignore[operator]
+
+
 PICTURES = {
     "sound": np.zeros((33, 40, 3), np.uint8),
     "none": None,
@@ -160,5 +179,19 @@ class Draws(Slide):
         return PICTURES[self.picture]
 
 
-for _kind in (Slide, InPlace, Gives, CannotClose, Shaped, Wants, Stumbles, Untyped, TakesNoMode, Draws):
+for _kind in (
+    Slide,
+    InPlace,
+    Gives,
+    CannotClose,
+    Shaped,
+    Wants,
+    Stumbles,
+    Untyped,
+    TakesNoMode,
+    Draws,
+    LateSpaces,
+    NoRobot,
+    Mistyped,
+):
     gym.register(f"{_kind.__name__}-v0", entry_point=_kind)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -45,6 +46,7 @@ def read_kwargs(words: Sequence[str]) -> dict[str, Any]:
         if name in found:
             raise ConfigError("--env-kwargs", word, f"{name} is there twice; give it once")
         found[name] = _typed(value)
+    check_kwargs(found)
     return found
 
 
@@ -69,10 +71,10 @@ def check_kwargs(kwargs: dict[str, Any]) -> None:
 def _typed(value: str) -> Any:
     if value in PYTHONS:
         return PYTHONS[value]
-    try:
-        return json.loads(value, parse_constant=str)
-    except ValueError:
-        return value
+    for kind in (int, float, json.loads):
+        with suppress(ValueError):
+            return kind(value)
+    return value
 
 
 def _word(value: Any) -> str:

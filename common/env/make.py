@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -22,7 +23,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from rmc.common.env.config import EnvConfig, check_kwargs
-from rmc.common.env.faults import RAISED, one_line, told
+from rmc.common.env.faults import RAISED, asked, one_line, told
 from rmc.common.env.spaces import space_fault
 from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Flicker, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
@@ -44,24 +45,28 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
     _check_options(config)
     _redirect_mujoco_warnings()
     with EnvCall(config.id, "make", config.env_timeout):
-        made: gym.Env[Any, Any] = WatchedEnv(_make(config, render), config.id, config.env_timeout)
-    fault = space_fault(made.observation_space, made.action_space)
+        spec = find_spec(config.id)
+        made: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
+    fault = asked("spaces", lambda: space_fault(made.observation_space, made.action_space))
     if fault is None and config.hide != "nothing" and not _structure(made):
         fault = f"it does not say which observations are {config.hide}; --hide is for MuJoCo's bodies, like Ant-v5"
     if fault is not None:
         with suppress(*RAISED):
             made.close()
         raise ConfigError("ENV", config.id, fault)
-    return _as_seen(made, config)
+    return _as_seen(made, config, config.time_limit or spec.max_episode_steps)
 
 
-def _make(config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
-    """As gymnasium makes it, with its own limit or ours."""
-    spec = copy(find_spec(config.id))
-    spec.order_enforce = False  # roles reset and step in order; the check costs time at every step
+def _make(known: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
+    """As gymnasium makes it, without a limit."""
+    spec = copy(known)
+    spec.max_episode_steps, spec.order_enforce = (
+        None,
+        False,
+    )  # roles reset and step in order; the check costs time at every step
     spec.kwargs = {**spec.kwargs, **config.env_kwargs, **({"render_mode": "rgb_array"} if render else {})}
     try:
-        return gym.make(spec, max_episode_steps=config.time_limit or None, disable_env_checker=True)
+        return gym.make(spec, disable_env_checker=True)
     except gym.error.Error as error:
         raise ConfigError("ENV", config.id, f"gymnasium cannot make it ({one_line(error)})") from None
     except RAISED as error:
@@ -93,11 +98,13 @@ def entry_point(spec: EnvSpec) -> Callable[..., Any]:
     return gym.envs.registration.load_env_creator(made_by) if isinstance(made_by, str) else made_by
 
 
-def _as_seen(env: gym.Env[Any, Any], config: EnvConfig) -> Env:
+def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> Env:
     """The environment as the agent sees it: each wrapper only where it does something."""
     shown = _shown(env, config.hide)
-    seen: Env = RescaledEnv(env)
-    if config.action_repeat > 1:  # around it: every step gets an action of its own
+    seen: Env = RescaledEnv(env)  # the innermost: it judges what the user's own code gives
+    if limit:
+        seen = gym.wrappers.TimeLimit(seen, limit)
+    if config.action_repeat > 1:
         seen = gym.wrappers.RepeatAction(seen, config.action_repeat)
     if shown is not None:
         seen = ObservationSlice(seen, shown)
@@ -186,6 +193,11 @@ def find_spec(env_id: str) -> EnvSpec:
 
 def _import_users_module(env_id: str, module: str) -> None:
     """Found in the working folder, too, but there last, so that it cannot shadow ours."""
+    if module.endswith(".py"):
+        right = f"{Path(module).stem}:{env_id.rpartition(':')[2]}"
+        raise ConfigError(
+            "ENV", env_id, f"give the module's name, not its file: {right}, from the folder that holds it"
+        )
     folder = os.getcwd()
     if folder not in sys.path:
         sys.path.append(folder)

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from rmc.common.env.faults import RAISED
 from rmc.common.errors import EnvFault
 
 LARGEST_ACTION = 1e9  # of an action space that means its bounds
@@ -43,14 +44,22 @@ def vector(space: gym.Space[Any], value: Any) -> NDArray[np.float32]:
 
 
 def _numbers(box: gym.Space[Any], value: Any) -> NDArray[np.float32]:
-    found = np.asarray(value)
-    if found.dtype.kind not in NUMBERS:
-        raise EnvFault(
-            f"the environment's observation {reprlib.repr(value)} is not of numbers; return an array of them"
-        )
+    found = array("observation", value)
     if found.shape != box.shape and _sides(found.shape) != _sides(box.shape or ()):
         raise EnvFault(f"the environment's observation has shape {found.shape}, its space says {box.shape}")
     return np.array(found, np.float32).ravel()  # a copy: some environments write into the same one again
+
+
+def array(name: str, value: Any) -> NDArray[Any]:
+    """An array of numbers; no copy. Raises EnvFault where it is none."""
+    try:
+        found = np.asarray(value)
+    except RAISED:  # a list whose rows differ, or a tensor on another device
+        found = np.empty(0, object)
+    if found.dtype.kind not in NUMBERS:
+        given = reprlib.repr(value)
+        raise EnvFault(f"the environment's {name} is {given}, not made of numbers; return an array of them")
+    return found
 
 
 def _sides(shape: tuple[int, ...]) -> list[int]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.env.faults import asked
-from rmc.common.env.spaces import NUMBERS, bounds, vector
+from rmc.common.env.spaces import array, bounds, vector
 from rmc.common.errors import EnvFault
 
 Floats = NDArray[np.float32]
@@ -83,8 +83,8 @@ def _number(name: str, value: Any) -> float:
     """A number, also as an array of one."""
     if isinstance(value, PLAIN):
         return float(value)
-    found = np.asarray(value)
-    if found.size != 1 or found.dtype.kind not in NUMBERS:
+    found = array(name, value)
+    if found.size != 1:
         raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}, not a number; return one")
     return float(found.item())
 

@@ -15,6 +15,7 @@ from rmc.analysis.baseline_settings import Algorithm, BaselineConfig
 from rmc.analysis.curves import Axis
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig, read_kwargs, write_kwargs
+from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig, WindowConfig
 from rmc.deploy.run.folder import IfExists
 from rmc.deploy.run.launch_options import Launcher, LaunchOptions
@@ -296,7 +297,8 @@ Command = (
 
 
 def parse(words: list[str]) -> Command:
-    """The command line as one of the classes above. Raises SystemExit, its message on standard error."""
+    """The command line as one of the classes above. Raises ConfigError; SystemExit, its message on standard error."""
+    _check_once("--env-kwargs", words)
     start = preset(_named_preset(words), EnvConfig(""))
     shared = {item.name: getattr(start, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
     commands = (
@@ -320,6 +322,13 @@ def parse(words: list[str]) -> Command:
     flat = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     command: Command = tyro.cli(commands, prog="rmc", args=words, config=flat)
     return command
+
+
+def _check_once(option: str, words: list[str]) -> None:
+    """Of two, the parser would drop the first without a word."""
+    given = [word for word in words if word.partition("=")[0].replace("_", "-") == option]
+    if len(given) > 1:
+        raise ConfigError(option, " ".join(given), "is there twice; give all of NAME=VALUE after one")
 
 
 def _named_preset(words: list[str]) -> Preset:

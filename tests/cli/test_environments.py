@@ -54,6 +54,7 @@ def test_every_command_makes_the_environment_with_its_keywords(tmp_path: Path, c
         ([], "missing a required argument: 'goal'"),
         (["--env-kwargs", "goal=1.5", "gool=2"], "unexpected keyword argument 'gool'; it takes (goal: float"),
         (["--env-kwargs", "goal"], "--env-kwargs='goal': write NAME=VALUE"),
+        (["--env-kwargs", "goal=1.5", "--env_kwargs", "size=4"], "is there twice; give all of NAME=VALUE after one"),
     ],
 )
 def test_keywords_that_do_not_fit_are_one_line(command: str, words: list[str], says: str, capsys: Any) -> None:
@@ -100,7 +101,7 @@ def test_a_run_of_whole_episodes_keeps_their_length(tmp_path: Path) -> None:
     ("env", "says"),
     [
         ("Stumbles", "the environment's step raises LinAlgError: Singular matrix (habits.py, line "),
-        ("Untyped", "the environment's reward is 'much', not a number; return one"),
+        ("Untyped", "the environment's reward is 'much', not made of numbers"),
     ],
 )
 def test_check_env_train_and_evaluate_say_the_same(

@@ -1,5 +1,6 @@
 """What a user's environment may give and do, and that every command says the same of it."""
 
+import dataclasses
 import logging
 from collections.abc import Iterator
 from pathlib import Path
@@ -56,15 +57,16 @@ def test_numbers_of_any_shape_are_a_vector(shape: str) -> None:
 
 
 WRONG = [
-    (0, None, "the environment's observation None is not of numbers"),
-    (0, ["1", "2", "3"], "the environment's observation ['1', '2', '3'] is not of numbers"),
+    (0, None, "the environment's observation is None, not made of numbers; return an array of them"),
+    (0, ["1", "2", "3"], "the environment's observation is ['1', '2', '3'], not made of numbers"),
+    (0, [1.0, [2.0]], "the environment's observation is [1.0, [2.0]], not made of numbers"),
     (0, [1.0, 2.0], "the environment's observation has shape (2,), its space says (3,)"),
-    (1, "1", "the environment's reward is '1', not a number"),
-    (1, None, "the environment's reward is None, not a number"),
+    (1, "1", "the environment's reward is '1', not made of numbers"),
+    (1, None, "the environment's reward is None, not made of numbers"),
     (1, [1.0, 2.0], "the environment's reward is [1.0, 2.0], not a number"),
-    (2, "False", "the environment's terminated is 'False', not a number"),
+    (2, "False", "the environment's terminated is 'False', not made of numbers"),
     (4, None, "the environment's info is None, not a dict; return {} if it says nothing"),
-    (4, {"missing": "no"}, "the environment's info[\"missing\"] is 'no', not a number"),
+    (4, {"missing": "no"}, "the environment's info[\"missing\"] is 'no', not made of numbers"),
 ]
 
 
@@ -90,7 +92,7 @@ def test_what_means_the_same_is_taken(part: int, value: Any) -> None:
 
 def test_the_older_way_of_gym_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(habits.Slide, "step", lambda *_: (np.zeros(3), 0.0, False, {}))
-    env = make_env(habit("Slide"))
+    env = make_env(dataclasses.replace(habit("Slide"), time_limit=9))
     env.reset()
     with pytest.raises(EnvFault, match=r"step gives 4 values; return \(observation, reward, terminated"):
         env.step(np.zeros(2, np.float32))
@@ -117,10 +119,24 @@ def test_the_innermost_place_in_the_users_file_is_named() -> None:
 
 
 def test_keywords_are_typed_and_written_as_they_are_read() -> None:
-    words = ["goal=1.5", "size=3", "name=maze", "at=[0, 1]", "deep=true", "no=None", 'text="3"', "empty=", "e=a=b"]
+    words = [
+        "goal=1.5",
+        "least=.5",
+        "many=1_000",
+        "most=-1e3",
+        "size=3",
+        "name=maze",
+        "at=[0, 1]",
+        "deep=true",
+        "no=None",
+        'text="3"',
+        "empty=",
+        "e=a=b",
+    ]
     found = read_kwargs(words)
     assert found == {
-        "goal": 1.5, "size": 3, "name": "maze", "at": [0, 1], "deep": True, "no": None, "text": "3", "empty": "",
+        "goal": 1.5, "least": 0.5, "many": 1000, "most": -1000.0, "size": 3, "name": "maze", "at": [0, 1],
+        "deep": True, "no": None, "text": "3", "empty": "",
         "e": "a=b",
     }  # fmt: skip
     assert read_kwargs(write_kwargs(found)) == found
@@ -132,6 +148,8 @@ def test_keywords_are_typed_and_written_as_they_are_read() -> None:
         (["goal"], "--env-kwargs='goal': write NAME=VALUE"),
         (["a-b=1"], "--env-kwargs='a-b=1'"),
         (["a=1", "a=2"], "a is there twice"),
+        (["a=nan"], "--env-kwargs a=nan: take finite numbers"),
+        (["a=[1, -inf]", "b=-inf"], "--env-kwargs b=-inf: take finite numbers"),
     ],
 )
 def test_other_words_are_refused(words: list[str], says: str) -> None:
@@ -146,3 +164,27 @@ def test_a_missing_keyword_comes_with_its_remedy() -> None:
     assert "missing a required argument: 'goal'; it takes (goal: float, size: int = 3" in str(caught.value)
     assert "give --env-kwargs NAME=VALUE" in str(caught.value)
     assert env_spaces(habit("Wants", goal=1.5, size=5))[0] == 5
+
+
+@pytest.mark.parametrize("env", ["mine.py:Mine-v0", "./mine.py:Mine-v0", "/home/me/mine.py:Mine-v0"])
+def test_a_file_in_place_of_a_module_comes_with_the_right_name(env: str) -> None:
+    with pytest.raises(ConfigError, match="give the module's name, not its file: mine:Mine-v0, from the folder that"):
+        make_env(EnvConfig(env))
+
+
+@pytest.mark.parametrize(
+    ("env", "says"),
+    [
+        (
+            "LateSpaces",
+            "spaces raises AttributeError: 'LateSpaces' object has no attribute 'observation",
+        ),
+        ("NoRobot", "the environment's spaces raises RuntimeError: no robot answers (habits.py, line "),
+        ("Mistyped", "the environment cannot be made: TypeError: can only concatenate str"),
+    ],
+)
+def test_faults_of_its_making_are_one_line(env: str, says: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        env_spaces(habit(env))
+    assert says in str(caught.value)
+    assert env == "LateSpaces" or "habits.py, line " in str(caught.value)
