@@ -23,11 +23,11 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from rmc.common.env.config import EnvConfig
+from rmc.common.env.process_state import ApartCall
 from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Flicker, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
-from rmc.common.process.watchdog import EnvCall
 
 log = logging.getLogger(__name__)
 DM_CONTROL = "dm_control/"
@@ -43,7 +43,7 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
     """
     _check_numbers(config)
     _redirect_mujoco_warnings()
-    with EnvCall(config.id, "make", config.env_timeout):
+    with ApartCall(config.id, "make", config.env_timeout):
         made: gym.Env[Any, Any] = WatchedEnv(_make(config, render), config.id, config.env_timeout)
     fault = _space_fault(made.observation_space, made.action_space)
     if fault is None and config.hide != "nothing" and not _structure(made):
