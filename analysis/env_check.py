@@ -15,6 +15,7 @@ from rich.console import Console
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.faults import RAISED, told
 from rmc.common.env.make import first_env
+from rmc.common.env.process_state import changes
 from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Floats
 from rmc.common.errors import EnvFault
@@ -70,6 +71,8 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
     found: list[str] = []
     while stages and not _faults(found):  # what comes later needs what was before to be sound
         found += stages.pop(0)()
+    if changed := changes():
+        found.append(f"note: it changes {', '.join(changed)} of its process; training keeps its own apart")
     for line in [*_facts(env, played), *dict.fromkeys(found)]:
         console.print(line, soft_wrap=True)
     env.close()

@@ -24,12 +24,12 @@ from gymnasium.envs.registration import EnvSpec
 
 from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.env.faults import RAISED, asked, one_line, told
+from rmc.common.env.process_state import ApartCall
 from rmc.common.env.spaces import space_fault
 from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Flicker, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
 from rmc.common.errors import ConfigError, EnvFault
 from rmc.common.extra import how_to_install
-from rmc.common.process.watchdog import EnvCall
 
 log = logging.getLogger(__name__)
 DM_CONTROL = "dm_control/"
@@ -44,7 +44,7 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
     """
     _check_options(config)
     _redirect_mujoco_warnings()
-    with EnvCall(config.id, "make", config.env_timeout):
+    with ApartCall(config.id, "make", config.env_timeout):
         spec = find_spec(config.id)
         made: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
     fault = asked("spaces", lambda: space_fault(made.observation_space, made.action_space))

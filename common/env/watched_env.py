@@ -1,21 +1,21 @@
-"""An environment each of whose calls must return in time, where the process is watched."""
+"""An environment whose calls must return in time, where the process is watched, and change it for themselves alone."""
 
 from typing import Any
 
 import gymnasium as gym
 
-from rmc.common.process.watchdog import EnvCall
+from rmc.common.env.process_state import ApartCall
 
 
 class WatchedEnv(gym.Wrapper[Any, Any, Any, Any]):
-    """Says when a call begins and ends; see ``rmc.common.process.watchdog``."""
+    """Says when a call begins and ends; see ``ApartCall`` and ``rmc.common.process.watchdog``."""
 
     def __init__(self, env: gym.Env[Any, Any], env_id: str, seconds: float) -> None:
         super().__init__(env)
         self._id, self._seconds = env_id, seconds
 
-    def _call(self, name: str) -> EnvCall:
-        return EnvCall(self._id, name, self._seconds)
+    def _call(self, name: str) -> ApartCall:
+        return ApartCall(self._id, name, self._seconds)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         with self._call("reset"):
