@@ -39,8 +39,13 @@ def run(words: list[str]) -> int:
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
-    if os.getcwd() not in sys.path:  # a user's own environments, last, so that they cannot shadow ours
-        sys.path.append(os.getcwd())
+    try:
+        here = os.getcwd()
+        if here not in sys.path:  # a user's own environments, last, so that they cannot shadow ours
+            sys.path.append(here)
+    except FileNotFoundError:
+        if parent is None:  # a role is given whole paths
+            return _complain("the working folder is gone; cd to one that is there", CONFIG_STATUS)
     from rmc.common.errors import ConfigError, RmcError
 
     try:

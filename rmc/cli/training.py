@@ -20,6 +20,7 @@ from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.errors import ConfigError, RoleDied
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local import launcher
+from rmc.deploy.local.socket_folder import place_for_sockets
 from rmc.deploy.local.supervisor import EXIT_CONFIG
 from rmc.deploy.monitor import attach
 from rmc.deploy.monitor.monitor import Monitor
@@ -164,6 +165,8 @@ def prepare(config: RunConfig, options: LaunchOptions) -> RunFolder:
         raise ConfigError(
             "--replay-shards", config.replay.replay_shards, "a lockstep run has one; use --launcher local"
         )
+    if options.launcher in ("local", "ray"):
+        place_for_sockets()
     if options.launcher == "manual" and options.redis_url is None:
         raise ConfigError("--redis-url", None, "say which Redis the roles that you start by hand will use")
     if options.redis_url is not None:

@@ -109,10 +109,10 @@ def test_starts_in_the_same_second_get_a_folder_each(
     with ThreadPoolExecutor(4) as pool:
         runs = list(pool.map(start, range(4)))
     name = "InvertedPendulum-v5__debug__0__20260102-030405"
-    assert {run.path.name for run in runs} == {name, *(f"{name}-{number}" for number in (2, 3, 4))}
-    assert {stat.S_IMODE(run.path.stat().st_mode) for run in runs} == {0o700}
-    for run in runs:
-        run.unlock()
+    assert {one.path.name for one in runs} == {name, *(f"{name}-{number}" for number in (2, 3, 4))}
+    assert {stat.S_IMODE(one.path.stat().st_mode) for one in runs} == {0o700}
+    for one in runs:
+        one.unlock()
 
 
 def test_a_place_for_runs_that_is_none_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
