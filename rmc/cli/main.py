@@ -8,6 +8,7 @@ import os
 import sys
 
 from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
+from rmc.deploy.monitor import output
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
 ROLES = SINGLE_THREADED | {"learner", "launcher"}
@@ -21,11 +22,18 @@ def main() -> None:
     Leaves without Python's own clearing up: all is closed by then, and with torch loaded that takes seconds,
     which a user waits for after Ctrl-C.
     """
+    output.take_over()
     status = run(sys.argv[1:])
     logging.shutdown()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
+    os._exit(status or _unwritten())
+
+
+def _unwritten() -> int:
+    """The exit status of a command whose words were lost; a run has its result, and whoever ends a pipe knows of it."""
+    failure = getattr(sys.stdout, "failure", "")
+    if not failure or output.Output.log is not None or failure == os.strerror(errno.EPIPE):
+        return 0
+    return _complain(f"standard output: {failure}", FAILED_STATUS)
 
 
 def run(words: list[str]) -> int:

@@ -24,6 +24,7 @@ from rmc.deploy.local.socket_folder import place_for_sockets
 from rmc.deploy.local.supervisor import EXIT_CONFIG
 from rmc.deploy.monitor import attach
 from rmc.deploy.monitor.monitor import Monitor
+from rmc.deploy.monitor.output import Output
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder, open_run
 from rmc.deploy.run.launch_options import LaunchOptions
@@ -43,7 +44,7 @@ def train(config: RunConfig, options: LaunchOptions, console: Console) -> int:
 
 def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
     """Be the launcher of a run whose folder is locked, from its first evaluation to its last."""
-    status = 1
+    status, Output.log = 1, folder.logs / "launcher.log"
     try:
         console.print(f"run folder {folder.path}", soft_wrap=True)
         before = _before(config, folder)
