@@ -9,6 +9,7 @@ import uuid
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from urllib.parse import quote
 
 import ray
 
@@ -28,7 +29,10 @@ AWAY = (ray.exceptions.RayError, ValueError, CheckpointError, OSError)  # of who
 
 @dataclass(frozen=True)
 class Task:
-    """What a host runs. In its texts ``{scratch}`` is its folder on the node, and ``{ip}`` the address."""
+    """What a host runs. In its texts ``{scratch}`` is its folder on the node, ``{ip}`` the address.
+
+    ``{scratch_url}`` is the folder as it stands in a URL.
+    """
 
     run: str
     command: RoleCommand
@@ -102,7 +106,11 @@ class RoleActor:
         return replace(command, words=tuple(map(self._filled, command.words)))
 
     def _filled(self, text: str) -> str:
-        return text.replace("{scratch}", str(self.scratch)).replace("{ip}", ray.util.get_node_ip_address())
+        return (
+            text.replace("{scratch}", str(self.scratch))
+            .replace("{scratch_url}", quote(str(self.scratch)))
+            .replace("{ip}", ray.util.get_node_ip_address())
+        )
 
     def _environment(self) -> dict[str, str]:
         """Without what Ray says to its own workers: a role is none, and the launcher begins a job of its own."""

@@ -11,6 +11,7 @@ from rich.console import Console
 from rmc.cli.ending import say_end
 from rmc.cli.signals import signals_caught
 from rmc.common.process.role import StopSignal
+from rmc.deploy.local.socket_folder import place_for_sockets
 from rmc.deploy.monitor import attach
 from rmc.deploy.ray import launcher, placement
 from rmc.deploy.run.config import RunConfig
@@ -38,6 +39,7 @@ def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> int
     config = dataclasses.replace(config, learner=learner, actors=fit if options.all_cpus else config.actors)
     validate(config)  # again: the cluster may have changed the number of actors
     check_machine(config, options)
+    place_for_sockets()
     folder = open_run(config, options.run_dir, options.if_exists)
     folder.unlock()
     launcher.launch(config, folder, options.device, options.all_cpus, options.tls)

@@ -11,8 +11,10 @@ from rmc.common.bus.protocol import Bus
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local import launcher
+from rmc.deploy.local.socket_folder import place_for_sockets
 from rmc.deploy.local.supervisor import EXIT_CONFIG
 from rmc.deploy.monitor.monitor import Monitor
+from rmc.deploy.monitor.output import Output
 from rmc.deploy.redis.connect import connect
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder, open_run
@@ -35,6 +37,8 @@ def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
     validate(config)
     validate_launch(config, options)
     check_machine(config, options)
+    if options.launcher == "local":
+        place_for_sockets()
     if options.redis_url is not None:
         connect(options.redis_url, "check")
     return open_run(config, options.run_dir, options.if_exists)
@@ -42,7 +46,7 @@ def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
 
 def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
     """Be the launcher of a run whose folder is locked, from its first evaluation to its last."""
-    status = 1
+    status, Output.log = 1, folder.logs / "launcher.log"
     try:
         console.print(f"run folder {folder.path}", soft_wrap=True)
         before = _before(config, folder, console)

@@ -6,6 +6,7 @@ import re
 import stat
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -166,6 +167,22 @@ def test_a_full_disk_is_one_line(
     monkeypatch.setattr(main, "_parse_and_run", full)
     assert main.run(["train"]) == 1
     assert capsys.readouterr().err == "rmc: disk: No space left on device; make room and try again\n"
+
+
+@pytest.mark.parametrize("words", [DEBUG, ["stats", "run"], ["--help"]])
+def test_a_working_folder_that_is_gone_is_one_line(words: list[str], tmp_path: Path) -> None:
+    gone = f"mkdir gone && cd gone && rmdir ../gone && exec {sys.executable} -m rmc.cli.main {' '.join(words)}"
+    done = subprocess.run(["sh", "-c", gone], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (2, "rmc: the working folder is gone; cd to one that is there\n")
+
+
+def test_without_a_temporary_folder_nothing_starts(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/nowhere"])
+    assert "rmc: TMPDIR=" in complaint([*DEBUG, "--run-dir", str(tmp_path / "run")], capsys)
+    assert not (tmp_path / "run").exists()
 
 
 def made_run(folder: Path) -> RunFolder:
