@@ -31,7 +31,7 @@ class CheckpointFolder:
     def __init__(self, folder: Path, keep: int = 3) -> None:
         self.folder, self.keep = folder, keep
         self._lock: int | None = None
-        self._damaged: set[int] = set()  # passed over by latest(): the run goes on from before them
+        self.damaged: set[int] = set()  # passed over by latest(): the run goes on from before them
 
     def lock(self) -> None:
         """Become the one writer. Raises ConfigError where another process stays it."""
@@ -78,7 +78,7 @@ class CheckpointFolder:
             shutil.rmtree(temporary, ignore_errors=True)
             reason = error.strerror or "?"
             raise CheckpointError(f"checkpoint {final} cannot be written ({reason})", reason) from None
-        self._damaged.discard(number)
+        self.damaged.discard(number)
         self._prune(number)
         return final
 
@@ -119,8 +119,8 @@ class CheckpointFolder:
         A damaged one that can be read again later must not be resumed from: the run has gone another way.
         """
         best, numbers = self.best(), self.numbers()
-        whole = [number for number in numbers if number <= written and number not in self._damaged]
-        kept = {best, *whole[-self.keep :], *(number for number in numbers if number > written)} - self._damaged
+        whole = [number for number in numbers if number <= written and number not in self.damaged]
+        kept = {best, *whole[-self.keep :], *(number for number in numbers if number > written)} - self.damaged
         for number in numbers:
             if number not in kept:
                 shutil.rmtree(self.path(number), ignore_errors=True)  # the next one tries again
@@ -149,7 +149,7 @@ class CheckpointFolder:
                 return number, self.load(number)
             except CheckpointError as error:
                 log.warning("%s; falling back to an older one", error)
-                self._damaged.add(number)
+                self.damaged.add(number)
         return None
 
     def mark_best(self, number: int, score: float) -> None:

@@ -5,7 +5,7 @@ RmcError
 ├── EnvFault             a user's environment raises, or gives what it may not
 ├── MessageError         a message that is not what its header or the run promises
 ├── FencedError          a newer process has taken this role's name: end yourself
-├── BusUnavailable       Redis cannot be reached (worth retrying)
+├── BusUnavailable       Redis cannot be reached, or answers that it cannot now (worth retrying)
 ├── BusFull              Redis is out of memory, or of disk for its log (worth waiting)
 ├── AuthenticationError  the other end of a socket does not know the run's secret
 ├── CheckpointError      a checkpoint is missing, does not match its manifest, or cannot be written

@@ -258,8 +258,9 @@ class Learner:
         """Go on from the newest valid checkpoint; returns the epoch it was written in."""
         self._next_checkpoint = self.config.checkpoint_steps
         newest = self.checkpoints.latest()
+        self._damaged_checkpoints = len(self.checkpoints.damaged)
         if newest is None:
-            if self.checkpoints.numbers():
+            if self._damaged_checkpoints:
                 raise CheckpointError(f"{self.checkpoints.folder}: no checkpoint is valid; move the folder away")
             return 0
         number, files = newest
@@ -291,6 +292,7 @@ class Learner:
             "checkpoint_update": self.last_checkpoint,
             "checkpoint_env_steps": self._checkpoint_steps,
             "checkpoint_error": self._checkpoint_error,
+            "damaged_checkpoints": self._damaged_checkpoints,
             **({"observation_unexplained": unexplained} if unexplained else {}),
             **self._means.take(),
         }

@@ -22,6 +22,7 @@ from rmc.common.bus.protocol import (
     join_pieces,
     split_pieces,
 )
+from rmc.common.bus.redis_client import RedisClient, refusal
 from rmc.common.bus.redis_url import HIDDEN, fault, shown
 from rmc.common.checksum import crc32
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
@@ -62,7 +63,7 @@ class RedisBus:
         if fix := fault(url):
             raise ConfigError("--redis-url", shown(url), fix)
         try:
-            self._redis: Any = redis.Redis.from_url(  # Any: its annotations do not know decode_responses
+            self._redis: Any = RedisClient.from_url(  # Any: its annotations do not know decode_responses
                 url, retry=retry, socket_timeout=TIMEOUT_SECONDS
             )
             pool = self._redis.connection_pool
@@ -83,12 +84,8 @@ class RedisBus:
             raise BusUnavailable("Redis did not answer in time")
         try:
             return action(*args)
-        except redis.exceptions.OutOfMemoryError as error:
-            raise BusFull(str(error)) from None
         except redis.exceptions.ResponseError as error:
-            if "MISCONF" in str(error):  # it cannot write its append-only file: no room, most often
-                raise BusFull(str(error)) from None
-            raise
+            raise refusal(error, self.url) from None
         except redis.exceptions.TimeoutError as error:
             self._rests_until = time.monotonic() + TIMEOUT_SECONDS  # half of the time is for what needs no Redis
             raise BusUnavailable(str(error)) from None
@@ -99,9 +96,9 @@ class RedisBus:
         """Raises BusUnavailable where no Redis answers, or one that will not have us."""
         try:
             self._call(self._redis.ping)
-        except redis.exceptions.ResponseError as error:  # one that knows no login repeats it
+        except ConfigError as error:  # a Redis that knows no login repeats it
             password = self._redis.connection_pool.connection_kwargs.get("password")
-            raise BusUnavailable(str(error).replace(password or HIDDEN, HIDDEN)) from None
+            raise BusUnavailable(error.fix.replace(password or HIDDEN, HIDDEN)) from None
 
     def expire(self, seconds: int | None) -> None:
         """Let all that this run has in Redis vanish after so many seconds; None takes that back."""
@@ -133,13 +130,13 @@ class RedisBus:
         self._call(lambda: self._redis.incrby(self._key("epoch", role), 0))  # a write that changes nothing
 
     def current_epoch(self, role: str) -> int:
-        return int(self._call(lambda: self._redis.get(self._key("epoch", role))) or 0)
+        return self._number(self._call(lambda: self._redis.get(self._key("epoch", role))))
 
     def append(self, actor: int, entry_id: EntryId, payload: bytes) -> None:
         stream = self._key("windows", actor)
         try:
             self._call(lambda: self._add_entry(actor, stream, entry_id, payload))
-        except redis.exceptions.ResponseError as error:
+        except ConfigError as error:
             if "equal or smaller" not in str(error):
                 raise
             self._check_not_fenced(actor, stream, entry_id)
@@ -157,7 +154,7 @@ class RedisBus:
         """A refused id is ours, stored by a retried call, unless a larger epoch wrote since."""
         try:
             last = _entry_id(self._call(lambda: self._redis.xinfo_stream(stream))["last-generated-id"])
-        except redis.exceptions.ResponseError as error:
+        except ConfigError as error:
             if "no such key" not in str(error):
                 raise
             raise _gone(stream) from None  # it was dropped after it had refused the id
@@ -229,7 +226,7 @@ class RedisBus:
 
     def _held(self, pipe: Any, owner: ReplayOwner) -> int:
         """The newest epoch of this replay server that Redis knows. Raises FencedError where it is newer than ours."""
-        held = int(pipe.get(self._key("epoch", owner.role)) or 0)
+        held = self._number(pipe.get(self._key("epoch", owner.role)))
         if held > owner.epoch:
             raise FencedError(f"{owner.role} epoch {owner.epoch} was replaced by {held}")
         return held
@@ -275,7 +272,7 @@ class RedisBus:
         epoch_key = self._key("epoch", "learner")
 
         def transaction(pipe: Any) -> None:
-            held = int(pipe.get(epoch_key) or 0)
+            held = self._number(pipe.get(epoch_key))
             if held > version.epoch:
                 raise FencedError(f"learner epoch {version.epoch} was replaced by {held}")
             if pipe.exists(*pieces) < len(pieces):
@@ -296,6 +293,10 @@ class RedisBus:
             return [int(word) for word in words]
         self.refused["control"] += bool(raw)
         return None
+
+    def _number(self, raw: bytes | None) -> int:
+        """A number as it stands in a value; 0 where there is none."""
+        return (self._integers(raw, 1) or [0])[0]
 
     def _head(self, evaluate: bool) -> tuple[Version, int, int] | None:
         raw = self._call(lambda: self._redis.get(self._key(KINDS[evaluate])))
@@ -361,7 +362,7 @@ class RedisBus:
 
     def stop_requested(self) -> str | None:
         raw: bytes | None = self._call(lambda: self._redis.get(self._key("stop")))
-        return raw.decode() if raw is not None else None
+        return raw.decode(errors="replace") if raw is not None else None
 
     def clear_stop(self) -> None:
         self._call(lambda: self._redis.delete(self._key("stop")))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.errors import BusFull, BusUnavailable
+from rmc.common.errors import BusFull, BusUnavailable, RmcError
 from rmc.common.process.role import StopSignal
 from rmc.common.shard import Shard
 from rmc.deploy.local.role_environment import URL_VARIABLE
@@ -105,7 +105,7 @@ class LocalRun:
 
 def _expire(bus: RedisBus) -> None:
     """Do not leave a user's Redis full of runs that are over; what they need to go on is in their folders."""
-    with suppress(BusUnavailable, BusFull):
+    with suppress(RmcError):
         bus.expire(KEPT_SECONDS)
 
 

@@ -30,6 +30,7 @@ class Tail:
     def take(self) -> list[dict[str, Any]]:
         """Those that are new since the last call."""
         with suppress(FileNotFoundError), self._path.open("rb") as file:
+            self._position = min(self._position, os.fstat(file.fileno()).st_size)  # it may have been cut
             file.seek(self._position)
             text = file.read()
             whole = text[: text.rfind(b"\n") + 1]

@@ -22,7 +22,7 @@ class MetricsLog:
     """Of one launcher. What is said while nothing can be written is not kept, which the log says once."""
 
     def __init__(self, folder: RunFolder) -> None:
-        self._lines = os.open(folder.metrics, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        self._lines = os.open(folder.metrics, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
         self._path, self._events_folder = folder.metrics, folder.events
         self._events: EventFileWriter | None = None
         self._retry_at: float | None = None
@@ -68,8 +68,10 @@ class MetricsLog:
 
 
 def _append(file: int, line: bytes) -> None:
-    """The whole line or none of it. Raises OSError."""
+    """The whole line or none of it, after a torn one as a line of its own. Raises OSError."""
     size = os.fstat(file).st_size
+    if size and os.pread(file, 1, size - 1) != b"\n":
+        line = b"\n" + line
     try:
         if os.write(file, line) < len(line):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -147,6 +147,25 @@ def _stages(board: RunStatus) -> Table:
     return stages
 
 
+def _damaged(board: RunStatus) -> str:
+    """What was found damaged and passed over."""
+    counts = {"windows of the ring": board.replay("damaged_windows", sum)}
+    counts["newer checkpoints"] = board.get("learner", "damaged_checkpoints")
+    return ", ".join(f"{number(count, ',')} {name}" for name, count in counts.items() if count)
+
+
+def notices(board: RunStatus) -> dict[str, str]:
+    """What is not as it should be, by its heading."""
+    off = board.replay("replay_ratio_off", max)
+    found = {
+        "not running": board.get("launcher", "not_running"),
+        "not saved": board.get("learner", "checkpoint_error"),
+        "damaged": _damaged(board),
+        "replay ratio": f"far from {board.replay_ratio:g}, see the troubleshooting page" if off else "",
+    }
+    return {name: str(text) for name, text in found.items() if text}
+
+
 def table(board: RunStatus) -> Group:
     """Everything, for a terminal."""
     facts = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
@@ -154,10 +173,8 @@ def table(board: RunStatus) -> Group:
     facts.add_column()
     for name, value in _facts(board):
         facts.add_row(name, value)
-    if board.get("launcher", "not_running"):
-        facts.add_row("not running", board.get("launcher", "not_running"))
-    if board.get("learner", "checkpoint_error"):
-        facts.add_row("not saved", str(board.get("learner", "checkpoint_error")))
+    for name, text in notices(board).items():
+        facts.add_row(name, text)
     title = Text.assemble((board.env, "bold"), f" · {board.preset} · seed {board.seed}")
     return Group(title, facts, _stages(board))
 
@@ -186,9 +203,7 @@ def line(board: RunStatus) -> str:
         f"lag {number(board.policy_lag, '.1f')}",
         f"restarts {board.get('launcher', 'restarts') or 0}",
     ]
-    missing = board.get("launcher", "not_running")
-    parts += [f"not running: {missing}"] if missing else []
-    parts += [f"not saved: {learner['checkpoint_error']}"] if learner.get("checkpoint_error") else []
+    parts += [f"{name}: {text}" for name, text in notices(board).items()]
     return " | ".join(parts) + (f" | waiting: {', '.join(waits)}" if waits else "")
 
 

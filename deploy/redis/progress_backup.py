@@ -7,7 +7,7 @@ from contextlib import suppress
 import msgpack
 
 from rmc.common.bus.protocol import Bus
-from rmc.common.errors import BusUnavailable
+from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.shard import Shard
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.folder import RunFolder
@@ -30,7 +30,7 @@ class ProgressBackup:
         if not at_once and time.monotonic() < self._keep_at:
             return
         self._keep_at = time.monotonic() + KEEP_SECONDS
-        with suppress(BusUnavailable, OSError):  # the disk is full: those before stay
+        with suppress(BusUnavailable, BusFull, OSError):  # the disk is full: those before stay
             found = {role: raw for role in self._roles if (raw := bus.progress(role)) is not None}
             if found and all(map(is_whole, found.values())):
                 write_whole(self._path, msgpack.packb(found))

@@ -4,7 +4,7 @@ import time
 from contextlib import suppress
 
 from rmc.common.bus.redis_bus import RedisBus
-from rmc.common.errors import BusFull, BusUnavailable
+from rmc.common.errors import BusFull, BusUnavailable, RmcError
 from rmc.deploy.redis.progress_backup import ProgressBackup
 from rmc.deploy.run.config import RunConfig, to_json
 from rmc.deploy.run.folder import RunFolder
@@ -40,8 +40,9 @@ class Registration:
         self._progress_backup.keep(self._bus)
 
     def keep(self) -> None:
-        """Copy what is counted, at once."""
-        self._progress_backup.keep(self._bus, at_once=True)
+        """Copy what is counted, at once, if that can be had; a run's end must not fail for it."""
+        with suppress(RmcError):
+            self._progress_backup.keep(self._bus, at_once=True)
 
     def _tell(self) -> None:
         """The counters first: a replay server that finds the config goes on from them."""

@@ -7,6 +7,7 @@ import dataclasses
 import fcntl
 import hashlib
 import json
+import logging
 import os
 import secrets
 import socket
@@ -24,6 +25,7 @@ from rmc.common.errors import CheckpointError, ConfigError
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import RunConfig, from_json, option, to_json
 
+log = logging.getLogger(__name__)
 SECRET_LENGTH = 64  # hexadecimal characters
 LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
 IfExists = Literal["resume", "fail", "new"]
@@ -314,15 +316,18 @@ def _check_resumable(folder: RunFolder, config: RunConfig) -> None:
 
 
 def check_checkpoints(folder: RunFolder) -> None:
-    """Raises ConfigError where there are checkpoints but none is whole."""
+    """Raises ConfigError where there are checkpoints but none is whole; damaged newer ones are told."""
     checkpoints = CheckpointFolder(folder.checkpoints)
     faults = []
     for number in reversed(checkpoints.numbers()):
         try:
             checkpoints.load(number)
-            return
         except CheckpointError as error:
             faults.append(str(error))
+            continue
+        for fault in faults:
+            log.warning("%s; the run goes on from the checkpoint of update %d", fault, number)
+        return
     if faults:
         raise ConfigError("--run-dir", str(folder.path), f"{faults[0]}; none is whole, so use another --run-dir")
 

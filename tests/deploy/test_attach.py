@@ -87,3 +87,15 @@ def test_records_are_taken_once_and_whole(tmp_path: Path) -> None:
         file.flush()
         assert tail.take() == [{"role": "b", "x": 1}]
     assert tail.take() == []
+
+
+def test_records_after_a_cut_are_taken(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_text(f"{json.dumps({'role': 'a', 'x': 'long' * 99})}\n")
+    tail = Tail(path)
+    tail.take()
+    os.truncate(path, 10)
+    assert tail.take() == []
+    with path.open("a") as file:
+        file.write("\n" + json.dumps({"role": "b"}) + "\n")
+    assert tail.take() == [{"role": "b"}]

@@ -14,6 +14,7 @@ import pytest
 
 from rmc.analysis.history import of_run
 from rmc.cli.main import run
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import to_json
@@ -170,3 +171,21 @@ def test_a_baseline_is_not_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[
     (tmp_path / "config.json").write_text(BASELINE)
     assert run(["evaluate", str(tmp_path), "--video", "x.mp4"]) == 2
     assert "--video='x.mp4': only runs of rmc train are filmed" in capsys.readouterr().err
+
+
+def test_a_newer_damaged_checkpoint_is_told_where_the_run_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = debug(EnvConfig("Pendulum-v1"))
+    folder = open_run(config, tmp_path / "run", "fail")
+    folder.unlock()
+    checkpoints = CheckpointFolder(folder.checkpoints)
+    for update in (10, 20, 30):
+        checkpoints.save(update, {"state": b"x"})
+    for update in (20, 30):
+        (checkpoints.path(update) / "state").write_bytes(b"y")
+    open_run(config, tmp_path / "run", "resume").unlock()
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 2
+    assert all("does not match its manifest; the run goes on from the checkpoint of update 10" in text for text in said)
+    assert "000000030" in said[0]

@@ -3,6 +3,7 @@
 import io
 import json
 import logging
+import os
 from pathlib import Path
 
 import pytest
@@ -70,3 +71,16 @@ def test_a_view_that_cannot_be_written_ends_nothing() -> None:
         View(board, Console(file=full, force_terminal=False)).refresh()
         with pytest.raises(OSError, match="No space"):
             full.write("x")
+
+
+@pytest.mark.parametrize("torn", ['{"role": "learner", "x": 1}\n{"role": "lea', '{"role": "lea', "\0\0\0", ""])
+def test_a_torn_line_costs_no_record_after_it(folder: RunFolder, torn: str) -> None:
+    folder.metrics.write_text(torn)
+    kept = MetricsLog(folder)
+    for x in (2, 3):
+        kept.write({"role": "learner", "x": x}, 0)
+    os.truncate(folder.metrics, folder.metrics.stat().st_size - 5)  # and while the run goes on
+    kept.write({"role": "learner", "x": 4}, 0)
+    kept.close()
+    assert [found["x"] for found in folder.records()] == [1, 2, 4][not torn.startswith('{"role": "learner"') :]
+    assert b"\n\n" not in folder.metrics.read_bytes()

@@ -1,10 +1,12 @@
 """The launcher takes in whatever roles say, and goes on."""
 
+import io
 import json
 import math
 import random
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -165,4 +167,32 @@ def test_evaluations_that_found_no_room_are_marked_when_there_is_some(
     for _ in range(2):
         monitor.record({"role": "learner", "updates": 30})
     assert marked == [(10, 1.0), (20, 3.0), (30, 2.0)]
+    monitor.close()
+
+
+def shown(board: RunStatus) -> list[str]:
+    """The view as a table, and as a line."""
+    console = Console(file=io.StringIO(), width=200)
+    console.print(table(board))
+    return [console.file.getvalue(), line(board)]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("role", "said", "heading", "text"),
+    [
+        ("replay-0", {"damaged_windows": 8}, "damaged", "8 windows of the ring"),
+        ("learner", {"damaged_checkpoints": 2}, "damaged", "2 newer checkpoints"),
+        ("replay-1", {"replay_ratio": 39765.0, "replay_ratio_off": 1}, "replay ratio", "far from"),
+        ("learner", {"checkpoint_error": "No space left on device"}, "not saved", "No space left on device"),
+        ("launcher", {"not_running": "actor-3"}, "not running", "actor-3"),
+    ],
+)
+def test_what_is_not_as_it_should_be_is_shown(
+    monitor: Monitor, role: str, said: dict[str, Any], heading: str, text: str
+) -> None:
+    for sound in (False, True):
+        record = dict.fromkeys(said, type(next(iter(said.values())))()) if sound else said
+        monitor.board.take({"role": role, **record})
+        for view in shown(monitor.board):
+            assert (heading in view and text in view) is not sound
     monitor.close()

@@ -1,10 +1,12 @@
-"""A run in a Redis of the user's own, which stands still, or comes back empty when an actor has died, too."""
+"""A run in a Redis of the user's own, which stands still, comes back empty, is busy, or has a key of another type."""
 
 import tempfile
 import time
+from contextlib import closing
 from pathlib import Path
 
 import psutil
+import redis
 
 from rmc.deploy.redis.server import RedisServer
 from tests.integration.running import Training
@@ -34,6 +36,36 @@ def test_neither_ends_the_run_or_a_role(tmp_path: Path) -> None:
         training.wait_for_updates(100)
         assert training.newest("launcher", "restarts") == 1, training.logs()
         assert training.interrupt() < 20
+
+
+def test_answers_that_pass_are_waited_out_and_one_that_does_not_names_its_key(tmp_path: Path) -> None:
+    with (
+        tempfile.TemporaryDirectory() as short,
+        RedisServer(Path(short)) as server,
+        Training(tmp_path / "run", *OPTIONS, "--redis-url", server.url()) as training,
+        closing(redis.Redis.from_url(server.url())) as client,
+    ):
+        training.wait_for_updates()
+        _be_busy(client, 4.0)
+        training.wait_for_updates(100)
+        client.replicaof("127.0.0.1", "1")
+        time.sleep(4.0)
+        client.replicaof("NO", "ONE")
+        training.wait_for_updates(100)
+        assert training.newest("launcher", "restarts") == 0, training.logs()
+        (acks,) = client.keys("rmc:*:acks")
+        client.pipeline().delete(acks).rpush(acks, "a list").execute()
+        training.finish(30)
+        told = training.text().splitlines()[-1]
+        assert "WRONGTYPE" in told, training.text()
+        assert acks.decode() in told
+        assert "Traceback" not in training.text()
+
+
+def _be_busy(client: redis.Redis, seconds: float) -> None:
+    """As a script of somebody else's makes it."""
+    client.config_set("lua-time-limit", 10)
+    client.eval(f"local t = redis.call('TIME')[1] + {seconds} while redis.call('TIME')[1] + 0 < t do end", 0)
 
 
 def _stand_still(server: RedisServer, seconds: float) -> None:

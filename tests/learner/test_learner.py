@@ -158,6 +158,18 @@ def test_no_valid_checkpoint_is_an_error(setting):
         setting.start()
 
 
+def test_a_newer_checkpoint_that_is_damaged_is_passed_over_and_told(setting):
+    setting.feed(60)
+    setting.learner.step()
+    assert setting.learner.metrics()["damaged_checkpoints"] == 0
+    setting.learner.close()
+    checkpoints = setting.learner.checkpoints
+    number, files = checkpoints.latest()
+    (checkpoints.save(number + 1, files) / "learner.pt").write_bytes(b"damaged")
+    resumed = setting.learner = setting.start()
+    assert (resumed.updates, resumed.metrics()["damaged_checkpoints"]) == (number, 1)
+
+
 def test_a_checkpoint_never_executes_code(setting):
     setting.feed(60)
     setting.learner.step()

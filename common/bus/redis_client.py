@@ -1,0 +1,68 @@
+"""The client of a bus: what Redis answers in error names the command and its keys, and is waited out or told."""
+
+from typing import Any
+
+import redis
+from redis.client import Pipeline
+from redis.exceptions import ResponseError
+
+from rmc.common.bus.redis_url import shown
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RmcError
+
+KEYS = "rmc:"  # how every key of ours begins
+FULL = {"OOM", "MISCONF", "NOREPLICAS"}  # no memory, no disk for its log, or too few replicas for a write
+FIXES = {  # of answers that do not pass; others do: somebody's script, a failover, a cluster that moves slots
+    "ERR": "mend that, or give another Redis",
+    "WRONGTYPE": "another program uses this key; delete it, or give another database",
+    "NOPERM": "let this user do that",
+    "ASK": "it is a part of a cluster; give a Redis that is none",
+    "MOVED": "it is a part of a cluster; give a Redis that is none",
+    "CROSSSLOT": "it is a part of a cluster; give a Redis that is none",
+}
+
+
+def refusal(error: ResponseError, url: str) -> RmcError:
+    """What an error that Redis answered means: BusFull, BusUnavailable, or ConfigError where it will not pass."""
+    text = str(error)
+    code = getattr(error, "status_code", None) or text.partition(" ")[0]
+    if code == "ERR":  # so Redis 6 begins for a script, in which the cause stands
+        code = next((word for word in text.replace("-", " ").split() if word in FULL | {"READONLY"}), code)
+    if code in FULL:
+        return BusFull(text)
+    if code not in FIXES:
+        return BusUnavailable(text)
+    return ConfigError("--redis-url", shown(url), f"it answers {text}; {FIXES[code]}")
+
+
+def _name(error: ResponseError, command: tuple[Any, ...]) -> None:
+    """Add the command and its keys to an error's text, and the code that the client has cut off."""
+    words = [word.decode(errors="replace") if isinstance(word, bytes) else str(word) for word in command]
+    keys = [word for word in words[1:] if word.startswith(KEYS)]
+    code = getattr(error, "status_code", None) or ""
+    error.args = (" ".join(f"{code} {error.args[0]} ({' '.join(words[:1] + keys)})".split()),)
+
+
+class _Pipeline(Pipeline):
+    def immediate_execute_command(self, *args: Any, **options: Any) -> Any:
+        try:
+            return super().immediate_execute_command(*args, **options)
+        except ResponseError as error:
+            _name(error, args)
+            raise
+
+    def annotate_exception(self, exception: Any, _: int, command: Any) -> None:
+        _name(exception, tuple(command))
+
+
+class RedisClient(redis.Redis):
+    """A ``redis.Redis`` whose errors name the command and the keys of ours in it, and no values."""
+
+    def pipeline(self, transaction: bool = True, shard_hint: Any = None) -> _Pipeline:
+        return _Pipeline(self.connection_pool, self.response_callbacks, transaction, shard_hint)
+
+    def execute_command(self, *args: Any, **options: Any) -> Any:
+        try:
+            return super().execute_command(*args, **options)
+        except ResponseError as error:
+            _name(error, args)
+            raise

@@ -1,0 +1,191 @@
+"""What a Redis answers in error: waited out where it passes, one line with the key where it does not; real answers."""
+
+import re
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+import redis
+
+from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner, Version
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
+from rmc.deploy.redis.server import RedisServer, server_binary
+
+Call = Callable[[RedisBus], object]
+ACK = {0: Ack(EntryId(1, 1), 5)}
+READS: dict[str, Call] = {
+    "config": lambda bus: bus.config(),
+    "actors": lambda bus: bus.actors(),
+    "acks": lambda bus: bus.ack(0),
+    "progress": lambda bus: bus.progress("replay"),
+    "replay": lambda bus: bus.replay_address("replay"),
+    "weights": lambda bus: bus.latest_version(),
+    "weights:1:1:0": lambda bus: bus.weights(),
+    "windows:0": lambda bus: bus.read({0: EntryId(0, 0)}, 10),
+    "metrics:learner": lambda bus: bus.records({"learner": "0"}),
+    "stop": lambda bus: bus.stop_requested(),
+    "epoch:actor-0": lambda bus: bus.current_epoch("actor-0"),
+}
+WRITES: dict[str, Call] = {
+    "config": lambda bus: bus.set_config(b"{}"),
+    "windows:0": lambda bus: bus.append(0, EntryId(1, 1), b"x"),
+    "metrics:learner": lambda bus: bus.emit("learner", {"updates": 1}),
+    "acks": lambda bus: bus.commit(ReplayOwner("replay", 1), ACK, b"x"),
+    "epoch:learner": lambda bus: bus.take_epoch("learner"),
+    "weights": lambda bus: bus.publish_weights(Version(1, 2), b"two"),
+    "stop": lambda bus: bus.request_stop("x"),
+    "dead": lambda bus: bus.dead_letter(bus.read({0: EntryId(0, 0)}, 1)[0], "x"),
+    "replay": lambda bus: bus.announce_replay(ReplayOwner("replay", 1), "unix:x"),
+    "run": lambda bus: bus.expire(60),
+}
+OF_ANOTHER_TYPE = {  # a key that somebody made a list, and who stumbles over it
+    **{key: call for key, call in READS.items() if key != "weights:1:1:0"},
+    "weights:1:1:0": READS["weights:1:1:0"],
+    "acks ": WRITES["acks"],
+    "windows:0 ": WRITES["windows:0"],
+    "metrics:learner ": WRITES["metrics:learner"],
+    "epoch:learner": WRITES["epoch:learner"],
+    "epoch:learner ": WRITES["weights"],
+    "epoch:replay": WRITES["acks"],
+    "dead": WRITES["dead"],
+    "replay ": WRITES["replay"],
+}
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[RedisServer]:
+    with tempfile.TemporaryDirectory(prefix="rmc-replies-") as folder, RedisServer(Path(folder)) as server:
+        yield server
+
+
+@pytest.fixture
+def bus(server: RedisServer, run_name: str) -> RedisBus:
+    made = RedisBus(server.url(), re.sub(r"[^\w-]", "-", run_name))
+    made.set_config(b"{}")
+    made.append(0, EntryId(1, 0), b"hello")
+    made.publish_weights(Version(1, 1), b"weights")
+    made.emit("learner", {"updates": 0})
+    return made
+
+
+@contextmanager
+def busy(server: RedisServer) -> Iterator[None]:
+    """Somebody's script runs on and on."""
+    client = redis.Redis.from_url(server.url())
+    client.config_set("lua-time-limit", 10)
+
+    def run_script() -> None:
+        with suppress(redis.exceptions.RedisError):
+            redis.Redis.from_url(server.url()).eval("while true do end", 0)
+
+    thread = threading.Thread(target=run_script)
+    thread.start()
+    time.sleep(0.1)
+    yield
+    client.execute_command("SCRIPT", "KILL")
+    thread.join()
+
+
+@contextmanager
+def replica(server: RedisServer, serves_stale_data: str) -> Iterator[None]:
+    """A failover has made it a replica of one that it cannot reach."""
+    client = redis.Redis.from_url(server.url())
+    client.config_set("replica-serve-stale-data", serves_stale_data)
+    client.replicaof("127.0.0.1", "1")
+    yield
+    client.replicaof("NO", "ONE")
+
+
+@pytest.mark.parametrize("call", [*READS.values(), *WRITES.values()], ids=[*READS, *(f"{key}-write" for key in WRITES)])
+def test_busy(server: RedisServer, bus: RedisBus, call: Call) -> None:
+    with busy(server), pytest.raises(BusUnavailable, match="BUSY"):
+        call(bus)
+
+
+@pytest.mark.parametrize("call", WRITES.values(), ids=WRITES)
+def test_readonly(server: RedisServer, bus: RedisBus, call: Call) -> None:
+    with replica(server, "yes"):
+        with pytest.raises(BusUnavailable, match="READONLY"):
+            call(bus)
+        assert bus.config() == b"{}"
+
+
+@pytest.mark.parametrize("call", READS.values(), ids=READS)
+def test_masterdown(server: RedisServer, bus: RedisBus, call: Call) -> None:
+    with replica(server, "no"), pytest.raises(BusUnavailable, match="MASTERDOWN"):
+        call(bus)
+
+
+@pytest.mark.parametrize("call", WRITES.values(), ids=WRITES)
+def test_too_few_replicas(server: RedisServer, bus: RedisBus, call: Call) -> None:
+    client = redis.Redis.from_url(server.url())
+    client.config_set("min-replicas-to-write", 1)
+    try:
+        with pytest.raises(BusFull, match="NOREPLICAS"):
+            call(bus)
+    finally:
+        client.config_set("min-replicas-to-write", 0)
+
+
+@pytest.mark.parametrize(("key", "call"), OF_ANOTHER_TYPE.items(), ids=OF_ANOTHER_TYPE)
+def test_a_key_of_another_type_is_named_in_one_line(bus: RedisBus, key: str, call: Call) -> None:
+    name = bus._key(*key.strip().split(":"))
+    bus._redis.delete(name)
+    bus._redis.rpush(name, "a list")
+    with pytest.raises(ConfigError, match="WRONGTYPE") as error:
+        call(bus)
+    assert name in str(error.value)
+    assert "delete it" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_an_answer_shows_no_value(bus: RedisBus) -> None:
+    bus._redis.delete(bus._key("acks"))
+    bus._redis.rpush(bus._key("acks"), "a list")
+    with pytest.raises(ConfigError) as error:
+        bus.commit(ReplayOwner("replay", 1), ACK, b"\x00secret\n")
+    assert "secret" not in str(error.value)
+
+
+def test_an_epoch_that_is_no_number_is_named_where_it_must_be_one(bus: RedisBus) -> None:
+    bus._redis.set(bus._key("epoch", "replay"), b"many")
+    assert bus.current_epoch("replay") == 0
+    assert bus.refused["control"] == 1
+    with pytest.raises(ConfigError, match=r"not an integer.*epoch:replay"):
+        bus.take_epoch("replay")
+    bus.commit(ReplayOwner("replay", 1), ACK)  # which says it anew
+    assert bus.current_epoch("replay") == 1
+
+
+def test_an_older_life_is_still_fenced(bus: RedisBus) -> None:
+    bus.append(0, EntryId(2, 0), b"hello")
+    with pytest.raises(FencedError):
+        bus.append(0, EntryId(1, 1), b"x")
+
+
+def test_a_cluster_is_waited_for_while_it_is_down_and_refused_where_keys_are_elsewhere() -> None:
+    with tempfile.TemporaryDirectory(prefix="rmc-cluster-") as folder:
+        words = ["--port", "0", "--unixsocket", f"{folder}/r", "--cluster-enabled", "yes", "--dir", folder]
+        with subprocess.Popen([server_binary(), *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as node:
+            try:
+                bus = RedisBus(f"unix://{folder}/r", "run")
+                _until_it_answers(bus)
+                with pytest.raises(BusUnavailable, match="CLUSTERDOWN"):
+                    bus.set_config(b"{}")
+            finally:
+                node.kill()
+
+
+def _until_it_answers(bus: RedisBus) -> None:
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        with suppress(BusUnavailable):
+            bus.ping()
+            return
+        time.sleep(0.02)
