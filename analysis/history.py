@@ -19,7 +19,7 @@ from rmc.common.env.config import EnvConfig, write_kwargs
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, option
 from rmc.deploy.run.folder import MAY_CHANGE, RunFolder, flat
-from rmc.deploy.run.presets import preset
+from rmc.deploy.run.presets import preset_config
 
 UNTOLD = MAY_CHANGE | {"seed", "preset", "evaluator.episodes", "env.id"}  # makes no other agent
 
@@ -160,7 +160,7 @@ def _with(name: str, words: list[str]) -> str:
 
 def _changes(config: RunConfig) -> list[str]:
     """Options that differ from the preset's, as they are typed."""
-    was, now = flat(preset(config.preset, config.env)), flat(config)
+    was, now = flat(preset_config(config.preset, config.env)), flat(config)
     return [_typed(path, now[path]) for path in now if path not in UNTOLD and now[path] != was[path]]
 
 

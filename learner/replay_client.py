@@ -37,7 +37,7 @@ RECEIVE_BUFFER = 8 << 20
 AWAY = (OSError, MessageError, AuthenticationError, ValueError, OverflowError)
 
 
-class Connection:
+class ReplayConnection:
     """One authenticated connection. Blocking, with a timeout."""
 
     def __init__(
@@ -213,8 +213,8 @@ class ReplayClient:
         self._last = EMPTY_SAMPLE
         self._may_share = not pinned and hasattr(os, "memfd_create")
         self._shared: SharedBatches | None = None
-        self._batches: Connection | None = None
-        self._control: Connection | None = None
+        self._batches: ReplayConnection | None = None
+        self._control: ReplayConnection | None = None
         self._is_away = False  # said in the log already
         self._epoch = 0
 
@@ -264,7 +264,7 @@ class ReplayClient:
             raise MessageError("length", f"{len(body)} bytes for a batch of {self._batch_size}")
         return np.frombuffer(body[:split], self._spec.dtype), np.frombuffer(body[split:], np.float64)
 
-    def _open_batches(self) -> Connection | None:
+    def _open_batches(self) -> ReplayConnection | None:
         address = self._address()
         if address is None:
             return None
@@ -342,11 +342,11 @@ class ReplayClient:
             raise
         return meta, body
 
-    def _open_control(self) -> Connection:
+    def _open_control(self) -> ReplayConnection:
         address = self._address()
         if address is None:
             raise ConnectionError("the replay server is not up yet")
         return self._connect(address, self._answer.nbytes)
 
-    def _connect(self, address: str, max_body: int) -> Connection:
-        return Connection(address, self._secret, self._spec.fingerprint, max_body, self._tls, self._epoch)
+    def _connect(self, address: str, max_body: int) -> ReplayConnection:
+        return ReplayConnection(address, self._secret, self._spec.fingerprint, max_body, self._tls, self._epoch)

@@ -23,7 +23,7 @@ class Frame(NamedTuple):
     body: bytes
 
 
-class Connection:
+class ClientConnection:
     """Buffers of one non-blocking socket. OSError from any method means: it is gone."""
 
     def __init__(self, connection: socket.socket, challenge: bytes) -> None:

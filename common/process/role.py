@@ -68,7 +68,7 @@ class Heartbeat:
                     return True
             if now >= self._next_metrics:
                 self._next_metrics = now + METRICS_PERIOD
-                self._bus.emit(self._role.name, self.record())
+                self._bus.emit(self._role.name, self.metrics())
                 self.outage.end()
         except (BusUnavailable, BusFull) as error:
             self.outage.begin(error)
@@ -76,7 +76,7 @@ class Heartbeat:
             self._next_stop = self._next_metrics = time.monotonic() + RECONNECT_SLEEP
         return False
 
-    def record(self) -> dict[str, Any]:
+    def metrics(self) -> dict[str, Any]:
         """What the role has to say now."""
         refused = {"refused_values": self._bus.refused.total()}
         return {"time": time.time(), **self._role.metrics(), **refused, **self._clock.shares()}
@@ -106,7 +106,7 @@ def run_role(
                 time.sleep(RECONNECT_SLEEP)
                 pulse.outage.begin(error)
                 clock.wait("redis")
-        last = pulse.record()
+        last = pulse.metrics()
     finally:
         role.close()
     with suppress(BusUnavailable, BusFull):  # said last, so that a Redis that hangs delays nothing

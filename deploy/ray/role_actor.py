@@ -89,7 +89,7 @@ class RoleActor:
     """Holds a role. Where it dies this actor ends, too, and Ray starts both again, here or on another node."""
 
     def __init__(self, task: Task) -> None:
-        self._task, self._life = task, uuid.uuid4().hex
+        self._task, self._incarnation = task, uuid.uuid4().hex
         self._replaced = self._run_ends = False
         self.trouble = ""
         self.scratch = scratch_folder(task.run)
@@ -173,15 +173,15 @@ class RoleActor:
 
     def report(self, incarnation: str, log_start: int) -> Report:
         """How the role is, and its log from there on; of another life's, from this one's start on."""
-        start = log_start if incarnation == self._life else self._role.log_start
+        start = log_start if incarnation == self._incarnation else self._role.log_start
         log = b""
         with suppress(FileNotFoundError), self._role.log.open("rb") as file:
             file.seek(start)
             log = file.read(LOG_BYTES)
         words = self._role.last_words() if self._status else ""
         return Report(
-            self._life, ray.util.get_node_ip_address(), self._role.pid, self._status, words, log, start + len(log),
-            self.trouble,
+            self._incarnation, ray.util.get_node_ip_address(), self._role.pid, self._status, words, log,
+            start + len(log), self.trouble,
         )  # fmt: skip
 
     def clear(self) -> None:

@@ -137,7 +137,7 @@ class RunFolder:
     def records(self) -> Iterator[dict[str, Any]]:
         """Those of ``metrics.jsonl`` that are whole, each with its role."""
         with suppress(FileNotFoundError), self.metrics.open("rb") as lines:
-            yield from filter(None, map(record, lines))
+            yield from filter(None, map(parse_record, lines))
 
     def secret(self) -> bytes:
         """The run's secret, made at first use. Only the owner may read it: where others could, they no longer can.
@@ -240,7 +240,7 @@ def read_object(path: Path, *numbers: str) -> dict[str, Any]:
     return found
 
 
-def record(line: bytes) -> dict[str, Any] | None:
+def parse_record(line: bytes) -> dict[str, Any] | None:
     """A line of ``metrics.jsonl``; None where it is torn by a crash, or is no role's."""
     with suppress(ValueError):
         found = json.loads(line)

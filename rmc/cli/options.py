@@ -19,7 +19,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig, WindowConfig
 from rmc.deploy.run.folder import IfExists
 from rmc.deploy.run.launch_options import Launcher, LaunchOptions
-from rmc.deploy.run.presets import preset
+from rmc.deploy.run.presets import preset_config
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
 
@@ -299,7 +299,7 @@ Command = (
 def parse(words: list[str]) -> Command:
     """The command line as one of the classes above. Raises ConfigError; SystemExit, its message on standard error."""
     _check_once("--env-kwargs", words)
-    start = preset(_named_preset(words), EnvConfig(""))
+    start = preset_config(_named_preset(words), EnvConfig(""))
     shared = {item.name: getattr(start, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
     commands = (
         Annotated[Train, tyro.conf.subcommand("train", default=Train(env=EnvOptions(id=tyro.MISSING), **shared))]
