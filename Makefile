@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo wheel site test test-faults test-cluster test-dm-control test-newest lint results trial comparisons docs bench peers clean
+.PHONY: env demo wheel site test test-faults test-cluster test-dm-control test-newest lint docs bench peers clean
 
 env: $(STAMP)
 
@@ -86,35 +86,6 @@ wheel: $(STAMP)
 # The documents as a site in build/site; every link is checked.
 site: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
-
-# Hours. Interrupt it as you like: the same command goes on from there.
-results: $(STAMP)
-	for seed in 1 2 3; do $(BIN)/rmc train HalfCheetah-v5 --seed $$seed --total-steps 300000 --run-dir runs/halfcheetah-$$seed || exit; done
-	for seed in 1 2 3; do $(BIN)/rmc train Hopper-v5 --seed $$seed --total-steps 300000 --run-dir runs/hopper-$$seed || exit; done
-	$(BIN)/rmc train HalfCheetah-v5 --flicker 0.5 --seed 1 --total-steps 300000 --run-dir runs/halfcheetah-flicker-1
-
-# What robust has and has not, one change at a time, two seeds each. Hours, too, and resumable.
-trial_base :=
-trial_layer_norm := --layer-norm
-trial_prioritized := --priority-exponent 0.6 --importance-exponent 0.4
-trial_ema_latent := --latent-target ema
-trial_ema_memory := --target-memory ema
-trial_curiosity := --curiosity 0.1 --curiosity-scale std
-trial_shortcut := --head-input hidden+embedding
-trial_raw_observations := --no-normalize-observations --no-fill-blanks
-TRIALS := base layer_norm prioritized ema_latent ema_memory curiosity shortcut raw_observations
-
-trial: $(STAMP)
-	$(foreach name,$(TRIALS),$(foreach seed,1 2,$(BIN)/rmc train HalfCheetah-v5 --seed $(seed) --total-steps 100000 --run-dir runs/trial-$(name)-$(seed) $(trial_$(name)) && )) true
-
-# With flicker, what the flag of blank frames is worth; and windows that begin with a stored state or with none.
-MEMORY40 := --hidden 64 --embedding 64 --heads 128 128 --head-input hidden+embedding --normalize-observations --learning-rate 5e-4 \
-	--polyak 0.99 --target-memory ema --batch-size 16 --capacity 5000 --warmup-steps 1000 --priority-exponent 0 \
-	--episodes 10 --replay-ratio 96 --alpha-learning-rate 5e-3 --trained-steps 42 --stride 14
-
-comparisons: $(STAMP)
-	for seed in 1 2 3 4 5; do for flag in no-blank-flag blank-flag; do $(BIN)/rmc train InvertedPendulum-v5 --flicker 0.5 --$$flag --seed $$seed --total-steps 30000 --run-dir runs/flicker-$$flag-$$seed || exit; done; done
-	for seed in 1 2 3; do for state in zero burn-in; do $(BIN)/rmc train tests.memory_env:Memory40-v0 $(MEMORY40) --state-strategy $$state --seed $$seed --total-steps 60000 --run-dir runs/memory40-$$state-$$seed || exit; done; done
 
 docs: $(STAMP)
 	$(BIN)/python -m docs.generate

@@ -20,7 +20,7 @@ from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Ack, Bus, Version
 from rmc.common.env.make import checked_reset, recreate_env
 from rmc.common.env.wrappers import Env, Floats
-from rmc.common.errors import BusFull, BusUnavailable, FencedError, MessageError
+from rmc.common.errors import BusFull, BusUnavailable, EnvFault, FencedError, MessageError
 from rmc.common.metrics import Means, Rate
 from rmc.common.window import Rows, WindowSpec
 
@@ -282,7 +282,7 @@ class Actor:
         if not (np.isfinite(self._observation).all() and np.isfinite(self._reward).all()):
             sound = np.isfinite(self._observation).all(1) & np.isfinite(self._reward)
             for i in np.flatnonzero(~sound).tolist():
-                self._faults.setdefault(i, ValueError("its observation or reward is not finite"))
+                self._faults.setdefault(i, EnvFault("the environment's observation or reward is not finite"))
         for i in self._faults:
             self._observation[i] = self._reward[i] = 0.0
             self._terminated[i] = self._truncated[i] = False
@@ -292,7 +292,7 @@ class Actor:
 
         Raises the error where environments break at the start of one episode after the other: they always will.
         """
-        log.warning("%s: environment %d broke in step %d of an episode: %r", self.name, i, self._lengths[i], error)
+        log.warning("%s: environment %d broke in step %d of an episode: %s", self.name, i, self._lengths[i], error)
         self._broken += 1
         self._broken_starts = self._broken_starts + 1 if self._lengths[i] <= 1 else 0
         if self._broken_starts >= BROKEN_STARTS:
@@ -315,7 +315,7 @@ class Actor:
         try:
             observation, info = checked_reset(self._envs[env], seed)
         except Exception as error:
-            log.warning("%s: environment %d broke in a reset: %r", self.name, env, error)
+            log.warning("%s: environment %d broke in a reset: %s", self.name, env, error)
             self._broken += 1
             self._envs[env] = recreate_env(self._envs[env], self._make_env)
             observation, info = checked_reset(self._envs[env], self._new_seed(env))

@@ -1,6 +1,6 @@
 """The evaluator: plays whole episodes with the policy's mean, without exploring.
 
-Shapes: N episodes played side by side, O observation, A action, S state.
+Shapes: N environments, here always one, O observation, A action, S state.
 """
 
 import logging
@@ -8,7 +8,7 @@ import math
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Protocol
 
@@ -21,7 +21,7 @@ from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Bus, Version
 from rmc.common.env.make import checked_reset, recreate_env
 from rmc.common.env.wrappers import Env, Floats
-from rmc.common.errors import BusFull, BusUnavailable, ConfigError, MessageError, RmcError
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError, EnvFault, MessageError
 
 log = logging.getLogger(__name__)
 POLL_SECONDS = 0.1  # between looks for a policy to play
@@ -55,86 +55,114 @@ class PolicyLike(Protocol):
 
 
 class Rollout:
-    """The first episode of each of N environments, played to its end; those that ended stand still.
+    """Deterministic episodes of one environment, one after the other: how many there are changes none of them.
 
-    Without a time limit, an episode's first 10 000 steps are what counts.
+    Without a time limit, an episode's first 10 000 steps are what counts. One in which the environment breaks counts
+    for nothing. After ``seconds`` (0: never) no more is played; the first episode then counts as far as it came.
     """
 
-    def __init__(self, runner: PolicyLike, envs: Sequence[Env], seed: int) -> None:
-        """``runner`` is for N environments. The i-th one is reset with seed + i."""
-        self._runner, self._envs = runner, envs
-        shape = envs[0].observation_space.shape
-        self._observation = np.zeros((len(envs), *(shape or ())), np.float32)
-        self._prev_action, self._state = runner.start()
-        self._playing = np.ones(len(envs), np.bool_)
-        self._missing, self.broken = np.zeros((2, len(envs)), np.bool_)
-        self._returns = np.zeros(len(envs))
-        self.steps = self._rounds = 0
-        for i in range(len(envs)):
-            self._guarded(i, self._reset, seed + i)
-        limited = all(env.spec is not None and env.spec.max_episode_steps is not None for env in envs)
+    def __init__(
+        self,
+        runner: PolicyLike,
+        env: Env,
+        make_env: Callable[[], Env],
+        episodes: int,
+        seed: int,
+        seconds: float = 0.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``env`` is replaced where it breaks. Episode k is reset with seed + k."""
+        self._runner, self.env, self._make_env, self._clock = runner, env, make_env, clock
+        self._seed, self.episodes = seed, episodes
+        self._deadline = clock() + seconds if seconds else math.inf
+        limited = env.spec is not None and env.spec.max_episode_steps is not None
         self._longest = sys.maxsize if limited else LONGEST_EPISODE
-
-    def step(self) -> bool:
-        """One step of every episode that goes on; whether any does."""
-        self._rounds += 1
-        action, state = self._runner.act(self._observation, self._prev_action, self._missing, self._state, None)
-        self._prev_action, self._state[:] = action, state
-        for i in np.flatnonzero(self._playing).tolist():
-            self._guarded(i, self._step_environment, action[i])
-        return bool(self._playing.any())
-
-    def _guarded(self, i: int, action: Callable[[int, Any], None], argument: Any) -> None:
-        """What an environment breaks in ends its episode, which then counts for nothing."""
-        try:
-            action(i, argument)
-        except Exception as error:
-            log.warning("environment %d of an evaluation broke: %r", i, error)
-            self._playing[i], self.broken[i] = False, True
-            self._observation[i] = 0.0
-
-    def _reset(self, i: int, seed: int) -> None:
-        self._observation[i], info = checked_reset(self._envs[i], seed)
-        self._missing[i] = info.get("missing", False)
-
-    def _step_environment(self, i: int, action: Floats) -> None:
-        self._observation[i], reward, terminated, truncated, info = self._envs[i].step(action)
-        if not (np.isfinite(self._observation[i]).all() and math.isfinite(reward)):
-            raise ValueError("its observation or reward is not finite")
-        self._missing[i] = info.get("missing", False)
-        self._returns[i] += float(reward)
-        self.steps += 1
-        self._playing[i] = not (terminated or truncated or self._rounds >= self._longest)
+        self.returns: list[float] = []  # of the episodes that are over
+        self.broken = self.steps = 0
+        self.fault: Exception | None = None  # what an environment broke in last
+        self.cut = False
+        self._prev_action, self._state = runner.start()
+        self._length = -1  # of the episode; it has not begun
 
     @property
-    def returns(self) -> NDArray[np.float64]:
-        """Of the episodes in which the environment did not break."""
-        return self._returns[~self.broken]
+    def episode(self) -> int:
+        """Which one is played, from 0 on."""
+        return len(self.returns) + self.broken
+
+    def step(self) -> bool:
+        """One reset or step; whether there is more to play."""
+        if self._length >= 0:
+            action, state = self._runner.act(self._seen, self._prev_action, self._missing, self._state, None)
+            self._prev_action, self._state[:] = action, state
+        try:
+            over = self._begin() if self._length < 0 else self._step_environment(self._prev_action[0])
+        except Exception as error:
+            if str(error) != str(self.fault):  # once, however many break alike
+                log.warning("episode %d of an evaluation broke: %s", self.episode, error)
+            self.fault = error
+            self.broken, self._length = self.broken + 1, -1
+            self.env = recreate_env(self.env, self._make_env)
+            over = False
+        self._judge(over)
+        return self.episode < self.episodes and not self.cut
+
+    def _begin(self) -> bool:
+        observation, info = checked_reset(self.env, self._seed + self.episode)
+        self._prev_action, self._state = self._runner.start()
+        self._see(observation, info)
+        self._length, self._return = 0, 0.0
+        return False
+
+    def _step_environment(self, action: Floats) -> bool:
+        """Whether the episode is over."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if not (np.isfinite(observation).all() and math.isfinite(reward)):
+            raise EnvFault("the environment's observation or reward is not finite")
+        self._see(observation, info)
+        self._return += float(reward)
+        self.steps += 1
+        self._length += 1
+        return bool(terminated or truncated or self._length >= self._longest)
+
+    def _see(self, observation: Floats, info: dict[str, Any]) -> None:
+        self._seen, self._missing = observation[None], np.array([bool(info.get("missing", False))])
+
+    def _judge(self, over: bool) -> None:
+        late = self._clock() >= self._deadline
+        self.cut = late and not over and (self._length > 0 or bool(self.returns))
+        if over or (self.cut and not self.returns):
+            self.returns.append(self._return)
+            self._length = -1
 
 
-def play_episodes(runner: PolicyLike, make_env: Callable[[], Env], episodes: int, seed: int) -> list[float]:
-    """Returns of so many deterministic episodes, played as one batch; ``runner`` is for as many environments.
+def play_episodes(
+    runner: PolicyLike,
+    make_env: Callable[[], Env],
+    episodes: int,
+    seed: int,
+    seconds: float = 0.0,
+    watch: Callable[[Rollout], None] = lambda _: None,
+) -> Rollout:
+    """So many deterministic episodes, as a ``Rollout``, which ``watch`` sees after each step.
 
-    Those in which the environment broke are left out. Raises RmcError where none is left.
+    Those in which the environment broke are left out. Raises EnvFault where none is left.
     """
-    envs = [make_env() for _ in range(episodes)]
+    match = Rollout(runner, make_env(), make_env, episodes, seed, seconds)
     try:
-        match = Rollout(runner, envs, seed)
         while match.step():
-            pass
+            watch(match)
     finally:
-        for env in envs:
-            env.close()
-    if not match.returns.size:
-        raise RmcError(f"the environment broke in each of {episodes} episodes; see what is said above")
-    return [float(value) for value in match.returns]
+        match.env.close()
+    if not match.returns:
+        raise EnvFault(f"the environment broke in each of {match.broken} episodes: {match.fault}")
+    return match
 
 
 class Evaluator:
     """A role: plays every policy that the learner asks to have played, the newest first.
 
-    One ``step`` is one step of all its episodes. Every evaluation starts from the same seeds, so that two
-    policies are compared on the same starts.
+    One ``step`` is one of an episode's. Every evaluation starts from the same seeds, so that two policies are
+    compared on the same starts.
     """
 
     name = "evaluator"
@@ -151,12 +179,12 @@ class Evaluator:
         """``seed`` is the run's; ``clock`` times the looks for new policies."""
         if config.episodes < 1:
             raise ConfigError("--episodes", config.episodes, "at least 1")
-        self._seed, self._bus, self._clock = first_start(seed), bus, clock
-        self._make_env, self._envs = make_env, [make_env() for _ in range(config.episodes)]
-        observation, action = self._envs[0].observation_space.shape, self._envs[0].action_space.shape
+        self._seed, self._bus, self._clock, self._config = first_start(seed), bus, clock, config
+        self._make_env, self._env = make_env, make_env()
+        observation, action = self._env.observation_space.shape, self._env.action_space.shape
         assert observation
         assert action
-        self._runner = PolicyRunner(observation[0], action[0], agent, config.episodes)
+        self._runner = PolicyRunner(observation[0], action[0], agent, envs=1)
         self._version = Version(0, -1)  # the newest that was looked at: none yet
         self._refused_weights = 0
         self._match: Rollout | None = None
@@ -169,10 +197,10 @@ class Evaluator:
             self._match = self._begin()
         if self._match is None:
             return False
-        if not self._match.step():
+        going_on = self._match.step()
+        self._env = self._match.env
+        if not going_on:
             self._records.append(_record(self._match, self._version))
-            for i in np.flatnonzero(self._match.broken).tolist():
-                self._envs[i] = recreate_env(self._envs[i], self._make_env)
             self._match = None
         return True
 
@@ -185,7 +213,10 @@ class Evaluator:
         if found is None:
             return None
         self._version, blob = found
-        return Rollout(self._runner, self._envs, self._seed) if self._load(blob) else None
+        if not self._load(blob):
+            return None
+        episodes, seconds = self._config.episodes, self._config.evaluation_seconds
+        return Rollout(self._runner, self._env, self._make_env, episodes, self._seed, seconds, self._clock)
 
     def _load(self, blob: bytes) -> bool:
         """Whether it is a policy; what cannot be read is refused, and the next one is waited for."""
@@ -211,18 +242,21 @@ class Evaluator:
             while self._records:
                 self._bus.emit(self.name, {"time": time.time(), **self._records[0]})
                 self._records.popleft()
-        for env in self._envs:
-            env.close()
+        self._env.close()
+
+
+def told(match: Rollout) -> dict[str, Any]:
+    """What an evaluation is told by, in records and results."""
+    return {
+        "eval_return_mean": float(np.mean(match.returns)),
+        "eval_return_std": float(np.std(match.returns)),
+        "eval_episodes": len(match.returns),
+        "eval_cut": int(match.cut),
+    }
 
 
 def _record(match: Rollout, version: Version) -> dict[str, Any]:
-    broken = {"eval_broken_episodes": int(match.broken.sum())}
-    if not match.returns.size:
+    broken = {"eval_broken_episodes": match.broken}
+    if not match.returns:
         return broken
-    return broken | {
-        "eval_return_mean": float(match.returns.mean()),
-        "eval_return_std": float(match.returns.std()),
-        "eval_episodes": len(match.returns),
-        "eval_steps": match.steps,
-        "eval_update": version.update,
-    }
+    return broken | told(match) | {"eval_steps": match.steps, "eval_update": version.update}

@@ -26,14 +26,16 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from rmc.actors.evaluator import first_start, play_episodes
+from rmc.actors.config import EvaluatorConfig
+from rmc.actors.evaluator import first_start, play_episodes, told
 from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, read, validate
-from rmc.analysis.evaluation import FINAL_EPISODES
-from rmc.common.env.make import first_env, make_env
+from rmc.analysis.evaluation import FINAL_EPISODES, Progress, Watch
+from rmc.common.env.make import env_spaces, make_env
 from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
-from rmc.deploy.run.folder import RunFolder, make, read_object, write_whole
+from rmc.common.whole_file import write_whole
+from rmc.deploy.run.folder import RunFolder, make, new_folder, read_object
 
 CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
 STOPPED = 130  # exit status after Ctrl-C, as shells have it
@@ -45,8 +47,8 @@ MODEL, BUFFER, SCALES, PROGRESS = "model.zip", "replay_buffer.pkl", "scales.pkl"
 def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: StopSignal) -> int:
     """Train to the end, or to a stop signal; the exit status. Raises ConfigError before anything is written."""
     validate(config)
-    first_env(config.env).close()
-    folder = _open_folder(config, run_dir)
+    sizes = _sizes(config)
+    folder = _open_folder(config, run_dir, sizes)
     try:
         _set_torch(config)
         console.print(f"run folder {folder.path}", soft_wrap=True)
@@ -75,11 +77,17 @@ def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: 
     return 0
 
 
-def _open_folder(config: BaselineConfig, run_dir: Path | None) -> RunFolder:
+def _sizes(config: BaselineConfig) -> dict[str, int]:
+    """What its networks are made for. Raises ConfigError."""
+    observations, actions, _ = env_spaces(config.env)
+    return {"observations": observations, "actions": actions}
+
+
+def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, int]) -> RunFolder:
     """Make or take up a run's folder, locked, as ``open_run``. Raises ConfigError."""
     env = config.env.id.replace(":", "_").replace("/", "_")
     name = f"{env}__{config.algorithm}-{config.settings}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
-    folder = RunFolder(run_dir or Path("runs") / name)
+    folder = RunFolder(run_dir) if run_dir is not None else new_folder(Path("runs").resolve() / name)
     about, now = folder.path / "config.json", json.loads(json.dumps(asdict(config)))
     if about.exists() and folder.is_baseline():
         was = folder.settings()
@@ -87,12 +95,14 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None) -> RunFolder:
             if key not in ("total_steps", "threads") and was.get(key) != now[key]:
                 fix = f"the run in {folder.path} has {was.get(key)!r}; use that, or another --run-dir"
                 raise ConfigError(f"--{key.replace('_', '-')}", now[key], fix)
+        folder.check_sizes(config.env.id, sizes)
     elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no baseline's; give another one")
     make(folder)
     folder.lock()
     folder.reopen(config.total_steps)
     write_whole(about, f"{json.dumps(now, indent=2)}\n".encode())
+    folder.write_sizes(sizes)
     for left in set(folder.checkpoints.glob("[0-9]*")) - set(_states(folder)):  # by a crash amid a save
         shutil.rmtree(left)
     return folder
@@ -128,18 +138,18 @@ def _grow(buffer: ReplayBuffer, size: int) -> None:
 
 
 class SB3Adapter:
-    """A model as our evaluator plays an agent; its memory, if it has one, is kept in here."""
+    """A model as our evaluator plays an agent, in one environment; its memory, if it has one, is kept in here."""
 
-    def __init__(self, model: Any, scaled: Callable[[Floats], Floats], envs: int) -> None:
-        self._model, self._scaled, self._envs = model, scaled, envs
+    def __init__(self, model: Any, scaled: Callable[[Floats], Floats]) -> None:
+        self._model, self._scaled = model, scaled
         self._state: Any = None
-        self._begins = np.ones(envs, np.bool_)
+        self._begins = np.ones(1, np.bool_)
 
     def start(self) -> tuple[Floats, Floats]:
         """Previous actions (N, A), and in place of a state (N, 0), at the start of episodes."""
-        self._state, self._begins = None, np.ones(self._envs, np.bool_)
+        self._state, self._begins = None, np.ones(1, np.bool_)
         sizes = (*self._model.action_space.shape, 0)
-        actions, nothing = (np.zeros((self._envs, size), np.float32) for size in sizes)
+        actions, nothing = (np.zeros((1, size), np.float32) for size in sizes)
         return actions, nothing
 
     def act(
@@ -148,7 +158,7 @@ class SB3Adapter:
         """(N, O) -> (N, A), as ``PolicyRunner.act``; of the rest nothing is used."""
         seen = self._scaled(observation)
         action, self._state = self._model.predict(seen, self._state, self._begins, deterministic=True)
-        self._begins = np.zeros(self._envs, np.bool_)
+        self._begins = np.zeros(1, np.bool_)
         return action.astype(np.float32), state
 
 
@@ -260,8 +270,10 @@ class _Run(BaseCallback):
     # -- evaluation and records -------------------------------------------------------------------------
 
     def _play(self, episodes: int, final: bool) -> dict[str, Any]:
-        opponent, seed = SB3Adapter(self._model, _scaled_by(self._vec), episodes), first_start(self.config.seed, final)
-        return _returns(play_episodes(opponent, lambda: make_env(self.config.env), episodes, seed))
+        opponent, seed = SB3Adapter(self._model, _scaled_by(self._vec)), first_start(self.config.seed, final)
+        watch = Progress(self._console, f"evaluation at step {self.steps:,}")
+        seconds = EvaluatorConfig.evaluation_seconds
+        return told(play_episodes(opponent, lambda: make_env(self.config.env), episodes, seed, seconds, watch))
 
     def _first_evaluation(self) -> float:
         """Of what it was before any training, once for the folder."""
@@ -303,11 +315,12 @@ class _Run(BaseCallback):
         }
 
 
-def evaluate(folder: RunFolder, episodes: int, flicker: float | None = None) -> dict[str, Any]:
+def evaluate(folder: RunFolder, episodes: int, flicker: float | None, seconds: float, watch: Watch) -> dict[str, Any]:
     """Deterministic episodes of what a baseline's run saved last, as ``evaluate_checkpoint``. Raises ConfigError."""
     config, states = read(folder), _states(folder)
     if not states:
         raise ConfigError("RUN", str(folder.path), "it has no checkpoint yet; train it for longer")
+    folder.check_sizes(config.env.id, _sizes(config))
     _set_torch(config)
     progress = read_object(states[-1] / PROGRESS, "env_steps", "updates")
     env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
@@ -317,15 +330,10 @@ def evaluate(folder: RunFolder, episodes: int, flicker: float | None = None) -> 
         model = CLASSES[config.algorithm].load(states[-1] / MODEL, device="cpu")
         scaled = _scaled_by(VecNormalize.load(str(scales), bare) if scales.exists() else bare)
     seed = first_start(config.seed, final=True)
-    returns = play_episodes(SB3Adapter(model, scaled, episodes), lambda: make_env(env), episodes, seed)
+    match = play_episodes(SB3Adapter(model, scaled), lambda: make_env(env), episodes, seed, seconds, watch)
     bare.close()
     about = {"env": env.id, "preset": config.name, "seed": config.seed, **progress}
-    return about | _returns(returns) | {"eval_flicker": env.flicker}
-
-
-def _returns(returns: list[float]) -> dict[str, Any]:
-    mean, std = float(np.mean(returns)), float(np.std(returns))
-    return {"eval_return_mean": mean, "eval_return_std": std, "eval_episodes": len(returns)}
+    return about | told(match) | {"eval_flicker": env.flicker}
 
 
 def _scaled_by(vec: VecEnv) -> Callable[[Floats], Floats]:

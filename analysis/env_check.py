@@ -13,12 +13,20 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from rmc.common.env.config import EnvConfig
+from rmc.common.env.faults import RAISED, told
 from rmc.common.env.make import first_env
+from rmc.common.env.process_state import changes
+from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Floats
+from rmc.common.errors import EnvFault
 
-BESIDE_THE_POINT = ("is -infinity", "is infinity", "symmetric and normalized")  # of vectors and stretched actions
+BESIDE_THE_POINT = (  # of vectors, stretched actions, and what watches the environment
+    "is -infinity", "is infinity", "symmetric and normalized", "different from the unwrapped version",
+)  # fmt: skip
 REPEATED_STEPS = 50  # played twice from one seed
 LARGE_REWARD = 100.0  # mean size of a step's reward from which the critics start far from their target
+LARGEST_REWARD = 1e4  # of one step, from which it outweighs all others in a batch
+SMALL_REWARD = 1e-3  # largest size of a step's reward up to which the critics see nothing of it
 LISTED = 20  # dimensions named in a note
 LARGE_OBSERVATION = 1e4  # from which float32 and a running mean lose precision
 
@@ -55,7 +63,7 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
     """Print facts, notes and faults; 0 where there is no fault, else 1. Raises ConfigError as ``rmc train`` would."""
     env, played = first_env(config), Played()
     stages: list[Callable[[], Iterable[str]]] = [
-        lambda: _gymnasiums_notes(env),
+        lambda: _gymnasiums_notes(WatchedEnv(env.unwrapped, config.id, config.env_timeout)),
         lambda: _guarded(lambda: played.play(env, steps, seed=0)),
         lambda: _nonsense(played),
         lambda: _hints(env, played),
@@ -63,6 +71,8 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
     found: list[str] = []
     while stages and not _faults(found):  # what comes later needs what was before to be sound
         found += stages.pop(0)()
+    if changed := changes():
+        found.append(f"note: it changes {', '.join(changed)} of its process; training keeps its own apart")
     for line in [*_facts(env, played), *dict.fromkeys(found)]:
         console.print(line, soft_wrap=True)
     env.close()
@@ -75,9 +85,9 @@ def _faults(found: list[str]) -> list[str]:
     return [text for text in found if text.startswith("fault: ")]
 
 
-def _gymnasiums_notes(env: Env) -> Iterator[str]:
+def _gymnasiums_notes(env: gym.Env[Any, Any]) -> Iterator[str]:
     """What gymnasium's own checks find: worth a look, but what counts is whether it can be played."""
-    for text in _guarded(lambda: gymnasiums_checks(env.unwrapped, skip_render_check=True, skip_close_check=True)):
+    for text in _guarded(lambda: gymnasiums_checks(env, skip_render_check=True, skip_close_check=True)):
         if not any(words in text for words in BESIDE_THE_POINT):
             yield "note: gymnasium says: " + text.partition(": ")[2]
 
@@ -88,8 +98,10 @@ def _guarded(action: Callable[[], None]) -> Iterator[str]:
         warnings.simplefilter("always")
         try:
             action()
-        except Exception as error:  # whatever a user's environment raises is a finding
-            yield f"fault: {type(error).__name__}: {' '.join(str(error).split())}"
+        except EnvFault as fault:
+            yield f"fault: {fault}"
+        except RAISED as error:  # whatever a user's environment raises is a finding
+            yield f"fault: {told(error)}"
     for text in dict.fromkeys(_plain(str(warning.message)) for warning in caught):
         yield f"note: {text}"
 
@@ -117,6 +129,9 @@ def _nonsense(played: Played) -> Iterator[str]:
     for name, values in (("observation", observations), ("reward", np.array(played.rewards))):
         if not np.isfinite(values).all():
             yield f"fault: {name}s are not finite; such an episode is dropped and its environment made anew"
+    largest = max(map(abs, played.rewards), default=0.0)
+    if float(np.finfo(np.float32).max) < largest < np.inf:
+        yield f"fault: rewards reach {largest:.3g}, past what float32 holds (3e+38); scale them in the environment"
 
 
 def _hints(env: Env, played: Played) -> Iterator[str]:
@@ -126,15 +141,22 @@ def _hints(env: Env, played: Played) -> Iterator[str]:
         yield f"note: observations {_listed(still)} never changed"
     if np.abs(observations).max() > LARGE_OBSERVATION:
         yield f"note: observations reach {np.abs(observations).max():.3g}; scale them in the environment"
-    if np.abs(rewards).mean() > LARGE_REWARD:
-        scale = 1.0 / np.abs(rewards).mean()
-        yield f"note: rewards are large; try --reward-scale {scale:.1g}"
+    yield from _reward_notes(np.abs(rewards))
     if not rewards.any():
         yield "note: no random step was rewarded; learning will need luck, or curiosity (--curiosity)"
     if not played.lengths:
         yield "note: no episode ended; without a time limit an evaluation stops at 10 000 steps (--time-limit)"
     if not np.array_equal(_again(env), _again(env)):
         yield "note: the same seed and actions gave other observations; runs will not be repeatable"
+
+
+def _reward_notes(sizes: NDArray[np.float64]) -> Iterator[str]:
+    """After the scale that is proposed, the mean size is 1 at most, and the largest a hundred."""
+    scale = min(1.0 / max(sizes.mean(), 1e-300), LARGE_REWARD / max(sizes.max(), 1e-300))
+    if sizes.mean() > LARGE_REWARD or sizes.max() > LARGEST_REWARD:
+        yield f"note: rewards are large, up to {sizes.max():.3g} a step; try --reward-scale {scale:.1g}"
+    if 0.0 < sizes.max() < SMALL_REWARD:
+        yield f"note: rewards are small, {sizes.max():.3g} a step at most; try --reward-scale {scale:.1g}"
 
 
 def _listed(numbers: list[int]) -> str:

@@ -2,15 +2,16 @@
 
 import dataclasses
 import json
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
 import safetensors.torch
 import torch
+from rich.console import Console
 
-from rmc.actors.evaluator import first_start, play_episodes
+from rmc.actors.evaluator import Rollout, first_start, play_episodes, told
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.common.agent import Agent
 from rmc.common.checkpoint import POLICY, PROGRESS, STATE, CheckpointFolder
@@ -20,22 +21,41 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
 FINAL_EPISODES = 10  # of a run's first and last evaluation
+SAY_SECONDS = 10.0  # between lines that an evaluation goes on
+Watch = Callable[[Rollout], None]
 
 
-def evaluate_blob(config: RunConfig, blob: bytes, episodes: int, flicker: float | None = None) -> dict[str, Any]:
-    """Deterministic episodes of a policy: mean, standard deviation and number of returns."""
+class Progress:
+    """Prints now and then how far an evaluation is."""
+
+    def __init__(self, console: Console, what: str) -> None:
+        self._console, self._what, self._due = console, what, time.monotonic() + SAY_SECONDS
+
+    def __call__(self, match: Rollout) -> None:
+        """After each step."""
+        if time.monotonic() >= self._due:
+            self._due = time.monotonic() + SAY_SECONDS
+            at = f"episode {match.episode + 1} of {match.episodes}, {match.steps:,} steps"
+            self._console.print(f"{self._what}: {at}", soft_wrap=True)
+
+
+def evaluate_blob(
+    config: RunConfig,
+    blob: bytes,
+    episodes: int,
+    flicker: float | None = None,
+    seconds: float = 0.0,
+    watch: Watch = lambda _: None,
+) -> dict[str, Any]:
+    """Deterministic episodes of a policy, cut after ``seconds`` (0: never): mean, deviation and number of returns."""
     env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
     spec = config.window_spec()
-    runner = PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, episodes)
+    runner = PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, envs=1)
     runner.load(blob)
     with _one_thread():
-        returns = play_episodes(runner, lambda: make_env(env), episodes, first_start(config.seed, final=True))
-    return {
-        "eval_return_mean": float(np.mean(returns)),
-        "eval_return_std": float(np.std(returns)),
-        "eval_episodes": len(returns),
-        "eval_flicker": env.flicker,
-    }
+        seed = first_start(config.seed, final=True)
+        match = play_episodes(runner, lambda: make_env(env), episodes, seed, seconds, watch)
+    return told(match) | {"eval_flicker": env.flicker}
 
 
 @contextmanager
@@ -50,7 +70,13 @@ def _one_thread() -> Iterator[None]:
 
 
 def evaluate_checkpoint(
-    folder: RunFolder, config: RunConfig, checkpoint: str, episodes: int, flicker: float | None = None
+    folder: RunFolder,
+    config: RunConfig,
+    checkpoint: str,
+    episodes: int,
+    flicker: float | None = None,
+    seconds: float = 0.0,
+    watch: Watch = lambda _: None,
 ) -> dict[str, Any]:
     """Deterministic episodes of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
     progress, blob = load_checkpoint(folder, config, checkpoint)
@@ -60,7 +86,7 @@ def evaluate_checkpoint(
         "seed": config.seed,
         "env_steps": progress["env_steps"],
         "updates": progress["updates"],
-        **evaluate_blob(config, blob, episodes, flicker),
+        **evaluate_blob(config, blob, episodes, flicker, seconds, watch),
     }
 
 
@@ -71,6 +97,7 @@ def load_checkpoint(folder: RunFolder, config: RunConfig, checkpoint: str) -> tu
     The best is of those that were evaluated while it trained, which the last one need not be.
     """
     files, spec = _load(folder, checkpoint), config.window_spec()
+    folder.check_sizes(config.env.id, config.sizes())
     try:
         PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, envs=1).load(files[POLICY])
     except MessageError as error:

@@ -15,11 +15,11 @@ import numpy as np
 
 from rmc.analysis import baseline_settings
 from rmc.common.bus.metrics_record import is_finite
-from rmc.common.env.config import EnvConfig
+from rmc.common.env.config import EnvConfig, write_kwargs
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, option
 from rmc.deploy.run.folder import MAY_CHANGE, RunFolder, flat
-from rmc.deploy.run.presets import preset
+from rmc.deploy.run.presets import preset_config
 
 UNTOLD = MAY_CHANGE | {"seed", "preset", "evaluator.episodes", "env.id"}  # makes no other agent
 
@@ -160,7 +160,7 @@ def _with(name: str, words: list[str]) -> str:
 
 def _changes(config: RunConfig) -> list[str]:
     """Options that differ from the preset's, as they are typed."""
-    was, now = flat(preset(config.preset, config.env)), flat(config)
+    was, now = flat(preset_config(config.preset, config.env)), flat(config)
     return [_typed(path, now[path]) for path in now if path not in UNTOLD and now[path] != was[path]]
 
 
@@ -177,9 +177,11 @@ def _stack(env: EnvConfig) -> list[str]:
 
 def _seen(env: EnvConfig) -> str:
     plain = EnvConfig(env.id)
-    names = [item.name for item in dataclasses.fields(env) if item.name not in ("frame_stack", "env_timeout")]
+    told = ("frame_stack", "env_timeout", "env_kwargs")  # elsewhere, or in words of its own
+    names = [item.name for item in dataclasses.fields(env) if item.name not in told]
     odd = [name for name in names if getattr(env, name) != getattr(plain, name)]
-    return ", ".join([env.id, *(f"{name.replace('_', ' ')} {getattr(env, name)}" for name in odd)])
+    said = (f"{name.replace('_', ' ')} {getattr(env, name)}" for name in odd)
+    return ", ".join([env.id, *write_kwargs(env.env_kwargs), *said])
 
 
 def _evaluations(records: list[dict[str, Any]]) -> list[Evaluation]:

@@ -18,6 +18,7 @@ from rmc.actors.policy_runner import PolicyRunner
 from rmc.analysis.evaluation import load_checkpoint
 from rmc.common.env.make import make_env
 from rmc.common.env.wrappers import Env, Floats
+from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
@@ -36,7 +37,7 @@ class Policy:
     def __init__(self, config: RunConfig, blob: bytes, seed: int = 0) -> None:
         """``blob`` is the safetensors of a policy; ``seed`` is for actions that explore. Raises MessageError."""
         spec = config.window_spec()
-        self.config = config
+        self.config, self._obs_dim = config, spec.obs_dim
         self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, envs=1)
         self._runner.load(blob)
         self._rng = np.random.default_rng(seed)
@@ -53,11 +54,25 @@ class Policy:
     def act(self, observation: Floats, missing: bool = False, explore: bool = False) -> Floats:
         """(O,) -> (A,) in [-1, 1]: the policy's mean, or a sample of it.
 
-        ``missing`` says that the frame is missing (``info["missing"]`` under flicker).
+        ``missing`` says that the frame is missing (``info["missing"]`` under flicker). A policy that fills missing
+        frames also takes one that is not finite for missing. Raises ConfigError for any other that it cannot read.
         """
         noise = self._rng.standard_normal(self._prev_action.shape, np.float32) if explore else None
-        seen = np.asarray(observation, np.float32)[None]
+        seen, missing = self._read(observation, missing)
         action, state = self._runner.act(seen, self._prev_action, np.array([missing]), self._state, noise)
         self._prev_action, self._state[:] = action, state
         found: Floats = action[0].copy()
         return found
+
+    def _read(self, observation: Floats, missing: bool) -> tuple[Floats, bool]:
+        """(O,) -> (1, O), and whether it counts as missing. Raises ConfigError; nothing is remembered of it then."""
+        with np.errstate(over="ignore"):  # infinity, which is judged below
+            seen = np.asarray(observation, np.float32)
+        if seen.shape != (self._obs_dim,):
+            raise ConfigError("observation", f"of shape {seen.shape}", f"the policy reads shape {(self._obs_dim,)}")
+        if not (missing or np.isfinite(seen).all()):
+            missing = True
+            if not self.config.agent.fill_blanks:
+                odd = {i: float(seen[i]) for i in np.flatnonzero(~np.isfinite(seen)).tolist()}
+                raise ConfigError("observation", odd, "give finite numbers, or missing=True where there is none")
+        return seen[None], missing

@@ -1,9 +1,13 @@
 """An episode of a policy as a video, rendered off screen."""
 
+import dataclasses
 import importlib.util
+import inspect
+import json
 import os
 import subprocess
 import sys
+import traceback
 from pathlib import Path
 
 import numpy as np
@@ -12,36 +16,64 @@ from numpy.typing import NDArray
 from rmc.actors.evaluator import LONGEST_EPISODE
 from rmc.analysis.policy import Policy
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.make import make_env
+from rmc.common.env.make import entry_point, find_spec, make_env
 from rmc.common.env.wrappers import Env
-from rmc.common.errors import ConfigError
+from rmc.common.errors import ConfigError, EnvFault
 from rmc.common.extra import how_to_install
 from rmc.deploy.run.folder import check_writable
 
 VIDEOS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
 BACKENDS = ("egl", "osmesa", "glfw")  # MuJoCo's, the ones that need no screen first
+RENDERERS = {"mujoco", "OpenGL", "glfw", "dm_control"}  # packages, and gymnasium's folder of MuJoCo's environments
 PROBE = "import sys; from rmc.analysis.video import probe; probe(sys.argv[1])"
 PROBE_SECONDS = 60
 FRAMES_PER_SECOND = 30
+MODE, PICTURE = "rgb_array", "an array (height, width, 3) of uint8"
+ENVS_FAULT = 3  # exit status of a probe whose environment is at fault
 
 
-def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path) -> float:
-    """Play one deterministic episode and write it to ``out``; its return. Raises ConfigError, before it plays."""
+def prepare(env: EnvConfig, out: Path) -> None:
+    """See that an episode can be filmed, and choose what renders. Raises ConfigError, which says why not."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ConfigError("--video", str(out), f"imageio-ffmpeg is missing; {how_to_install('video')}")
     check_writable("--video", out, VIDEOS)
-    os.environ["MUJOCO_GL"] = _working_backend(env_config, out)
+    fault = _mode_fault(env)
+    if fault is not None:
+        raise ConfigError("--video", str(out), f"{env.id} cannot be filmed: {fault}")
+    os.environ["MUJOCO_GL"] = _working_backend(env, out)
+
+
+def _mode_fault(env: EnvConfig) -> str | None:
+    """Why an environment has no pictures, as far as it can be told without making it."""
+    made_by = entry_point(find_spec(env.id))
+    modes = getattr(made_by, "metadata", {}).get("render_modes", [])
+    if isinstance(made_by, type) and MODE not in modes:
+        return f'its metadata["render_modes"] is {modes}; give it "{MODE}", and a render() that returns {PICTURE}'
+    try:
+        inspect.signature(made_by).bind_partial(render_mode=MODE)
+    except TypeError:
+        return f"it takes no render_mode; let its __init__ take and keep one, for a render() that returns {PICTURE}"
+    except ValueError:  # of a class that is not written in Python
+        return None
+    return None
+
+
+def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path) -> float:
+    """Play one deterministic episode and write it to ``out``; its return. ``prepare`` must have been called.
+
+    Raises EnvFault.
+    """
     from imageio_ffmpeg import write_frames  # an extra
 
     env = make_env(env_config, render=True)
     _follow(env)
     observation, info = env.reset(seed=seed)
-    frame, rate = _frame(env), env.metadata.get("render_fps", FRAMES_PER_SECOND)
+    frame, rate = _frame(env), env.metadata.get("render_fps") or FRAMES_PER_SECOND
     video = write_frames(str(out), (frame.shape[1], frame.shape[0]), fps=rate, macro_block_size=1)
     video.send(None)  # the generator's start
     total = 0.0
     for _ in range(LONGEST_EPISODE):
-        video.send(_frame(env).tobytes())
+        video.send(_frame(env, frame.shape).tobytes())
         action = policy.act(observation, bool(info.get("missing", False)))
         observation, reward, terminated, truncated, info = env.step(action)
         total += float(reward)
@@ -62,10 +94,15 @@ def _follow(env: Env) -> None:
         renderer.camera_id = camera if camera >= 0 else renderer.camera_id
 
 
-def _frame(env: Env) -> NDArray[np.uint8]:
-    """(height, width, 3), both even, as the codec wants them."""
-    frame = np.asarray(env.render(), np.uint8)
-    return frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
+def _frame(env: Env, shape: tuple[int, ...] | None = None) -> NDArray[np.uint8]:
+    """(height, width, 3), both even, as the codec wants them. Raises EnvFault where it is no picture of that shape."""
+    frame = np.asarray(env.render())
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8 or min(frame.shape) < 2:
+        raise EnvFault(f"the environment's render gives {frame.dtype} of shape {frame.shape}; return {PICTURE}")
+    frame = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
+    if shape not in (None, frame.shape):
+        raise EnvFault(f"the environment's render gives shape {frame.shape} after {shape}; keep one size")
+    return frame
 
 
 def _working_backend(env: EnvConfig, out: Path) -> str:
@@ -73,30 +110,46 @@ def _working_backend(env: EnvConfig, out: Path) -> str:
     asked = os.environ.get("MUJOCO_GL")
     said = {}
     for backend in (asked,) if asked else BACKENDS:
-        fault = _fault(backend, env)
-        if fault is None:
+        status, words = _probed(backend, env)
+        if status == 0:
             return backend
-        said[backend] = fault
+        if status == ENVS_FAULT:
+            raise ConfigError("--video", str(out), f"{env.id} cannot be filmed: {words}")
+        said[backend] = words
     reasons = "; ".join(f"{backend}: {reason}" for backend, reason in said.items())
     raise ConfigError("--video", str(out), f"nothing here can render ({reasons}); install libegl1 or libosmesa6")
 
 
-def _fault(backend: str, env: EnvConfig) -> str | None:
-    """Why a backend renders nothing, in a line; None where it does."""
+def _probed(backend: str, env: EnvConfig) -> tuple[int, str]:
+    """How a process ended that rendered a frame with a backend, and the last line that it said."""
     try:
         done = subprocess.run(
-            [sys.executable, "-c", PROBE, env.id],
+            [sys.executable, "-c", PROBE, json.dumps(dataclasses.asdict(env))],
             env={**os.environ, "MUJOCO_GL": backend, "PYTHONPATH": os.pathsep.join(sys.path)},
             capture_output=True, text=True, timeout=PROBE_SECONDS, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:  # a driver that hangs
-        return f"no frame in {PROBE_SECONDS} s"
-    return None if done.returncode == 0 else (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        return 1, f"no frame in {PROBE_SECONDS} s"
+    return done.returncode, (done.stderr.strip().splitlines() or ["no reason given"])[-1]
 
 
-def probe(env_id: str) -> None:
-    """Render one frame. Raises whatever stands in the way."""
-    env = make_env(EnvConfig(env_id), render=True)
-    env.reset(seed=0)
-    if env.render() is None:
-        raise RuntimeError("it renders nothing")
+def probe(env: str) -> None:
+    """Render one frame of an environment, its config as JSON; ends the process where the environment is at fault.
+
+    Raises whatever else stands in the way: what draws for it does not work here.
+    """
+    try:
+        made = make_env(EnvConfig(**json.loads(env)), render=True)
+        made.reset(seed=0)
+        _frame(made)
+    except EnvFault as fault:
+        if fault.__cause__ is not None and _is_renderers(fault.__cause__):
+            raise fault.__cause__ from None
+        sys.stderr.write(f"{fault}\n")
+        sys.exit(ENVS_FAULT)
+
+
+def _is_renderers(error: BaseException) -> bool:
+    """Whether an error comes from a library that draws, which another backend may help."""
+    files = [Path(frame.f_code.co_filename).parts for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return any(set(parts) & RENDERERS and "site-packages" in parts for parts in files)

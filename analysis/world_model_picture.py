@@ -65,6 +65,7 @@ class Insight:
 def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     """The whole agent of a checkpoint, with its world model. Raises ConfigError."""
     spec = config.window_spec()
+    folder.check_sizes(config.env.id, config.sizes())
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
     raw = load_state(folder, checkpoint)
     try:

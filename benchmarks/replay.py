@@ -86,9 +86,9 @@ class Learner:
         sample = self.client.sample(BATCH)
         assert sample.draw is SampleStatus.BATCH
         assert sample.rows is not None
-        assert sample.values is not None
+        assert sample.weights is not None
         self.env_steps = sample.env_steps
-        weights = importance_weights(sample.values, sample.mass, sample.windows, self._exponent)
+        weights = importance_weights(sample.weights, sample.total_weight, sample.windows, self._exponent)
         clear_padding(sample.rows, self.spec)
         raw = torch.from_numpy(sample.rows.view("u1").reshape(BATCH, -1))
         self.batch: Batch = view_batch(raw, torch.from_numpy(weights), self.spec)

@@ -277,7 +277,7 @@ class Agent(nn.Module):
     def unroll(
         self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor
     ) -> tuple[MemoryOutput, Tensor, Tensor]:
-        """The memory along a sequence; its observations, (B, T, O), missing ones filled; and the state after, (B, S)."""
+        """The memory along a sequence; what it read, (B, T, O), missing frames filled; the state after, (B, S)."""
         seen = observation
         if self.fills(missing):
             seen, after = self.fill(observation, missing, prev_action, state)

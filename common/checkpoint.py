@@ -16,6 +16,7 @@ from pathlib import Path
 
 from rmc.common.errors import CheckpointError, ConfigError
 from rmc.common.process.file_lock import take_lock
+from rmc.common.whole_file import write_synced, write_whole
 
 log = logging.getLogger(__name__)
 MANIFEST = "manifest.json"
@@ -67,7 +68,7 @@ class CheckpointFolder:
         try:
             temporary.mkdir(parents=True)
             for name, content in {**files, MANIFEST: _manifest(number, files)}.items():
-                _write(temporary / name, content)
+                write_synced(temporary / name, content)
             _sync_folder(temporary)
             if final.exists():  # a resumed run repeats this number: the new one replaces the old
                 shutil.rmtree(final)
@@ -110,8 +111,7 @@ class CheckpointFolder:
 
     def _note(self, name: str, text: str) -> None:
         with suppress(OSError):
-            _write(self.folder / f".{name}", text.encode())
-            (self.folder / f".{name}").rename(self.folder / name)
+            write_whole(self.folder / name, text.encode())
 
     def _prune(self, written: int) -> None:
         """Drop the damaged, and the whole that are older than the newest few; what a fall back left newer not counted.
@@ -155,9 +155,7 @@ class CheckpointFolder:
     def mark_best(self, number: int, score: float) -> None:
         """Record a checkpoint's evaluation if it is there and beats the best so far."""
         if self.path(number).exists() and score > self._best_record()[1]:
-            temporary = self.folder / f".{BEST}"
-            _write(temporary, json.dumps({"update": number, "eval_return_mean": score}).encode())
-            temporary.rename(self.folder / BEST)
+            write_whole(self.folder / BEST, json.dumps({"update": number, "eval_return_mean": score}).encode())
 
     def best(self) -> int | None:
         """Number of the best checkpoint evaluated so far, if any."""
@@ -183,13 +181,6 @@ def _check_names(path: Path, names: Iterable[str]) -> None:
 def _manifest(number: int, files: Mapping[str, bytes]) -> bytes:
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     return json.dumps({"update": number, "sha256": digests}, indent=1).encode()
-
-
-def _write(path: Path, content: bytes) -> None:
-    with path.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def _sync_folder(folder: Path) -> None:

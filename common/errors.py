@@ -2,6 +2,7 @@
 
 RmcError
 ├── ConfigError          an option, file or environment the user must change (exit status 2)
+├── EnvFault             a user's environment raises, or gives what it may not
 ├── MessageError         a message that is not what its header or the run promises
 ├── FencedError          a newer process has taken this role's name: end yourself
 ├── BusUnavailable       Redis cannot be reached, or answers that it cannot now (worth retrying)
@@ -22,6 +23,10 @@ class ConfigError(RmcError):
     def __init__(self, field: str, value: object, fix: str) -> None:
         super().__init__(f"{field}={value!r}: {fix}")
         self.field, self.value, self.fix = field, value, fix
+
+
+class EnvFault(RmcError):
+    """A user's environment raises, or gives what it may not. The message is one line, with the place in their file."""
 
 
 class MessageError(RmcError):

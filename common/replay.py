@@ -22,16 +22,16 @@ class SampleStatus(Enum):
 
 @dataclass(frozen=True)
 class Sample:
-    """One draw. ``rows`` and ``values`` are None unless ``draw`` is BATCH.
+    """One draw. ``rows`` and ``weights`` are None unless ``draw`` is BATCH.
 
     ``rows`` may be a view into a buffer that the next draw but one overwrites. What was drawn is in proportion to
-    ``values``, priority ** exponent each, of ``mass`` over all ``windows``.
+    ``weights``, priority ** exponent each, of ``total_weight`` over all ``windows``.
     """
 
     draw: SampleStatus
     rows: Rows | None  # (B,)
-    values: NDArray[np.float64] | None  # (B,)
-    mass: float
+    weights: NDArray[np.float64] | None  # (B,)
+    total_weight: float
     windows: int
     env_steps: int  # environment steps committed to the ring so far
     drawn_steps: int  # trained steps drawn so far

@@ -28,23 +28,23 @@ class SharedBatches:
         rows_bytes = batch_size * spec.dtype.itemsize
         self._bytes = np.frombuffer(mmap.mmap(descriptor, shared_bytes(spec, batch_size)), np.uint8).reshape(TURNS, -1)
         self.rows: list[Rows] = [part[:rows_bytes].view(spec.dtype) for part in self._bytes]
-        self.values: list[NDArray[np.float64]] = [part[rows_bytes:].view(np.float64) for part in self._bytes]
+        self.weights: list[NDArray[np.float64]] = [part[rows_bytes:].view(np.float64) for part in self._bytes]
 
-    def put(self, values: NDArray[np.float64]) -> dict[str, int]:
-        """Add the values to rows that lie there already; what the frame says of this turn."""
-        self.values[self.turn][:] = values
-        said = {"turn": self.turn, "crc": crc32(self._bytes[self.turn].data)}
+    def put(self, weights: NDArray[np.float64]) -> dict[str, int]:
+        """Add the weights to rows that lie there already; what the frame says of this turn."""
+        self.weights[self.turn][:] = weights
+        meta = {"turn": self.turn, "crc": crc32(self._bytes[self.turn].data)}
         self.turn = (self.turn + 1) % TURNS
-        return said
+        return meta
 
-    def take(self, said: dict[str, Any]) -> tuple[Rows, NDArray[np.float64]]:
-        """The rows and values of a frame. Raises MessageError."""
-        turn, crc = said.get("turn"), said.get("crc")
+    def take(self, meta: dict[str, Any]) -> tuple[Rows, NDArray[np.float64]]:
+        """The rows and weights of a frame. Raises MessageError."""
+        turn, crc = meta.get("turn"), meta.get("crc")
         if type(turn) is not int or not 0 <= turn < TURNS:
             raise MessageError("turn", f"{turn!r}, want 0 to {TURNS - 1}")
         if crc32(self._bytes[turn].data) != crc:
             raise MessageError("crc", "a batch in shared memory")
-        return self.rows[turn], self.values[turn]
+        return self.rows[turn], self.weights[turn]
 
 
 def shared_bytes(spec: WindowSpec, batch_size: int) -> int:

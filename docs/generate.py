@@ -48,6 +48,7 @@ WHEN = {
     "frame_stack": "to compare a memory with a stack; 1 with a memory",
     "action_repeat": "where a single step changes almost nothing",
     "time_limit": "where episodes do not end, or the end comes too late to learn from",
+    "env_kwargs": "where its `__init__` takes keywords, or must be given some",
     "env_timeout": "up for an environment whose steps or resets take long",
     "burn_in": "up where the past matters for longer than 10 steps",
     "trained_steps": "up to learn longer memories; the network unrolls them one after the other",
@@ -103,6 +104,7 @@ WHEN = {
     "keep_checkpoints": "up to go back further; the best is always kept",
     "precision": "`fp32` to rule rounding out, at half the speed where the CPU has bfloat16",
     "threads": "rarely: on a CPU two threads help only where nothing else runs",
+    "evaluation_seconds": "up where an episode takes minutes",
     "episodes": "up for less noise in what is called the best checkpoint",
 }
 
@@ -168,7 +170,7 @@ def _docstrings(kind: type[Any]) -> dict[str, str]:
 
 
 def _text(value: Any) -> str:
-    if value is None:
+    if value is None or value == {}:
         return "none"
     if isinstance(value, bool):
         return "on" if value else "off"

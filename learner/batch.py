@@ -31,10 +31,12 @@ class Batch:
     importance: Tensor  # (B,)
 
 
-def importance_weights(values: NDArray[np.float64], mass: float, windows: int, exponent: float) -> NDArray[np.float32]:
-    """(N P(i))^-exponent / max, P(i) = value / mass, N windows: (B,) -> (B,)."""
-    weights = (windows * values / mass) ** -exponent
-    scaled: NDArray[np.float32] = (weights / weights.max()).astype(np.float32)
+def importance_weights(
+    weights: NDArray[np.float64], total_weight: float, windows: int, exponent: float
+) -> NDArray[np.float32]:
+    """(N P(i))^-exponent / max, P(i) = weight / total_weight, N windows: (B,) -> (B,)."""
+    importance = (windows * weights / total_weight) ** -exponent
+    scaled: NDArray[np.float32] = (importance / importance.max()).astype(np.float32)
     return scaled
 
 

@@ -76,8 +76,8 @@ def latent_rank(hidden: Tensor) -> tuple[float, float]:
 
 def measurable(rows: Rows, spec: WindowSpec) -> BoolArray:
     """(B,) which windows are full and start after their episode did, when every state is zero."""
-    found: BoolArray = (rows["first"] == 0) & (rows["last"] == spec.steps) & (rows["episode_step"] > spec.burn_in)
-    return found
+    whole: BoolArray = (rows["first"] == 0) & (rows["last"] == spec.steps) & (rows["episode_step"] > spec.burn_in)
+    return whole
 
 
 @torch.no_grad()
@@ -104,19 +104,19 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
         for remembered in (recomputed, replayed)
     )
     gap = (q_replayed - q).abs() / q.abs().max().clamp(min=1e-8)
-    found = {
+    metrics = {
         "stale_state_stored": _distance(*(state[:, : agent.config.hidden] for state in (stored, before))),
         "stale_q_first_stored": gap[0],
         "stale_q_last_stored": gap[spec.train - 1],
     }
     if spec.burn_in:
         burned = spec.burn_in - 1
-        found |= {
+        metrics |= {
             "stale_state_burned": _distance(replayed.hidden[:, burned], recomputed.hidden[:, burned]),
             "stale_q_first_burned": gap[spec.burn_in],
             "stale_q_last_burned": gap[-1],
         }
-    return {name: float(value) for name, value in found.items()}
+    return {name: float(value) for name, value in metrics.items()}
 
 
 def _distance(replayed: Tensor, recomputed: Tensor) -> Tensor:

@@ -34,9 +34,9 @@ def fuse(agent: Agent) -> None:
 
 def _as(kind: type[ModuleT], module: nn.Module) -> ModuleT:
     """The same object's contents under another class, which adds nothing to them."""
-    made = kind.__new__(kind)
-    made.__dict__.update(module.__dict__)
-    return made
+    fused = kind.__new__(kind)
+    fused.__dict__.update(module.__dict__)
+    return fused
 
 
 def _applies(x: Tensor) -> bool:
@@ -206,26 +206,36 @@ class _Heads(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         x, w1, w2, w3, *hidden = ctx.saved_tensors
-        made = [torch.empty_like(w, dtype=torch.float32) for w in (w1, w2, w3)]
+        weight_grads = [torch.empty_like(w, dtype=torch.float32) for w in (w1, w2, w3)]
         biases = [torch.zeros(w.shape[0], w.shape[2]) for w in (w1, w2, w3)]
         wants_features, wants_action, _, wants_weights, *_ = ctx.needs_input_grad
         # of the inputs only those asked for: where the policy climbs Q, that is the action alone
         asked = slice(0 if wants_features else ctx.split, x.shape[1] if wants_action else ctx.split)
         dx = torch.zeros_like(x[:, asked])
         for net, (first, second) in enumerate(zip(hidden[::2], hidden[1::2], strict=True)):
-            d2 = _last_layer_back(grad[net], second, w3[net], made[2][net], biases[2][net], biases[1][net])
+            d2 = _last_layer_back(grad[net], second, w3[net], weight_grads[2][net], biases[2][net], biases[1][net])
             d1 = torch.mm(d2, w2[net].t())
             kernels.relu_back(_bits(d1), _bits(first), biases[0][net].numpy())
             if dx.shape[1]:
                 dx.addmm_(d1, w1[net][asked].t())
             if wants_weights:
-                _product(first, d2, made[1][net])
-                _product(x, d1, made[0][net])
+                _product(first, d2, weight_grads[1][net])
+                _product(x, d1, weight_grads[0][net])
         of_features = dx[:, : ctx.split] if wants_features else None
         of_action = dx[:, ctx.split - x.shape[1] :] if wants_action else None
         if not wants_weights:
             return of_features, of_action, *[None] * 7
-        return of_features, of_action, None, made[0], biases[0], made[1], biases[1], made[2], biases[2]
+        return (
+            of_features,
+            of_action,
+            None,
+            weight_grads[0],
+            biases[0],
+            weight_grads[1],
+            biases[1],
+            weight_grads[2],
+            biases[2],
+        )
 
 
 def _layer(x: Tensor, w: Tensor, b: Tensor) -> Tensor:

@@ -32,6 +32,7 @@ from rmc.learner.update import AVERAGE_UPDATES, UpdateResult, make_update
 log = logging.getLogger(__name__)
 NOT_OURS = (pickle.UnpicklingError, EOFError, RuntimeError, LookupError, ValueError, TypeError, AttributeError)
 METRICS_UPDATES = 20  # updates between looks at the update's metrics: each look waits for the device
+LARGE_REWARD = 1e4  # a step's, from which it is the likely cause of a divergence
 SAVE_AGAIN_SECONDS = 10.0  # after a checkpoint that could not be written
 LOOK_SECONDS = 5.0  # between looks, while waiting, whether Redis still has the weights
 INSIGHT_UPDATES = 500  # updates between looks at what takes longer: the latent's rank and the states' staleness
@@ -71,6 +72,7 @@ class Learner:
         self.finished = self._fenced = self._diverged = self._evaluation_due = False
         self._means, self._rate, self._waiting = Means(), Rate(), ""
         self._unexplained: list[float] = []  # of every observation dimension, since the last look at it
+        self._largest_reward = 0.0  # that was learnt from, as it was scaled
         self._look_at = 0.0  # when to ask next whether Redis still has the weights
         self._published: Version | None = None  # last
         self._save_at, self._checkpoint_error = 0.0, ""
@@ -123,11 +125,12 @@ class Learner:
         return True
 
     def _learn(self, sample: Sample) -> None:
-        rows, values = sample.rows, sample.values
+        rows, values = sample.rows, sample.weights
         assert rows is not None
         assert values is not None
         clear_padding(rows, self.spec)
-        weights = importance_weights(values, sample.mass, sample.windows, self.config.importance_exponent)
+        self._largest_reward = max(self._largest_reward, float(np.abs(rows["reward"]).max()))
+        weights = importance_weights(values, sample.total_weight, sample.windows, self.config.importance_exponent)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
         updated = self._updated(raw, torch.from_numpy(weights), self.update.config.beta(self.env_steps))
         self.updates += 1
@@ -193,9 +196,13 @@ class Learner:
     def _check_finite(self, state: Any) -> None:
         self._diverged = not all(map(is_finite, tensors_in(state)))
         if self._diverged:
-            raise RmcError(
-                f"update {self.updates}: training has diverged, weights are not finite; lower --learning-rate"
-            )
+            raise RmcError(f"update {self.updates}: training has diverged, weights are not finite; {self._remedy()}")
+
+    def _remedy(self) -> str:
+        """What to change after a divergence."""
+        if self._largest_reward < LARGE_REWARD:
+            return "lower --learning-rate"
+        return f"rewards reach {self._largest_reward:.2g}: make --reward-scale that much smaller"
 
     def _freeze_statistics(self) -> None:
         if self.agent.config.normalize_observations and self.env_steps > 0:
@@ -250,13 +257,13 @@ class Learner:
     def _resume(self) -> int:
         """Go on from the newest valid checkpoint; returns the epoch it was written in."""
         self._next_checkpoint = self.config.checkpoint_steps
-        found = self.checkpoints.latest()
+        newest = self.checkpoints.latest()
         self._damaged_checkpoints = len(self.checkpoints.damaged)
-        if found is None:
+        if newest is None:
             if self._damaged_checkpoints:
                 raise CheckpointError(f"{self.checkpoints.folder}: no checkpoint is valid; move the folder away")
             return 0
-        number, files = found
+        number, files = newest
         try:
             state = torch.load(io.BytesIO(files[STATE]), map_location=self.device, weights_only=True)
             self.update.load_state_dict(state)

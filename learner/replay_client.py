@@ -37,7 +37,7 @@ RECEIVE_BUFFER = 8 << 20
 AWAY = (OSError, MessageError, AuthenticationError, ValueError, OverflowError)
 
 
-class Connection:
+class ReplayConnection:
     """One authenticated connection. Blocking, with a timeout."""
 
     def __init__(
@@ -156,10 +156,10 @@ def _equal(given: Any, expected: bytes) -> bool:
 
 def _progress_backup(meta: dict[str, Any]) -> tuple[float, int, int, int]:
     """Mass, windows, env_steps and drawn_steps of an answer to a draw. Raises MessageError."""
-    mass = meta.get("mass")
-    if type(mass) is not float or not 0.0 <= mass < float("inf"):
-        raise MessageError("mass", f"{mass!r:.80}, want a finite number from 0.0 on")
-    return mass, _count(meta, "windows"), _count(meta, "env_steps"), _count(meta, "drawn_steps")
+    total_weight = meta.get("total_weight")
+    if type(total_weight) is not float or not 0.0 <= total_weight < float("inf"):
+        raise MessageError("total_weight", f"{total_weight!r:.80}, want a finite number from 0.0 on")
+    return total_weight, _count(meta, "windows"), _count(meta, "env_steps"), _count(meta, "drawn_steps")
 
 
 def _count(meta: dict[str, Any], name: str) -> int:
@@ -205,7 +205,7 @@ class ReplayClient:
     ) -> None:
         self._tls = tls
         self._address, self._secret, self._spec, self._batch_size = address, secret, spec, batch_size
-        body = batch_size * (spec.dtype.itemsize + 8)  # rows, then float64 values
+        body = batch_size * (spec.dtype.itemsize + 8)  # rows, then float64 weights
         tensors = [torch.empty(body, dtype=torch.uint8, pin_memory=pinned) for _ in range(AHEAD)]
         self._buffers = [tensor.numpy().data for tensor in tensors]
         self._answer = memoryview(bytearray(max(EPISODE_BYTES, spec.dtype.itemsize, 2 * 8 * spec.obs_dim)))
@@ -213,8 +213,8 @@ class ReplayClient:
         self._last = EMPTY_SAMPLE
         self._may_share = not pinned and hasattr(os, "memfd_create")
         self._shared: SharedBatches | None = None
-        self._batches: Connection | None = None
-        self._control: Connection | None = None
+        self._batches: ReplayConnection | None = None
+        self._control: ReplayConnection | None = None
         self._is_away = False  # said in the log already
         self._epoch = 0
 
@@ -233,7 +233,7 @@ class ReplayClient:
 
     def _away(self) -> Sample:
         """What was known last, without a batch."""
-        return replace(self._last, draw=SampleStatus.WAIT, rows=None, values=None)
+        return replace(self._last, draw=SampleStatus.WAIT, rows=None, weights=None)
 
     def _receive_sample(self, drawn_elsewhere_steps: int) -> Sample:
         connection = self._batches = self._batches or self._open_batches()
@@ -248,15 +248,15 @@ class ReplayClient:
         if header.kind is Kind.ERROR:
             connection.raise_error(meta)
         about = _progress_backup(meta)
-        draw, rows, values = SampleStatus.BATCH, None, None
+        draw, rows, weights = SampleStatus.BATCH, None, None
         if header.kind is Kind.SHARED and self._shared is not None:
-            rows, values = self._shared.take(meta)
+            rows, weights = self._shared.take(meta)
         elif header.kind is Kind.BATCH:
-            rows, values = self._split(body)
+            rows, weights = self._split(body)
         else:
             draw = SampleStatus.FINISHED if header.kind is Kind.FINISHED else SampleStatus.WAIT
         self._is_away = False
-        return Sample(draw, rows, values, *about)
+        return Sample(draw, rows, weights, *about)
 
     def _split(self, body: memoryview) -> tuple[Rows, NDArray[np.float64]]:
         split = self._batch_size * self._spec.dtype.itemsize
@@ -264,7 +264,7 @@ class ReplayClient:
             raise MessageError("length", f"{len(body)} bytes for a batch of {self._batch_size}")
         return np.frombuffer(body[:split], self._spec.dtype), np.frombuffer(body[split:], np.float64)
 
-    def _open_batches(self) -> Connection | None:
+    def _open_batches(self) -> ReplayConnection | None:
         address = self._address()
         if address is None:
             return None
@@ -342,11 +342,11 @@ class ReplayClient:
             raise
         return meta, body
 
-    def _open_control(self) -> Connection:
+    def _open_control(self) -> ReplayConnection:
         address = self._address()
         if address is None:
             raise ConnectionError("the replay server is not up yet")
         return self._connect(address, self._answer.nbytes)
 
-    def _connect(self, address: str, max_body: int) -> Connection:
-        return Connection(address, self._secret, self._spec.fingerprint, max_body, self._tls, self._epoch)
+    def _connect(self, address: str, max_body: int) -> ReplayConnection:
+        return ReplayConnection(address, self._secret, self._spec.fingerprint, max_body, self._tls, self._epoch)

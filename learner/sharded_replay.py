@@ -1,8 +1,8 @@
-"""Several replay servers as one: each gives its part of a batch, in proportion to the mass of its priorities.
+"""Several replay servers as one: each gives its part of a batch, in proportion to the weight of its priorities.
 
-Shapes: B windows in a batch, S shards. A window's chance is its value over the mass of all shards, as if one server
-held them all: a shard's part of a batch is how many of B equal strata of the whole mass fall to it, and within it
-the shard draws by its own values. A mass is that of a shard's newest draw. Serials become ``serial * S + shard`` here,
+Shapes: B windows in a batch, S shards. A window's chance is its weight over the total of all shards, as if one server
+held them all: a shard's part of a batch is how many of B equal strata of the whole weight fall to it, and within it
+the shard draws by its own weights. A total is that of a shard's newest draw. Serials become ``serial * S + shard``,
 so that priorities find their way back.
 """
 
@@ -23,23 +23,23 @@ class _Stock:
         self.replay, self.last = replay, EMPTY_SAMPLE
         self._chunk = chunk  # windows of one draw
         self._rows: Rows = np.empty(0, spec.dtype)
-        self._values = np.empty(0)
+        self._weights = np.empty(0)
 
     def fill(self, count: int, drawn_elsewhere_steps: int) -> SampleStatus:
         """Draw until there are ``count`` windows; else why there are not."""
         while len(self._rows) < count:
             self.last = self.replay.sample(self._chunk, drawn_elsewhere_steps)
-            if self.last.rows is None or self.last.values is None:
+            if self.last.rows is None or self.last.weights is None:
                 return self.last.draw
             self._rows = np.concatenate([self._rows, self.last.rows])
-            self._values = np.concatenate([self._values, self.last.values])
+            self._weights = np.concatenate([self._weights, self.last.weights])
         return SampleStatus.BATCH
 
-    def take(self, rows: Rows, values: NDArray[np.float64]) -> None:
+    def take(self, rows: Rows, weights: NDArray[np.float64]) -> None:
         """Fill both with the oldest."""
         count = len(rows)
-        rows[:], values[:] = self._rows[:count], self._values[:count]
-        self._rows, self._values = self._rows[count:], self._values[count:]
+        rows[:], weights[:] = self._rows[:count], self._weights[:count]
+        self._rows, self._weights = self._rows[count:], self._weights[count:]
 
 
 class ShardedReplay:
@@ -67,7 +67,7 @@ class ShardedReplay:
         """
         assert batch_size == self._batch_size, (batch_size, self._batch_size)
         while (live := self._live()).any():
-            parts = live.astype(np.int64) if self._parts is None else self._parts  # one of each: masses are known then
+            parts = live.astype(np.int64) if self._parts is None else self._parts  # one of each: totals are known then
             draws = [
                 stock.fill(part, drawn_elsewhere_steps + self._drawn_outside(stock))
                 for stock, part in zip(self._stocks, parts.tolist(), strict=True)
@@ -91,8 +91,8 @@ class ShardedReplay:
         return sum(other.last.drawn_steps for other in self._stocks if other is not stock)
 
     def _apportion(self, live: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """(S,) how many of B strata of the whole mass fall to each shard."""
-        ends = np.cumsum([stock.last.mass for stock in self._stocks] * live)
+        """(S,) how many of B strata of the whole weight fall to each shard."""
+        ends = np.cumsum([stock.last.total_weight for stock in self._stocks] * live)
         strata = (np.arange(self._batch_size) + self._random.random(self._batch_size)) / self._batch_size
         owners = np.minimum(np.searchsorted(ends, strata * ends[-1], side="right"), len(ends) - 1)
         return np.bincount(owners, minlength=len(ends))
@@ -100,35 +100,36 @@ class ShardedReplay:
     def _gathered(self) -> Sample:
         assert self._parts is not None
         self._buffers.reverse()
-        rows, values, start = self._buffers[0], np.empty(self._batch_size), 0
+        rows, weights, start = self._buffers[0], np.empty(self._batch_size), 0
         for shard, (stock, count) in enumerate(zip(self._stocks, self._parts.tolist(), strict=True)):
             part = slice(start, start + count)
-            stock.take(rows[part], values[part])
+            stock.take(rows[part], weights[part])
             rows["serial"][part] = rows["serial"][part] * len(self._stocks) + shard
             start += count
         self._parts = None
-        return self._sample(SampleStatus.BATCH, rows, values)
+        return self._sample(SampleStatus.BATCH, rows, weights)
 
     def _sample(
-        self, draw: SampleStatus, rows: Rows | None = None, values: NDArray[np.float64] | None = None
+        self, draw: SampleStatus, rows: Rows | None = None, weights: NDArray[np.float64] | None = None
     ) -> Sample:
         last = [stock.last for stock in self._stocks]
-        mass, windows, env_steps, drawn_steps = (
-            sum(getattr(sample, name) for sample in last) for name in ("mass", "windows", "env_steps", "drawn_steps")
+        total_weight, windows, env_steps, drawn_steps = (
+            sum(getattr(sample, name) for sample in last)
+            for name in ("total_weight", "windows", "env_steps", "drawn_steps")
         )
-        return Sample(draw, rows, values, mass, windows, env_steps, drawn_steps)
+        return Sample(draw, rows, weights, total_weight, windows, env_steps, drawn_steps)
 
     def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
         """Give priorities back to the shards that the windows came from."""
         for shard, stock in enumerate(self._stocks):
-            own = serials % len(self._stocks) == shard
-            stock.replay.update_priorities(serials[own] // len(self._stocks), priorities[own])
+            of_shard = serials % len(self._stocks) == shard
+            stock.replay.update_priorities(serials[of_shard] // len(self._stocks), priorities[of_shard])
 
     def statistics(self) -> ObservationStatistics:
         """The sums over all shards."""
-        found = [stock.replay.statistics() for stock in self._stocks]
-        totals, squares = (np.sum([getattr(x, name) for x in found], axis=0) for name in ("total", "total_square"))
-        return ObservationStatistics(sum(x.count for x in found), totals, squares)
+        statistics = [stock.replay.statistics() for stock in self._stocks]
+        totals, squares = (np.sum([getattr(x, name) for x in statistics], axis=0) for name in ("total", "total_square"))
+        return ObservationStatistics(sum(x.count for x in statistics), totals, squares)
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode, which are all in one shard."""

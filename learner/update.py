@@ -66,8 +66,8 @@ class JointUpdate:
 
     def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
         """One update from a Batch; ``beta`` is a scalar tensor."""
-        parts, updated = self.forward(batch, beta)
-        norm = self._step(self.optimizers[0], parts.values())
+        loss_values, updated = self.forward(batch, beta)
+        norm = self._step(self.optimizers[0], loss_values.values())
         self._follow(updated)
         return updated._replace(metrics=updated.metrics | {"grad_norm": norm})
 
@@ -111,17 +111,17 @@ class JointUpdate:
             q_pi = q_pi[0] if c.policy_q == "first" else q_pi.min(0).values
 
         log_pi, td_error = log_pi[:, :-1], (q.detach() - y).abs().mean(0)
-        parts = {
+        loss_values = {
             "model_loss": losses.model_loss(error, d, m),
             "q_loss": losses.q_loss(q, y, batch.importance, m),
             "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, m),
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
         observation_losses, unexplained = self._observation_losses(o, memory, prediction, batch, m)
-        parts |= observation_losses
-        detached = {name: value.detach() for name, value in parts.items()}
+        loss_values |= observation_losses
+        detached = {name: value.detach() for name, value in loss_values.items()}
         trace = Trace(detached, alpha, log_pi.detach(), q.detach(), td_error, i, change, r, d, m)
-        return parts, UpdateResult(
+        return loss_values, UpdateResult(
             priorities=losses.priority(td_error, c.eta, m),
             metrics=update_metrics(trace, beta, c.model_norm),
             curiosity_variance=curiosity_variance,
@@ -137,17 +137,19 @@ class JointUpdate:
         agent, steps = self.agent, slice(self.burn_in, None)
         a, r, seen = batch.action[:, steps], batch.reward[:, steps], _seen(batch)[:, steps]
         now, after, seen_now, seen_after = o[:, steps][:, :-1], o[:, steps][:, 1:], seen[:, :-1], seen[:, 1:]
-        found = {}
+        loss_values = {}
         if agent.next_frame is not None:
             with self._autocast():
                 expected = agent.next_frame(self._to_bf16(memory.hidden.detach()[:, :-1]), now, a)
-            found["fill_loss"] = losses.fill_loss(expected, after, seen_after, m)
+            loss_values["fill_loss"] = losses.fill_loss(expected, after, seen_after, m)
         if not agent.config.grounding:
-            return found, o.new_zeros(0)
+            return loss_values, o.new_zeros(0)
         predicted = now + prediction.observation_change.float()
         grounded = seen_after if agent.config.fill_blanks else seen_after * seen_now
-        found["grounding_loss"] = losses.grounding_loss(predicted, after, prediction.reward.float(), r, grounded, m)
-        return found, unexplained_change(predicted.detach() - now, after - now, m * seen_after * seen_now)
+        loss_values["grounding_loss"] = losses.grounding_loss(
+            predicted, after, prediction.reward.float(), r, grounded, m
+        )
+        return loss_values, unexplained_change(predicted.detach() - now, after - now, m * seen_after * seen_now)
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
@@ -172,10 +174,10 @@ class JointUpdate:
         running, weight = moved.unbind()
         return i / (running / weight).sqrt().clamp(min=1e-6), moved
 
-    def _step(self, optimizer: torch.optim.Adam, parts: Iterable[Tensor]) -> Tensor:
+    def _step(self, optimizer: torch.optim.Adam, loss_values: Iterable[Tensor]) -> Tensor:
         """Backward from the losses' sum, clip, Adam; returns the gradient's norm before clipping."""
         self.agent.zero_grad(set_to_none=True)
-        sum(parts, torch.zeros_like(self.agent.log_alpha)).backward()  # type: ignore[no-untyped-call]
+        sum(loss_values, torch.zeros_like(self.agent.log_alpha)).backward()  # type: ignore[no-untyped-call]
         gradients = [value.grad for value in self.agent.parameters() if value.grad is not None]
         norm = nn.utils.get_total_norm(gradients)
         if self.config.clip_norm:
@@ -265,12 +267,12 @@ class AlternateUpdate(JointUpdate):
         metrics: dict[str, Tensor] = {}
         norms = []
         for optimizer, (part, names) in zip(self.optimizers, self._stages(), strict=True):
-            parts, found = self.forward(batch, beta)
-            own = {name: loss for name, loss in parts.items() if name in names}
-            norms.append(self._step(optimizer, own.values()))
-            metrics |= {name: found.metrics[name] for name in own}
+            loss_values, stage = self.forward(batch, beta)
+            stage_losses = {name: loss for name, loss in loss_values.items() if name in names}
+            norms.append(self._step(optimizer, stage_losses.values()))
+            metrics |= {name: stage.metrics[name] for name in stage_losses}
             if part == "critic":
-                updated = found
+                updated = stage
         self._follow(updated)
         return updated._replace(metrics=updated.metrics | metrics | {"grad_norm": torch.stack(norms).norm()})
 

@@ -23,7 +23,7 @@ class Frame(NamedTuple):
     body: bytes
 
 
-class Connection:
+class ClientConnection:
     """Buffers of one non-blocking socket. OSError from any method means: it is gone."""
 
     def __init__(self, connection: socket.socket, challenge: bytes) -> None:
@@ -112,7 +112,7 @@ class Connection:
             return self.socket.send(self._unacked[0])
         return self.socket.sendmsg(self._unacked)
 
-    def own(self) -> None:
+    def copy_pending(self) -> None:
         """Copy what is still unsent, because its buffer is about to be used again."""
         if self._zero_copy:
             self._unacked = deque(memoryview(bytes(part)) for part in self._unacked)

@@ -5,7 +5,7 @@ from typing import Any
 
 from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.process.malloc import keep_freed_memory
-from rmc.common.process.role import next_try
+from rmc.common.process.role import RECONNECT_SLEEP
 from rmc.replay_server.server import ReplayServer
 from rmc.replay_server.socket_server import SocketServer
 
@@ -42,9 +42,9 @@ class ReplayProcess:
                 self.sockets.fence(self.server.bus.current_epoch("learner"))  # an older one may come to us first
                 self.server.bus.announce_replay(self.server.owner, self.sockets.address)
         except (BusUnavailable, BusFull):
-            self._bus_is_away, self._next_intake = True, next_try(now)
+            self._bus_is_away, self._next_intake = True, time.monotonic() + RECONNECT_SLEEP
             return False
-        self._wait = 0.0 if took else min(2 * self._wait + FIRST_WAIT, IDLE_WAIT)  # what was asked for ahead is near
+        self._wait = 0.0 if took else min(2 * self._wait + FIRST_WAIT, IDLE_WAIT)
         self._bus_is_away, self._next_intake = False, now + self._wait
         return took
 

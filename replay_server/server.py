@@ -56,7 +56,7 @@ class ReplayServer:
         self._own_actors = [actor for actor in range(actors) if shard.owns(actor)]
         self._share = len(self._own_actors) / actors  # of all that is collected
         self._slack_steps = shard.part(slack_steps, actors)
-        self._intake = StreamReader(spec, bus, actors, shard)
+        self._reader = StreamReader(spec, bus, actors, shard)
         self._store = open_store(folder, spec, -(-config.capacity // shard.count), config.priority_exponent)
         try:
             epoch = self._take_over()
@@ -133,7 +133,7 @@ class ReplayServer:
 
     def step(self) -> bool:
         """Take in one round of entries: ring, commit, acks. False where there was none."""
-        taken = self._intake.read(self._store.ring.progress.streams)
+        taken = self._reader.read(self._store.ring.progress.streams)
         if taken is not None:
             self._owes_acks = True
             self._insert(taken)
@@ -143,7 +143,7 @@ class ReplayServer:
             return False
         for actor, before in taken.broken.items():
             self.bus.drop_stream(self.owner, actor)
-            self._intake.sends_again(actor, before)
+            self._reader.sends_again(actor, before)
         return True
 
     def _insert(self, taken: IngestBatch) -> None:
@@ -320,9 +320,9 @@ class ReplayServer:
             "evicted_priorities": progress.evicted_priorities,
             "refused_priorities": self._refused_priorities,
             "damaged_windows": self._damaged_windows,
-            "entry_gaps": self._intake.gaps,
-            "dead_letters": self._intake.refused.total(),
-            **{f"dead_letters_{reason}": count for reason, count in self._intake.refused.items()},
+            "entry_gaps": self._reader.gaps,
+            "dead_letters": self._reader.refused.total(),
+            **{f"dead_letters_{reason}": count for reason, count in self._reader.refused.items()},
         }
 
     def metrics(self) -> dict[str, Any]:

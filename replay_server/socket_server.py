@@ -32,7 +32,7 @@ from rmc.common.replay import SampleStatus
 from rmc.common.shared_batches import SharedBatches, reserve_memory, shared_bytes
 from rmc.common.window import WindowSpec
 from rmc.common.wire import Kind, proof
-from rmc.replay_server.connection import Connection, Frame
+from rmc.replay_server.connection import ClientConnection, Frame
 from rmc.replay_server.server import ReplayServer
 
 log = logging.getLogger(__name__)
@@ -65,7 +65,7 @@ class SocketServer:
         self._listener, self._path, self.address = _listen(address)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, READ)
-        self._connections: dict[Connection, int] = {}  # and the events each is registered for
+        self._connections: dict[ClientConnection, int] = {}  # and the events each is registered for
         self._learner = 0  # the newest epoch that has introduced itself, or that the bus knows
         self.refused: Counter[str] = Counter()  # connections ended for a fault of theirs, by reason
 
@@ -94,7 +94,7 @@ class SocketServer:
         except OSError:  # it went away again, or has begun by something that is no handshake
             accepted.close()
             return
-        connection = Connection(accepted, os.urandom(NONCE_BYTES))
+        connection = ClientConnection(accepted, os.urandom(NONCE_BYTES))
         self._connections[connection] = READ
         self._selector.register(accepted, READ, connection)
         if connection.encrypted:
@@ -121,7 +121,7 @@ class SocketServer:
             return accepted
         return self._tls.wrap_socket(accepted, server_side=True, do_handshake_on_connect=False)
 
-    def _serve(self, connection: Connection, events: int) -> None:
+    def _serve(self, connection: ClientConnection, events: int) -> None:
         try:
             if not connection.encrypted:
                 if not connection.encrypt():
@@ -140,7 +140,7 @@ class SocketServer:
         except OSError:
             self._end(connection)
 
-    def _handle_frames(self, connection: Connection) -> None:
+    def _handle_frames(self, connection: ClientConnection) -> None:
         while not connection.sending:
             max_body = 12 * self._max_batch if connection.authenticated else 0
             frame = connection.next_frame(max_body)
@@ -151,12 +151,12 @@ class SocketServer:
             else:
                 self._authenticate(connection, frame)
 
-    def _await(self, connection: Connection, events: int) -> None:
+    def _await(self, connection: ClientConnection, events: int) -> None:
         if self._connections[connection] != events:
             self._connections[connection] = events
             self._selector.modify(connection.socket, events, connection)
 
-    def _authenticate(self, connection: Connection, frame: Frame) -> None:
+    def _authenticate(self, connection: ClientConnection, frame: Frame) -> None:
         nonce, given = frame.meta.get("nonce"), frame.meta.get("proof")
         if frame.kind is not Kind.PROOF or not isinstance(nonce, bytes) or len(nonce) != NONCE_BYTES:
             raise AuthenticationError("no proof came")
@@ -169,7 +169,7 @@ class SocketServer:
         answer = proof(self._secret, b"server", nonce, connection.challenge)
         connection.send(Kind.WELCOME, {"proof": answer, "fingerprint": self._spec.fingerprint})
 
-    def _introduce(self, connection: Connection, epoch: Any) -> None:
+    def _introduce(self, connection: ClientConnection, epoch: Any) -> None:
         """Only the newest learner is served, so that one which was stopped and replaced writes nothing any more."""
         if type(epoch) is not int or not 0 <= epoch < 2**62:
             raise AuthenticationError(f"{epoch!r} is no learner's epoch")
@@ -184,7 +184,7 @@ class SocketServer:
         for other in [other for other in self._connections if other.authenticated and other.epoch < epoch]:
             self._refuse(other, "fenced", f"the learner of epoch {other.epoch} was replaced by {epoch}", fenced=True)
 
-    def _handle(self, connection: Connection, frame: Frame) -> None:
+    def _handle(self, connection: ClientConnection, frame: Frame) -> None:
         if frame.kind is Kind.SAMPLE:
             self._sample(connection, frame.meta.get("batch_size"), frame.meta.get("elsewhere"))
         elif frame.kind is Kind.PRIORITIES:
@@ -202,7 +202,7 @@ class SocketServer:
         else:
             raise MessageError("kind", f"{frame.kind.name} is not a request")
 
-    def _share(self, connection: Connection, batch_size: Any) -> None:
+    def _share(self, connection: ClientConnection, batch_size: Any) -> None:
         """From now on its batches of that size lie in memory that it has, too, if it is on this machine."""
         self._check_batch_size(batch_size)
         if connection.socket.family != socket.AF_UNIX or connection.shared is not None:
@@ -221,26 +221,26 @@ class SocketServer:
         if type(batch_size) is not int or not 1 <= batch_size <= self._max_batch:
             raise MessageError("batch-size", f"{batch_size!r}, want 1 to {self._max_batch}")
 
-    def _sample(self, connection: Connection, batch_size: Any, drawn_elsewhere_steps: Any) -> None:
+    def _sample(self, connection: ClientConnection, batch_size: Any, drawn_elsewhere_steps: Any) -> None:
         self._check_batch_size(batch_size)
         if type(drawn_elsewhere_steps) is not int or not 0 <= drawn_elsewhere_steps < 2**62:
             raise MessageError("elsewhere", f"{drawn_elsewhere_steps!r}, want a number of steps")
         shared = connection.shared
         if shared is None or shared.batch_size != batch_size:
             for other in self._connections:
-                other.own()  # the draw takes a buffer that another client's batch may still lie in
+                other.copy_pending()  # the draw takes a buffer that another client's batch may still lie in
             sample = self._server.sample(batch_size, drawn_elsewhere_steps)
         else:
             sample = self._server.sample(batch_size, drawn_elsewhere_steps, shared.rows[shared.turn])
-        meta = {name: getattr(sample, name) for name in ("mass", "windows", "env_steps", "drawn_steps")}
-        if sample.rows is None or sample.values is None:
+        meta = {name: getattr(sample, name) for name in ("total_weight", "windows", "env_steps", "drawn_steps")}
+        if sample.rows is None or sample.weights is None:
             connection.send(Kind.FINISHED if sample.draw is SampleStatus.FINISHED else Kind.WAIT, meta)
         elif shared is None or shared.batch_size != batch_size:
-            connection.send(Kind.BATCH, meta, (sample.rows.view(np.uint8).data, sample.values.data.cast("B")))
+            connection.send(Kind.BATCH, meta, (sample.rows.view(np.uint8).data, sample.weights.data.cast("B")))
         else:
-            connection.send(Kind.SHARED, meta | shared.put(sample.values))
+            connection.send(Kind.SHARED, meta | shared.put(sample.weights))
 
-    def _episode(self, connection: Connection, serial: Any) -> None:
+    def _episode(self, connection: ClientConnection, serial: Any) -> None:
         if type(serial) is not int:
             raise MessageError("serial", f"{serial!r}, want a number")
         rows = self._server.episode(serial)
@@ -254,7 +254,7 @@ class SocketServer:
         serials = np.frombuffer(frame.body, np.int64, count)
         self._server.update_priorities(serials, np.frombuffer(frame.body, np.float32, count, 8 * count))
 
-    def _refuse(self, connection: Connection, reason: str, detail: str, fenced: bool = False) -> None:
+    def _refuse(self, connection: ClientConnection, reason: str, detail: str, fenced: bool = False) -> None:
         log.warning("replay socket: a client was refused: %s", detail)
         self.refused[reason] += 1
         shown = {"fenced": proof(self._secret, b"fenced", connection.nonce, connection.challenge)} if fenced else {}
@@ -269,7 +269,7 @@ class SocketServer:
             if not connection.authenticated and connection.opened < oldest:
                 self._refuse(connection, "silent", "no proof came in time")
 
-    def _end(self, connection: Connection) -> None:
+    def _end(self, connection: ClientConnection) -> None:
         if self._connections.pop(connection, None) is not None:
             self._selector.unregister(connection.socket)
             connection.close()

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.bus.protocol import LIVES, Bus, Entry, EntryId, actor_role
-from rmc.common.errors import BusFull, BusUnavailable, MessageError
+from rmc.common.errors import BusFull, MessageError
 from rmc.common.shard import WHOLE, Shard
 from rmc.common.window import Rows, WindowSpec
 from rmc.common.wire import decode_rows, max_entry_bytes
@@ -46,20 +46,15 @@ class StreamReader:
         self._entry_bytes = ROUND_BYTES  # the largest entry of the last round that had any
 
     def read(self, positions: Mapping[int, StreamPosition]) -> IngestBatch | None:
-        """The next entries of all streams, or None where there are none; those after them are expected already."""
+        """The next entries of all streams, or None where there are none."""
         if self._rounds % DISCOVERY_ROUNDS == 0:
             self._actors.update(filter(self._shard.owns, self.bus.actors()), positions)
         self._rounds += 1
         entries = self.bus.read(self._cursors(positions), self._count())
         if not entries:
-            self.bus.expect(self._cursors(positions), self._count())
             return None
         self._entry_bytes = max(len(entry.payload) for entry in entries) + 64
-        found = self._round(entries, dict(positions))
-        if not found.broken:  # of a broken stream the same entries would come again, and then pass for all there is
-            with suppress(BusUnavailable):  # what is refused in this round shall not be refused again
-                self.bus.expect(self._cursors(found.positions), self._count())
-        return found
+        return self._round(entries, dict(positions))
 
     def sends_again(self, actor: int, before: EntryId) -> None:
         """An actor's stream was dropped, so that it sends again what came after that entry."""

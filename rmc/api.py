@@ -5,6 +5,7 @@ from typing import Any
 
 from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_checkpoint
 from rmc.cli import training
+from rmc.cli.ending import STOPPED
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig
@@ -35,9 +36,9 @@ def train(
     if launcher == "ray":
         status = training.train(config, options, console)
     else:
-        run = training.prepare(config, options)  # with if_exists="new" the folder is another one
+        run = training.open_folder(config, options)  # with if_exists="new" the folder is another one
         folder, status = run.path, training.conduct(config, run, options, console)
-    if status == training.STOPPED:
+    if status == STOPPED:
         raise KeyboardInterrupt
     result = RunFolder(folder).result()
     assert result is not None  # written by every run that ends in order

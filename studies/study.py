@@ -44,7 +44,7 @@ class Scale:
     envs: Sequence[str] = ("HalfCheetah-v5",)
 
 
-SMOKE, SMALL, FULL = Scale(600, (1,)), Scale(100_000, (1, 2)), Scale(1_000_000, (1, 2, 3, 4, 5))
+SMOKE, SMALL, FULL = Scale(1_200, (1,)), Scale(100_000, (1, 2)), Scale(1_000_000, (1, 2, 3, 4, 5))
 
 
 @dataclasses.dataclass(frozen=True)

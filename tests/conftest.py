@@ -94,7 +94,7 @@ def run_name(request: pytest.FixtureRequest) -> str:
 
 def _left_over() -> set[str]:
     children = {f"process {child.pid} {' '.join(child.cmdline()[:6])}" for child in _running_children()}
-    temporary = {str(path) for path in Path(tempfile.gettempdir()).glob("rmc-run-*")}
+    temporary = {str(path) for path in Path(tempfile.gettempdir()).glob("rmc-sockets-*")}
     return children | temporary | (set() if WORKER else _shared_memory())
 
 

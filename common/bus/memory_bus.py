@@ -72,14 +72,11 @@ class MemoryBus:
         return sorted(self._streams)
 
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
-        found: list[Entry] = []
+        entries: list[Entry] = []
         for actor, cursor in after.items():
             stream = self._streams.get(actor, {})
-            found += [Entry(actor, key, stream[key]) for key in stream if key > cursor][:count]
-        return found
-
-    def expect(self, after: Mapping[int, EntryId], count: int) -> None:
-        """Nothing has to come from anywhere."""
+            entries += [Entry(actor, key, stream[key]) for key in stream if key > cursor][:count]
+        return entries
 
     def commit(self, owner: ReplayOwner, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
         self._check_replay(owner)
@@ -132,20 +129,20 @@ class MemoryBus:
         return self._weights.get(evaluate)
 
     def emit(self, role: str, record: Mapping[str, Any]) -> None:
-        said = self._records.setdefault(role, [])
-        said.append({**record, "role": role})
-        if len(said) >= 2 * METRICS_KEPT:
-            del said[:METRICS_KEPT]
+        kept = self._records.setdefault(role, [])
+        kept.append({**record, "role": role})
+        if len(kept) >= 2 * METRICS_KEPT:
+            del kept[:METRICS_KEPT]
             self._forgotten[role] += METRICS_KEPT
 
     def records(self, after: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, str]]:
-        found: list[dict[str, Any]] = []
+        records: list[dict[str, Any]] = []
         cursors = {}
         for role, cursor in after.items():
-            said, forgotten = self._records.get(role, []), self._forgotten[role]
-            found += said[max(0, int(cursor) - forgotten) :]
-            cursors[role] = str(forgotten + len(said))
-        return found, cursors
+            kept, forgotten = self._records.get(role, []), self._forgotten[role]
+            records += kept[max(0, int(cursor) - forgotten) :]
+            cursors[role] = str(forgotten + len(kept))
+        return records, cursors
 
     def request_stop(self, reason: str) -> None:
         self._stop = reason

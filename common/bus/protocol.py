@@ -126,13 +126,7 @@ class Bus(Protocol):
         """Ids of all actors that have appended anything."""
 
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
-        """Up to ``count`` entries of each actor named in ``after``, past the id given, in order.
-
-        None that is there already is missing, but after ``expect``: then only what has come of that.
-        """
-
-    def expect(self, after: Mapping[int, EntryId], count: int) -> None:
-        """Begin to read: ``read`` past the same ids takes what has come by then, without a wait."""
+        """Up to ``count`` entries of each actor named in ``after``, past the id given, in order."""
 
     def commit(self, owner: ReplayOwner, acks: Mapping[int, Ack], progress: bytes = b"") -> None:
         """Publish acks and trim what they cover, unless a newer replay has come. Raises FencedError.

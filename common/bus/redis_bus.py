@@ -1,9 +1,10 @@
 """The bus over Redis: unix socket, TCP or TLS; the keys stand in ``common/bus/protocol.py``."""
 
 import re
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import redis
@@ -11,7 +12,6 @@ from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
 from rmc.common.bus.metrics_record import decode_record, encode_record
-from rmc.common.bus.pending_read import PendingRead
 from rmc.common.bus.protocol import (
     LIVES,
     METRICS_KEPT,
@@ -26,7 +26,7 @@ from rmc.common.bus.protocol import (
     split_pieces,
 )
 from rmc.common.bus.redis_client import RedisClient, refusal
-from rmc.common.bus.redis_url import shown
+from rmc.common.bus.redis_url import HIDDEN, fault, shown
 from rmc.common.checksum import crc32
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
 
@@ -56,43 +56,52 @@ class RedisBus:
     """All roles of one run over one Redis. Not thread-safe: one per thread.
 
     Redis's own retries are short (a lost reply is repeated, which explicit ids make harmless);
-    an outage longer than that raises BusUnavailable and the role's loop waits. ``around`` is entered for every call.
+    an outage longer than that raises BusUnavailable and the role's loop waits.
     """
 
     def __init__(self, url: str, run: str) -> None:
         """``url``: ``unix:///path``, ``redis://host:port`` or ``rediss://…``. Raises ConfigError."""
         lost = (redis.exceptions.ConnectionError,)  # one that hangs would keep the role once more
         retry = Retry(ExponentialBackoff(cap=0.1, base=0.01), retries=3, supported_errors=lost)
+        if fix := fault(url):
+            raise ConfigError("--redis-url", shown(url), fix)
         try:
             self._redis: Any = RedisClient.from_url(  # Any: its annotations do not know decode_responses
                 url, retry=retry, socket_timeout=TIMEOUT_SECONDS
             )
-        except ValueError:  # its words quote parts of the URL, which may be a password's
-            fix = "not a Redis URL; give unix:///path, redis://host:port or rediss://…; in a password, %2F is /"
-            raise ConfigError("--redis-url", shown(url), fix) from None
+            pool = self._redis.connection_pool
+            pool.connection_class(**pool.connection_kwargs)  # knows what may stand behind the question mark
+        except (ValueError, TypeError, redis.exceptions.RedisError):  # whose words may quote a password
+            raise ConfigError(
+                "--redis-url", shown(url), "its options are not redis-py's; mend what follows ?"
+            ) from None
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
-        self._pending = PendingRead(self._redis.connection_pool)
-        self.around: Callable[[], AbstractContextManager[None]] = nullcontext
+        self._rests_until = 0.0  # by the monotonic clock: a Redis that hangs is left alone for as long as it took
 
     def _key(self, *parts: object) -> str:
         return ":".join([self._prefix, *map(str, parts)])
 
     def _call(self, action: Callable[..., T], *args: Any) -> T:
+        if time.monotonic() < self._rests_until:
+            raise BusUnavailable("Redis did not answer in time")
         try:
-            with self.around():
-                return action(*args)
+            return action(*args)
         except redis.exceptions.ResponseError as error:
             raise refusal(error, self.url) from None
-        except (redis.exceptions.ConnectionError, redis.exceptions.TimeoutError, OSError) as error:
+        except redis.exceptions.TimeoutError as error:
+            self._rests_until = time.monotonic() + TIMEOUT_SECONDS  # half of the time is for what needs no Redis
+            raise BusUnavailable(str(error)) from None
+        except (redis.exceptions.ConnectionError, OSError) as error:
             raise BusUnavailable(str(error)) from None
 
     def ping(self) -> None:
         """Raises BusUnavailable where no Redis answers, or one that will not have us."""
         try:
             self._call(self._redis.ping)
-        except ConfigError as error:
-            raise BusUnavailable(error.fix) from None
+        except ConfigError as error:  # a Redis that knows no login repeats it
+            password = self._redis.connection_pool.connection_kwargs.get("password")
+            raise BusUnavailable(error.fix.replace(password or HIDDEN, HIDDEN)) from None
 
     def expire(self, seconds: int | None) -> None:
         """Let all that this run has in Redis vanish after so many seconds; None takes that back."""
@@ -130,7 +139,8 @@ class RedisBus:
             return floor
 
     def check_room(self, role: str) -> None:
-        self._call(lambda: self._redis.incrby(self._key("epoch", role), 0))  # a write that changes nothing
+        with suppress(ConfigError):  # no number: who takes an epoch next mends it, or says so
+            self._call(lambda: self._redis.incrby(self._key("epoch", role), 0))  # a write that changes nothing
 
     def current_epoch(self, role: str) -> int:
         return self._number(self._call(lambda: self._redis.get(self._key("epoch", role))))
@@ -176,23 +186,7 @@ class RedisBus:
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
         if not after:
             return []
-        asked = self._pending.asked
-        if asked is not None and asked.items() <= after.items():
-            return self._take_pending()
-        if asked is not None:
-            self._pending.drop()
         return _entries(self._call(lambda: self._redis.xread(self._cursors(after), count=count)))
-
-    def _take_pending(self) -> list[Entry]:
-        try:
-            return _entries(self._call(self._pending.take)) if self._call(self._pending.ready) else []
-        except BusUnavailable:
-            self._pending.drop()
-            raise
-
-    def expect(self, after: Mapping[int, EntryId], count: int) -> None:
-        if after and self._pending.asked is None:
-            self._call(lambda: self._pending.send(dict(after), self._cursors(after), count))
 
     def _cursors(self, after: Mapping[int, EntryId]) -> dict[str, str]:
         return {self._key("windows", actor): f"{cursor.epoch}-{max(cursor.seq, 0)}" for actor, cursor in after.items()}

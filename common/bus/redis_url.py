@@ -5,6 +5,10 @@ from urllib.parse import SplitResult, parse_qs, urlsplit
 
 SCHEMES = ("redis", "rediss", "unix")
 HIDDEN = "…"  # stands for what may hold a password
+UNREADABLE = (
+    "not a Redis URL; give unix:///path, redis://host:port or rediss://…; in a password, write %40 for @, %2F for /, "
+    "%3F for ? and %23 for #"
+)
 
 
 def shown(url: str) -> str:
@@ -24,9 +28,20 @@ def _place(parts: SplitResult) -> str:
     Raises ValueError where the port is none.
     """
     _ = parts.port  # read for its check
-    if parts.fragment or "@" in parts.path + parts.query:
+    path = parts.path if parts.netloc or parts.scheme != "unix" else ""  # what begins by a path has no user-info
+    if parts.fragment or "@" in path + parts.query:
         return ""
     return parts.path if parts.scheme == "unix" else parts.netloc.rpartition("@")[2]
+
+
+def fault(url: str) -> str:
+    """Why it is refused, where a client may read it in another way than it was meant; empty where it may not."""
+    if shown(url).endswith(HIDDEN):
+        return UNREADABLE
+    parts = urlsplit(url)
+    if parts.scheme != "unix" and not re.fullmatch("[0-9]*", parts.path.strip("/")):
+        return "its database is no number; end it by /0 to /15, or by nothing"
+    return ""
 
 
 def has_password(url: str) -> bool:
@@ -39,5 +54,5 @@ def has_password(url: str) -> bool:
 
 
 def without_passwords(word: str) -> str:
-    """A word of a command line, the URL that it may end with as it may be shown."""
-    return re.sub(r"[\w+.-]*://.*", lambda found: shown(found[0]), word, flags=re.DOTALL)
+    """A word of a command line, the URL or the login that it may end with as it may be shown."""
+    return re.sub(r"[\w+.-]*://.*|[^=]*@.*", lambda found: shown(found[0]), word, flags=re.DOTALL)

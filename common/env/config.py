@@ -1,7 +1,14 @@
 """Which environment, and what is changed about it; readable without gymnasium."""
 
-from dataclasses import dataclass
-from typing import Literal
+import json
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from rmc.common.errors import ConfigError
+
+PYTHONS = {"True": True, "False": False, "None": None}  # as Python writes what JSON writes otherwise
 
 
 @dataclass(frozen=True)
@@ -23,4 +30,52 @@ class EnvConfig:
     time_limit: int = 0
     """Steps of the environment after which an episode is cut off; 0 keeps the environment's own limit."""
     env_timeout: float = 60.0
-    """Seconds in a step or reset after which an environment hangs: its process is ended and started again."""
+    """Seconds after which a call into an environment hangs: its making, reset, step, render or close. Its process ends;
+    a role's is started again."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keywords that the environment is made with, like goal=1.5 map=maze pose=[0,1]: numbers, words, JSON."""
+
+
+def read_kwargs(words: Sequence[str]) -> dict[str, Any]:
+    """NAME=VALUE words as keywords, their values typed. Raises ConfigError."""
+    found: dict[str, Any] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (equals and name.isidentifier()):
+            raise ConfigError("--env-kwargs", word, "write NAME=VALUE, like goal=1.5, and ENV before them")
+        if name in found:
+            raise ConfigError("--env-kwargs", word, f"{name} is there twice; give it once")
+        found[name] = _typed(value)
+    check_kwargs(found)
+    return found
+
+
+def write_kwargs(kwargs: dict[str, Any]) -> list[str]:
+    """Keywords as the words that ``read_kwargs`` reads."""
+    return [f"{name}={_word(value)}" for name, value in kwargs.items()]
+
+
+def check_kwargs(kwargs: dict[str, Any]) -> None:
+    """Raises ConfigError where a value is none that config.json can hold and give back."""
+    for name, value in kwargs.items():
+        try:
+            same = json.loads(json.dumps(value, allow_nan=False)) == value
+        except (TypeError, ValueError):
+            same = False
+        if not same:
+            raise ConfigError(
+                f"--env-kwargs {name}", value, "take finite numbers, text, true, false, null, or lists of such"
+            )
+
+
+def _typed(value: str) -> Any:
+    if value in PYTHONS:
+        return PYTHONS[value]
+    for kind in (int, float, json.loads):
+        with suppress(ValueError):
+            return kind(value)
+    return value
+
+
+def _word(value: Any) -> str:
+    return value if isinstance(value, str) and _typed(value) == value else json.dumps(value)

@@ -6,11 +6,11 @@ Shapes: O observation, A action.
 import difflib
 import importlib
 import importlib.util
+import inspect
 import logging
 import math
 import os
 import sys
-import traceback
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -22,62 +22,90 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from rmc.common.env.config import EnvConfig
+from rmc.common.env.config import EnvConfig, check_kwargs
+from rmc.common.env.faults import RAISED, asked, one_line, told
+from rmc.common.env.process_state import ApartCall
+from rmc.common.env.spaces import space_fault
+from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Flicker, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
-from rmc.common.errors import ConfigError
+from rmc.common.errors import ConfigError, EnvFault
 from rmc.common.extra import how_to_install
 
 log = logging.getLogger(__name__)
 DM_CONTROL = "dm_control/"
-LARGEST_ACTION = 1e9  # of an action space that means its bounds
+SHORTEST_TIMEOUT = 0.1  # seconds
 
 
 def make_env(config: EnvConfig, render: bool = False) -> Env:
     """One environment: (O,) float32 observations, (A,) float32 actions in [-1, 1], cut off at its time limit.
 
     With ``render``, its ``render()`` gives frames. Raises ConfigError where it is unknown, or its spaces are none that
-    the agent can learn in.
+    the agent can learn in; EnvFault where it raises.
     """
-    _check_numbers(config)
+    _check_options(config)
     _redirect_mujoco_warnings()
-    made = _make(config, render)
-    fault = _space_fault(made.observation_space, made.action_space)
+    with ApartCall(config.id, "make", config.env_timeout):
+        spec = find_spec(config.id)
+        made: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
+    fault = asked("spaces", lambda: space_fault(made.observation_space, made.action_space))
     if fault is None and config.hide != "nothing" and not _structure(made):
         fault = f"it does not say which observations are {config.hide}; --hide is for MuJoCo's bodies, like Ant-v5"
     if fault is not None:
-        made.close()
+        with suppress(*RAISED):
+            made.close()
         raise ConfigError("ENV", config.id, fault)
-    return _as_seen(made, config)
+    return _as_seen(made, config, config.time_limit or spec.max_episode_steps)
 
 
-def _make(config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
-    """As gymnasium makes it, with its own limit or ours."""
-    spec = copy(_find_spec(config.id))
-    spec.order_enforce = False  # roles reset and step in order; the check costs time at every step
+def _make(known: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
+    """As gymnasium makes it, without a limit."""
+    spec = copy(known)
+    spec.max_episode_steps, spec.order_enforce = (
+        None,
+        False,
+    )  # roles reset and step in order; the check costs time at every step
+    spec.kwargs = {**spec.kwargs, **config.env_kwargs, **({"render_mode": "rgb_array"} if render else {})}
     try:
-        return gym.make(
-            spec,
-            max_episode_steps=config.time_limit or None,
-            disable_env_checker=True,
-            **({"render_mode": "rgb_array"} if render else {}),
-        )
+        return gym.make(spec, disable_env_checker=True)
     except gym.error.Error as error:
-        raise ConfigError("ENV", config.id, f"gymnasium cannot make it ({_one_line(error)})") from None
-    except Exception as error:
+        raise ConfigError("ENV", config.id, f"gymnasium cannot make it ({one_line(error)})") from None
+    except RAISED as error:
+        if (fault := _keyword_fault(spec)) is not None:
+            raise ConfigError("ENV", config.id, fault) from None
         if not config.id.startswith(DM_CONTROL):
-            raise
-        fix = f"dm_control cannot make it ({_one_line(error)}); it wants MuJoCo 3: {how_to_install('dm-control')}"
+            raise EnvFault(f"the environment cannot be made: {told(error)}") from error
+        fix = f"dm_control cannot make it ({one_line(error)}); it wants MuJoCo 3: {how_to_install('dm-control')}"
         raise ConfigError("ENV", config.id, fix) from None
 
 
-def _as_seen(env: gym.Env[Any, Any], config: EnvConfig) -> Env:
+def _keyword_fault(spec: EnvSpec) -> str | None:
+    """Which keyword is missing or too many, and what the environment takes; None where it is not that."""
+    try:
+        takes = inspect.signature(entry_point(spec))
+    except ValueError:  # of a class that is not written in Python
+        return None
+    try:
+        takes.bind(**spec.kwargs)
+    except TypeError as error:
+        return f"it cannot be made: {error}; it takes {takes}: give --env-kwargs NAME=VALUE"
+    return None
+
+
+def entry_point(spec: EnvSpec) -> Callable[..., Any]:
+    """What makes the environment: its class, or a function."""
+    made_by = spec.entry_point
+    assert made_by is not None
+    return gym.envs.registration.load_env_creator(made_by) if isinstance(made_by, str) else made_by
+
+
+def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> Env:
     """The environment as the agent sees it: each wrapper only where it does something."""
     shown = _shown(env, config.hide)
-    if isinstance(env.observation_space, gym.spaces.Dict):
-        env = gym.wrappers.FlattenObservation(env)
+    seen: Env = RescaledEnv(env)  # the innermost: it judges what the user's own code gives
+    if limit:
+        seen = gym.wrappers.TimeLimit(seen, limit)
     if config.action_repeat > 1:
-        env = gym.wrappers.RepeatAction(env, config.action_repeat)
-    seen: Env = RescaledEnv(env)
+        seen = gym.wrappers.RepeatAction(seen, config.action_repeat)
     if shown is not None:
         seen = ObservationSlice(seen, shown)
     if config.noise:
@@ -88,10 +116,10 @@ def _as_seen(env: gym.Env[Any, Any], config: EnvConfig) -> Env:
 
 
 def checked_reset(env: Env, seed: int | None) -> tuple[Floats, dict[str, Any]]:
-    """Reset. Raises ValueError where the observation is not finite."""
+    """Reset. Raises EnvFault, also where the observation is not finite."""
     observation, info = env.reset(seed=seed)
     if not np.isfinite(observation).all():
-        raise ValueError("its first observation is not finite")
+        raise EnvFault("the environment's first observation is not finite")
     return observation, info
 
 
@@ -106,10 +134,8 @@ def first_env(config: EnvConfig) -> Env:
     """``make_env`` where nothing runs yet: whatever the environment raises is the user's to mend, as a ConfigError."""
     try:
         return make_env(config)
-    except ConfigError:
-        raise
-    except Exception as error:
-        raise ConfigError("ENV", config.id, f"it cannot be made: {_told(error)}") from None
+    except EnvFault as fault:
+        raise ConfigError("ENV", config.id, str(fault)) from None
 
 
 def env_spaces(config: EnvConfig) -> tuple[int, int, int | None]:
@@ -136,17 +162,21 @@ def _shown(env: gym.Env[Any, Any], hide: str) -> slice | None:
     return {"nothing": None, "velocities": slice(0, positions), "positions": slice(positions, None)}[hide]
 
 
-def _check_numbers(config: EnvConfig) -> None:
+def _check_options(config: EnvConfig) -> None:
     if not 0.0 <= config.flicker <= 1.0:
         raise ConfigError("--flicker", config.flicker, "a probability from 0 to 1")
     if not 0.0 <= config.noise < math.inf:
         raise ConfigError("--noise", config.noise, "a standard deviation, 0 or more")
+    if not config.env_timeout >= SHORTEST_TIMEOUT:
+        raise ConfigError("--env-timeout", config.env_timeout, f"{SHORTEST_TIMEOUT} seconds or more")
     for name, least in (("frame_stack", 1), ("action_repeat", 1), ("time_limit", 0)):
         if getattr(config, name) < least:
             raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), f"{least} or more")
+    check_kwargs(config.env_kwargs)
 
 
-def _find_spec(env_id: str) -> EnvSpec:
+def find_spec(env_id: str) -> EnvSpec:
+    """What gymnasium knows of an environment; imports its module. Raises ConfigError."""
     module, _, name = env_id.rpartition(":")
     if name.startswith(DM_CONTROL):
         _import_dm_control(env_id)
@@ -161,36 +191,13 @@ def _find_spec(env_id: str) -> EnvSpec:
         raise ConfigError("ENV", env_id, f"{fault}; {fix}") from None
 
 
-def _space_fault(observation: gym.Space[Any], action: gym.Space[Any]) -> str | None:
-    """Why the agent cannot learn with these spaces, and what to do about it; None if it can."""
-    Box = gym.spaces.Box
-    if isinstance(observation, gym.spaces.Dict):
-        odd = {name: type(part).__name__ for name, part in observation.items() if not isinstance(part, Box)}
-        if odd:
-            return f"of its observations {odd} are no Box; turn them into one, or leave them out"
-        images = {name: part.shape for name, part in observation.items() if len(part.shape or ()) > 2}
-        if images:
-            return f"of its observations {images} are images; only vectors are learnt from, leave them out"
-        return _space_fault(gym.spaces.flatten_space(observation), action)
-    if not isinstance(observation, Box):
-        return f"its observations are {type(observation).__name__}; flatten them to a Box"
-    if len(observation.shape) > 1:
-        return f"its observations are images {observation.shape}; only vectors are learnt from"
-    if not observation.shape or not observation.shape[0]:
-        return f"its observations have shape {observation.shape}; only vectors are learnt from"
-    if not isinstance(action, Box):
-        return f"its actions are {type(action).__name__}; only continuous ones (a Box) are learnt"
-    if len(action.shape) != 1 or not action.shape[0]:
-        return f"its actions have shape {action.shape}; only vectors are learnt"
-    if not np.issubdtype(action.dtype, np.floating):
-        return f"its actions are {action.dtype}; only continuous ones (a Box of floats) are learnt"
-    if not (np.abs([action.low, action.high]) < LARGEST_ACTION).all():
-        return "its action space is unbounded; give it a Box with the low and high that its actions really have"
-    return None
-
-
 def _import_users_module(env_id: str, module: str) -> None:
     """Found in the working folder, too, but there last, so that it cannot shadow ours."""
+    if module.endswith(".py"):
+        right = f"{Path(module).stem}:{env_id.rpartition(':')[2]}"
+        raise ConfigError(
+            "ENV", env_id, f"give the module's name, not its file: {right}, from the folder that holds it"
+        )
     folder = os.getcwd()
     if folder not in sys.path:
         sys.path.append(folder)
@@ -200,8 +207,8 @@ def _import_users_module(env_id: str, module: str) -> None:
         ours = error.name is not None and (module == error.name or module.startswith(f"{error.name}."))
         fix = f"start from the folder that holds {module}" if ours else f"{module} needs it; install it"
         raise ConfigError("ENV", env_id, f"{error}; {fix}") from None
-    except Exception as error:
-        raise ConfigError("ENV", env_id, f"{module} cannot be imported: {_told(error)}") from None
+    except RAISED as error:
+        raise ConfigError("ENV", env_id, f"{module} cannot be imported: {told(error)}") from None
 
 
 def _import_dm_control(env_id: str) -> None:
@@ -226,14 +233,3 @@ def _redirect_mujoco_warnings() -> None:
 def _log_mujoco_warning(message: str) -> None:
     level = logging.DEBUG if "is deprecated" in message else logging.WARNING  # gymnasium's models, not the user's doing
     log.log(level, "mujoco: %s", message)
-
-
-def _told(error: Exception) -> str:
-    """An error of a user's code in a line, with its place."""
-    at = traceback.extract_tb(error.__traceback__)[-1]
-    place = f" ({Path(at.filename).name}, line {at.lineno})" if not isinstance(error, SyntaxError) else ""
-    return f"{type(error).__name__}: {_one_line(error)}{place}"
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

@@ -5,67 +5,112 @@ Shapes: O observation, A action.
 
 import logging
 import math
+import reprlib
 from collections import deque
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from rmc.common.env.faults import asked
+from rmc.common.env.spaces import array, bounds, vector
+from rmc.common.errors import EnvFault
+
 Floats = NDArray[np.float32]
 Env = gym.Env[Floats, Floats]
 log = logging.getLogger(__name__)
+RESET, STEP = ("observation", "info"), ("observation", "reward", "terminated", "truncated", "info")
+PLAIN = (float, int)  # numbers of Python's own, and numpy's float64
 
 
 class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
-    """Observations as float32; actions in [-1, 1], stretched over the environment's own bounds.
+    """Observations as (O,) float32; actions in [-1, 1], stretched over the environment's own bounds, in its own shapes.
 
+    The one judgement of what a user's environment gives: raises EnvFault where it is not what gymnasium asks for.
     ``info["missing"]`` says that a frame is missing; ``info["blank"]``, its old name, is understood with one warning.
-    Raises ValueError where an observation is no vector of numbers of the size that its space says.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
-        inner = env.action_space
-        assert isinstance(inner, gym.spaces.Box)
-        assert env.observation_space.shape is not None
-        self._low, self._high = inner.low.astype(np.float64), inner.high.astype(np.float64)
+        self._given, self._taken = env.observation_space, env.action_space
+        self._low, self._high = bounds(env.action_space)
         self._half_range = (self._high - self._low) / 2
-        self._plain = bool((inner.low == -1.0).all() and (inner.high == 1.0).all())
-        self._bounds, self._dtype, self._shape = inner, inner.dtype, env.observation_space.shape
-        self.action_space = gym.spaces.Box(-1.0, 1.0, inner.shape, np.float32)
-        self.observation_space = _box(env.observation_space.shape[0])
+        self._vectors = isinstance(env.action_space, gym.spaces.Box) and len(env.action_space.shape) == 1
+        self._plain = bool((self._low == -1.0).all() and (self._high == 1.0).all())
+        self.action_space = gym.spaces.Box(-1.0, 1.0, self._low.shape, np.float32)
+        self.observation_space = _box(gym.spaces.flatdim(env.observation_space))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        observation, info = self.env.reset(seed=seed, options=options)
-        return self._vector(observation), _renamed(info)
+        found = asked("reset", partial(self.env.reset, seed=seed, options=options))
+        observation, info = _values("reset", found, RESET)
+        return vector(self._given, observation), _own(info)
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        found = asked("step", self.env.step, self._stretched(action))
+        observation, reward, terminated, truncated, info = _values("step", found, STEP)
+        ends = _bool("terminated", terminated), _bool("truncated", truncated)
+        return vector(self._given, observation), _number("reward", reward), *ends, _own(info)
+
+    def render(self) -> Any:
+        return asked("render", self.env.render)
+
+    def close(self) -> None:
+        """What it raises is said once, and harms nobody."""
+        try:
+            asked("close", self.env.close)
+        except EnvFault as fault:
+            _warn_once(f"{fault}; it is left as it is")
+
+    def _stretched(self, action: Floats) -> Any:
+        """(A,) in [-1, 1] -> an action of the environment's own space, which it may change as it likes."""
         if not self._plain:
-            stretched = self._low + (action + 1.0) * self._half_range
-            action = stretched.astype(self._dtype).clip(self._bounds.low, self._bounds.high)  # rounding may pass one
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._vector(observation), float(reward), terminated, truncated, _renamed(info)
-
-    def _vector(self, observation: Any) -> Floats:
-        vector = np.array(observation, np.float32)  # a copy: some environments write into the same one again
-        if vector.shape != self._shape:
-            raise ValueError(f"its observation has shape {vector.shape}, its space says {self._shape}")
-        return vector
+            action = (self._low + (action + 1.0) * self._half_range).clip(self._low, self._high)
+        if self._vectors:
+            return np.array(action, self._taken.dtype)
+        return gym.spaces.unflatten(self._taken, action.astype(np.float64))
 
 
-def _renamed(info: dict[str, Any]) -> dict[str, Any]:
-    """``info`` with the key that a missing frame had until 0.2 under today's name."""
-    if "blank" not in info or "missing" in info:
-        return info
-    _warn_of_old_name()
-    return {"missing" if name == "blank" else name: value for name, value in info.items()}
+def _values(method: str, found: Any, wanted: tuple[str, ...]) -> tuple[Any, ...]:
+    if isinstance(found, tuple) and len(found) == len(wanted):
+        return found
+    given = f"{len(found)} values" if isinstance(found, tuple) else f"a {type(found).__name__}"
+    raise EnvFault(f"the environment's {method} gives {given}; return ({', '.join(wanted)})")
+
+
+def _number(name: str, value: Any) -> float:
+    """A number, also as an array of one."""
+    if isinstance(value, PLAIN):
+        return float(value)
+    found = array(name, value)
+    if found.size != 1:
+        raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}, not a number; return one")
+    return float(found.item())
+
+
+def _bool(name: str, value: Any) -> bool:
+    return value if isinstance(value, bool) else bool(_number(name, value))
+
+
+def _own(info: Any) -> dict[str, Any]:
+    """A copy of ``info``, its missing frame as a bool, also under the name that it had until 0.2."""
+    if not isinstance(info, dict):
+        raise EnvFault(f"the environment's info is {reprlib.repr(info)}, not a dict; return {{}} if it says nothing")
+    own = info.copy()
+    if "blank" in own and "missing" not in own:
+        _warn_once(
+            'the environment gives info["blank"]; call it info["missing"], the old name goes in the next version'
+        )
+        own["missing"] = own.pop("blank")
+    if "missing" in own:
+        own["missing"] = _bool('info["missing"]', own["missing"])
+    return own
 
 
 @cache
-def _warn_of_old_name() -> None:
-    log.warning('the environment gives info["blank"]; call it info["missing"], the old name goes in the next version')
+def _warn_once(text: str) -> None:
+    log.warning("%s", text)
 
 
 class ObservationSlice(gym.Wrapper[Floats, Floats, Floats, Floats]):

@@ -68,24 +68,18 @@ class Heartbeat:
                     return True
             if now >= self._next_metrics:
                 self._next_metrics = now + METRICS_PERIOD
-                self._bus.emit(self._role.name, self.record())
+                self._bus.emit(self._role.name, self.metrics())
                 self.outage.end()
         except (BusUnavailable, BusFull) as error:
             self.outage.begin(error)
             self._clock.wait("redis")
-            self._next_stop = self._next_metrics = next_try(now)
+            self._next_stop = self._next_metrics = time.monotonic() + RECONNECT_SLEEP
         return False
 
-    def record(self) -> dict[str, Any]:
+    def metrics(self) -> dict[str, Any]:
         """What the role has to say now."""
         refused = {"refused_values": self._bus.refused.total()}
         return {"time": time.time(), **self._role.metrics(), **refused, **self._clock.shares()}
-
-
-def next_try(began: float) -> float:
-    """When to try again what failed: where Redis hangs, half of the time is for what needs none."""
-    now = time.monotonic()
-    return now + max(RECONNECT_SLEEP, now - began)
 
 
 def run_role(
@@ -93,9 +87,8 @@ def run_role(
     bus: Bus,
     stop: StopSignal,
     finished: Callable[[], bool] = lambda: False,
-    beat: Callable[[], None] = lambda: None,
 ) -> None:
-    """Step a role until it is stopped, fenced or finished; always closes it. ``beat`` is called before every step.
+    """Step a role until it is stopped, fenced or finished; always closes it.
 
     Redis away or full is waited out here; every other error ends the role.
     """
@@ -103,7 +96,6 @@ def run_role(
     pulse = Heartbeat(role, bus, clock)
     try:
         while not (stop.requested or finished() or pulse.says_stop()):
-            beat()
             try:
                 if role.step():
                     clock.busy()
@@ -114,7 +106,7 @@ def run_role(
                 time.sleep(RECONNECT_SLEEP)
                 pulse.outage.begin(error)
                 clock.wait("redis")
-        last = pulse.record()
+        last = pulse.metrics()
     finally:
         role.close()
     with suppress(BusUnavailable, BusFull):  # said last, so that a Redis that hangs delays nothing

@@ -1,36 +1,83 @@
-"""Ends a process that hangs, even in a library's C code."""
+"""Ends a process in which an environment's call hangs, and says which one."""
 
 import faulthandler
+import os
+import signal
+import sys
+import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+import traceback
+from contextlib import suppress
+from pathlib import Path
+from typing import Self
+
+LOOK_SECONDS = 0.1
+HUNG_STATUS = 3  # of a process that ended so
+SLACK = 1.1  # of the time that a call has, until it counts as one that cannot even be told
 
 
-class Watchdog:
-    """Where no ``beat`` came for ``seconds`` (up to a tenth more), the process dies with its traceback on stderr."""
+class EnvCall:
+    """``with`` it, a call into an environment that must return within so many seconds; it costs under a microsecond."""
 
-    def __init__(self, seconds: float) -> None:
-        self._seconds, self._next = seconds, float("-inf")
+    current: "EnvCall | None" = None  # of this process
 
-    def beat(self) -> None:
-        """All is well. Costs a look at the clock, and a new timer ten times in ``seconds``."""
-        now = time.monotonic()
-        if now >= self._next:
-            self._next = now + self._seconds / 10
-            faulthandler.dump_traceback_later(1.1 * self._seconds, exit=True)
+    def __init__(self, env_id: str, name: str, seconds: float) -> None:
+        self.env_id, self.name, self.seconds = env_id, name, seconds
+        self.thread = threading.get_ident()
 
-    @contextmanager
-    def asleep(self) -> Iterator[None]:
-        """Watch nothing in here; afterwards it begins anew, if it had begun."""
-        begun = self._next > float("-inf")
-        faulthandler.cancel_dump_traceback_later()
-        try:
-            yield
-        finally:
-            self._next = float("-inf")
-            if begun:
-                self.beat()
+    def __enter__(self) -> Self:
+        self._outer, EnvCall.current = EnvCall.current, self
+        return self
 
-    def close(self) -> None:
-        """Watch no more."""
-        faulthandler.cancel_dump_traceback_later()
+    def __exit__(self, *_: object) -> None:
+        EnvCall.current = self._outer
+
+    def told(self) -> str:
+        """That it hangs, and where, in a line."""
+        frame = sys._current_frames().get(self.thread)
+        at = traceback.extract_stack(frame)[-1] if frame is not None else None
+        place = f" ({Path(at.filename).name}, line {at.lineno})" if at is not None else ""
+        fix = "mend it, or raise --env-timeout"
+        return f"ENV={self.env_id!r}: {self.name} has not returned for {self.seconds:g} s{place}; {fix}"
+
+
+def start() -> None:
+    """From now on watch this process, which is ours alone: where a call hangs, a line on stderr and the end of it.
+
+    C code that keeps Python's lock for as long gets faulthandler's traceback in place of the line.
+    """
+    if signal.getsignal(signal.SIGTSTP) == signal.SIG_DFL:
+        signal.signal(signal.SIGTSTP, _suspend)
+    threading.Thread(target=_watch, daemon=True, name="watchdog").start()
+
+
+def _watch() -> None:
+    """Counts looks, not seconds: a process that was stopped for a while has not hung."""
+    seen, looks, seconds, arm_at = EnvCall.current, 0, 0.0, float("-inf")
+    while True:
+        time.sleep(LOOK_SECONDS)
+        call = EnvCall.current
+        looks = looks + 1 if call is seen else 0
+        seen, seconds = call, seconds if call is None else call.seconds
+        over = seconds > 0.0 and looks * LOOK_SECONDS >= seconds
+        if over and call is not None:
+            _end(call)
+        if over:  # this process calls none any more
+            faulthandler.cancel_dump_traceback_later()
+            seconds, arm_at = 0.0, float("-inf")
+        elif seconds and time.monotonic() >= arm_at:
+            arm_at = time.monotonic() + (SLACK - 1.0) * seconds
+            faulthandler.dump_traceback_later(SLACK * seconds + LOOK_SECONDS, exit=True)
+
+
+def _end(call: EnvCall) -> None:
+    with suppress(OSError, ValueError):
+        os.write(2, f"rmc: {call.told()}\n".encode())
+        sys.stdout.flush()
+    os._exit(HUNG_STATUS)
+
+
+def _suspend(*_: object) -> None:
+    """Ctrl-Z: the time until the process goes on is nobody's fault."""
+    faulthandler.cancel_dump_traceback_later()
+    os.kill(os.getpid(), signal.SIGSTOP)

@@ -7,8 +7,7 @@ import torch
 from rmc.actors.actor import Actor
 from rmc.actors.evaluator import Evaluator
 from rmc.common.errors import ConfigError
-from rmc.common.process.role import Role, run_role
-from rmc.common.process.watchdog import Watchdog
+from rmc.common.process.role import run_role
 from rmc.deploy.local.role_process import Process, RunConnection, wait_for_room
 from rmc.deploy.run.config import RunConfig
 from rmc.learner.initial_priority import InitialPriority
@@ -28,7 +27,7 @@ def run_actor(place: RunConnection, index: int) -> None:
     actor = Actor(
         index, config.seed, process.make_env, spec, config.agent, config.actor, process.bus, priority_fn=priority_fn
     )
-    _run_watched(actor, process)
+    run_role(actor, process.bus, process.stop)
 
 
 def initial_priority(config: RunConfig, index: int) -> InitialPriority | None:
@@ -46,12 +45,4 @@ def run_evaluator(place: RunConnection) -> None:
     torch.set_num_threads(1)
     os.nice(EVALUATOR_NICENESS)
     evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, process.bus)
-    _run_watched(evaluator, process)
-
-
-def _run_watched(role: Role, process: Process) -> None:
-    """A role that dies where an environment hangs; Redis may hang."""
-    watchdog = Watchdog(process.config.env.env_timeout)
-    process.bus.around = watchdog.asleep
-    run_role(role, process.bus, process.stop, beat=watchdog.beat)
-    watchdog.close()
+    run_role(evaluator, process.bus, process.stop)

@@ -1,14 +1,9 @@
 """A run as processes of this machine: embedded Redis if none is given, roles under the supervisor, the monitor."""
 
 import logging
-import os
-import shutil
-import tempfile
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
-
-import psutil
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
@@ -16,6 +11,7 @@ from rmc.common.errors import BusFull, BusUnavailable, RmcError
 from rmc.common.process.role import StopSignal
 from rmc.common.shard import Shard
 from rmc.deploy.local.role_environment import URL_VARIABLE
+from rmc.deploy.local.socket_folder import SocketFolder
 from rmc.deploy.local.supervisor import STOP_SECONDS, RoleCommand, Supervisor
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.redis.connect import PATIENCE_VARIABLE, connect
@@ -28,7 +24,6 @@ from rmc.deploy.run.folder import RunFolder
 TICK_SECONDS = 0.1
 OUTAGE_SECONDS = 86_400.0  # of a Redis that answered once, until a role that is started amid it gives up
 KEPT_SECONDS = 3600  # in a user's Redis, after the end
-PREFIX = "rmc-run-"  # of the temporary folders that hold the sockets
 log = logging.getLogger(__name__)
 
 
@@ -37,11 +32,15 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
     place = ("--run", folder.name)
     secret = ("--secret-file", str(folder.secret_file))
     learn = ("--folder", str(folder.checkpoints), "--device", device)
-    actors = [RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))) for index in range(config.actors)]
+    timeout = config.env.env_timeout
+    actors = [
+        RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index)), env_timeout=timeout)
+        for index in range(config.actors)
+    ]
     return [
         *(_replay_command(shard, folder, sockets, (*place, *secret)) for shard in config.shards()),
         RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
-        RoleCommand("evaluator", ("evaluator", *place)),
+        RoleCommand("evaluator", ("evaluator", *place), env_timeout=timeout),
         *actors,
     ]
 
@@ -61,18 +60,17 @@ class LocalRun:
 
     def __init__(self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str) -> None:
         self._leave = ExitStack()
-        sweep()
-        self.sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))  # private, and short: see redis_server
-        self._leave.callback(shutil.rmtree, self.sockets)
+        self._sockets = SocketFolder()
+        self._leave.callback(self._sockets.close)
         try:
-            self._server = None if redis_url else self._leave.enter_context(_redis(config, folder, self.sockets))
+            self._server = None if redis_url else self._leave.enter_context(_redis(config, folder, self._sockets.path))
             self.bus = connect(redis_url or self._url(LAUNCHER), folder.name)
             self._registration = Registration(config, folder, self.bus)
         except BaseException:
             self._leave.close()
             raise
         self.supervisor = Supervisor(
-            commands(config, folder, self.sockets, device),
+            commands(config, folder, self._sockets.path, device),
             lambda role: {URL_VARIABLE: redis_url or self._url(role), PATIENCE_VARIABLE: str(OUTAGE_SECONDS)},
             folder.logs,
             lambda role: CheckpointFolder(folder.checkpoints).patience(0.0) if role == "learner" else 0.0,
@@ -103,15 +101,6 @@ class LocalRun:
                 _expire(self.bus)
         finally:
             self._leave.close()
-
-
-def sweep() -> None:
-    """Remove what launchers killed by force have left; their processes died with them."""
-    for left in Path(tempfile.gettempdir()).glob(f"{PREFIX}*-*"):
-        owner = left.name.removeprefix(PREFIX).partition("-")[0]
-        with suppress(FileNotFoundError):  # another launcher sweeps, too
-            if owner.isdigit() and not psutil.pid_exists(int(owner)) and left.stat().st_uid == os.getuid():
-                shutil.rmtree(left, ignore_errors=True)
 
 
 def _expire(bus: RedisBus) -> None:
@@ -166,8 +155,3 @@ def watch(monitor: Monitor, bus: RedisBus) -> None:
         monitor.outage.end()
     except (BusUnavailable, BusFull) as error:
         monitor.outage.begin(error)
-
-
-def check_redis(url: str) -> None:
-    """Raises ConfigError where no Redis answers."""
-    connect(url, "check")

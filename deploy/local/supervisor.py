@@ -13,6 +13,7 @@ from typing import BinaryIO
 
 from rmc.common.errors import RoleDied
 from rmc.common.process.parent_death import PARENT_VARIABLE
+from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.local.fork_server import ForkedProcess, ForkServer
 from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inherited
 
@@ -38,6 +39,7 @@ class RoleCommand:
     single_thread: bool = True
     forked: bool = True  # if of a single thread: by the fork server, which has torch in memory
     ends: bool = False  # in order, once the run is done; any other that ends unasked is started again
+    env_timeout: float = 0.0  # seconds, of one that plays: what it hung for is no part of its life
 
 
 class RoleProcess:
@@ -102,7 +104,8 @@ class RoleProcess:
 
     def _note_death(self, status: int) -> None:
         now = time.monotonic()
-        quick = now - self._started_at < QUICK_SECONDS and not from_outside(status)
+        lived = now - self._started_at - (self.command.env_timeout if status == HUNG_STATUS else 0.0)
+        quick = lived < QUICK_SECONDS and not from_outside(status)
         self._quick_deaths = self._quick_deaths + 1 if quick else 0
         if self._quick_deaths >= QUICK_DEATHS or status == EXIT_CONFIG:
             how = f"killed by signal {-status}" if status < 0 else f"exit status {status}"

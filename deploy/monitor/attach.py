@@ -14,7 +14,7 @@ from rich.console import Console
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import RunStatus, View
-from rmc.deploy.run.folder import RunFolder, record
+from rmc.deploy.run.folder import RunFolder, parse_record
 
 LOOK_SECONDS = 0.2
 AWAY_SECONDS = 30.0  # a launcher on Ray that was killed begins again within that
@@ -35,7 +35,7 @@ class Tail:
             text = file.read()
             whole = text[: text.rfind(b"\n") + 1]
             self._position += len(whole)
-            return list(filter(None, map(record, whole.splitlines())))
+            return list(filter(None, map(parse_record, whole.splitlines())))
         return []
 
 

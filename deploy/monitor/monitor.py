@@ -64,14 +64,14 @@ class Monitor:
     def _take_in(self, bus: Bus) -> None:
         while records := self._read(bus):
             for record in records:
-                self.record(record)
+                self.take(record)
 
     def _read(self, bus: Bus) -> list[dict[str, Any]]:
         self._refused = bus.refused.total()
         records, self._cursors = bus.records({role: self._cursors.get(role, "0") for role in self.roles()})
         return records
 
-    def record(self, record: dict[str, Any]) -> None:
+    def take(self, record: dict[str, Any]) -> None:
         """Write one record (with its ``role``) and take it into the view."""
         self.board.take(record)
         at = self.board.checkpoint_steps(record.get("eval_update"))  # an evaluation belongs where its checkpoint was
@@ -92,7 +92,7 @@ class Monitor:
     def _record_launcher(self) -> None:
         restarts = {f"restarts_{role}": count for role, count in self.restarts().items()}
         total = sum(restarts.values())
-        self.record(
+        self.take(
             {
                 "role": "launcher",
                 "time": time.time(),

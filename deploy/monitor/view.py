@@ -1,6 +1,6 @@
 """The newest state of a run as a table for a terminal, or as one plain line."""
 
-import errno
+import sys
 import time
 from collections.abc import Callable
 from statistics import mean
@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rmc.common.bus.metrics_record import is_finite
+from rmc.deploy.monitor.output import unfailing
 
 NONE_YET = "-"
 REFRESH_SECONDS = 0.5  # of a live view
@@ -23,7 +24,7 @@ SILENT_SECONDS = 5.0  # after which a role's silence is shown
 
 def terminal(width: int | None = None) -> Console:
     """What is printed, shown as it is: a name may hold what a console takes for markup."""
-    return Console(width=width, markup=False, emoji=False, highlight=False)
+    return Console(file=unfailing(sys.stdout), width=width, markup=False, emoji=False, highlight=False)
 
 
 class RunStatus:
@@ -223,13 +224,8 @@ class View:
             self._show()
 
     def _show(self) -> None:
-        try:
-            self._print()
-        except OSError as error:
-            if error.errno != errno.ENOSPC:  # written to a file whose disk is full: less is seen, nothing else
-                raise
-
-    def _print(self) -> None:
+        if getattr(self._console.file, "lost", False):  # nobody sees it
+            return
         if self._live is not None:
             self._live.update(table(self._board), refresh=True)
         else:

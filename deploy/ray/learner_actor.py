@@ -44,7 +44,7 @@ class LearnerActor(RoleActor):
         while True:
             try:
                 launcher = self._launcher()
-                return launcher, ray.get(launcher.claim.remote(self._life, place))
+                return launcher, ray.get(launcher.claim.remote(self._incarnation, place))
             except AWAY:
                 if time.monotonic() > deadline:
                     raise
@@ -65,11 +65,11 @@ class LearnerActor(RoleActor):
         newest, took = max(self._archived, default=-1), self._folder.last_save()
         for number in self._folder.numbers():
             if number > newest and number not in self._archived:
-                ray.get(self._launcher().archive.remote(self._life, number, self._folder.load(number), took))
+                ray.get(self._launcher().archive.remote(self._incarnation, number, self._folder.load(number), took))
                 self._archived.add(number)
         epoch = self._folder.last_epoch()
         if epoch > self._epoch:
-            self._epoch = ray.get(self._launcher().note_epoch.remote(self._life, epoch))
+            self._epoch = ray.get(self._launcher().note_epoch.remote(self._incarnation, epoch))
 
     def patience(self) -> float:
         return self._folder.patience(role_actor.STOP_SECONDS)

@@ -95,16 +95,22 @@ def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[st
     secret: tuple[str, ...] = ("--secret-file", "{scratch}/secret")
     if encrypted and config.replay.replay_shards > 1:  # one alone has a unix socket
         secret += ("--tls-folder", "{scratch}")
-    learn = ("--folder", "{scratch}/checkpoints", "--device", device)
+    learn, timeout = ("--folder", "{scratch}/checkpoints", "--device", device), config.env.env_timeout
     found = [
         *_replays(config, (*place, *secret)),
         RolePlacement(
             LearnerActor, RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
             learner_cpus(config), float(device.startswith("cuda")), group="learner",
         ),
-        RolePlacement(RoleActor, RoleCommand("evaluator", ("evaluator", *place)), EVALUATOR_CPUS, group="learner"),
+        RolePlacement(
+            RoleActor, RoleCommand("evaluator", ("evaluator", *place), env_timeout=timeout), EVALUATOR_CPUS,
+            group="learner",
+        ),
         *(
-            RolePlacement(RoleActor, RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index))), 1.0)
+            RolePlacement(
+                RoleActor,
+                RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index)), env_timeout=timeout), 1.0,
+            )
             for index in range(config.actors)
         ),
     ]  # fmt: skip

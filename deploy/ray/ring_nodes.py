@@ -6,7 +6,8 @@ from contextlib import suppress
 import ray
 from ray.util.placement_group import PlacementGroup, placement_group_table
 
-from rmc.deploy.run.folder import RunFolder, write_whole
+from rmc.common.whole_file import write_whole
+from rmc.deploy.run.folder import RunFolder
 
 READY_SECONDS = 5.0
 

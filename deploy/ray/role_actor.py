@@ -9,6 +9,7 @@ import uuid
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from urllib.parse import quote
 
 import ray
 
@@ -28,7 +29,10 @@ AWAY = (ray.exceptions.RayError, ValueError, CheckpointError, OSError)  # of who
 
 @dataclass(frozen=True)
 class Task:
-    """What a host runs. In its texts ``{scratch}`` is its folder on the node, and ``{ip}`` the address."""
+    """What a host runs. In its texts ``{scratch}`` is its folder on the node, ``{ip}`` the address.
+
+    ``{scratch_url}`` is the folder as it stands in a URL.
+    """
 
     run: str
     command: RoleCommand
@@ -85,7 +89,7 @@ class RoleActor:
     """Holds a role. Where it dies this actor ends, too, and Ray starts both again, here or on another node."""
 
     def __init__(self, task: Task) -> None:
-        self._task, self._life = task, uuid.uuid4().hex
+        self._task, self._incarnation = task, uuid.uuid4().hex
         self._replaced = self._run_ends = False
         self.trouble = ""
         self.scratch = scratch_folder(task.run)
@@ -102,7 +106,11 @@ class RoleActor:
         return replace(command, words=tuple(map(self._filled, command.words)))
 
     def _filled(self, text: str) -> str:
-        return text.replace("{scratch}", str(self.scratch)).replace("{ip}", ray.util.get_node_ip_address())
+        return (
+            text.replace("{scratch}", str(self.scratch))
+            .replace("{scratch_url}", quote(str(self.scratch)))
+            .replace("{ip}", ray.util.get_node_ip_address())
+        )
 
     def _environment(self) -> dict[str, str]:
         """Without what Ray says to its own workers: a role is none, and the launcher begins a job of its own."""
@@ -165,15 +173,15 @@ class RoleActor:
 
     def report(self, incarnation: str, log_start: int) -> Report:
         """How the role is, and its log from there on; of another life's, from this one's start on."""
-        start = log_start if incarnation == self._life else self._role.log_start
+        start = log_start if incarnation == self._incarnation else self._role.log_start
         log = b""
         with suppress(FileNotFoundError), self._role.log.open("rb") as file:
             file.seek(start)
             log = file.read(LOG_BYTES)
         words = self._role.last_words() if self._status else ""
         return Report(
-            self._life, ray.util.get_node_ip_address(), self._role.pid, self._status, words, log, start + len(log),
-            self.trouble,
+            self._incarnation, ray.util.get_node_ip_address(), self._role.pid, self._status, words, log,
+            start + len(log), self.trouble,
         )  # fmt: skip
 
     def clear(self) -> None:

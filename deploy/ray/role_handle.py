@@ -9,6 +9,7 @@ from typing import Any
 import ray
 
 from rmc.common.errors import RoleDied
+from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.local.supervisor import EXIT_CONFIG, QUICK_DEATHS, QUICK_SECONDS, from_outside
 from rmc.deploy.ray.role_actor import Report
 
@@ -19,8 +20,8 @@ log = logging.getLogger(__name__)
 class RoleHandle:
     """A role's host as the launcher sees it: asked how it is again and again, without waiting for it."""
 
-    def __init__(self, name: str, handle: Any, cpus: float) -> None:
-        self.name, self.handle, self.cpus = name, handle, cpus
+    def __init__(self, name: str, handle: Any, cpus: float, env_timeout: float = 0.0) -> None:
+        self.name, self.handle, self.cpus, self._env_timeout = name, handle, cpus, env_timeout
         self.report: Report | None = None  # the newest; None until the first
         self.restarts = 0
         self.dead = ""  # for good, and why: somebody killed it, or it could not begin
@@ -86,7 +87,8 @@ class RoleHandle:
 
     def _note_death(self, report: Report) -> None:
         assert report.status is not None
-        quick = time.monotonic() - self._began_at < QUICK_SECONDS and not from_outside(report.status)
+        lived = time.monotonic() - self._began_at - (self._env_timeout if report.status == HUNG_STATUS else 0.0)
+        quick = lived < QUICK_SECONDS and not from_outside(report.status)
         self._quick_deaths = self._quick_deaths + 1 if quick else 0
         if report.status == EXIT_CONFIG or self._quick_deaths >= QUICK_DEATHS:
             often = f"{self._quick_deaths} times in a row soon after its start" if self._quick_deaths > 1 else "at once"

@@ -8,14 +8,11 @@ Learner, evaluator and a single replay server share a node; actors take a CPU ea
 import dataclasses
 import logging
 import os
-import shutil
 import socket
-import tempfile
 import time
 import zlib
 from contextlib import ExitStack, suppress
 from math import ceil
-from pathlib import Path
 from typing import Any
 
 try:
@@ -32,8 +29,9 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RoleDied
 from rmc.common.process.role import StopSignal
 from rmc.common.shard import WHOLE
-from rmc.deploy.local.launcher import PREFIX, TICK_SECONDS, sweep, watch
+from rmc.deploy.local.launcher import TICK_SECONDS, watch
 from rmc.deploy.local.role_environment import URL_VARIABLE
+from rmc.deploy.local.socket_folder import SocketFolder
 from rmc.deploy.local.supervisor import QUICK_DEATHS
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.ray.placement import (
@@ -75,16 +73,15 @@ class ClusterRun:
         self.config, self._folder, self._device, self._all_cpus = config, folder, device, all_cpus
         self._encrypted, self._ring_locations = encrypted, RingLocations(folder)
         self._leave = ExitStack()
-        sweep()
-        sockets = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))
-        self._leave.callback(shutil.rmtree, sockets)
+        sockets = SocketFolder()
+        self._leave.callback(sockets.close)
         try:
             ip = ray.util.get_node_ip_address()
             if encrypted:
                 tls.make_certificate(folder.path, ip)
             number, self._moved = _port(folder, ip)
             port = Port(ip, number, folder.path if encrypted else None)
-            self._server = RedisServer(sockets, port=port, users=self._users())
+            self._server = RedisServer(sockets.path, port=port, users=self._users())
             self._leave.enter_context(self._server)
             self.bus = connect(self._server.url(), folder.name)
             self._registration = Registration(config, folder, self.bus)
@@ -133,7 +130,7 @@ class ClusterRun:
     def _place_all(self) -> None:
         for name, place in places(self.config, self._folder.name, self._device, self._encrypted).items():
             if name not in self._hosts:
-                self._hosts[name] = RoleHandle(name, self._create(name, place), place.cpus)
+                self._hosts[name] = RoleHandle(name, self._create(name, place), place.cpus, place.command.env_timeout)
                 self._hosts[name].handle.stopping.remote(False)  # one that was found may have heard otherwise
 
     def _create(self, name: str, place: RolePlacement) -> Any:
@@ -146,7 +143,7 @@ class ClusterRun:
             name=actor_name(self._folder.name, name), namespace=NAMESPACE, lifetime="detached", get_if_exists=True,
             max_restarts=-1, num_cpus=place.cpus, num_gpus=place.gpus, scheduling_strategy=strategy,
         )  # fmt: skip
-        url = self._server.network_url(name, f"{{scratch}}/{tls.CERTIFICATE}")
+        url = self._server.network_url(name, f"{{scratch_url}}/{tls.CERTIFICATE}")
         secrets = {f"redis-url-{name}": url.encode()}  # roles on one node share its scratch folder
         if name == "learner" or name.startswith("replay"):
             secrets["secret"] = self._folder.secret()

@@ -9,7 +9,8 @@ import msgpack
 from rmc.common.bus.protocol import Bus
 from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.shard import Shard
-from rmc.deploy.run.folder import RunFolder, write_whole
+from rmc.common.whole_file import write_whole
+from rmc.deploy.run.folder import RunFolder
 from rmc.replay_server.commit_record import is_whole
 
 KEEP_SECONDS = 10.0

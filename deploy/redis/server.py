@@ -12,6 +12,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from urllib.parse import quote
 
 import redis
 
@@ -22,7 +23,7 @@ from rmc.deploy.run import tls
 
 START_SECONDS = 10.0
 STOP_SECONDS = 2.0
-SOCKET_PATH_LIMIT = 107  # bytes of a unix socket's path that the kernel takes
+SOCKET_PATH_LIMIT = 107 if sys.platform == "linux" else 103  # bytes of a unix socket's path that the kernel takes
 MAXMEMORY = 2 << 30  # the last backstop: what is on its way is far less, and a full server refuses instead of evicting
 # Bytes of one value at most: a policy's pieces have 256 KiB, windows some MiB; Redis would take 512 MiB.
 MAX_VALUE = 64 << 20
@@ -70,11 +71,11 @@ class RedisServer:
         self.socket = folder / "redis.sock"
         self.process: subprocess.Popen[bytes] | None = None
         if len(os.fsencode(self.socket)) > SOCKET_PATH_LIMIT:
-            raise ConfigError("--run-dir", str(folder), f"a socket path may have {SOCKET_PATH_LIMIT} bytes at most")
+            raise ConfigError("TMPDIR", str(folder), f"a socket path may have {SOCKET_PATH_LIMIT} bytes at most")
 
     def url(self, user: str = LAUNCHER) -> str:
         """What a user on this machine connects to."""
-        return f"unix://{self.users.login(user) if self.users else ''}{self.socket}"
+        return f"unix://{self.users.login(user) if self.users else ''}{quote(str(self.socket))}"
 
     def network_url(self, user: str, certificate: str = "") -> str:
         """What a user on another machine connects to; where it has the certificate, if it needs it."""
@@ -88,31 +89,30 @@ class RedisServer:
     def start(self) -> None:
         """Start it, and wait until it answers."""
         self.socket.unlink(missing_ok=True)
-        command = [server_binary(), str(self._write_config())]
-        tied = [sys.executable, "-I", parent_death.__file__, str(os.getpid()), *command]
+        if self.users is not None:
+            self._write_users()
+        tied = [sys.executable, "-I", parent_death.__file__, str(os.getpid()), server_binary(), "-"]
         with (self.folder / "redis.log").open("ab") as log:
             self.process = subprocess.Popen(
-                tied, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=self.folder, process_group=0
+                tied, stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=self.folder, process_group=0
             )
+        assert self.process.stdin is not None
+        with suppress(BrokenPipeError), self.process.stdin as settings:  # a file's name would be taken for a pattern
+            settings.writelines(f"{name} {_quoted(value)}\n".encode() for name, value in self._options().items())
         self._wait()
 
-    def _write_config(self) -> Path:
-        """A file, which only the owner may read: what is on a command line is seen by everyone."""
-        if self.users is not None:
-            self._write("users.acl", self.users.acl())
-        return self._write("redis.conf", "".join(f'{name} "{value}"\n' for name, value in self._options().items()))
-
-    def _write(self, name: str, text: str) -> Path:
-        path = self.folder / name
+    def _write_users(self) -> None:
+        """In a file that only the owner may read."""
+        assert self.users is not None
+        path = self.folder / "users.acl"
         path.unlink(missing_ok=True)
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.write(text)
-        return path
+            file.write(self.users.acl())
 
     def admit(self, users: RedisUsers) -> None:
         """Take other users than before, of the same secret. A server that is away reads of them when it comes back."""
         self.users = users
-        self._write("users.acl", users.acl())
+        self._write_users()
         client = redis.Redis.from_url(self.url())
         with closing(client), suppress(redis.exceptions.ConnectionError):
             client.acl_load()
@@ -185,3 +185,9 @@ class RedisServer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _quoted(value: str) -> str:
+    """A word of a Redis's configuration, whatever is in it."""
+    plain = (chr(byte) if 32 <= byte < 127 and byte not in b'"\\' else f"\\x{byte:02x}" for byte in os.fsencode(value))
+    return f'"{"".join(plain)}"'

@@ -81,6 +81,12 @@ class RunConfig:
             )
         return spec
 
+    def sizes(self) -> dict[str, int]:
+        """What a run's networks and windows were made for, in words. Raises ConfigError."""
+        spec = self.window_spec()
+        whole = {"steps an episode": spec.train} if self.actor.state_strategy == "episode" else {}
+        return {"observations": spec.obs_dim, "actions": spec.action_dim, **whole}
+
     def shards(self) -> list[Shard]:
         """The replay servers."""
         count = self.replay.replay_shards
@@ -151,6 +157,8 @@ def _matches(kind: Any, value: Any) -> bool:
         return value in get_args(kind)
     if get_origin(kind) in (types.UnionType, typing.Union):
         return any(_matches(part, value) for part in get_args(kind))
+    if get_origin(kind) is dict:
+        return isinstance(value, dict)
     if kind is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     return type(value) is kind

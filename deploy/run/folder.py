@@ -15,12 +15,14 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import CheckpointError, ConfigError
+from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import RunConfig, from_json, option, to_json
 
 log = logging.getLogger(__name__)
@@ -44,6 +46,7 @@ MAY_CHANGE = {
     "learner.threads",
     "learner.keep_checkpoints",
     "learner.checkpoint_steps",
+    "evaluator.evaluation_seconds",
 }
 
 
@@ -55,7 +58,7 @@ class RunFolder:
         self.checkpoints, self.replay, self.logs = self.path / "checkpoints", self.path / "replay", self.path / "logs"
         self.metrics, self.events = self.path / "metrics.jsonl", self.path / "events"
         self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
-        self.initial_file = self.path / "initial.json"
+        self.initial_file, self.sizes_file = self.path / "initial.json", self.path / "sizes.json"
         self._lock: int | None = None
 
     @property
@@ -110,6 +113,21 @@ class RunFolder:
         """Write ``initial.json``, whole or not at all."""
         write_whole(self.initial_file, f"{json.dumps(played, indent=2)}\n".encode())
 
+    def check_sizes(self, env_id: str, sizes: dict[str, int]) -> None:
+        """Raises ConfigError where the environment has other ``sizes`` than when the run began."""
+        try:
+            before = read_object(self.sizes_file, *sizes)
+        except (OSError, ConfigError):  # damaged, it is as none
+            return
+        for name, now in sizes.items():
+            if before[name] != now:
+                fault = f"the environment now has {now} {name}, the run was trained with {before[name]}"
+                raise ConfigError("ENV", env_id, f"{fault}; undo that, or train another run")
+
+    def write_sizes(self, sizes: dict[str, int]) -> None:
+        """Write ``sizes.json``, whole or not at all."""
+        write_whole(self.sizes_file, f"{json.dumps(sizes)}\n".encode())
+
     def reopen(self, total_steps: int) -> None:
         """Drop the result where steps are missing: what it says is no longer the end. Raises ConfigError."""
         result = self.result()
@@ -119,7 +137,7 @@ class RunFolder:
     def records(self) -> Iterator[dict[str, Any]]:
         """Those of ``metrics.jsonl`` that are whole, each with its role."""
         with suppress(FileNotFoundError), self.metrics.open("rb") as lines:
-            yield from filter(None, map(record, lines))
+            yield from filter(None, map(parse_record, lines))
 
     def secret(self) -> bytes:
         """The run's secret, made at first use. Only the owner may read it: where others could, they no longer can.
@@ -202,16 +220,6 @@ class RunFolder:
         return int(number) if word == "ended" else None
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a small file whole or not at all: what is in it is on the disk before it has its name."""
-    temporary = path.with_name(f".{path.name}")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.rename(path)
-
-
 def _locked(handle: int, kind: int) -> bool:
     try:
         fcntl.flock(handle, kind | fcntl.LOCK_NB)
@@ -232,7 +240,7 @@ def read_object(path: Path, *numbers: str) -> dict[str, Any]:
     return found
 
 
-def record(line: bytes) -> dict[str, Any] | None:
+def parse_record(line: bytes) -> dict[str, Any] | None:
     """A line of ``metrics.jsonl``; None where it is torn by a crash, or is no role's."""
     with suppress(ValueError):
         found = json.loads(line)
@@ -244,8 +252,8 @@ def record(line: bytes) -> dict[str, Any] | None:
 def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> RunFolder:
     """Make or take up a run's folder, locked. Raises ConfigError before anything is written where it may not be."""
     folder = RunFolder(run_dir or Path("runs") / _new_name(config))
-    if if_exists == "new":
-        folder = _unused(folder)
+    if run_dir is None or if_exists == "new":
+        folder = new_folder(folder.path)
     if (folder.path / "config.json").exists():
         if if_exists == "fail":
             raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")
@@ -256,6 +264,7 @@ def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> Ru
     folder.lock()
     folder.reopen(config.total_steps)
     folder.write_config(config)
+    folder.write_sizes(config.sizes())
     folder.secret()
     return folder
 
@@ -265,12 +274,22 @@ def _new_name(config: RunConfig) -> str:
     return f"{env}__{config.preset}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
 
 
-def _unused(folder: RunFolder) -> RunFolder:
-    number, candidate = 1, folder
-    while candidate.path.exists():
-        number += 1
-        candidate = RunFolder(folder.path.with_name(f"{folder.path.name}-{number}"))
-    return candidate
+def new_folder(path: Path) -> RunFolder:
+    """A folder of that name that was not there, or beside it: two starts in the same second get one each."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for number in count(1):
+            with suppress(FileExistsError):
+                folder = RunFolder(path if number == 1 else path.with_name(f"{path.name}-{number}"))
+                folder.path.mkdir(0o700)
+                break
+    except OSError as error:
+        raise _cannot_be_made(path, error) from None
+    return folder
+
+
+def _cannot_be_made(path: Path, error: OSError) -> ConfigError:
+    return ConfigError("--run-dir", str(path), f"cannot be made ({error.strerror}); give another")
 
 
 def make(folder: RunFolder) -> None:
@@ -282,7 +301,7 @@ def make(folder: RunFolder) -> None:
         for path in (folder.checkpoints, folder.logs):
             path.mkdir(exist_ok=True)
     except OSError as error:
-        raise ConfigError("--run-dir", str(folder.path), f"cannot be made ({error.strerror}); give another") from None
+        raise _cannot_be_made(folder.path, error) from None
 
 
 def _check_resumable(folder: RunFolder, config: RunConfig) -> None:
@@ -292,6 +311,7 @@ def _check_resumable(folder: RunFolder, config: RunConfig) -> None:
             name = "ENV" if path == "env.id" else option(path)
             fix = f"the run in {folder.path} has {was[path]!r}; use that, or another --run-dir"
             raise ConfigError(name, now[path], fix)
+    folder.check_sizes(config.env.id, config.sizes())
     check_checkpoints(folder)
 
 

@@ -9,8 +9,18 @@ import psutil
 
 from rmc.common.errors import ConfigError
 from rmc.common.window import WindowSpec
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.launch_options import LaunchOptions
 
 DISK_RESERVE = 256 << 20  # bytes left for checkpoints, metrics and logs
+
+
+def check_machine(config: RunConfig, options: LaunchOptions) -> None:
+    """Raises ConfigError where the device, the disk or the memory does not do. On Ray, the device is a node's."""
+    if options.launcher != "ray":
+        check_device(options.device)
+    runs = Path("runs") if options.run_dir is None else options.run_dir / "replay"
+    check_ring_fits(config.window_spec(), config.replay.capacity, runs.resolve())
 
 
 def check_ring_fits(spec: WindowSpec, capacity: int, folder: Path) -> None:

@@ -8,7 +8,7 @@ from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
 
 
-def preset(name: Preset, env: EnvConfig) -> RunConfig:
+def preset_config(name: Preset, env: EnvConfig) -> RunConfig:
     """A preset's RunConfig for an environment."""
     return {"robust": robust, "paper": paper, "debug": debug}[name](env)
 

@@ -2,8 +2,10 @@
 
 from typing import Any
 
+from rmc.common.bus.redis_url import shown
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, option
+from rmc.deploy.run.launch_options import LaunchOptions
 
 _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no range
     "seed": (0, 2**63 - 1),
@@ -20,7 +22,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "agent.hidden": (1, 65_536),
     "agent.embedding": (0, 65_536),
     "actor.envs_per_actor": (1, 4096),
-    "actor.reward_scale": (1e-12, 1e12),
+    "actor.reward_scale": (1e-37, 1e37),
     "actor.refresh_steps": (1, 2**31),
     "actor.chunk_windows": (1, 65_536),
     "actor.chunk_seconds": (1e-3, 3600),
@@ -49,6 +51,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "learner.keep_checkpoints": (1, 1_000_000),
     "learner.threads": (0, 1024),
     "evaluator.episodes": (1, 10_000),
+    "evaluator.evaluation_seconds": (0, 1e9),
 }
 
 
@@ -91,3 +94,19 @@ def validate(config: RunConfig) -> None:
         raise ConfigError(
             "--total-steps", config.total_steps, f"take more than --warmup-steps={config.replay.warmup_steps}"
         )
+
+
+def validate_launch(config: RunConfig, options: LaunchOptions) -> None:
+    """Raises ConfigError for options that the launcher has no use for, or lacks."""
+    launcher = options.launcher
+    if launcher == "ray" and options.redis_url is not None:
+        raise ConfigError("--redis-url", shown(options.redis_url), "a run on Ray has a Redis of its own, on the head")
+    if launcher != "ray" and options.all_cpus:
+        raise ConfigError("--all-cpus", True, "give --launcher ray; elsewhere say how many --actors")
+    if launcher != "ray" and options.tls:
+        raise ConfigError("--tls", True, "give --launcher ray; elsewhere take a --redis-url of rediss://")
+    if launcher == "lockstep" and config.replay.replay_shards > 1:
+        fix = "a lockstep run has one; use --launcher local"
+        raise ConfigError("--replay-shards", config.replay.replay_shards, fix)
+    if launcher == "manual" and options.redis_url is None:
+        raise ConfigError("--redis-url", None, "say which Redis the roles that you start by hand will use")

@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from rmc.analysis import curves, env_check, export, history, video, world_model_picture
-from rmc.analysis.evaluation import evaluate_checkpoint
+from rmc.analysis.evaluation import Progress, evaluate_checkpoint
 from rmc.analysis.policy import load_policy
-from rmc.cli import options, training
+from rmc.cli import options
+from rmc.cli.ending import cut_note
+from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
 from rmc.deploy.monitor.view import terminal
@@ -26,12 +29,16 @@ def evaluate(command: options.Evaluate) -> int:
     """Play a checkpoint and print how it did."""
     if not 1 <= command.episodes <= 10_000:
         raise ConfigError("--episodes", command.episodes, "take 1 to 10_000")
+    if not command.seconds >= 0.0:
+        raise ConfigError("--seconds", command.seconds, "take 0 or more")
     for flicker in command.flicker:
         if not 0.0 <= flicker <= 1.0:
             raise ConfigError("--flicker", flicker, "take probabilities from 0 to 1")
     folder, console = RunFolder(command.run), terminal()
     if command.video is not None and folder.is_baseline():
         raise ConfigError("--video", str(command.video), "only runs of rmc train are filmed; leave it")
+    if command.video is not None:
+        video.prepare(folder.config().env, command.video)
     for probability in command.flicker or (None,):
         played = _played(folder, command, probability)
         text = json.dumps(played) if command.json else _said(played)
@@ -46,14 +53,17 @@ def evaluate(command: options.Evaluate) -> int:
 
 
 def _played(folder: RunFolder, command: options.Evaluate, flicker: float | None) -> dict[str, Any]:
+    watch = Progress(Console(stderr=True), str(command.run))
     if not folder.is_baseline():
-        return evaluate_checkpoint(folder, folder.config(), command.checkpoint, command.episodes, flicker)
+        return evaluate_checkpoint(
+            folder, folder.config(), command.checkpoint, command.episodes, flicker, command.seconds, watch
+        )
     if command.checkpoint != "latest":
         raise ConfigError("--checkpoint", command.checkpoint, "a baseline keeps its last state only; use latest")
     _check_baselines(str(folder.path))
     from rmc.analysis import baselines
 
-    return baselines.evaluate(folder, command.episodes, flicker)
+    return baselines.evaluate(folder, command.episodes, flicker, command.seconds, watch)
 
 
 def _check_baselines(what: str) -> None:
@@ -66,7 +76,7 @@ def _said(played: dict[str, Any]) -> str:
     mean, deviation, flicker = (played[f"eval_{name}"] for name in ("return_mean", "return_std", "flicker"))
     seen = f" with {flicker:.0%} of the frames missing" if flicker else ""
     text = f"{played['env']}{seen}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
-    return f"{text}, after {played['env_steps']:,} environment steps"
+    return f"{text}{cut_note(played)}, after {played['env_steps']:,} environment steps"
 
 
 def export_policy(command: options.Export) -> int:
@@ -103,7 +113,7 @@ def baseline(command: options.Baseline) -> int:
     _check_baselines(command.algorithm)
     from rmc.analysis import baselines  # an extra, and slow to import
 
-    with training.signals_caught() as stop:
+    with signals_caught() as stop:
         return baselines.train(command.config(), command.run_dir, terminal(), stop)
 
 

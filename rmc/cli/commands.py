@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rmc.cli import options, training
+from rmc.cli.ending import say_end
 from rmc.common.bus.redis_url import has_password, shown
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.role_environment import SECRET_VARIABLE, URL_VARIABLE
@@ -104,7 +105,7 @@ def attach(command: options.Attach) -> int:
     except KeyboardInterrupt:
         console.print(f"it goes on; rmc stop {command.run} ends it", soft_wrap=True)
         return 0
-    return training.say_end(folder, console)
+    return say_end(folder, console)
 
 
 def stop(command: options.Stop) -> int:
@@ -114,7 +115,7 @@ def stop(command: options.Stop) -> int:
     if folder.is_baseline():  # its own terminal says how
         terminal().print(f"{folder.path} has ended", soft_wrap=True)
         return 0
-    training.say_end(folder, terminal())
+    say_end(folder, terminal())
     return 0
 
 

@@ -7,7 +7,9 @@ import logging
 import os
 import sys
 
+from rmc.common.process import watchdog
 from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
+from rmc.deploy.monitor import output
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
 ROLES = SINGLE_THREADED | {"learner", "launcher"}
@@ -21,11 +23,19 @@ def main() -> None:
     Leaves without Python's own clearing up: all is closed by then, and with torch loaded that takes seconds,
     which a user waits for after Ctrl-C.
     """
+    output.take_over()
+    watchdog.start()
     status = run(sys.argv[1:])
     logging.shutdown()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
+    os._exit(status or _unwritten())
+
+
+def _unwritten() -> int:
+    """The exit status of a command whose words were lost; a run has its result, and whoever ends a pipe knows of it."""
+    failure = getattr(sys.stdout, "failure", "")
+    if not failure or output.Output.log is not None or failure == os.strerror(errno.EPIPE):
+        return 0
+    return _complain(f"standard output: {failure}", FAILED_STATUS)
 
 
 def run(words: list[str]) -> int:
@@ -39,8 +49,13 @@ def run(words: list[str]) -> int:
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
-    if os.getcwd() not in sys.path:  # a user's own environments, last, so that they cannot shadow ours
-        sys.path.append(os.getcwd())
+    try:
+        here = os.getcwd()
+        if here not in sys.path:  # a user's own environments, last, so that they cannot shadow ours
+            sys.path.append(here)
+    except FileNotFoundError:
+        if parent is None:  # a role is given whole paths
+            return _complain("the working folder is gone; cd to one that is there", CONFIG_STATUS)
     from rmc.common.errors import ConfigError, RmcError
 
     try:

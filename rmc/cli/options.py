@@ -2,24 +2,34 @@
 
 import dataclasses
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional
+from tyro.constructors import PrimitiveConstructorSpec
 
 from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.analysis.baseline_settings import Algorithm, BaselineConfig
 from rmc.analysis.curves import Axis
 from rmc.common.agent_config import AgentConfig
-from rmc.common.env.config import EnvConfig
+from rmc.common.env.config import EnvConfig, read_kwargs, write_kwargs
+from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig, WindowConfig
 from rmc.deploy.run.folder import IfExists
 from rmc.deploy.run.launch_options import Launcher, LaunchOptions
-from rmc.deploy.run.presets import preset
+from rmc.deploy.run.presets import preset_config
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
+
+KEYWORDS = PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="NAME=VALUE",
+    instance_from_str=read_kwargs,
+    is_instance=lambda value: isinstance(value, dict),
+    str_from_instance=write_kwargs,
+)
 
 
 @dataclass(frozen=True)
@@ -28,6 +38,8 @@ class EnvOptions(EnvConfig):
 
     id: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
     """Gymnasium id, like HalfCheetah-v5 or dm_control/walker-walk-v0, or module:EnvId-v0 for your own."""
+    env_kwargs: Annotated[dict[str, Any], KEYWORDS] = field(default_factory=dict)
+    """Keywords that the environment is made with, like goal=1.5 map=maze pose=[0,1]: numbers, words, JSON."""
 
     def config(self) -> EnvConfig:
         """The same, as the roles know it."""
@@ -101,6 +113,9 @@ class Evaluate:
     """The run's folder."""
     episodes: int = 10
     """Episodes to play."""
+    seconds: float = 0.0
+    """Seconds after which no more are played: those that are over count, or else the first as far as it came. 0 plays
+    all."""
     flicker: tuple[float, ...] = ()
     """Probabilities of a missing observation, each of which is played; by default the run's own."""
     checkpoint: str = "latest"
@@ -282,8 +297,9 @@ Command = (
 
 
 def parse(words: list[str]) -> Command:
-    """The command line as one of the classes above. Raises SystemExit, its message on standard error."""
-    start = preset(_named_preset(words), EnvConfig(""))
+    """The command line as one of the classes above. Raises ConfigError; SystemExit, its message on standard error."""
+    _check_once("--env-kwargs", words)
+    start = preset_config(_named_preset(words), EnvConfig(""))
     shared = {item.name: getattr(start, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
     commands = (
         Annotated[Train, tyro.conf.subcommand("train", default=Train(env=EnvOptions(id=tyro.MISSING), **shared))]
@@ -306,6 +322,13 @@ def parse(words: list[str]) -> Command:
     flat = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     command: Command = tyro.cli(commands, prog="rmc", args=words, config=flat)
     return command
+
+
+def _check_once(option: str, words: list[str]) -> None:
+    """Of two, the parser would drop the first without a word."""
+    given = [word for word in words if word.partition("=")[0].replace("_", "-") == option]
+    if len(given) > 1:
+        raise ConfigError(option, " ".join(given), "is there twice; give all of NAME=VALUE after one")
 
 
 def _named_preset(words: list[str]) -> Preset:

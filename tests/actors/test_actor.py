@@ -25,7 +25,7 @@ from rmc.common.window import Rows, WindowSpec
 from rmc.common.wire import decode_rows
 from tests.actors.support import join_rows
 from tests.broken_env import FAULTS
-from tests.counting_env import ACTION_DIM, OBS_DIM, Step, audit
+from tests.counting_env import ACTION_DIM, OBS_DIM, CountingEnv, Step, audit
 from tests.learner.rows import step_valid
 
 AGENT = AgentConfig(hidden=8, embedding=8, heads=(8, 8))
@@ -463,6 +463,29 @@ def test_a_broken_episode_is_dropped_and_training_goes_on(fault: str) -> None:
     assert actor.metrics()["broken_episodes"] > 10
     sent = {step.step for step in found.trained if step.episode % 3 == 2}
     assert {0, SPEC.train - 1} <= sent
+    actor.close()
+
+
+class Scaling(CountingEnv):
+    """Changes the very array that it is given."""
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        action *= 3
+        return super().step(action)
+
+
+gym.register("Scaling-v0", entry_point=Scaling)
+
+
+def test_a_window_holds_the_agents_own_actions() -> None:
+    bus, clock = MemoryBus(), itertools.count().__next__
+    publish(bus, 0)
+    actor = Actor(0, 1, lambda: make_env(EnvConfig("Scaling-v0")), SPEC, AGENT, CONFIG, bus, clock)
+    reader = Reader(bus)
+    play(bus, actor, reader, 500)
+    rows = reader.rows()
+    assert 0.9 < np.abs(rows["action"]).max() <= 1.0
+    assert 0.9 < np.abs(rows["prev_action"]).max() <= 1.0
     actor.close()
 
 

@@ -29,41 +29,66 @@ def counting() -> Env:
     return make_env(EnvConfig("tests.counting_env:Counting-v0"))
 
 
-def runner_for(agent: Agent, envs: int) -> PolicyRunner:
-    runner = PolicyRunner(agent.obs_dim, agent.action_dim, agent.config, envs)
+def runner_for(agent: Agent) -> PolicyRunner:
+    runner = PolicyRunner(agent.obs_dim, agent.action_dim, agent.config, envs=1)
     runner.load(save(agent.policy_weights()))
     return runner
 
 
-def test_each_environment_plays_its_first_episode_to_its_end() -> None:
+def test_an_environment_plays_each_episode_to_its_end() -> None:
     """A counting episode of n steps returns 1 + … + n; stepping one past its end would fail there."""
     agent = Agent(OBS_DIM, ACTION_DIM, AGENT)
-    returns = play_episodes(runner_for(agent, 8), counting, 8, seed=4)
+    returns = play_episodes(runner_for(agent), counting, 8, seed=4).returns
     lengths = [int(np.random.Generator(np.random.PCG64(4 + i)).integers(1, 41)) for i in range(8)]
     assert returns == [n * (n + 1) / 2 for n in lengths]
     assert len(set(lengths)) > 3
 
 
-def test_a_batch_of_episodes_is_as_good_as_one_after_the_other() -> None:
-    agent = Agent(3, 1, AGENT)
-    together = play_episodes(runner_for(agent, 3), lambda: make_env(PENDULUM), 3, seed=0)
-    for i, value in enumerate(together):
-        (alone,) = play_episodes(runner_for(agent, 1), lambda: make_env(PENDULUM), 1, seed=i)
-        assert value == pytest.approx(alone, rel=1e-3)
-    assert together == play_episodes(runner_for(agent, 3), lambda: make_env(PENDULUM), 3, seed=0)
+def test_an_episodes_return_does_not_depend_on_how_many_are_played() -> None:
+    """Bit by bit, with networks so large that a product's rounding depends on its rows."""
+    agent, cheetah = Agent(17, 6, AgentConfig()), EnvConfig("HalfCheetah-v5", time_limit=300)
+    returns = {n: play_episodes(runner_for(agent), lambda: make_env(cheetah), n, seed=0).returns for n in (1, 3, 6)}
+    assert returns[1] == returns[6][:1]
+    assert returns[3] == returns[6][:3]
+    assert play_episodes(runner_for(agent), lambda: make_env(cheetah), 1, seed=4).returns == returns[6][4:5]
+
+
+def endless() -> Env:
+    pendulum = gym.make("Pendulum-v1").unwrapped
+    pendulum.spec = None
+    return RescaledEnv(pendulum)
 
 
 def test_an_episode_without_end_is_judged_by_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    def endless() -> Env:
-        pendulum = gym.make("Pendulum-v1").unwrapped
-        pendulum.spec = None
-        return RescaledEnv(pendulum)
-
     monkeypatch.setattr("rmc.actors.evaluator.LONGEST_EPISODE", 30)
-    envs = [endless() for _ in range(2)]
-    match = Rollout(runner_for(Agent(3, 1, AGENT), 2), envs, seed=0)
-    rounds = next(count for count in itertools.count(1) if not match.step())
-    assert (rounds, match.steps) == (30, 60)
+    match = play_episodes(runner_for(Agent(3, 1, AGENT)), endless, 2, seed=0)
+    assert (len(match.returns), match.steps, match.cut) == (2, 60, False)
+
+
+def test_an_evaluation_that_takes_too_long_is_cut() -> None:
+    """What is over counts; where nothing is, the first episode as far as it came. The clock goes on at each look."""
+    runner = runner_for(Agent(3, 1, AGENT))
+
+    def pendulum() -> Env:
+        return make_env(PENDULUM)  # 200 steps
+
+    def cut_after(seconds: float, episodes: int) -> Rollout:
+        clock = itertools.count()
+        match = Rollout(runner, pendulum(), pendulum, episodes, 0, seconds, lambda: float(next(clock)))
+        while match.step():
+            pass
+        match.env.close()
+        return match
+
+    whole = play_episodes(runner, pendulum, 3, seed=0)
+    assert not whole.cut
+    for seconds, episodes, over in ((50, 3, 1), (50, 1, 1), (250, 3, 1), (450, 3, 2)):
+        match = cut_after(seconds, episodes)
+        assert (match.cut, len(match.returns)) == (True, over)
+        assert seconds - 4 <= match.steps <= seconds
+        assert (match.returns == whole.returns[:over]) is (seconds > 200)
+    for seconds in (0, 1e6):
+        assert (cut_after(seconds, 3).cut, cut_after(seconds, 3).returns) == (False, whole.returns)
 
 
 def test_what_picks_the_best_is_not_what_judges_it() -> None:
@@ -144,18 +169,14 @@ class Dead(gym.Wrapper[Any, Any, Any, Any]):
         raise RuntimeError("it is dead")
 
 
-def test_an_episode_that_breaks_is_left_out() -> None:
-    sound = play_episodes(runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT), 3), counting, 3, seed=4)
+def test_an_episode_that_breaks_is_left_out_and_its_environment_made_anew() -> None:
+    runner = runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT))
+    sound = play_episodes(runner, counting, 3, seed=4).returns
     made = itertools.count()
-    some = play_episodes(
-        runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT), 3),
-        lambda: Dead(counting()) if next(made) == 1 else counting(),
-        3,
-        4,
-    )
-    assert some == [sound[0], sound[2]]
+    some = play_episodes(runner, lambda: Dead(counting()) if next(made) == 0 else counting(), 3, seed=4)
+    assert (some.returns, some.broken) == (sound[1:], 1)
     with pytest.raises(RmcError, match="broke in each of 2 episodes"):
-        play_episodes(runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT), 2), lambda: Dead(counting()), 2, seed=4)
+        play_episodes(runner, lambda: Dead(counting()), 2, seed=4)
 
 
 def test_the_evaluator_counts_them_and_makes_new_environments() -> None:

@@ -8,11 +8,13 @@ import sys
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box
 from rich.console import Console
 
-from rmc.analysis.baseline_settings import Algorithm, BaselineConfig, Settings, choose
+from rmc.analysis.baseline_settings import Algorithm, BaselineConfig, Settings, choose, read
 from rmc.analysis.baselines import evaluate, train
 from rmc.analysis.history import of_run
 from rmc.cli.main import run as rmc
@@ -20,6 +22,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.run.folder import RunFolder
+from tests import habits
 
 ENV = EnvConfig("InvertedPendulum-v5")
 ALGORITHMS = get_args(Algorithm)
@@ -161,5 +164,25 @@ def test_files_that_are_cut_are_named(tmp_path):
                     run(config(total_steps=200), folder)
             if path.name in ("progress.json", "model.zip", "config.json"):
                 with pytest.raises(ConfigError, match=rf"{folder}.*{fault}"):
-                    evaluate(RunFolder(folder), 1)
+                    evaluate(RunFolder(folder), 1, None, 0.0, lambda _: None)
         path.write_bytes(whole)
+
+
+def test_the_environments_keywords_and_sizes_are_kept(tmp_path, monkeypatch, capsys):
+    env = EnvConfig("tests.habits:Wants-v0", time_limit=20, env_kwargs={"goal": 1.5, "size": 4})
+    assert run(config(env=env, total_steps=150), tmp_path / "run") == 0
+    assert read(RunFolder(tmp_path / "run")).env == env
+    assert of_run(RunFolder(tmp_path / "run")).env == "tests.habits:Wants-v0, goal=1.5, size=4, time limit 20"
+    grown = Box(-99.0, 99.0, (5,), np.float32)
+    monkeypatch.setattr(habits.Wants, "__init__", lambda self, **_: setattr(self, "observation_space", grown))
+    says = "the environment now has 5 observations, the run was trained with 4"
+    assert rmc(["evaluate", str(tmp_path / "run")]) == 2
+    assert says in capsys.readouterr().err
+    with pytest.raises(ConfigError, match=says):
+        run(config(env=env, total_steps=300), tmp_path / "run")
+
+
+def test_an_environment_that_raises_is_one_line(tmp_path, capsys, caplog):
+    words = ["baseline", "sac", "tests.habits:Stumbles-v0", "--run-dir", str(tmp_path / "run")]
+    assert rmc(words) == 1
+    assert "the environment's step raises LinAlgError: Singular matrix (habits.py, line " in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """rmc check-env, as someone who brings an environment sees it."""
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -8,6 +9,9 @@ import numpy as np
 import pytest
 
 from rmc.cli import main
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.run.presets import debug
+from rmc.deploy.run.validation import validate
 
 
 def said(env: str, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, str]:
@@ -39,6 +43,21 @@ class Unrewarded(Odd):
         return self._observation(), 0.0, False, False, {}
 
 
+class Rewarded(Odd):
+    """Each reward has the same size, but for every hundredth."""
+
+    def __init__(self, size: float, rare: float = 0.0) -> None:
+        self._size, self._rare, self._steps = size, rare, 0
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        return self._observation(), self._rare if self._steps % 100 == 0 else self._size, False, False, {}
+
+
+for _name, _sizes in {
+    "Huge": (-1e30,), "Vast": (1e39,), "Tiny": (1e-9,), "Rare": (0.0, 1e6), "Plain": (1.0, 90.0),
+}.items():  # fmt: skip
+    gym.register(f"{_name}-v0", Rewarded, kwargs=dict(zip(("size", "rare"), _sizes, strict=False)))
 gym.register("Odd-v0", entry_point=Odd)
 gym.register("Unrewarded-v0", entry_point=Unrewarded)
 
@@ -63,12 +82,38 @@ def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
 
 
 @pytest.mark.parametrize(
+    ("env", "status", "words"),
+    [
+        ("Huge", 0, "note: rewards are large, up to 1e+30 a step; try --reward-scale 1e-30"),
+        ("Rare", 0, "note: rewards are large, up to 1e+06 a step; try --reward-scale 0.0001"),
+        ("Tiny", 0, "note: rewards are small, 1e-09 a step at most; try --reward-scale 1e+09"),
+        ("Vast", 1, "fault: rewards reach 1e+39, past what float32 holds"),
+    ],
+)
+def test_a_reward_scale_is_proposed_that_train_takes(env, status, words, capsys):
+    found, text = said(f"{env}-v0", capsys, "--steps", "300")
+    assert found == status
+    assert words in text
+    if status == 0:
+        scale = float(text.partition("--reward-scale ")[2].split()[0])
+        config = debug(EnvConfig(f"{env}-v0"))
+        validate(replace(config, actor=replace(config.actor, reward_scale=scale)))
+
+
+def test_rewards_of_an_ordinary_size_need_no_scale(capsys):
+    assert "--reward-scale" not in said("Plain-v0", capsys, "--steps", "300")[1]
+
+
+@pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("raise", "fault: RuntimeError: the simulation is unstable"),
+        (
+            "raise",
+            "fault: the environment's step raises RuntimeError: the simulation is unstable (broken_env.py, line ",
+        ),
         ("nan", "fault: observations are not finite"),
         ("reward", "fault: rewards are not finite"),
-        ("shape", "fault: ValueError: its observation has shape (3,), its space says (4,)"),
+        ("shape", "fault: the environment's observation has shape (3,), its space says (4,)"),
     ],
 )
 def test_faults_are_named(fault, words, capsys):

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
@@ -84,3 +85,41 @@ def test_a_grid_of_flicker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert "with 100% of the frames missing: return" in lines[2]
     assert main.run(["evaluate", folder, "--flicker", "0", "2"]) == 2
     assert "--flicker=2.0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("env", "kwargs", "says"),
+    [
+        ("Slide", {}, 'cannot be filmed: its metadata["render_modes"] is []; give it "rgb_array", and a render()'),
+        ("TakesNoMode", {}, "cannot be filmed: it takes no render_mode; let its __init__ take and keep one"),
+        ("Draws", {"picture": "none"}, "render gives object of shape (); return an array (height, width, 3) of uint8"),
+        ("Draws", {"picture": "floats"}, "render gives float64 of shape (32, 40, 3); return an array"),
+        ("Draws", {"picture": "list"}, "render gives uint8 of shape (1, 32, 40, 3); return an array"),
+        ("Draws", {"picture": "with alpha"}, "render gives uint8 of shape (32, 40, 4); return an array"),
+        (
+            "Draws",
+            {"picture": "raises"},
+            "cannot be filmed: the environment's render raises KeyError: 'raises' (habits.py,",
+        ),
+    ],
+)
+def test_an_environment_without_pictures_is_named_before_anything_is_played(
+    env: str, kwargs: dict[str, Any], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    folder = make_run(tmp_path / "run", AGENTS["robust"], f"tests.habits:{env}-v0", env_kwargs=kwargs).path
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    assert main.run(["evaluate", str(folder), "--video", str(tmp_path / "episode.mp4")]) == 2
+    said = capsys.readouterr()
+    assert says in said.err
+    assert "libegl1" not in said.err
+    assert (len(said.err.splitlines()), said.out) == (1, "")
+    assert not (tmp_path / "episode.mp4").exists()
+
+
+def test_an_environment_of_ones_own_is_filmed_without_a_screen(tmp_path: Path, monkeypatch) -> None:
+    kwargs = {"picture": "sound"}
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "tests.habits:Draws-v0", env_kwargs=kwargs).path
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    done = evaluate(folder, "--video", str(tmp_path / "episode.mp4"))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "episode.mp4: an episode with return" in done.stdout

@@ -6,12 +6,13 @@ import re
 import stat
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from rmc.cli import main, options
-from rmc.cli.training import prepare
+from rmc.cli.training import open_folder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import to_json
@@ -25,7 +26,7 @@ DEBUG = ["train", PENDULUM, "--preset", "debug"]
 # Whoever changes this list changes what users have in their scripts.
 TRAIN_FLAGS = """
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
-    --env-timeout --run-dir --if-exists --launcher --device --redis-url
+    --env-timeout --env-kwargs --run-dir --if-exists --launcher --device --redis-url
     --ray-address --all-cpus --tls
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
@@ -37,11 +38,11 @@ TRAIN_FLAGS = """
     --scheme --policy-through-q --update-order --model-norm --n-step --state-strategy
     --curiosity --curiosity-scale --curiosity-steps --eta
     --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads
-    --episodes
+    --episodes --evaluation-seconds
 """.split()  # noqa: SIM905
-ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit --env-timeout".split()  # noqa: SIM905
+ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit --env-timeout --env-kwargs".split()  # noqa: SIM905
 OTHER_FLAGS = {
-    "evaluate": ["--episodes", "--flicker", "--checkpoint", "--video", "--json"],
+    "evaluate": ["--episodes", "--seconds", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
     "inspect": ["--out", "--checkpoint"],
     "check-env": [*ENV_FLAGS, "--steps"],
@@ -153,7 +154,7 @@ def test_a_redis_beside_ray_is_refused_without_its_password() -> None:
     """Where the check is made: to get there from the command line takes a cluster."""
     placement = LaunchOptions(None, "fail", "ray", "cpu", "redis://user:hush@localhost:1")
     with pytest.raises(ConfigError, match="--redis-url='redis://localhost:1': a run on Ray"):
-        prepare(debug(EnvConfig(PENDULUM)), placement)
+        open_folder(debug(EnvConfig(PENDULUM)), placement)
 
 
 def test_a_full_disk_is_one_line(
@@ -166,6 +167,22 @@ def test_a_full_disk_is_one_line(
     monkeypatch.setattr(main, "_parse_and_run", full)
     assert main.run(["train"]) == 1
     assert capsys.readouterr().err == "rmc: disk: No space left on device; make room and try again\n"
+
+
+@pytest.mark.parametrize("words", [DEBUG, ["stats", "run"], ["--help"]])
+def test_a_working_folder_that_is_gone_is_one_line(words: list[str], tmp_path: Path) -> None:
+    gone = f"mkdir gone && cd gone && rmdir ../gone && exec {sys.executable} -m rmc.cli.main {' '.join(words)}"
+    done = subprocess.run(["sh", "-c", gone], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (2, "rmc: the working folder is gone; cd to one that is there\n")
+
+
+def test_without_a_temporary_folder_nothing_starts(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/nowhere"])
+    assert "rmc: TMPDIR=" in complaint([*DEBUG, "--run-dir", str(tmp_path / "run")], capsys)
+    assert not (tmp_path / "run").exists()
 
 
 def made_run(folder: Path) -> RunFolder:

@@ -1,15 +1,32 @@
 """What rmc train does around the roles."""
 
+import io
 import json
+import time
+from dataclasses import replace
 
+import gymnasium as gym
 from rich.console import Console
 
 from rmc.analysis import evaluation
-from rmc.cli import training
+from rmc.cli import main, training
 from rmc.cli.training import conduct
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from tests.analysis.test_policy import AGENTS, make_run
+from tests.counting_env import CountingEnv
+
+
+class Endless(CountingEnv):
+    """A slow one whose episodes have no end."""
+
+    def step(self, action):
+        time.sleep(0.01)
+        self._length = self._step + 2
+        return super().step(action)
+
+
+gym.register("NeverEnding-v0", entry_point=Endless)
 
 
 def test_the_last_evaluation_judges_and_does_not_choose(tmp_path, monkeypatch):
@@ -30,9 +47,9 @@ def test_the_untrained_policy_is_played_once(tmp_path, monkeypatch):
     placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
     played, play = [], evaluation.evaluate_blob
 
-    def counted(config, blob, episodes, flicker=None):
+    def counted(config, blob, *others):
         played.append(blob)
-        return play(config, blob, episodes, flicker)
+        return play(config, blob, *others)
 
     monkeypatch.setattr(evaluation, "evaluate_blob", counted)
 
@@ -55,3 +72,25 @@ def test_the_untrained_policy_is_played_once(tmp_path, monkeypatch):
         assert folder.initial_file.read_bytes() == kept
     folder.initial_file.unlink()
     assert (train(), len(played)) == (first, 2)
+
+
+def test_an_evaluation_without_end_shows_that_it_goes_on_and_is_cut(tmp_path, monkeypatch, capsys):
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "NeverEnding-v0")
+    monkeypatch.setattr(training, "_launch", lambda *_: True)
+    monkeypatch.setattr(evaluation, "SAY_SECONDS", 0.1)
+    config, said, began = folder.config(), io.StringIO(), time.monotonic()
+    config = replace(config, evaluator=replace(config.evaluator, evaluation_seconds=0.5))
+    folder.lock()
+    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
+    assert conduct(config, folder, placement, Console(file=said, width=200)) == 0
+    assert 1.0 < time.monotonic() - began < 60
+    for when in ("before training:", "after training:"):
+        assert f"{when} episode 1 of 10, " in said.getvalue()
+    assert said.getvalue().count("over 1 deterministic episodes, cut when its seconds were over") == 3
+    assert json.loads(folder.result_file.read_bytes())["eval_cut"] == 1
+    assert main.run(["evaluate", str(folder.path), "--seconds", "0.5", "--json"]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)["eval_cut"] == 1
+    assert f"{folder.path}: episode 1 of 10, " in told.err.replace("\n", "")
+    assert main.run(["evaluate", str(folder.path), "--seconds", "nan"]) == 2
+    assert "--seconds=nan: take 0 or more" in capsys.readouterr().err

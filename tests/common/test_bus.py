@@ -4,7 +4,6 @@ import itertools
 import os
 import shutil
 import tempfile
-import time
 import uuid
 from pathlib import Path
 
@@ -63,54 +62,6 @@ def test_entries_are_read_in_order_and_trimmed_by_commit(bus):
     assert bus.ack(4) is None
 
 
-def read_until(bus: Bus, after: dict[int, EntryId], count: int) -> list[int]:
-    """Sequence numbers of so many entries, looked for until they are there."""
-    found: list[int] = []
-    end = time.monotonic() + 5.0
-    while len(found) < count and time.monotonic() < end:
-        found += [entry.id.seq for entry in bus.read(after, 10)]
-    return found
-
-
-def test_what_is_expected_comes_once_it_is_there(bus):
-    for seq in range(3):
-        bus.append(0, EntryId(1, seq), b"x")
-    bus.expect({0: EntryId(1, 0)}, 10)
-    assert read_until(bus, {0: EntryId(1, 0)}, 2) == [1, 2]
-    bus.expect({0: EntryId(1, 2)}, 10)
-    assert bus.read({0: EntryId(1, 2)}, 10) == []
-    bus.append(0, EntryId(1, 3), b"x")
-    assert read_until(bus, {0: EntryId(1, 2)}, 1) == [3]
-
-
-def test_what_was_expected_from_elsewhere_is_forgotten(bus):
-    for seq in range(3):
-        bus.append(0, EntryId(1, seq), b"x")
-        bus.append(1, EntryId(1, seq), b"x")
-    bus.expect({0: EntryId(1, 1)}, 10)
-    assert [entry.id.seq for entry in bus.read({0: EntryId(1, 0)}, 10)] == [1, 2]
-    bus.expect({0: EntryId(1, 1)}, 10)  # an actor more than was expected: it is read next time
-    assert read_until(bus, {0: EntryId(1, 1), 1: EntryId(1, 0)}, 1)[0] == 2
-
-
-def test_expecting_without_a_redis_says_so_and_goes_on_with_the_next(tmp_path):
-    folder = tmp_path / "redis"
-    folder.mkdir(mode=0o700)
-    with RedisServer(folder) as server:
-        bus = RedisBus(server.url(), "run")
-        bus.append(0, EntryId(1, 0), b"x")
-        bus.expect({0: EntryId(1, 0)}, 10)
-        server.close()
-        with pytest.raises(BusUnavailable):
-            read_until(bus, {0: EntryId(1, 0)}, 1)
-        with pytest.raises(BusUnavailable):
-            bus.expect({0: EntryId(1, 0)}, 10)
-        server.start()
-        bus.append(0, EntryId(1, 0), b"x")
-        bus.expect({0: EntryId(0, 0)}, 10)
-        assert read_until(bus, {0: EntryId(0, 0)}, 1) == [0]
-
-
 def test_a_repeated_append_is_stored_once(bus):
     for _ in range(3):
         bus.append(0, EntryId(1, 0), b"hello")
@@ -142,7 +93,7 @@ def test_an_entry_of_an_epoch_that_nobody_can_have_taken_fences_nobody(redis_url
     epoch = [bus.take_epoch("actor-0") for _ in range(2)][-1]
     for seq in range(2):
         bus.append(0, EntryId(epoch, seq), b"%d" % seq)
-    bus._redis.xadd(bus._key("windows", 0), {"p": b"x"}, id="%d-%d" % forged)
+    bus._redis.xadd(bus._key("windows", 0), {"p": b"x"}, id=f"{forged[0]}-{forged[1]}")
     bus._redis.set(bus._key("epoch", "actor-0"), counted)
     is_lawful = forged[0] == 3 and counted > 2  # a life that was begun
     for seq in (0, 2):

@@ -112,19 +112,34 @@ def test_the_outermost_actions_are_within_the_bounds(bound: float, dtype: type) 
         (odd("Image-v0", Box(0, 255, (8, 8, 3), np.uint8), VECTOR), "images (8, 8, 3)"),
         (odd("Dict-v0", gym.spaces.Dict(a=VECTOR, b=gym.spaces.Discrete(3)), VECTOR), "{'b': 'Discrete'} are no Box"),
         (odd("Pictures-v0", gym.spaces.Dict(a=VECTOR, b=Box(0, 255, (9, 8, 3), np.uint8)), VECTOR), "{'b': (9, 8, 3)}"),
-        (odd("Tuple-v0", gym.spaces.Tuple([VECTOR]), VECTOR), "observations are Tuple"),
+        (odd("Tuple-v0", gym.spaces.Tuple([VECTOR, gym.spaces.Text(3)]), VECTOR), "{'1': 'Text'} are no Box"),
+        (
+            odd("Film-v0", Box(0, 1, (4, 84, 84)), VECTOR),
+            "images (4, 84, 84); only vectors are learnt from: give what an",
+        ),
+        (odd("Gray-v0", Box(0, 255, (9, 8), np.uint8), VECTOR), "images (9, 8)"),
+        (
+            odd("Eye-v0", gym.spaces.Dict(a=gym.spaces.Dict(b=Box(0, 1, (64, 64)))), VECTOR),
+            "{'a.b': (64, 64)} are images",
+        ),
+        (odd("Still-v0", VECTOR, Box(np.float32([-1, 0.5]), np.float32([1, 0.5]))), "its actions [1] cannot move"),
+        (
+            odd("Many-v0", VECTOR, gym.spaces.Dict(a=VECTOR, b=gym.spaces.Discrete(2))),
+            "of its actions {'b': 'Discrete'}",
+        ),
         (EnvConfig("Pendulum-v1", hide="velocities"), "--hide is for MuJoCo's bodies"),
         (EnvConfig("HalfCheetah-v5", noise=-0.1), "--noise=-0.1"),
         (EnvConfig("HalfCheetah-v5", frame_stack=0), "--frame-stack=0"),
         (EnvConfig("HalfCheetah-v5", action_repeat=0), "--action-repeat=0"),
         (EnvConfig("HalfCheetah-v5", time_limit=-1), "--time-limit=-1"),
-        (odd("Scalar-v0", Box(0, 1, (), np.float32), VECTOR), "have shape ()"),
+        (odd("Empty-v0", Box(0, 1, (0,), np.float32), VECTOR), "its observations have shape (0,)"),
         (odd("Unbounded-v0", VECTOR, Box(-np.inf, np.inf, (2,))), "action space is unbounded"),
         (odd("Endless-v0", VECTOR, Box(-3e38, 3e38, (2,))), "action space is unbounded"),
         (odd("Whole-v0", VECTOR, Box(0, 3, (2,), np.int64)), "actions are int64"),
         (EnvConfig("json:Nothing-v0"), "json registers no Nothing-v0"),
         (odd("Multi-v0", VECTOR, gym.spaces.MultiDiscrete([2, 2])), "actions are MultiDiscrete"),
-        (odd("Matrix-v0", VECTOR, Box(-1, 1, (2, 2))), "actions have shape (2, 2)"),
+        (EnvConfig("Pendulum-v1", env_kwargs={"g": math.inf}), "--env-kwargs g=inf: take finite numbers"),
+        (EnvConfig("Pendulum-v1", env_kwargs={"gg": 9}), "unexpected keyword argument 'gg'; it takes (render_mode"),
     ],
     ids=lambda value: value.id if isinstance(value, EnvConfig) else "",
 )
@@ -143,10 +158,12 @@ def test_refused_in_one_line(config: EnvConfig, says: str) -> None:
         ("import nothere", "No module named 'nothere'; broken needs it; install it"),
         ("x = (", "broken cannot be imported: SyntaxError: '(' was never closed (broken.py, line 1)"),
         ("x = 1\nx / 0", "broken cannot be imported: ZeroDivisionError: division by zero (broken.py, line 2)"),
+        ("import json\njson.loads('x')", "Expecting value: line 1 column 1 (char 0) (broken.py, line 2)"),
+        ("import sys\nsys.exit('no licence')", "broken cannot be imported: SystemExit: no licence (broken.py, line 2)"),
         (
-            "import gymnasium\nclass Env(gymnasium.Env):\n  def __init__(self):\n    self.missing.x\n"
+            "import gymnasium\nclass Env(gymnasium.Env):\n  def __init__(self):\n    self.x\n"
             "gymnasium.register('Broken-v0', entry_point=Env)",
-            "it cannot be made: AttributeError: 'Env' object has no attribute 'missing' (broken.py, line 4)",
+            "the environment cannot be made: AttributeError: 'Env' object has no attribute 'x' (broken.py, line 4)",
         ),
     ],
 )

@@ -158,6 +158,7 @@ def test_an_epoch_that_none_can_be_is_mended(bus: RedisBus, value: str | int) ->
     """By who takes the next; those that look meanwhile, or commit, are not kept from it."""
     bus._redis.set(bus._key("epoch", "actor-0"), value)
     bus.current_epoch("actor-0")
+    bus.check_room("actor-0")
     assert [bus.take_epoch("actor-0", floor=9) for _ in range(2)] == [10, 11]
     bus._redis.set(bus._key("epoch", "replay"), "many")
     bus.commit(ReplayOwner("replay", 1), ACK)

@@ -157,7 +157,7 @@ class OldName(gym.Env[np.ndarray, np.ndarray]):
 
 
 def test_the_old_name_of_a_missing_frame_is_understood_with_one_warning(caplog: pytest.LogCaptureFixture) -> None:
-    wrappers._warn_of_old_name.cache_clear()
+    wrappers._warn_once.cache_clear()
     env = RescaledEnv(OldName())
     assert env.reset()[1] == {"missing": True}
     assert [env.step(ACTION[:1])[4] for _ in range(3)] == [{"missing": False, "goal": 3}] * 3

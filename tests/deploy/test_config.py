@@ -14,7 +14,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig, from_json, option, to_json
 from rmc.deploy.run.folder import flat
-from rmc.deploy.run.presets import debug, paper, preset, robust
+from rmc.deploy.run.presets import debug, paper, preset_config, robust
 from rmc.deploy.run.validation import validate
 
 ENV = EnvConfig("InvertedPendulum-v5")
@@ -23,7 +23,7 @@ NAMES: list[Preset] = ["robust", "paper", "debug"]
 
 @pytest.mark.parametrize("name", NAMES)
 def test_presets_are_valid_and_come_back_from_json(name: Preset) -> None:
-    config = preset(name, ENV)
+    config = preset_config(name, ENV)
     validate(config)
     assert config.preset == name
     assert from_json(to_json(config)) == config

@@ -18,7 +18,7 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import to_json
-from rmc.deploy.run.folder import RESULT, RunFolder, open_run
+from rmc.deploy.run.folder import RESULT, IfExists, RunFolder, open_run
 from rmc.deploy.run.presets import debug
 
 
@@ -93,6 +93,34 @@ def test_a_run_that_is_made_longer_has_no_result_until_it_ends(tmp_path: Path) -
     for more, there in ((0, True), (1, False)):
         open_run(dataclasses.replace(config, total_steps=config.total_steps + more), folder.path, "resume").unlock()
         assert (folder.result() is not None) == there
+
+
+@pytest.mark.parametrize("if_exists", ["resume", "fail", "new"])
+def test_starts_in_the_same_second_get_a_folder_each(
+    if_exists: IfExists, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("time.strftime", lambda *_: "20260102-030405")
+    barrier = Barrier(4)
+
+    def start(_: int) -> RunFolder:
+        barrier.wait()
+        return open_run(debug(EnvConfig("InvertedPendulum-v5")), None, if_exists)
+
+    with ThreadPoolExecutor(4) as pool:
+        runs = list(pool.map(start, range(4)))
+    name = "InvertedPendulum-v5__debug__0__20260102-030405"
+    assert {one.path.name for one in runs} == {name, *(f"{name}-{number}" for number in (2, 3, 4))}
+    assert {stat.S_IMODE(one.path.stat().st_mode) for one in runs} == {0o700}
+    for one in runs:
+        one.unlock()
+
+
+def test_a_place_for_runs_that_is_none_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").touch()
+    with pytest.raises(ConfigError, match=r"--run-dir='.*runs.*cannot be made \(.+\); give another"):
+        open_run(debug(EnvConfig("InvertedPendulum-v5")), None, "resume")
 
 
 def test_odd_lines_of_metrics_are_passed_over(tmp_path: Path) -> None:

@@ -68,8 +68,8 @@ def test_any_number_is_shown(monitor: Monitor, value: float) -> None:
     [(2**53, 2**53), (2**53 + 1, 2**53 + 1), (1e300, 2**63 - 1), (1.5, 1), (-1, 0), (math.nan, 0), (math.inf, 0)],
 )
 def test_steps_beyond_what_a_float_counts_are_shown(monitor: Monitor, said: float, shown: int) -> None:
-    monitor.record({"role": "replay", "env_steps": said})
-    monitor.record({"role": "learner", "checkpoint_update": 3, "checkpoint_env_steps": said})
+    monitor.take({"role": "replay", "env_steps": said})
+    monitor.take({"role": "learner", "checkpoint_update": 3, "checkpoint_env_steps": said})
     assert monitor.board.env_steps == shown
     assert monitor.board.checkpoint_steps(3) == (shown or None)
     assert f"steps {shown}/" in line(monitor.board)
@@ -108,9 +108,9 @@ def test_whatever_a_role_leaves_out_the_run_goes_on(monitor: Monitor, tmp_path: 
 )
 def test_half_of_an_evaluation_is_none(monitor: Monitor, said: dict[str, float]) -> None:
     monitor._checkpoints.save(3, {})
-    monitor.record({"role": "evaluator", **said})
+    monitor.take({"role": "evaluator", **said})
     assert monitor._checkpoints.best() is None
-    monitor.record({"role": "evaluator", "eval_update": 3, "eval_return_mean": 1})
+    monitor.take({"role": "evaluator", "eval_update": 3, "eval_return_mean": 1})
     assert monitor._checkpoints.best() == 3
     assert "± - at update 3" in _evaluation(monitor.board)
     monitor.close()
@@ -162,10 +162,10 @@ def test_evaluations_that_found_no_room_are_marked_when_there_is_some(
 
     for update, score in ((10, 1.0), (20, 3.0), (30, 2.0)):
         monkeypatch.setattr(monitor._checkpoints, "mark_best", full)
-        monitor.record({"role": "evaluator", "eval_update": update, "eval_return_mean": score})
+        monitor.take({"role": "evaluator", "eval_update": update, "eval_return_mean": score})
     monkeypatch.setattr(monitor._checkpoints, "mark_best", lambda *found: marked.append(found))
     for _ in range(2):
-        monitor.record({"role": "learner", "updates": 30})
+        monitor.take({"role": "learner", "updates": 30})
     assert marked == [(10, 1.0), (20, 3.0), (30, 2.0)]
     monitor.close()
 

@@ -85,8 +85,7 @@ def test_every_role_can_do_its_work(server: RedisServer) -> None:
     owner = ReplayOwner("replay", 5)
     assert replay.progress("replay") == b"counted"
     assert replay.actors() == [0]
-    replay.expect({0: EntryId(0, 0)}, 10)
-    assert len(replay.read({0: EntryId(0, 0)}, 10)) <= 2
+    assert len(replay.read({0: EntryId(0, 0)}, 10)) == 2
     (_, entry) = replay.read({0: EntryId(4, 0)}, 10)
     replay.dead_letter(entry, "a test")
     replay.announce_replay(owner, "unix:/nowhere")
@@ -219,6 +218,6 @@ def test_passwords_are_nowhere_to_be_read(tmp_path: Path) -> None:
         assert server.process is not None
         said = Path(f"/proc/{server.process.pid}/cmdline").read_text() + repr(USERS)
         said += "".join(file.read_text() for file in folder.iterdir() if not file.is_socket())
-        assert [stat.S_IMODE((folder / file).stat().st_mode) for file in ("redis.conf", "users.acl")] == [0o600] * 2
+        assert stat.S_IMODE((folder / "users.acl").stat().st_mode) == 0o600
         assert not [user for user in ROLES if USERS.password(user) in said]
         assert SECRET.decode() not in said

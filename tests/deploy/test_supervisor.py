@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from rmc.common.errors import RoleDied
+from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.local import supervisor
 from rmc.deploy.local.supervisor import RoleCommand, RoleProcess, Supervisor
 
@@ -53,6 +54,16 @@ def test_any_other_role_that_ends_unasked_is_started_again(quick: Path) -> None:
     with pytest.raises(RoleDied, match=r"3 times in a row soon after its start, exit status 0"):
         tend_until(role)
     assert role.restarts == 2
+
+
+def test_one_that_hangs_soon_after_each_start_ends_the_run(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long it hung before it was ended for that."""
+    monkeypatch.setattr(supervisor, "QUICK_SECONDS", 0.5)
+    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\nsleep 0.7\nexit {HUNG_STATUS}\n")
+    role = RoleProcess(RoleCommand("actor-0", ("actor",), env_timeout=0.6), {}, quick)
+    role.start()
+    with pytest.raises(RoleDied, match=rf"3 times in a row soon after its start, exit status {HUNG_STATUS}"):
+        tend_until(role)
 
 
 @pytest.mark.parametrize("number", [9, 15])

@@ -114,6 +114,8 @@ def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Pat
     assert "time limit 100" in said[0]
     assert said[0].endswith("it can be trained on\n")
     assert "note" not in said[0]
+    assert "shuttle.mp4: an episode with return" in said[2]
+    assert (tmp_path / "shuttle.mp4").stat().st_size > 1000
 
 
 def test_the_docs_name_options_that_exist() -> None:

@@ -57,7 +57,7 @@ class Training:
 
     def sockets(self) -> list[Path]:
         """The files of its temporary folder."""
-        folders = Path(tempfile.gettempdir()).glob(f"rmc-run-{self.process.pid}-*")
+        folders = Path(tempfile.gettempdir()).glob(f"rmc-sockets-{self.process.pid}-*")
         return [path for folder in folders for path in (folder, *folder.iterdir())]
 
     def records(self, role: str) -> list[dict[str, Any]]:

@@ -20,6 +20,8 @@ def test_training_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         assert training.finish(170) == 0, training.text() + training.logs()
         assert re.search(r"episode [\d.,-]+, \d+ broken", training.text())
     assert mark.exists()
+    logs = "".join(path.read_text() for path in (tmp_path / "run" / "logs").glob("*.log"))
+    assert "rmc: ENV='tests.broken_env:Hanging-v0': step has not returned for 5 s (broken_env.py, line" in logs
     records = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert max(record.get("broken_episodes", 0) for record in records) > 0
     assert max(record.get("restarts", 0) for record in records) >= 1

@@ -31,6 +31,15 @@ def test_a_killed_launcher_takes_everything_along(tmp_path: Path) -> None:
         again.interrupt()
 
 
+def test_a_temporary_folder_with_a_long_and_odd_name_is_no_fault(tmp_path: Path) -> None:
+    """Sockets lie in it, or in another one where their paths do not fit."""
+    odd = tmp_path / f'a#b?c%d e"f\\g{"x" * 60}'
+    odd.mkdir()
+    with Training(tmp_path / "run", environment={"TMPDIR": str(odd)}) as training:
+        assert training.finish(150) == 0, training.text()
+    assert (tmp_path / "run" / "result.json").exists()
+
+
 def test_a_role_that_dies_at_once_ends_the_run_with_its_traceback(tmp_path: Path) -> None:
     environments = tmp_path / "broken_env.py"
     environments.write_text(BROKEN)

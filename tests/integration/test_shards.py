@@ -91,14 +91,14 @@ def test_any_number_of_shards_samples_with_the_same_distribution(wholes: list[Wh
         for _ in range(draws):
             sample = whole.replay.sample(BATCH)
             assert sample.rows is not None
-            assert sample.values is not None
+            assert sample.weights is not None
             for row in sample.rows:
                 counts[name(row)] += 1
-            weights = importance_weights(sample.values, sample.mass, sample.windows, 0.4)
+            weights = importance_weights(sample.weights, sample.total_weight, sample.windows, 0.4)
             truth = np.array([priority(*name(row)) for row in sample.rows]) ** (-0.4 * FREE.priority_exponent)
             np.testing.assert_allclose(weights, truth / truth.max(), rtol=1e-5)
             assert sample.windows == len(names)
-            assert sample.mass == pytest.approx(expected.sum())
+            assert sample.total_weight == pytest.approx(expected.sum())
         found = np.array(list(counts.values()))
         assert found.sum() == draws * BATCH
         p_value = stats.chisquare(found, draws * BATCH * expected / expected.sum()).pvalue
@@ -140,9 +140,9 @@ def test_priorities_find_their_windows_in_rings_that_wrap(count: int, tmp_path: 
         found = np.array([priority(*name(row)) for row in sample.rows], np.float32)
         whole.replay.update_priorities(sample.rows["serial"].copy(), found)
     assert sample.rows is not None
-    assert sample.values is not None
+    assert sample.weights is not None
     truth = np.array([priority(*name(row)) for row in sample.rows]) ** FREE_AND_SMALL.priority_exponent
-    np.testing.assert_allclose(sample.values, truth, rtol=1e-5)
+    np.testing.assert_allclose(sample.weights, truth, rtol=1e-5)
     for server in whole.servers:
         server.close()
 

@@ -4,6 +4,7 @@ import io
 import json
 import time
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
@@ -42,8 +43,9 @@ class Setting:
         checkpoints, update = CheckpointFolder(self.folder / "checkpoints"), UpdateConfig(policy_average=policy_average)
         return Learner(SPEC, AGENT, update, CONFIG, self.server, self.bus, checkpoints, seed=1)
 
-    def feed(self, windows: int) -> None:
+    def feed(self, windows: int, reward: float = 1.0) -> None:
         rows = random_rows(windows, self.seq)
+        rows["reward"] *= reward
         rows["new_steps"] = rows["last"] - SPEC.burn_in
         rows["new_observations"] = rows["new_steps"]
         self.seq += 1
@@ -289,6 +291,15 @@ def test_divergence_ends_it_and_keeps_the_last_good_checkpoint(setting):
         step_for_long(setting)
     setting.learner.close()
     assert setting.learner.checkpoints.numbers() == saved
+
+
+@pytest.mark.parametrize("size", [1e25, 1e30])
+def test_a_divergence_from_huge_rewards_names_their_size(setting, size):
+    setting.feed(60, size)
+    with pytest.raises(
+        RmcError, match=rf"not finite; rewards reach 1e\+{np.log10(size):.0f}: make --reward-scale that"
+    ):
+        step_for_long(setting)
 
 
 SPOILT = {

@@ -82,8 +82,8 @@ def test_values_are_what_windows_are_drawn_by(make: Make, bus: MemoryBus) -> Non
     sample = server.sample(64)
     assert sample.rows is not None
     scaled = priorities.astype(float) ** 0.6
-    np.testing.assert_allclose(sample.values, scaled[sample.rows["serial"]])
-    assert sample.mass == pytest.approx(scaled.sum())
+    np.testing.assert_allclose(sample.weights, scaled[sample.rows["serial"]])
+    assert sample.total_weight == pytest.approx(scaled.sum())
     assert (sample.windows, sample.drawn_steps) == (20, 64 * SPEC.train)
 
 
@@ -97,7 +97,7 @@ def test_exponent_zero_is_uniform(make: Make, bus: MemoryBus) -> None:
     for _ in range(40):
         sample = server.sample(50)
         assert sample.rows is not None
-        assert (sample.values == 1).all()
+        assert (sample.weights == 1).all()
         counts += np.bincount(sample.rows["serial"], minlength=50)
     assert (counts == 40).all()  # 50 strata over 50 equal windows
 
@@ -151,8 +151,8 @@ def test_draws_follow_from_seed_number_and_ring_alone(make: Make, tmp_path: Path
             for _ in range(3):
                 sample = server.sample(16)
                 assert sample.rows is not None
-                assert sample.values is not None
-                drawn.append(sample.rows.tobytes() + sample.values.tobytes())
+                assert sample.weights is not None
+                drawn.append(sample.rows.tobytes() + sample.weights.tobytes())
                 server.update_priorities(sample.rows["serial"].copy(), sample.rows["reward"][:, 0] + 1)
             if number % 2:
                 server.checkpoint()
@@ -344,7 +344,9 @@ def test_what_a_stream_lacks_is_sent_again(make: Make, kind: str, redis_url: str
 
 def forge(bus: RedisBus, entry_id: EntryId) -> None:
     """An entry as whoever has the actor's login can add one."""
-    bus._redis.xadd(f"{bus._prefix}:windows:0", {"p": encode_windows(make_rows(1), SPEC)}, id="%d-%d" % entry_id)
+    bus._redis.xadd(
+        f"{bus._prefix}:windows:0", {"p": encode_windows(make_rows(1), SPEC)}, id=f"{entry_id.epoch}-{entry_id.seq}"
+    )
 
 
 FORGED = [
@@ -454,11 +456,13 @@ def test_what_redis_did_not_hear_is_said_when_it_is_back(make: Make, away: str) 
 
 
 def test_what_is_refused_is_refused_once_though_redis_goes_away(make: Make) -> None:
-    bus = Failing("expect")
+    bus = Failing("commit")
     server, sender = make(on=bus), Sender(bus)
     drain(server)
     sender.send_raw(b"junk")
     bus.failing = True
+    with pytest.raises(BusUnavailable):
+        drain(server)
     drain(server)
     assert server.stats()["dead_letters"] == len(bus.dead_letters) == 1
 

@@ -21,7 +21,7 @@ from rmc.common.errors import AuthenticationError, ConfigError, FencedError, Mes
 from rmc.common.replay import Sample, SampleStatus
 from rmc.common.shared_batches import TURNS
 from rmc.common.wire import HEADER, MAGIC, VERSION, Kind, decode_header, decode_meta, encode_frame, proof
-from rmc.learner.replay_client import Connection, ReplayClient
+from rmc.learner.replay_client import ReplayClient, ReplayConnection
 from rmc.replay_server import socket_server
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.server import ReplayServer
@@ -59,8 +59,8 @@ class Served:
         self.sockets.close()
         self.replay.close()
 
-    def connect(self, secret: bytes = SECRET, epoch: int = 0) -> Connection:
-        return Connection(self.address, secret, SPEC.fingerprint, BIG, epoch=epoch)
+    def connect(self, secret: bytes = SECRET, epoch: int = 0) -> ReplayConnection:
+        return ReplayConnection(self.address, secret, SPEC.fingerprint, BIG, epoch=epoch)
 
     def client(self, epoch: int) -> ReplayClient:
         """A learner's end."""
@@ -103,12 +103,12 @@ def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serve]:
         served.close()
 
 
-def draw(connection: Connection, batch_size: int = 32) -> tuple[Kind, np.ndarray, np.ndarray]:
+def draw(connection: ReplayConnection, batch_size: int = 32) -> tuple[Kind, np.ndarray, np.ndarray]:
     connection.send(Kind.SAMPLE, {"batch_size": batch_size, "elsewhere": 0})
     return receive(connection, batch_size)
 
 
-def receive(connection: Connection, batch_size: int) -> tuple[Kind, np.ndarray, np.ndarray]:
+def receive(connection: ReplayConnection, batch_size: int) -> tuple[Kind, np.ndarray, np.ndarray]:
     header, _, body = connection.receive(memoryview(bytearray(BIG)))
     split = batch_size * SPEC.dtype.itemsize if header.kind is Kind.BATCH else 0
     return header.kind, np.frombuffer(body[:split], SPEC.dtype), np.frombuffer(body[split:], np.float64)
@@ -137,7 +137,7 @@ def test_pipelined_draws_are_what_a_server_in_the_same_thread_gives(serve: Serve
         assert kind is Kind.BATCH
         assert sample.rows is not None
         assert rows.tobytes() == sample.rows.tobytes()
-        assert np.array_equal(values, sample.values)
+        assert np.array_equal(values, sample.weights)
     connection.close()
 
 
@@ -152,7 +152,7 @@ def test_the_learners_client_gets_the_same_draws_however_they_come(serve: Serve,
         sample, expected = client.sample(64), twin.replay.sample(64)
         assert sample.rows is not None
         assert expected.rows is not None
-        assert np.array_equal(sample.values, expected.values)
+        assert np.array_equal(sample.weights, expected.weights)
         if before is not None:  # a batch stays what it is until the next draw but one
             assert before[0].tobytes() == before[1]
         before = sample.rows, expected.rows.tobytes()
@@ -268,7 +268,7 @@ def test_a_server_with_another_secret_is_refused(impostor: Callable[[Frame], str
         return Kind.WELCOME, {"proof": answer, "fingerprint": SPEC.fingerprint}
 
     with pytest.raises(AuthenticationError, match="does not know this run's secret"):
-        Connection(impostor(frame), SECRET, SPEC.fingerprint, BIG)
+        ReplayConnection(impostor(frame), SECRET, SPEC.fingerprint, BIG)
 
 
 @pytest.mark.parametrize(
@@ -296,9 +296,9 @@ def test_who_proves_nothing_ends_no_learner(
     client.close()
 
 
-@pytest.mark.parametrize("mass", ["x", None, [], True, float("nan"), float("inf"), -1.0])
-def test_a_draw_of_no_mass_is_an_outage(serve: Serve, mass: Any, caplog: pytest.LogCaptureFixture) -> None:
-    away_for(serve(), Sample(SampleStatus.WAIT, None, None, mass, 3, 12, 0), "mass", caplog)
+@pytest.mark.parametrize("total_weight", ["x", None, [], True, float("nan"), float("inf"), -1.0])
+def test_a_draw_of_no_mass_is_an_outage(serve: Serve, total_weight: Any, caplog: pytest.LogCaptureFixture) -> None:
+    away_for(serve(), Sample(SampleStatus.WAIT, None, None, total_weight, 3, 12, 0), "total_weight", caplog)
 
 
 @pytest.mark.parametrize("count", ["3", None, {}, True, float("nan"), float("inf"), 1.5, -1])
@@ -501,7 +501,7 @@ def test_a_thousand_strangers_stop_no_batch(serve: Serve) -> None:
 def test_a_client_of_other_windows_is_told(serve: Serve) -> None:
     served = serve()
     with pytest.raises(MessageError, match="fingerprint"):
-        Connection(served.address, SECRET, "0" * 16, BIG)
+        ReplayConnection(served.address, SECRET, "0" * 16, BIG)
 
 
 def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> None:

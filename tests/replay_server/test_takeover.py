@@ -251,7 +251,7 @@ def test_a_ring_that_is_ahead_of_another_that_came_after_it_goes(make: Make, bus
         sender.send(2)
     drain(old)
     one.send(9)
-    taken = old._intake.read(old._store.ring.progress.streams)
+    taken = old._reader.read(old._store.ring.progress.streams)
     assert taken is not None
     old._insert(taken)  # and stands still before it publishes that
     new = make(folder="new")

@@ -130,7 +130,7 @@ def learner() -> None:
     from rmc.learner.device_update import DeviceUpdate
     from rmc.learner.learner import Learner
 
-    write, resume, update = checkpoint._write, Learner._resume, DeviceUpdate.__call__
+    write, resume, update = checkpoint.write_synced, Learner._resume, DeviceUpdate.__call__
 
     def half_a_file(path: Path, content: bytes) -> None:
         if path.name == STATE and strikes("half-a-checkpoint"):
@@ -156,7 +156,7 @@ def learner() -> None:
         time.sleep((times_slower() - 1) * (time.monotonic() - began))
         return result
 
-    checkpoint._write, Learner._resume = half_a_file, compared  # type: ignore[method-assign]
+    checkpoint.write_synced, Learner._resume = half_a_file, compared  # type: ignore[method-assign]
     DeviceUpdate.__call__ = slower  # type: ignore[method-assign]
     after(checkpoint, "_sync_folder", "synchronised")
     after(checkpoint.CheckpointFolder, "save", "saved")

@@ -1,0 +1,127 @@
+"""What an environment may change of its whole process, and our code relies on: each has its own, ours and theirs."""
+
+import os
+import random
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rmc.common.process.watchdog import EnvCall
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class ProcessState(NamedTuple):
+    """As it is now; None for what cannot be known. Torch's is only asked where it is imported."""
+
+    folder: str | None
+    numpy_errors: dict[str, Any]
+    dtype: Any
+    gradients: bool
+    threads: int | None
+    device: Any
+    handlers: tuple[Any, ...]
+
+    @classmethod
+    def read(cls) -> "ProcessState":
+        """Takes some microseconds."""
+        folder = None
+        with suppress(OSError):  # it was deleted
+            folder = os.getcwd()
+        errors, handlers = dict(np.geterr()), tuple(map(signal.getsignal, SIGNALS))
+        torch = sys.modules.get("torch")
+        if torch is None or not hasattr(torch, "get_default_device"):  # it may just be being imported
+            return cls(folder, errors, None, True, None, None, handlers)
+        dtype, device = torch.get_default_dtype(), torch.get_default_device()
+        return cls(folder, errors, dtype, torch.is_grad_enabled(), torch.get_num_threads(), device, handlers)
+
+    def install(self, now: "ProcessState") -> None:
+        """Where ``now``, as it is, differs."""
+        torch = sys.modules.get("torch")
+        setters: dict[str, Callable[[Any], Any]] = {
+            "folder": os.chdir, "numpy_errors": lambda errors: np.seterr(**errors), "handlers": _catch,
+        }  # fmt: skip
+        if torch is not None:
+            setters |= {
+                "dtype": lambda dtype: torch.set_default_dtype(dtype or torch.float32),
+                "gradients": torch.set_grad_enabled,
+                "threads": lambda threads: torch.set_num_threads(threads or now.threads),
+                "device": lambda device: torch.set_default_device(None if str(device) == "cpu" else device),
+            }
+        for name in self.differences(now) & set(setters):
+            setters[name](getattr(self, name))
+
+    def differences(self, other: "ProcessState") -> set[str]:
+        """The names of what is not the same."""
+        return {name for name, mine, theirs in zip(self._fields, self, other, strict=True) if mine != theirs}
+
+
+def _catch(handlers: tuple[Any, ...]) -> None:
+    if threading.current_thread() is threading.main_thread():  # elsewhere none can be set, by nobody
+        for number, handler in zip(SIGNALS, handlers, strict=True):
+            if handler is not None:  # not set from Python
+                signal.signal(number, handler)
+
+
+class ApartCall(EnvCall):
+    """A call in which the process is as the environment has left it; afterwards it is as it was before the call.
+
+    A step is not looked at for changes of its own. Signals' handlers stay ours.
+    """
+
+    theirs: ProcessState | None = None  # where it differs from ours
+    changed: dict[str, Any] = {}  # noqa: RUF012 - by any environment of this process: what, and into what
+
+    def __enter__(self) -> "ApartCall":
+        super().__enter__()
+        self._ours = ProcessState.read() if self.name != "step" or ApartCall.theirs is not None else None
+        self._random = _random_state() if self.name == "make" else None
+        if self._ours is not None and ApartCall.theirs is not None:
+            ApartCall.theirs._replace(handlers=self._ours.handlers).install(self._ours)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._ours is not None:
+            self._part(self._ours)
+        super().__exit__(*error)
+
+    def _part(self, ours: ProcessState) -> None:
+        now = ProcessState.read()
+        if ours.dtype is None and now.dtype is not None:  # torch was imported meanwhile
+            torch = sys.modules["torch"]
+            ours = ours._replace(dtype=torch.float32, threads=now.threads, device=torch.device("cpu"))
+        found = {name: getattr(now, name) for name in sorted(ours.differences(now))}
+        if self._random is not None and self._random != _random_state():
+            found["random"] = None
+        ApartCall.changed |= found
+        ours.install(now)
+        ApartCall.theirs = now if set(found) - {"handlers", "random"} else None
+
+
+def _random_state() -> tuple[Any, ...]:
+    """Of the generators that all share; it changes where they are seeded, and after hundreds of draws."""
+    torch = sys.modules.get("torch")
+    seed = torch.initial_seed() if torch is not None and hasattr(torch, "initial_seed") else None
+    return str(np.random.get_state()[1]), random.getstate()[1][:-1], seed  # type: ignore[index] # noqa: NPY002
+
+
+TOLD = {
+    "folder": "its working folder ({})",
+    "numpy_errors": "numpy's error state",
+    "dtype": "torch's default dtype ({})",
+    "gradients": "torch's grad mode ({})",
+    "threads": "torch's threads ({})",
+    "device": "torch's default device ({})",
+    "handlers": "the handlers of signals",
+    "random": "the random generators that all share",
+}
+
+
+def changes() -> list[str]:
+    """What environments have changed of this process so far, in words."""
+    return [TOLD[name].format(value) for name, value in ApartCall.changed.items()]

@@ -1,0 +1,63 @@
+"""``rmc train --launcher ray``: hands a run to a launcher on the cluster's head, and watches it."""
+
+import dataclasses
+import os
+import signal
+from collections.abc import Callable
+from math import ceil
+
+from rich.console import Console
+
+from rmc.cli.ending import say_end
+from rmc.cli.signals import signals_caught
+from rmc.common.process.role import StopSignal
+from rmc.deploy.local.socket_folder import place_for_sockets
+from rmc.deploy.monitor import attach
+from rmc.deploy.ray import launcher, placement
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.preflight import check_machine, cores
+from rmc.deploy.run.validation import validate, validate_launch
+
+
+def train(config: RunConfig, options: LaunchOptions, console: Console) -> int:
+    """Hand a run to a launcher on the cluster's head, and watch it; Ctrl-C ends the run, a closed terminal does not."""
+    validate(config)
+    validate_launch(config, options)
+    enough = max(cores(), ceil(placement.reserved_cpus(config)) + config.actors)  # of a cluster of our own
+    with launcher.joined(options.ray_address, enough):
+        return _watched(config, options, console)
+
+
+def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> int:
+    if options.run_dir is not None and (options.run_dir / "secret").exists():
+        launcher.check_not_there(RunFolder(options.run_dir))
+    placement.check_room(config, options.device)
+    fit = placement.actors_that_fit(config)
+    learner = dataclasses.replace(config.learner, threads=placement.learner_cpus(config))
+    config = dataclasses.replace(config, learner=learner, actors=fit if options.all_cpus else config.actors)
+    validate(config)  # again: the cluster may have changed the number of actors
+    check_machine(config, options)
+    place_for_sockets()
+    folder = open_run(config, options.run_dir, options.if_exists)
+    folder.unlock()
+    launcher.launch(config, folder, options.device, options.all_cpus, options.tls)
+    console.print(f"run folder {folder.path}", soft_wrap=True)
+    with signals_caught(hangup=False) as stop:
+        attach.watch(folder, console, _passes_on(stop, folder))
+    return say_end(folder, console)
+
+
+def _passes_on(stop: StopSignal, folder: RunFolder) -> Callable[[], bool]:
+    """Whether the run's launcher is gone; tells it to stop, once, when we are."""
+    stopped: int | None = None  # which of the launchers, if it is started again
+
+    def gone() -> bool:
+        nonlocal stopped
+        if stop.requested and (trainer := folder.trainer()) not in (None, stopped):
+            stopped = trainer
+            os.kill(trainer, signal.SIGTERM)
+        return not launcher.is_there(folder)
+
+    return gone

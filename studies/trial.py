@@ -1,0 +1,18 @@
+"""What ``robust`` has and has not, one change at a time."""
+
+from studies.study import Study
+
+CHANGES = {
+    "RMC": "",
+    "layer norm": "--layer-norm",
+    "prioritized": "--priority-exponent 0.6 --importance-exponent 0.4",
+    "EMA latent": "--latent-target ema",
+    "EMA memory": "--target-memory ema",
+    "curiosity": "--curiosity 0.1 --curiosity-scale std",
+    "embedding beside": "--head-input hidden+embedding",
+    "raw observations": "--no-normalize-observations --no-fill-blanks",
+}
+STUDY = Study("trial", {name: f"train ENV {words}" for name, words in CHANGES.items()})
+
+if __name__ == "__main__":
+    STUDY.main()

@@ -1,0 +1,121 @@
+"""What every command says and does of a user's own environment."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+
+from rmc.analysis.policy import load_policy
+from rmc.cli import main, options
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import from_json, to_json
+from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.presets import debug
+from tests import habits
+from tests.analysis.test_policy import AGENTS, make_run
+from tests.cli.test_main import complaint
+
+WANTS = "tests.habits:Wants-v0"
+SLIDE = "tests.habits:Slide-v0"
+
+
+def wanting_run(folder: Path) -> RunFolder:
+    return make_run(folder, AGENTS["robust"], WANTS, env_kwargs={"goal": 1.5, "size": 4})
+
+
+def test_keywords_go_from_the_command_line_into_config_json() -> None:
+    command = options.parse(["train", WANTS, "--env-kwargs", "goal=1.5", "size=4", "name=hall", "--seed", "3"])
+    assert isinstance(command, options.Train)
+    config = command.config()
+    assert config.env.env_kwargs == {"goal": 1.5, "size": 4, "name": "hall"}
+    assert json.loads(to_json(config))["env"]["env_kwargs"] == config.env.env_kwargs
+    assert from_json(to_json(config)) == config
+
+
+def test_every_command_makes_the_environment_with_its_keywords(tmp_path: Path, capsys: Any) -> None:
+    assert main.run(["check-env", WANTS, "--env-kwargs", "goal=1.5", "size=4", "--steps", "50"]) == 0
+    assert "observations 4, actions 2" in capsys.readouterr().out
+    run = wanting_run(tmp_path / "run")
+    assert main.run(["evaluate", str(run.path), "--episodes", "1"]) == 0
+    assert load_policy(run.path).make_env().unwrapped.goal == 1.5  # type: ignore[attr-defined]
+    assert main.run(["inspect", str(run.path), "--out", str(tmp_path / "a.png")]) == 2  # no state in there, but made
+    assert "--checkpoint='latest'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["check-env", "train"])
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ([], "missing a required argument: 'goal'"),
+        (["--env-kwargs", "goal=1.5", "gool=2"], "unexpected keyword argument 'gool'; it takes (goal: float"),
+        (["--env-kwargs", "goal"], "--env-kwargs='goal': write NAME=VALUE"),
+        (["--env-kwargs", "goal=1.5", "--env_kwargs", "size=4"], "is there twice; give all of NAME=VALUE after one"),
+    ],
+)
+def test_keywords_that_do_not_fit_are_one_line(command: str, words: list[str], says: str, capsys: Any) -> None:
+    assert says in complaint([command, WANTS, *words], capsys)
+
+
+def test_a_run_goes_on_with_its_own_keywords_only(tmp_path: Path) -> None:
+    run = wanting_run(tmp_path / "run")
+    was = run.config()
+    other = dataclasses.replace(was, env=dataclasses.replace(was.env, env_kwargs={"goal": 2.5, "size": 4}))
+    with pytest.raises(ConfigError, match=r"--env-kwargs=\{'goal': 2.5, 'size': 4\}: the run in .* has \{'goal': 1.5"):
+        open_run(other, run.path, "resume")
+
+
+def test_an_environment_that_has_gained_an_observation_is_named_by_every_command(
+    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(tmp_path / "run", AGENTS["robust"], SLIDE)
+    monkeypatch.setattr(habits.Slide, "observation_space", Box(-99.0, 99.0, (4,), np.float32))
+    monkeypatch.setattr(habits.Slide, "seen", lambda self: np.zeros(4, np.float32))
+    says = f"ENV='{SLIDE}': the environment now has 4 observations, the run was trained with 3; undo that"
+    before = sorted(path.name for path in run.path.iterdir())
+    out = str(tmp_path / "out.")
+    for words in (["evaluate", str(run.path)], ["export", str(run.path), "--out", f"{out}onnx"]):
+        assert says in complaint(words, capsys)
+    assert says in complaint(["inspect", str(run.path), "--out", f"{out}png"], capsys)
+    for resume in (lambda: open_run(run.config(), run.path, "resume"), lambda: load_policy(run.path)):
+        with pytest.raises(ConfigError, match="the environment now has 4 observations, the run was trained with 3"):
+            resume()
+    assert sorted(path.name for path in run.path.iterdir()) == before
+
+
+def test_a_run_of_whole_episodes_keeps_their_length(tmp_path: Path) -> None:
+    config = debug(EnvConfig("InvertedPendulum-v5"))
+    config = dataclasses.replace(config, actor=dataclasses.replace(config.actor, state_strategy="episode"))
+    run = open_run(config, tmp_path / "run", "fail")
+    run.unlock()
+    run.write_sizes(config.sizes() | {"steps an episode": 500})
+    with pytest.raises(ConfigError, match="now has 1000 steps an episode, the run was trained with 500"):
+        open_run(config, run.path, "resume")
+
+
+@pytest.mark.parametrize(
+    ("env", "says"),
+    [
+        ("Stumbles", "the environment's step raises LinAlgError: Singular matrix (habits.py, line "),
+        ("Untyped", "the environment's reward is 'much', not made of numbers"),
+    ],
+)
+def test_check_env_train_and_evaluate_say_the_same(
+    env: str, says: str, tmp_path: Path, capsys: Any, caplog: Any
+) -> None:
+    run = make_run(tmp_path / "run", AGENTS["robust"], f"tests.habits:{env}-v0")
+    for words in (
+        ["check-env", run.config().env.id],
+        ["evaluate", str(run.path), "--episodes", "3"],
+        ["train", run.config().env.id, "--preset", "debug", "--run-dir", str(tmp_path / "new")],
+    ):
+        caplog.clear()
+        assert main.run(words) == 1
+        said = capsys.readouterr()
+        assert says in (said.err if words[0] != "check-env" else said.out)
+        assert len(said.err.splitlines()) <= 1
+        assert len(caplog.records) <= 1

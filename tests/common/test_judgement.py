@@ -1,0 +1,190 @@
+"""What a user's environment may give and do, and that every command says the same of it."""
+
+import dataclasses
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rmc.common.env import wrappers
+from rmc.common.env.config import EnvConfig, read_kwargs, write_kwargs
+from rmc.common.env.make import env_spaces, make_env
+from rmc.common.errors import ConfigError, EnvFault
+from tests import habits
+
+
+def habit(name: str, **options: Any) -> EnvConfig:
+    return EnvConfig(f"tests.habits:{name}-v0", env_kwargs=options)
+
+
+@pytest.fixture(autouse=True)
+def _all_warnings() -> Iterator[None]:
+    wrappers._warn_once.cache_clear()
+    yield
+    wrappers._warn_once.cache_clear()
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
+@pytest.mark.parametrize("bound", [1.0, 0.1])
+def test_an_environment_gets_an_action_of_its_own(dtype: str, bound: float) -> None:
+    """It may change it, also while a step is repeated; it is in its action space, outermost ones too."""
+    config = EnvConfig("tests.habits:InPlace-v0", action_repeat=3, env_kwargs={"dtype": dtype, "bound": bound})
+    env = make_env(config)
+    env.reset(seed=0)
+    for given in ([1.0, -1.0], [0.25, 0.5]):
+        action = np.array(given, np.float32)
+        env.step(action)
+        assert action.tolist() == given
+        taken = env.unwrapped.taken[-3:]  # type: ignore[attr-defined]
+        assert [one.dtype.name for one in taken] == [dtype] * 3
+        np.testing.assert_allclose(taken, [[value * bound for value in given]] * 3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("shape", ["column", "row", "nested", "tuple"])
+def test_numbers_of_any_shape_are_a_vector(shape: str) -> None:
+    env, plain = make_env(habit("Shaped", shape=shape)), make_env(habit("Shaped", shape="plain"))
+    assert env_spaces(habit("Shaped", shape=shape))[:2] == (3, 2)
+    assert env.reset(seed=3)[0].tolist() == plain.reset(seed=3)[0].tolist()
+    for _ in range(3):
+        seen = env.step(np.array([0.5, -1.0], np.float32))[0]
+        assert seen.shape == (3,)
+    assert seen[2] == 3.0
+    bounds = {"column": (1.0, -2.0), "row": (0.5, -1.0), "nested": (1.5, -1.0), "tuple": (0.5, 0.0)}[shape]
+    assert seen[1] == pytest.approx(0.3 * sum(bounds), rel=1e-5)
+
+
+WRONG = [
+    (0, None, "the environment's observation is None, not made of numbers; return an array of them"),
+    (0, ["1", "2", "3"], "the environment's observation is ['1', '2', '3'], not made of numbers"),
+    (0, [1.0, [2.0]], "the environment's observation is [1.0, [2.0]], not made of numbers"),
+    (0, [1.0, 2.0], "the environment's observation has shape (2,), its space says (3,)"),
+    (1, "1", "the environment's reward is '1', not made of numbers"),
+    (1, None, "the environment's reward is None, not made of numbers"),
+    (1, [1.0, 2.0], "the environment's reward is [1.0, 2.0], not a number"),
+    (2, "False", "the environment's terminated is 'False', not made of numbers"),
+    (4, None, "the environment's info is None, not a dict; return {} if it says nothing"),
+    (4, {"missing": "no"}, "the environment's info[\"missing\"] is 'no', not made of numbers"),
+]
+
+
+@pytest.mark.parametrize(("part", "value", "says"), WRONG)
+def test_what_a_step_gives_is_judged(part: int, value: Any, says: str) -> None:
+    env = make_env(habit("Gives", part=part, value=value))
+    env.reset(seed=0)
+    env.step(np.zeros(2, np.float32))
+    with pytest.raises(EnvFault) as caught:
+        env.step(np.zeros(2, np.float32))
+    assert str(caught.value).startswith(says)
+
+
+@pytest.mark.parametrize(("part", "value"), [(1, [0.5]), (1, 1), (1, True), (2, [0]), (4, {"missing": 0})])
+def test_what_means_the_same_is_taken(part: int, value: Any) -> None:
+    env = make_env(habit("Gives", part=part, value=value))
+    env.reset(seed=0)
+    for _ in range(3):
+        _, reward, terminated, _, _ = env.step(np.zeros(2, np.float32))
+    assert terminated is False
+    assert type(reward) is float
+
+
+def test_the_older_way_of_gym_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(habits.Slide, "step", lambda *_: (np.zeros(3), 0.0, False, {}))
+    env = make_env(dataclasses.replace(habit("Slide"), time_limit=9))
+    env.reset()
+    with pytest.raises(EnvFault, match=r"step gives 4 values; return \(observation, reward, terminated"):
+        env.step(np.zeros(2, np.float32))
+    monkeypatch.setattr(habits.Slide, "reset", lambda *_, **__: np.zeros(3))
+    with pytest.raises(EnvFault, match=r"reset gives a ndarray; return \(observation, info\)"):
+        env.reset()
+
+
+def test_a_close_that_raises_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    for _ in range(3):
+        make_env(habit("CannotClose")).close()
+    (said,) = [record for record in caplog.records if record.levelno == logging.WARNING]
+    assert said.getMessage().startswith("the environment's close raises RuntimeError: already closed (habits.py, line ")
+
+
+def test_the_innermost_place_in_the_users_file_is_named() -> None:
+    env = make_env(habit("Stumbles"))
+    env.reset()
+    lines = Path(habits.__file__).read_text().splitlines()
+    line = 1 + next(i for i, text in enumerate(lines) if text.endswith("# the line that must be named"))
+    with pytest.raises(EnvFault) as caught:
+        env.step(np.zeros(2, np.float32))
+    assert str(caught.value) == (f"the environment's step raises LinAlgError: Singular matrix (habits.py, line {line})")
+
+
+def test_keywords_are_typed_and_written_as_they_are_read() -> None:
+    words = [
+        "goal=1.5",
+        "least=.5",
+        "many=1_000",
+        "most=-1e3",
+        "size=3",
+        "name=maze",
+        "at=[0, 1]",
+        "deep=true",
+        "no=None",
+        'text="3"',
+        "empty=",
+        "e=a=b",
+    ]
+    found = read_kwargs(words)
+    assert found == {
+        "goal": 1.5, "least": 0.5, "many": 1000, "most": -1000.0, "size": 3, "name": "maze", "at": [0, 1],
+        "deep": True, "no": None, "text": "3", "empty": "",
+        "e": "a=b",
+    }  # fmt: skip
+    assert read_kwargs(write_kwargs(found)) == found
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["goal"], "--env-kwargs='goal': write NAME=VALUE"),
+        (["a-b=1"], "--env-kwargs='a-b=1'"),
+        (["a=1", "a=2"], "a is there twice"),
+        (["a=nan"], "--env-kwargs a=nan: take finite numbers"),
+        (["a=[1, -inf]", "b=-inf"], "--env-kwargs b=-inf: take finite numbers"),
+    ],
+)
+def test_other_words_are_refused(words: list[str], says: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        read_kwargs(words)
+    assert says in str(caught.value)
+
+
+def test_a_missing_keyword_comes_with_its_remedy() -> None:
+    with pytest.raises(ConfigError) as caught:
+        env_spaces(habit("Wants"))
+    assert "missing a required argument: 'goal'; it takes (goal: float, size: int = 3" in str(caught.value)
+    assert "give --env-kwargs NAME=VALUE" in str(caught.value)
+    assert env_spaces(habit("Wants", goal=1.5, size=5))[0] == 5
+
+
+@pytest.mark.parametrize("env", ["mine.py:Mine-v0", "./mine.py:Mine-v0", "/home/me/mine.py:Mine-v0"])
+def test_a_file_in_place_of_a_module_comes_with_the_right_name(env: str) -> None:
+    with pytest.raises(ConfigError, match="give the module's name, not its file: mine:Mine-v0, from the folder that"):
+        make_env(EnvConfig(env))
+
+
+@pytest.mark.parametrize(
+    ("env", "says"),
+    [
+        (
+            "LateSpaces",
+            "spaces raises AttributeError: 'LateSpaces' object has no attribute 'observation",
+        ),
+        ("NoRobot", "the environment's spaces raises RuntimeError: no robot answers (habits.py, line "),
+        ("Mistyped", "the environment cannot be made: TypeError: can only concatenate str"),
+    ],
+)
+def test_faults_of_its_making_are_one_line(env: str, says: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        env_spaces(habit(env))
+    assert says in str(caught.value)
+    assert env == "LateSpaces" or "habits.py, line " in str(caught.value)

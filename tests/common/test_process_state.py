@@ -1,0 +1,79 @@
+"""What an environment changes of its process is its own: our code finds the process as it was."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rmc.cli import main
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import make_env
+from rmc.common.env.process_state import ApartCall, ProcessState
+from tests import meddling_env
+
+
+@pytest.fixture(autouse=True)
+def nothing_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ApartCall, "theirs", None)
+    monkeypatch.setattr(ApartCall, "changed", {})
+
+
+@pytest.mark.parametrize("when", ["early", "late"])
+@pytest.mark.parametrize("habit", meddling_env.HABITS)
+def test_both_find_the_process_as_they_left_it(habit: str, when: str) -> None:
+    before = ProcessState.read()
+    env = make_env(EnvConfig(f"tests.meddling_env:Meddling-{habit}-{when}-v0"))
+    for seed in range(2):
+        env.reset(seed=seed)
+        assert ProcessState.read() == before
+        env.step(np.zeros(2, np.float32))  # it asserts that it finds its own
+        assert ProcessState.read() == before
+    env.close()
+    assert ProcessState.read() == before
+
+
+def test_check_env_names_what_is_changed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.run(["check-env", "tests.meddling_env:Meddling-v0", "--steps", "50"]) == 0
+    said = capsys.readouterr().out
+    for words in (
+        "note: it changes", "torch's default dtype (torch.float64)", "torch's grad mode (False)",
+        "its working folder (/",
+        "torch's threads (3)", "numpy's error state", "torch's default device (meta)", "the handlers of signals",
+        "the random generators that all share",
+    ):  # fmt: skip
+        assert words in said
+    ApartCall.changed, ApartCall.theirs = {}, None
+    main.run(["check-env", "tests.counting_env:Counting-v0", "--steps", "50"])
+    assert "it changes" not in capsys.readouterr().out
+
+
+MODULE = """
+from tests.meddling_env import HABITS, MeddlingEnv
+import gymnasium as gym
+for habit in HABITS.values():
+    habit()
+gym.register("Mine-v0", MeddlingEnv, max_episode_steps=20)
+"""
+
+
+@pytest.mark.parametrize("launcher", ["local", "lockstep"])
+def test_training_does_not_notice(tmp_path: Path, launcher: str) -> None:
+    """The module lies where the command is started, and meddles when it is imported, too; the run's folder is there."""
+    (tmp_path / "mine.py").write_text(MODULE)
+    words = ["train", "mine:Mine-v0", "--preset", "debug", "--run-dir", "run", "--launcher", launcher]
+    done = subprocess.run(
+        [sys.executable, "-m", "rmc.cli.main", *words, "--total-steps", "1200", "--checkpoint-steps", "600"],
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": os.getcwd(), "RMC_SECRET": ""}, capture_output=True, text=True,
+        timeout=170, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "run" / "result.json").exists()
+    words = ["inspect", "run", "--out", "picture.png"]
+    assert subprocess.run(
+        [sys.executable, "-m", "rmc.cli.main", *words], cwd=tmp_path, timeout=100, check=False,
+        env={**os.environ, "PYTHONPATH": os.getcwd()},
+    ).returncode == 0  # fmt: skip
+    assert (tmp_path / "picture.png").exists()
