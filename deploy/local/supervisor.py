@@ -91,6 +91,7 @@ class RoleProcess:
         if self.finished or self.running:
             return
         if (status := self.status) is not None:
+            self._end_group()
             self._process = None
             if status == 0 and self.command.ends:
                 self.finished = True
@@ -133,7 +134,14 @@ class RoleProcess:
             self._process.wait(max(0.0, timeout))
         except subprocess.TimeoutExpired:
             return False
+        self._end_group()
         return True
+
+    def _end_group(self) -> None:
+        """What it has started goes with it; the fork server, which sees to those that left the group, may be gone."""
+        if self._process is not None and self._process.pid > 0:  # none where there was no room for one
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
 
 
 class Supervisor:
