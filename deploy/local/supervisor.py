@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from rmc.common.errors import RoleDied
 from rmc.common.process.parent_death import PARENT_VARIABLE
-from rmc.deploy.local.fork_server import ForkedProcess, ForkServer
+from rmc.deploy.local.fork_server import ForkedProcess, ForkServer, open_log
 from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inherited
 
 # So many deaths of a role's own in a row, each within so long of its start, end the run.
@@ -73,7 +73,7 @@ class RoleProcess:
         """Start its process, in a process group of its own: Ctrl-C is for the supervisor alone."""
         self.log_start = self.log.stat().st_size if self.log.exists() else 0
         self._started_at = time.monotonic()
-        with self.log.open("ab") as log:
+        with open_log(self.log) as log:
             if self._fork_server is not None:
                 self._process = self._fork_server.fork(self.command.words, self._environment, log.fileno())
             else:
@@ -113,7 +113,8 @@ class RoleProcess:
 
     def last_words(self) -> str:
         """The end of its log, of this start only: the traceback, if it left one."""
-        with self.log.open("rb") as log:
+        text = ""
+        with suppress(OSError), self.log.open("rb") as log:
             log.seek(max(self.log_start, self.log.stat().st_size - TRACEBACK_BYTES))
             text = log.read().decode(errors="replace").rstrip()
         start = text.rfind("Traceback (most recent call last)")
