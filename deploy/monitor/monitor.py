@@ -1,5 +1,6 @@
 """What everyone looks at: metrics from the bus to metrics.jsonl, TensorBoard, and a live view or plain lines."""
 
+import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -16,7 +17,8 @@ from rmc.deploy.monitor.view import RunStatus, View
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
-RECORD_SECONDS = 5.0  # between the launcher's own records
+RECORD_SECONDS = 5.0  # between the launcher's own records, and looks at the run's folder
+log = logging.getLogger(__name__)
 
 
 class Monitor:
@@ -35,6 +37,7 @@ class Monitor:
         self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
         self._next_record = 0.0
         self._metrics_log = MetricsLog(folder)
+        self._folder, self._writable = folder, True
         self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
         self.view, self.outage = View(self.board, console), OutageLog("launcher")
 
@@ -53,13 +56,24 @@ class Monitor:
             pass
 
     def watch(self, bus: Bus) -> None:
-        """Take in what is new, and refresh the view when it is due."""
+        """Take in what is new, and refresh the view when it is due.
+
+        Raises ConfigError where the run's folder was deleted or moved.
+        """
         self._take_in(bus)
         now = time.monotonic()
         if now >= self._next_record:
             self._next_record = now + RECORD_SECONDS
+            self._look_at_folder()
             self._record_launcher()
         self.view.refresh()
+
+    def _look_at_folder(self) -> None:
+        self._folder.check_there()
+        if self._folder.writable() != self._writable:
+            self._writable = not self._writable
+            said = "can be written again" if self._writable else "is read-only: training goes on, its end waits"
+            log.warning("%s %s", self._folder.path, said)
 
     def _take_in(self, bus: Bus) -> None:
         while records := self._read(bus):
