@@ -70,7 +70,7 @@ def _make(known: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
     except gym.error.Error as error:
         raise ConfigError("ENV", config.id, f"gymnasium cannot make it ({one_line(error)})") from None
     except RAISED as error:
-        if (fault := _keyword_fault(spec)) is not None:
+        if isinstance(error, TypeError) and (fault := _keyword_fault(spec)) is not None:
             raise ConfigError("ENV", config.id, fault) from None
         if not config.id.startswith(DM_CONTROL):
             raise EnvFault(f"the environment cannot be made: {told(error)}") from error

@@ -17,7 +17,7 @@ from rmc.common.process.outage import OutageLog
 from rmc.common.process.role import RECONNECT_SLEEP, StopSignal
 from rmc.deploy.local.role_environment import SECRET_VARIABLE
 from rmc.deploy.redis.connect import PATIENCE_SECONDS, PATIENCE_VARIABLE, Deadline, connect
-from rmc.deploy.run.config import RunConfig, from_json
+from rmc.deploy.run.config import RunConfig, from_registration
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ class Process:
         while True:
             with suppress(BusUnavailable):
                 if (raw := self.bus.config()) is not None:
-                    return from_json(raw)
+                    return from_registration(raw)
             if not waits.wait(f"run {run} to be registered in that Redis"):
                 raise ConfigError("--run", run, "no run of this name is registered in that Redis; start it first")
 

@@ -115,11 +115,38 @@ def to_json(config: RunConfig) -> str:
 
 def from_json(text: str | bytes) -> RunConfig:
     """The config again. Raises ConfigError on anything unknown, missing or of the wrong type."""
+    return _build(RunConfig, _read(text), "")
+
+
+def to_registration(config: RunConfig, sizes: dict[str, int]) -> bytes:
+    """The config as JSON for the roles, with the sizes that the launcher's environment has."""
+    return json.dumps(dataclasses.asdict(config) | {"sizes": sizes}).encode()
+
+
+def from_registration(text: bytes) -> RunConfig:
+    """The config again. Raises ConfigError, also where the environment has other sizes in this process."""
+    raw = _read(text)
+    sizes = raw.pop("sizes", {}) if isinstance(raw, dict) else {}
+    if not isinstance(sizes, dict):
+        raise ConfigError("config.json sizes", sizes, "must be an object")
+    config = _build(RunConfig, raw, "")
+    check_sizes(config.env.id, sizes, config.sizes())
+    return config
+
+
+def check_sizes(env_id: str, before: dict[str, Any], sizes: dict[str, int]) -> None:
+    """Raises ConfigError where the environment has other ``sizes`` than ``before``, when the run began."""
+    for name, now in sizes.items():
+        if before.get(name, now) != now:
+            fault = f"the environment now has {now} {name}, the run was trained with {before[name]}"
+            raise ConfigError("ENV", env_id, f"{fault}; undo that, or train another run")
+
+
+def _read(text: str | bytes) -> Any:
     try:
-        raw = json.loads(text)
+        return json.loads(text)
     except ValueError as error:
         raise ConfigError("config.json", str(error), "not JSON; restore the file or start a new run") from None
-    return _build(RunConfig, raw, "")
 
 
 def _build(kind: type[ConfigT], raw: Any, path: str) -> ConfigT:

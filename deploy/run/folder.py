@@ -23,7 +23,7 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import CheckpointError, ConfigError
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.config import RunConfig, from_json, option, to_json
+from rmc.deploy.run.config import RunConfig, check_sizes, from_json, option, to_json
 
 log = logging.getLogger(__name__)
 SECRET_LENGTH = 64  # hexadecimal characters
@@ -123,10 +123,7 @@ class RunFolder:
             before = read_object(self.sizes_file, *sizes)
         except (OSError, ConfigError):  # damaged, it is as none
             return
-        for name, now in sizes.items():
-            if before[name] != now:
-                fault = f"the environment now has {now} {name}, the run was trained with {before[name]}"
-                raise ConfigError("ENV", env_id, f"{fault}; undo that, or train another run")
+        check_sizes(env_id, before, sizes)
 
     def write_sizes(self, sizes: dict[str, int]) -> None:
         """Write ``sizes.json``, whole or not at all."""
