@@ -17,7 +17,7 @@ class Registration:
 
     def __init__(self, config: RunConfig, folder: RunFolder, bus: RedisBus) -> None:
         """Make the run known, afresh. Raises BusUnavailable, BusFull."""
-        self._config, self._bus = to_json(config).encode(), bus
+        self._config, self._bus = to_json(config, spaces=True).encode(), bus
         self._progress_backup = ProgressBackup(folder, config.replay.replay_shards)
         self._look_at = 0.0
         bus.expire(None)
@@ -26,7 +26,7 @@ class Registration:
 
     def change(self, config: RunConfig) -> None:
         """From now on roles begin with this config. Raises BusUnavailable, BusFull."""
-        changed = to_json(config).encode()
+        changed = to_json(config, spaces=True).encode()
         self._bus.set_config(changed)
         self._config = changed
 

@@ -89,7 +89,8 @@ class RunConfig:
     def roles(self) -> tuple[str, ...]:
         """The names of all roles."""
         actors = [f"actor-{index}" for index in range(self.actors)]
-        return ("learner", "evaluator", *(shard.role for shard in self.shards()), *actors)
+        evaluator = ("evaluator",) if self.evaluator.episodes else ()
+        return ("learner", *evaluator, *(shard.role for shard in self.shards()), *actors)
 
     def slack_steps(self) -> int:
         """How far actors may run ahead of the replay ratio: two windows of every environment.
@@ -102,9 +103,13 @@ class RunConfig:
 # -- JSON ---------------------------------------------------------------------------------------------
 
 
-def to_json(config: RunConfig) -> str:
-    """The config as JSON, as in ``config.json`` and in Redis."""
-    return json.dumps(dataclasses.asdict(config), indent=2)
+def to_json(config: RunConfig, spaces: bool = False) -> str:
+    """The config as JSON, as in ``config.json``.
+
+    With ``spaces``, as in Redis: who reads it need not make an environment to know its sizes.
+    """
+    known = {"spaces": config._spaces} if spaces else {}
+    return json.dumps(dataclasses.asdict(config) | known, indent=2)
 
 
 def from_json(text: str | bytes) -> RunConfig:
@@ -113,7 +118,11 @@ def from_json(text: str | bytes) -> RunConfig:
         raw = json.loads(text)
     except ValueError as error:
         raise ConfigError("config.json", str(error), "not JSON; restore the file or start a new run") from None
-    return _build(RunConfig, raw, "")
+    spaces = raw.pop("spaces", None) if isinstance(raw, dict) else None
+    config = _build(RunConfig, raw, "")
+    if spaces is not None:
+        config.__dict__["_spaces"] = tuple(spaces)  # where the cached property keeps it
+    return config
 
 
 def _build(kind: type[ConfigT], raw: Any, path: str) -> ConfigT:
