@@ -38,6 +38,16 @@ def test_it_is_trained(tmp_path: Path, launcher: str) -> None:
     assert main.run(["evaluate", str(tmp_path / "run")]) == 0
 
 
+@pytest.mark.parametrize("episodes", [0, 1])
+def test_without_episodes_there_is_no_evaluator(tmp_path: Path, episodes: int) -> None:
+    config = replace(debug(EnvConfig("Pendulum-v1")), evaluator=EvaluatorConfig(episodes=episodes))
+    validate(config)
+    local = [command.name for command in commands(config, RunFolder(tmp_path), tmp_path, "cpu")]
+    for names in (config.roles(), local, list(places(config, "run", "cpu", encrypted=False))):
+        assert ("evaluator" in names) is (episodes > 0)
+        assert {"learner", "actor-0"} <= set(names)
+
+
 @pytest.mark.parametrize(
     ("left_out", "what"), [(2, "an environment of actor-0's 2"), (4, "the evaluator's environment")]
 )
