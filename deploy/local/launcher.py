@@ -34,6 +34,7 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
     secret = ("--secret-file", str(folder.secret_file))
     learn = ("--folder", str(folder.checkpoints), "--device", device)
     timeout = config.env.env_timeout
+    evaluator = [RoleCommand("evaluator", ("evaluator", *place), env_timeout=timeout)] * (config.evaluator.episodes > 0)
     actors = [
         RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index)), env_timeout=timeout)
         for index in range(config.actors)
@@ -41,7 +42,7 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
     return [
         *(_replay_command(shard, folder, sockets, (*place, *secret)) for shard in config.shards()),
         RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
-        RoleCommand("evaluator", ("evaluator", *place), env_timeout=timeout),
+        *evaluator,
         *actors,
     ]
 

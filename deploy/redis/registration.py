@@ -17,8 +17,7 @@ class Registration:
 
     def __init__(self, config: RunConfig, folder: RunFolder, bus: RedisBus) -> None:
         """Make the run known, afresh. Raises BusUnavailable, BusFull."""
-        self._sizes, self._bus = config.sizes(), bus
-        self._config = to_registration(config, self._sizes)
+        self._config, self._bus = to_registration(config), bus
         self._progress_backup = ProgressBackup(folder, config.replay.replay_shards)
         self._look_at = 0.0
         bus.expire(None)
@@ -27,7 +26,7 @@ class Registration:
 
     def change(self, config: RunConfig) -> None:
         """From now on roles begin with this config. Raises BusUnavailable, BusFull."""
-        changed = to_registration(config, self._sizes)
+        changed = to_registration(config)
         self._bus.set_config(changed)
         self._config = changed
 

@@ -42,7 +42,7 @@ CONFIG = dataclasses.replace(
 @pytest.fixture
 def bus(redis_url: str, run_name: str) -> RedisBus:
     made = RedisBus(redis_url, run_name)
-    made.set_config(to_registration(CONFIG, CONFIG.sizes()))
+    made.set_config(to_registration(CONFIG))
     made.publish_weights(Version(made.take_epoch("learner"), 1), initial_policy(CONFIG))
     return made
 
