@@ -29,9 +29,7 @@ MAX_ENTRY_BYTES = 1 << 20  # 1 MiB: a chunk never grows past it, unless one wind
 MAX_META_BYTES = 1 << 20
 WINDOWS, HELLO = 1, 2
 _FINGERPRINT_LENGTH = 16
-_BEFORE_BODY = (int, int, str, int, int)  # version, kind, fingerprint, count, crc32
-_BEFORE_BODY_BYTES = 64  # more than they ever take
-_BIN_LENGTHS = {0xC4: ">B", 0xC5: ">H", 0xC6: ">I"}  # of msgpack's bin 8, 16 and 32, by their first byte
+_ENTRY = (int, int, str, int, int, bytes)  # version, kind, fingerprint, count, crc32, body
 
 
 class Kind(IntEnum):
@@ -41,7 +39,7 @@ class Kind(IntEnum):
     PROOF = 2  # client -> server: its nonce and HMAC, and the epoch of the learner that it is
     WELCOME = 3  # server -> client: its HMAC, window fingerprint
     SAMPLE = 4  # client -> server: batch_size, elsewhere (see ``Replay.sample``)
-    BATCH = 5  # server -> client: rows | values (float64), with mass, windows, env_steps, drawn_steps
+    BATCH = 5  # server -> client: rows | weights (float64), with total_weight, windows, env_steps, drawn_steps
     WAIT = 6  # server -> client: the limiter holds the draw back
     FINISHED = 7  # server -> client: all steps are in and the ratio is spent
     PRIORITIES = 8  # client -> server: serials (int64) | priorities (float32); no reply
@@ -97,40 +95,18 @@ def decode_rows(payload: bytes, spec: WindowSpec) -> Rows:
     return np.frombuffer(body, dtype=spec.dtype)
 
 
-def _unpack_entry(payload: bytes) -> tuple[int, int, str, int, int, memoryview]:
-    """The six fields; the body, all but a few bytes of it, stays where it is."""
-    unpacker = msgpack.Unpacker(
-        raw=False,
-        strict_map_key=True,
-        max_array_len=6,
-        max_map_len=0,
-        max_str_len=_FINGERPRINT_LENGTH,
-        max_bin_len=0,
-        max_ext_len=0,
-    )
+def _unpack_entry(payload: bytes) -> tuple[int, int, str, int, int, bytes]:
+    """The six fields."""
     try:
-        unpacker.feed(payload[:_BEFORE_BODY_BYTES])
-        count = unpacker.read_array_header()
-        fields = [unpacker.unpack() for _ in range(min(count, len(_BEFORE_BODY)))]
+        fields = msgpack.unpackb(
+            payload, raw=False, max_array_len=len(_ENTRY), max_map_len=0, max_str_len=_FINGERPRINT_LENGTH, max_ext_len=0
+        )
     except Exception as error:  # msgpack raises several unrelated classes on hostile bytes
         raise MessageError("msgpack", type(error).__name__) from None
-    if count != len(_BEFORE_BODY) + 1:
-        raise MessageError("structure", "not a list of six")
-    if any(type(field) is not kind for field, kind in zip(fields, _BEFORE_BODY, strict=True)):
-        raise MessageError("structure", "a field has the wrong type")
-    version, kind, fingerprint, rows, crc = fields
-    return version, kind, fingerprint, rows, crc, _binary(memoryview(payload)[unpacker.tell() :])
-
-
-def _binary(packed: memoryview) -> memoryview:
-    """What a msgpack ``bin`` holds that ends where these bytes do."""
-    length = struct.Struct(_BIN_LENGTHS.get(packed[0], "")) if len(packed) else struct.Struct("")
-    if not length.size:
-        raise MessageError("structure", "the body is not binary")
-    body = packed[1 + length.size :]
-    if len(packed) < 1 + length.size or length.unpack(packed[1 : 1 + length.size])[0] != len(body):
-        raise MessageError("length", f"{len(body)} bytes of body, not what its length says")
-    return body
+    if not isinstance(fields, list) or tuple(map(type, fields)) != _ENTRY:
+        raise MessageError("structure", "not the six fields of an entry")
+    version, kind, fingerprint, rows, crc, body = fields
+    return version, kind, fingerprint, rows, crc, body
 
 
 class FrameHeader(NamedTuple):

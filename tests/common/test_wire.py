@@ -58,12 +58,12 @@ def repacked(index: int, value: object) -> bytes:
         (msgpack.packb([1, 1, msgpack.ExtType(4, b"x"), 0, 0, b""]), "msgpack"),
         (msgpack.packb([1, 1, [[[]]], 0, 0, b""]), "structure"),
         (msgpack.packb([1, 1, "x" * 100, 0, 0, b""]), "msgpack"),
-        (repacked(5, "text" * 9), "structure"),
-        (wire.encode_windows(random_rows(2), SPEC) + b"more", "length"),
-        (wire.encode_windows(random_rows(2), SPEC)[:-1], "length"),
-        (wire.encode_hello(SPEC)[:-1], "length"),
-        (wire.encode_hello(SPEC)[:-1] + b"\x01", "length"),
-        (wire.encode_hello(SPEC)[:-2], "structure"),
+        (repacked(5, "text" * 9), "msgpack"),
+        (wire.encode_windows(random_rows(2), SPEC) + b"more", "msgpack"),
+        (wire.encode_windows(random_rows(2), SPEC)[:-1], "msgpack"),
+        (wire.encode_hello(SPEC)[:-1], "msgpack"),
+        (wire.encode_hello(SPEC)[:-1] + b"\x01", "msgpack"),
+        (wire.encode_hello(SPEC)[:-2], "msgpack"),
     ],
 )
 def test_refusals_name_their_reason(payload, reason):
