@@ -73,10 +73,9 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
 
 
 def _values(method: str, found: Any, wanted: tuple[str, ...]) -> Sequence[Any]:
-    several = isinstance(found, tuple | list)
-    if several and len(found) == len(wanted):
+    if isinstance(found, tuple | list) and len(found) == len(wanted):
         return found
-    given = f"{len(found)} values" if several else f"a {type(found).__name__}"
+    given = f"{len(found)} values" if isinstance(found, tuple | list) else f"a {type(found).__name__}"
     raise EnvFault(f"the environment's {method} gives {given}; return ({', '.join(wanted)})")
 
 
