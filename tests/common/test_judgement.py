@@ -184,7 +184,7 @@ def test_a_file_in_place_of_a_module_comes_with_the_right_name(env: str) -> None
             "spaces raises AttributeError: 'LateSpaces' object has no attribute 'observation",
         ),
         ("NoRobot", "the environment's spaces raises RuntimeError: no robot answers (habits.py, line "),
-        ("Nowhere", "the environment cannot be made: ModuleNotFoundError: No module named 'tests.nowhere'"),
+        ("NoModule", "the environment cannot be made: ModuleNotFoundError: No module named 'tests.nowhere'"),
         ("Mistyped", "the environment cannot be made: TypeError: can only concatenate str"),
     ],
 )
@@ -192,4 +192,4 @@ def test_faults_of_its_making_are_one_line(env: str, says: str) -> None:
     with pytest.raises(ConfigError) as caught:
         env_spaces(habit(env))
     assert says in str(caught.value)
-    assert env in ("LateSpaces", "Nowhere") or "habits.py, line " in str(caught.value)
+    assert env in ("LateSpaces", "NoModule") or "habits.py, line " in str(caught.value)
