@@ -37,11 +37,11 @@ TRAIN_FLAGS = """
     --scheme --policy-through-q --update-order --model-norm --n-step --state-strategy
     --curiosity --curiosity-scale --curiosity-steps --eta
     --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads
-    --episodes
+    --episodes --evaluation-seconds
 """.split()  # noqa: SIM905
 ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit --env-timeout".split()  # noqa: SIM905
 OTHER_FLAGS = {
-    "evaluate": ["--episodes", "--flicker", "--checkpoint", "--video", "--json"],
+    "evaluate": ["--episodes", "--seconds", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
     "inspect": ["--out", "--checkpoint"],
     "check-env": [*ENV_FLAGS, "--steps"],
