@@ -315,7 +315,13 @@ class _Run(BaseCallback):
         }
 
 
-def evaluate(folder: RunFolder, episodes: int, flicker: float | None, seconds: float, watch: Watch) -> dict[str, Any]:
+def evaluate(
+    folder: RunFolder,
+    episodes: int,
+    flicker: float | None = None,
+    seconds: float = 0.0,
+    watch: Watch = lambda _: None,
+) -> dict[str, Any]:
     """Deterministic episodes of what a baseline's run saved last, as ``evaluate_checkpoint``. Raises ConfigError."""
     config, states = read(folder), _states(folder)
     if not states:

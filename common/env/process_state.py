@@ -44,7 +44,7 @@ class ProcessState(NamedTuple):
         """Where ``now``, as it is, differs."""
         torch = sys.modules.get("torch")
         setters: dict[str, Callable[[Any], Any]] = {
-            "folder": os.chdir, "numpy_errors": lambda errors: np.seterr(**errors), "handlers": _catch,
+            "folder": _go, "numpy_errors": lambda errors: np.seterr(**errors), "handlers": _catch,
         }  # fmt: skip
         if torch is not None:
             setters |= {
@@ -59,6 +59,12 @@ class ProcessState(NamedTuple):
     def differences(self, other: "ProcessState") -> set[str]:
         """The names of what is not the same."""
         return {name for name, mine, theirs in zip(self._fields, self, other, strict=True) if mine != theirs}
+
+
+def _go(folder: str | None) -> None:
+    """Where it is still there."""
+    with suppress(OSError):
+        os.chdir(folder or "")
 
 
 def _catch(handlers: tuple[Any, ...]) -> None:

@@ -3,8 +3,10 @@
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
 from rmc.common.env.process_state import ApartCall, ProcessState
 from tests import meddling_env
+from tests.counting_env import CountingEnv
 
 
 @pytest.fixture(autouse=True)
@@ -33,6 +36,28 @@ def test_both_find_the_process_as_they_left_it(habit: str, when: str) -> None:
         assert ProcessState.read() == before
     env.close()
     assert ProcessState.read() == before
+
+
+class Homeless(CountingEnv):
+    """Its working folder is deleted under it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        folder = tempfile.mkdtemp()
+        os.chdir(folder)
+        os.rmdir(folder)
+
+
+gym.register("Homeless-v0", Homeless)
+
+
+def test_a_folder_that_is_gone_harms_nobody() -> None:
+    before = os.getcwd()
+    env = make_env(EnvConfig("Homeless-v0"))
+    env.reset(seed=0)
+    env.step(np.zeros(2, np.float32))
+    env.close()
+    assert os.getcwd() == before
 
 
 def test_check_env_names_what_is_changed(capsys: pytest.CaptureFixture[str]) -> None:
