@@ -18,7 +18,7 @@ from rmc.actors.unacked_entries import UnackedEntries
 from rmc.actors.window_builder import WindowBuilder
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Ack, Bus, Version
-from rmc.common.env.make import checked_reset, recreate_env
+from rmc.common.env.make import checked_reset, further_env, recreate_env
 from rmc.common.env.wrappers import Env, Floats
 from rmc.common.errors import BusFull, BusUnavailable, EnvFault, FencedError, MessageError
 from rmc.common.metrics import Means, Rate
@@ -76,7 +76,8 @@ class Actor:
         self._index, self._seed, self._spec, self._config = index, seed, spec, config
         self._bus, self._clock, self._priority_fn = bus, clock, priority_fn
         n = config.envs_per_actor
-        self._make_env, self._envs = make_env, [make_env() for _ in range(n)]
+        what = f"an environment of {self.name}'s {n}"
+        self._make_env, self._envs = make_env, [further_env(make_env, what) for _ in range(n)]
         self._faults: dict[int, Exception] = {}  # of this step, by environment
         self._broken = self._broken_starts = 0  # episodes that an environment's fault ended; in a row, at their start
         self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, n)

@@ -9,7 +9,8 @@ class EvaluatorConfig:
     """How a policy is judged."""
 
     episodes: int = 5
-    """Episodes per evaluation, played with the policy's mean, one after the other."""
+    """Episodes per evaluation, played with the policy's mean, one after the other. 0 evaluates before and after
+    training alone, with no evaluator beside the actors."""
     evaluation_seconds: float = 300.0
     """Seconds after which an evaluation is cut: episodes that are over count, or else the first as far as it came.
     0 never cuts."""

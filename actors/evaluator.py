@@ -19,7 +19,7 @@ from rmc.actors.config import EvaluatorConfig
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Bus, Version
-from rmc.common.env.make import checked_reset, recreate_env
+from rmc.common.env.make import checked_reset, further_env, recreate_env
 from rmc.common.env.wrappers import Env, Floats
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, EnvFault, MessageError
 
@@ -83,6 +83,7 @@ class Rollout:
         self.cut = False
         self._prev_action, self._state = runner.start()
         self._length = -1  # of the episode; it has not begun
+        self._prev_action, self._state = runner.start()
 
     @property
     def episode(self) -> int:
@@ -180,7 +181,7 @@ class Evaluator:
         if config.episodes < 1:
             raise ConfigError("--episodes", config.episodes, "at least 1")
         self._seed, self._bus, self._clock, self._config = first_start(seed), bus, clock, config
-        self._make_env, self._env = make_env, make_env()
+        self._make_env, self._env = make_env, further_env(make_env, "the evaluator's environment")
         observation, action = self._env.observation_space.shape, self._env.action_space.shape
         assert observation
         assert action

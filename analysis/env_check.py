@@ -14,7 +14,7 @@ from rich.console import Console
 
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.faults import RAISED, told
-from rmc.common.env.make import first_env
+from rmc.common.env.make import first_env, make_env
 from rmc.common.env.process_state import changes
 from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Floats
@@ -67,6 +67,7 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
         lambda: _guarded(lambda: played.play(env, steps, seed=0)),
         lambda: _nonsense(played),
         lambda: _hints(env, played),
+        lambda: _second(config),
     ]
     found: list[str] = []
     while stages and not _faults(found):  # what comes later needs what was before to be sound
@@ -148,6 +149,18 @@ def _hints(env: Env, played: Played) -> Iterator[str]:
         yield "note: no episode ended; without a time limit an evaluation stops at 10 000 steps (--time-limit)"
     if not np.array_equal(_again(env), _again(env)):
         yield "note: the same seed and actions gave other observations; runs will not be repeatable"
+
+
+def _second(config: EnvConfig) -> Iterator[str]:
+    """Whether another one can be played while the first is there, as in training."""
+    try:
+        env = make_env(config)
+        env.reset(seed=0)
+        env.step(np.zeros(env.action_space.shape or (), np.float32))
+        env.close()
+    except Exception as error:
+        found = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        yield f"note: no second one can be beside it ({found}); take --actors 1 --envs-per-actor 1 --episodes 0"
 
 
 def _reward_notes(sizes: NDArray[np.float64]) -> Iterator[str]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rmc.actors.evaluator import LONGEST_EPISODE
 from rmc.analysis.policy import Policy
 from rmc.common.env.config import EnvConfig
+from rmc.common.env.faults import asked
 from rmc.common.env.make import entry_point, find_spec, make_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError, EnvFault
@@ -45,8 +46,9 @@ def prepare(env: EnvConfig, out: Path) -> None:
 
 def _mode_fault(env: EnvConfig) -> str | None:
     """Why an environment has no pictures, as far as it can be told without making it."""
-    made_by = entry_point(find_spec(env.id))
-    modes = getattr(made_by, "metadata", {}).get("render_modes", [])
+    made_by = asked("entry point", lambda: entry_point(find_spec(env.id)))
+    metadata = getattr(made_by, "metadata", None)
+    modes = metadata.get("render_modes") or [] if isinstance(metadata, dict) else []
     if isinstance(made_by, type) and MODE not in modes:
         return f'its metadata["render_modes"] is {modes}; give it "{MODE}", and a render() that returns {PICTURE}'
     try:
@@ -107,9 +109,9 @@ def _frame(env: Env, shape: tuple[int, ...] | None = None) -> NDArray[np.uint8]:
 
 def _working_backend(env: EnvConfig, out: Path) -> str:
     """The first backend that renders, tried in processes of their own: a failed one spoils a process for others."""
-    asked = os.environ.get("MUJOCO_GL")
+    chosen = os.environ.get("MUJOCO_GL")
     said = {}
-    for backend in (asked,) if asked else BACKENDS:
+    for backend in (chosen,) if chosen else BACKENDS:
         status, words = _probed(backend, env)
         if status == 0:
             return backend

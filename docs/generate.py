@@ -105,7 +105,7 @@ WHEN = {
     "precision": "`fp32` to rule rounding out, at half the speed where the CPU has bfloat16",
     "threads": "rarely: on a CPU two threads help only where nothing else runs",
     "evaluation_seconds": "up where an episode takes minutes",
-    "episodes": "up for less noise in what is called the best checkpoint",
+    "episodes": "up for less noise in what is called the best checkpoint; 0 where one environment alone can exist",
 }
 
 

@@ -53,7 +53,7 @@ def evaluate(
     ``flicker`` is the probability of a missing observation, by default the run's own. The keys are those of
     ``rmc evaluate --json``: ``eval_return_mean``, ``eval_return_std``, ``eval_episodes``, ``env_steps`` and more.
 
-    Raises ConfigError.
+    Raises ConfigError; RmcError where the environment breaks in every episode.
     """
     if not 1 <= episodes <= 10_000:
         raise ConfigError("episodes", episodes, "take 1 to 10_000")

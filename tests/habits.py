@@ -195,3 +195,4 @@ for _kind in (
     Mistyped,
 ):
     gym.register(f"{_kind.__name__}-v0", entry_point=_kind)
+gym.register("Nowhere-v0", entry_point="tests.nowhere:Env")

@@ -46,6 +46,8 @@ def read_kwargs(words: Sequence[str]) -> dict[str, Any]:
         if name in found:
             raise ConfigError("--env-kwargs", word, f"{name} is there twice; give it once")
         found[name] = _typed(value)
+        if found[name] == value and value.startswith(("[", "{")):
+            raise ConfigError("--env-kwargs", word, 'no JSON; keep its quotes from the shell: \'names=["a", "b"]\'')
     check_kwargs(found)
     return found
 

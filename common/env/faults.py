@@ -7,7 +7,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
-from rmc.common.errors import EnvFault
+from rmc.common.errors import EnvFault, RmcError
 
 RAISED = (Exception, SystemExit)  # what a user's code may raise; a module that calls sys.exit ends nobody else
 INSTALLED = {"site-packages", "dist-packages"}
@@ -19,7 +19,7 @@ def asked(what: str, call: Callable[..., ResultT], *given: Any) -> ResultT:
     """What a method of the environment's gives. Raises EnvFault with the error's place where it raises."""
     try:
         return call(*given)
-    except EnvFault:
+    except RmcError:
         raise
     except RAISED as error:
         raise EnvFault(f"the environment's {what} raises {told(error)}") from error

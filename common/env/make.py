@@ -28,7 +28,7 @@ from rmc.common.env.process_state import ApartCall
 from rmc.common.env.spaces import space_fault
 from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Flicker, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
-from rmc.common.errors import ConfigError, EnvFault
+from rmc.common.errors import ConfigError, EnvFault, RmcError
 from rmc.common.extra import how_to_install
 
 log = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ def _make(known: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
     except gym.error.Error as error:
         raise ConfigError("ENV", config.id, f"gymnasium cannot make it ({one_line(error)})") from None
     except RAISED as error:
-        if (fault := _keyword_fault(spec)) is not None:
+        if isinstance(error, TypeError) and (fault := _keyword_fault(spec)) is not None:
             raise ConfigError("ENV", config.id, fault) from None
         if not config.id.startswith(DM_CONTROL):
             raise EnvFault(f"the environment cannot be made: {told(error)}") from error
@@ -128,6 +128,15 @@ def recreate_env(env: Env, make_env: Callable[[], Env]) -> Env:
     with suppress(Exception):
         env.close()
     return make_env()
+
+
+def further_env(make_env: Callable[[], Env], what: str) -> Env:
+    """One where it is known that a first one can be made. Raises RmcError, which says what that may mean."""
+    try:
+        return make_env()
+    except Exception as error:
+        fix = "where only one can exist, take --actors 1 --envs-per-actor 1 --episodes 0"
+        raise RmcError(f"{what} cannot be made beside the others ({type(error).__name__}: {error}); {fix}") from error
 
 
 def first_env(config: EnvConfig) -> Env:

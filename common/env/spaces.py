@@ -44,21 +44,20 @@ def vector(space: gym.Space[Any], value: Any) -> NDArray[np.float32]:
 
 
 def _numbers(box: gym.Space[Any], value: Any) -> NDArray[np.float32]:
-    found = array("observation", value)
+    found = array("observation", value, "an array of numbers")
     if found.shape != box.shape and _sides(found.shape) != _sides(box.shape or ()):
         raise EnvFault(f"the environment's observation has shape {found.shape}, its space says {box.shape}")
     return np.array(found, np.float32).ravel()  # a copy: some environments write into the same one again
 
 
-def array(name: str, value: Any) -> NDArray[Any]:
-    """An array of numbers; no copy. Raises EnvFault where it is none."""
+def array(name: str, value: Any, wanted: str) -> NDArray[Any]:
+    """What is of numbers as an array; no copy. Raises EnvFault with what is ``wanted`` where it is none."""
     try:
         found = np.asarray(value)
     except RAISED:  # a list whose rows differ, or a tensor on another device
         found = np.empty(0, object)
     if found.dtype.kind not in NUMBERS:
-        given = reprlib.repr(value)
-        raise EnvFault(f"the environment's {name} is {given}, not made of numbers; return an array of them")
+        raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}; return {wanted}")
     return found
 
 

@@ -7,6 +7,7 @@ import logging
 import math
 import reprlib
 from collections import deque
+from collections.abc import Sequence
 from functools import cache, partial
 from typing import Any
 
@@ -22,7 +23,6 @@ Floats = NDArray[np.float32]
 Env = gym.Env[Floats, Floats]
 log = logging.getLogger(__name__)
 RESET, STEP = ("observation", "info"), ("observation", "reward", "terminated", "truncated", "info")
-PLAIN = (float, int)  # numbers of Python's own, and numpy's float64
 
 
 class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
@@ -72,31 +72,31 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
         return gym.spaces.unflatten(self._taken, action.astype(np.float64))
 
 
-def _values(method: str, found: Any, wanted: tuple[str, ...]) -> tuple[Any, ...]:
-    if isinstance(found, tuple) and len(found) == len(wanted):
+def _values(method: str, found: Any, wanted: tuple[str, ...]) -> Sequence[Any]:
+    if isinstance(found, tuple | list) and len(found) == len(wanted):
         return found
-    given = f"{len(found)} values" if isinstance(found, tuple) else f"a {type(found).__name__}"
+    given = f"{len(found)} values" if isinstance(found, tuple | list) else f"a {type(found).__name__}"
     raise EnvFault(f"the environment's {method} gives {given}; return ({', '.join(wanted)})")
 
 
-def _number(name: str, value: Any) -> float:
+def _number(name: str, value: Any, wanted: str = "a number") -> float:
     """A number, also as an array of one."""
-    if isinstance(value, PLAIN):
+    if isinstance(value, float):
         return float(value)
-    found = array(name, value)
+    found = array(name, value, wanted)
     if found.size != 1:
-        raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}, not a number; return one")
+        raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}; return {wanted}")
     return float(found.item())
 
 
 def _bool(name: str, value: Any) -> bool:
-    return value if isinstance(value, bool) else bool(_number(name, value))
+    return value if isinstance(value, bool) else bool(_number(name, value, "a bool"))
 
 
 def _own(info: Any) -> dict[str, Any]:
     """A copy of ``info``, its missing frame as a bool, also under the name that it had until 0.2."""
     if not isinstance(info, dict):
-        raise EnvFault(f"the environment's info is {reprlib.repr(info)}, not a dict; return {{}} if it says nothing")
+        raise EnvFault(f"the environment's info is {reprlib.repr(info)}; return a dict, {{}} if it says nothing")
     own = info.copy()
     if "blank" in own and "missing" not in own:
         _warn_once(

@@ -11,6 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
+from rmc.common.process import descendants
+
 LOOK_SECONDS = 0.1
 HUNG_STATUS = 3  # of a process that ended so
 SLACK = 1.1  # of the time that a call has, until it counts as one that cannot even be told
@@ -74,6 +76,7 @@ def _end(call: EnvCall) -> None:
     with suppress(OSError, ValueError):
         os.write(2, f"rmc: {call.told()}\n".encode())
         sys.stdout.flush()
+    descendants.end_children()  # a simulator that the environment has started
     os._exit(HUNG_STATUS)
 
 

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import msgpack
 
@@ -20,6 +20,14 @@ END_SECONDS = 2.0
 IMPORT_SECONDS, REPLY_SECONDS = 120.0, 10.0  # until one that does not answer counts as gone
 FAILED_STATUS = 1
 LARGEST = 65_536  # bytes of a request
+
+
+def open_log(path: Path) -> BinaryIO:
+    """A log to append to; where its folder is gone or read-only, which the launcher says, one that keeps nothing."""
+    try:
+        return path.open("ab")
+    except OSError:
+        return open(os.devnull, "ab")
 
 
 class ForkedProcess:
@@ -84,7 +92,7 @@ class ForkServer:
         self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         environment = {**inherited(), **SINGLE_THREAD, parent_death.PARENT_VARIABLE: str(os.getpid())}
         words = [sys.executable, "-P", "-m", "rmc.cli.fork_server", str(theirs.fileno())]
-        with theirs, self._log.open("ab") as log:
+        with theirs, open_log(self._log) as log:
             self._program = subprocess.Popen(
                 words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0,
                 pass_fds=(theirs.fileno(),),

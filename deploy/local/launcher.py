@@ -1,6 +1,7 @@
 """A run as processes of this machine: embedded Redis if none is given, roles under the supervisor, the monitor."""
 
 import logging
+import signal
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -33,6 +34,7 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
     secret = ("--secret-file", str(folder.secret_file))
     learn = ("--folder", str(folder.checkpoints), "--device", device)
     timeout = config.env.env_timeout
+    evaluator = [RoleCommand("evaluator", ("evaluator", *place), env_timeout=timeout)] * (config.evaluator.episodes > 0)
     actors = [
         RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index)), env_timeout=timeout)
         for index in range(config.actors)
@@ -40,7 +42,7 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
     return [
         *(_replay_command(shard, folder, sockets, (*place, *secret)) for shard in config.shards()),
         RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
-        RoleCommand("evaluator", ("evaluator", *place), env_timeout=timeout),
+        *evaluator,
         *actors,
     ]
 
@@ -69,6 +71,7 @@ class LocalRun:
         except BaseException:
             self._leave.close()
             raise
+        self._shards, self._listening = config.shards(), set[str]()
         self.supervisor = Supervisor(
             commands(config, folder, self._sockets.path, device),
             lambda role: {URL_VARIABLE: redis_url or self._url(role), PATIENCE_VARIABLE: str(OUTAGE_SECONDS)},
@@ -82,11 +85,25 @@ class LocalRun:
 
     def tend(self) -> None:
         """Start again what died: roles, and the embedded Redis. Raises RoleDied."""
+        if self._sockets.renew():
+            log.warning("%s was removed; it is made again", self._sockets.path)
         if self._server is not None and not self._server.alive():
-            log.warning("the embedded Redis died; starting it again")
+            log.warning("the embedded Redis died or lost its socket; starting it again")
             self._server.start()
+        self._end_unreachable()
         self._registration.tend()
         self.supervisor.tend()
+
+    def _end_unreachable(self) -> None:
+        """A replay server whose socket others have removed is started again, and listens again."""
+        for shard in self._shards:
+            socket = self._sockets.path / f"{shard.role}.sock"
+            if socket.exists():
+                self._listening.add(shard.role)
+            elif shard.role in self._listening:
+                log.warning("%s was removed; starting %s again", socket, shard.role)
+                self._listening.remove(shard.role)
+                self.supervisor.roles[shard.role].signal(signal.SIGKILL)
 
     def finished(self) -> bool:
         """Whether the learner has ended in order."""

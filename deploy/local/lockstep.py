@@ -59,20 +59,19 @@ class Lockstep:
             )
             for index in range(config.actors)
         ]
-        self.evaluator = Evaluator(
-            config.seed,
-            lambda: make_env(config.env),
-            config.agent,
-            replace(config.evaluator, evaluation_seconds=0.0),  # no clock cuts one, either
-            self.bus,
-            clock=lambda: float(next(ticks)),
+        self.evaluator = (
+            self._evaluator(config, clock=lambda: float(next(ticks))) if config.evaluator.episodes else None
         )
         self._seen = self.learner.last_checkpoint
         self._restart_due = False
 
+    def _evaluator(self, config: RunConfig, clock: Callable[[], float]) -> Evaluator:
+        uncut = replace(config.evaluator, evaluation_seconds=0.0)  # no clock decides this, either
+        return Evaluator(config.seed, lambda: make_env(config.env), config.agent, uncut, self.bus, clock)
+
     @property
     def roles(self) -> list[Role]:
-        return [self.learner, self.server, *self.actors, self.evaluator]
+        return [self.learner, self.server, *self.actors, *([self.evaluator] if self.evaluator else [])]
 
     def step(self) -> None:
         """One update, or one round of collection where none is due."""
@@ -91,7 +90,7 @@ class Lockstep:
     def _after_checkpoint(self) -> None:
         """Save the ring beside the learner; the actors begin anew in the next step, as those of a resumed run do."""
         self._seen = self.learner.last_checkpoint
-        while self.evaluator.step():
+        while self.evaluator is not None and self.evaluator.step():
             pass
         self.server.checkpoint()
         self._restart_due = True

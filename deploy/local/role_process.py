@@ -17,7 +17,7 @@ from rmc.common.process.outage import OutageLog
 from rmc.common.process.role import RECONNECT_SLEEP, StopSignal
 from rmc.deploy.local.role_environment import SECRET_VARIABLE
 from rmc.deploy.redis.connect import PATIENCE_SECONDS, PATIENCE_VARIABLE, Deadline, connect
-from rmc.deploy.run.config import RunConfig, from_json
+from rmc.deploy.run.config import RunConfig, check_sizes, env_sizes, from_registration
 
 log = logging.getLogger(__name__)
 
@@ -66,13 +66,15 @@ class Process:
         while True:
             with suppress(BusUnavailable):
                 if (raw := self.bus.config()) is not None:
-                    return from_json(raw)
+                    return from_registration(raw)
             if not waits.wait(f"run {run} to be registered in that Redis"):
                 raise ConfigError("--run", run, "no run of this name is registered in that Redis; start it first")
 
     def make_env(self) -> Env:
-        """A new environment of the run."""
-        return make_env(self.config.env)
+        """A new environment of the run. Raises ConfigError where it has other sizes than the launcher's."""
+        env = make_env(self.config.env)
+        check_sizes(self.config.env.id, self.config.sizes(), env_sizes(env))
+        return env
 
 
 def wait_for_room(bus: Bus, role: str, stop: StopSignal) -> None:

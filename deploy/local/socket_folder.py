@@ -7,7 +7,7 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-from rmc.common.errors import ConfigError
+from rmc.common.errors import ConfigError, RoleDied
 from rmc.deploy.redis.server import SOCKET_PATH_LIMIT
 
 PREFIX = "rmc-sockets-"
@@ -34,6 +34,23 @@ class SocketFolder:
                 return
             if self._lock is not None:
                 return
+
+    def renew(self) -> bool:
+        """Make it again where others, like a cleaner of old files, have removed it; whether they had.
+
+        Raises RoleDied where it cannot be made again.
+        """
+        if self.path.is_dir() and (self._lock is None or os.path.samestat(os.fstat(self._lock), self.path.stat())):
+            return False
+        try:
+            self.path.mkdir(0o700)
+            lock = _locked(self.path)
+        except OSError as error:
+            raise RoleDied(f"{self.path} was removed, and cannot be made again ({error.strerror})") from None
+        if self._lock is not None:
+            os.close(self._lock)
+        self._lock = lock
+        return True
 
     def close(self) -> None:
         """Remove it. One that others have removed is no fault."""

@@ -14,7 +14,7 @@ from typing import BinaryIO
 from rmc.common.errors import RoleDied
 from rmc.common.process.parent_death import PARENT_VARIABLE
 from rmc.common.process.watchdog import HUNG_STATUS
-from rmc.deploy.local.fork_server import ForkedProcess, ForkServer
+from rmc.deploy.local.fork_server import ForkedProcess, ForkServer, open_log
 from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inherited
 
 # So many deaths of a role's own in a row, each within so long of its start, end the run.
@@ -75,7 +75,7 @@ class RoleProcess:
         """Start its process, in a process group of its own: Ctrl-C is for the supervisor alone."""
         self.log_start = self.log.stat().st_size if self.log.exists() else 0
         self._started_at = time.monotonic()
-        with self.log.open("ab") as log:
+        with open_log(self.log) as log:
             if self._fork_server is not None:
                 self._process = self._fork_server.fork(self.command.words, self._environment, log.fileno())
             else:
@@ -93,6 +93,7 @@ class RoleProcess:
         if self.finished or self.running:
             return
         if (status := self.status) is not None:
+            self._end_group()
             self._process = None
             if status == 0 and self.command.ends:
                 self.finished = True
@@ -115,7 +116,8 @@ class RoleProcess:
 
     def last_words(self) -> str:
         """The end of its log, of this start only: the traceback, if it left one."""
-        with self.log.open("rb") as log:
+        text = ""
+        with suppress(OSError), self.log.open("rb") as log:
             log.seek(max(self.log_start, self.log.stat().st_size - TRACEBACK_BYTES))
             text = log.read().decode(errors="replace").rstrip()
         start = text.rfind("Traceback (most recent call last)")
@@ -136,7 +138,14 @@ class RoleProcess:
             self._process.wait(max(0.0, timeout))
         except subprocess.TimeoutExpired:
             return False
+        self._end_group()
         return True
+
+    def _end_group(self) -> None:
+        """What it has started goes with it; the fork server, which sees to those that left the group, may be gone."""
+        if self._process is not None and self._process.pid > 0:  # none where there was no room for one
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
 
 
 class Supervisor:

@@ -1,16 +1,19 @@
 """A run's records as they are kept: lines of metrics.jsonl and TensorBoard's events. A full disk is waited out."""
 
 import errno
+import io
 import json
 import logging
 import os
+import socket
 import time
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary
-from tensorboard.summary.writer.event_file_writer import EventFileWriter
+from tensorboard.summary.writer.record_writer import RecordWriter
 
 from rmc.deploy.run.folder import RunFolder
 
@@ -24,7 +27,7 @@ class MetricsLog:
     def __init__(self, folder: RunFolder) -> None:
         self._lines = os.open(folder.metrics, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
         self._path, self._events_folder = folder.metrics, folder.events
-        self._events: EventFileWriter | None = None
+        self._events: int | None = None
         self._retry_at: float | None = None
 
     def write(self, record: dict[str, Any], env_steps: int) -> None:
@@ -32,50 +35,64 @@ class MetricsLog:
         if self._retry_at is not None and time.monotonic() < self._retry_at:
             return
         try:
-            _append(self._lines, (json.dumps(record) + "\n").encode())
+            before = b"\n" if _ends_in_a_torn_line(self._lines) else b""
+            _append(self._lines, before + json.dumps(record).encode() + b"\n")
             self._add_event(record, env_steps)
         except OSError as error:
             if self._retry_at is None:
                 log.warning("%s is not written: %s; it is again once that is over", self._path, error.strerror)
             self._retry_at = time.monotonic() + RETRY_SECONDS
-            self._drop_events()  # its thread ends at the first error
             return
         if self._retry_at is not None:
             log.warning("%s is written again", self._path)
             self._retry_at = None
 
     def _add_event(self, record: dict[str, Any], env_steps: int) -> None:
-        if self._events is None:
-            self._events = EventFileWriter(str(self._events_folder))
         values = [
             Summary.Value(tag=f"{record['role']}/{name}", simple_value=value)
             for name, value in record.items()
             if isinstance(value, int | float) and name != "time"
         ]
         when = record.get("time", time.time())
-        self._events.add_event(Event(wall_time=when, step=env_steps, summary=Summary(value=values)))
-
-    def _drop_events(self) -> None:
-        events, self._events = self._events, None
-        with suppress(OSError):
-            if events is not None:
-                events.close()
+        if self._events is None:
+            self._events = _open_events(self._events_folder)
+        _append(self._events, _framed(Event(wall_time=when, step=env_steps, summary=Summary(value=values))))
 
     def close(self) -> None:
-        """Write what is left."""
-        os.close(self._lines)
-        self._drop_events()
+        """All is written by then."""
+        for handle in filter(None, (self._lines, self._events)):
+            os.close(handle)
 
 
-def _append(file: int, line: bytes) -> None:
-    """The whole line or none of it, after a torn one as a line of its own. Raises OSError."""
+def _open_events(folder: Path) -> int:
+    """A new file of TensorBoard's; its name is one that TensorBoard looks for. Raises OSError."""
+    folder.mkdir(exist_ok=True)
+    now = time.time()
+    name = f"events.out.tfevents.{now:010.0f}.{socket.gethostname()}.{os.getpid()}.{time.monotonic_ns()}"
+    handle = os.open(folder / name, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    _append(handle, _framed(Event(wall_time=now, file_version="brain.Event:2")))
+    return handle
+
+
+def _framed(event: Event) -> bytes:
+    """An event as it stands in a file, with its length and checksums."""
+    frame = io.BytesIO()
+    RecordWriter(frame).write(event.SerializeToString())
+    return frame.getvalue()
+
+
+def _append(file: int, content: bytes) -> None:
+    """All of it or nothing. Raises OSError."""
     size = os.fstat(file).st_size
-    if size and os.pread(file, 1, size - 1) != b"\n":
-        line = b"\n" + line
     try:
-        if os.write(file, line) < len(line):
+        if os.write(file, content) < len(content):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     except OSError:
         with suppress(OSError):
             os.ftruncate(file, size)
         raise
+
+
+def _ends_in_a_torn_line(file: int) -> bool:
+    size = os.fstat(file).st_size
+    return size > 0 and os.pread(file, 1, size - 1) != b"\n"

@@ -1,5 +1,6 @@
 """What everyone looks at: metrics from the bus to metrics.jsonl, TensorBoard, and a live view or plain lines."""
 
+import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,7 +18,8 @@ from rmc.deploy.monitor.view import RunStatus, View
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
-RECORD_SECONDS = 5.0  # between the launcher's own records
+RECORD_SECONDS = 5.0  # between the launcher's own records, and looks at the run's folder
+log = logging.getLogger(__name__)
 
 
 class Monitor:
@@ -41,6 +43,7 @@ class Monitor:
         self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
         self._next_record, self._is_away = 0.0, False
         self._metrics_log = MetricsLog(folder)
+        self._folder, self._writable = folder, True
         self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
         self.view, self.outage = View(self.board, console), OutageLog("launcher")
 
@@ -59,7 +62,10 @@ class Monitor:
             pass
 
     def watch(self, bus: Bus) -> None:
-        """Take in what is new. A Redis that is away costs nothing but that, and is noted at once."""
+        """Take in what is new. A Redis that is away costs nothing but that, and is noted at once.
+
+        Raises ConfigError where the run's folder was deleted or moved.
+        """
         was_away = self._is_away
         try:
             self._take_in(bus)
@@ -69,7 +75,15 @@ class Monitor:
         self._is_away = self.outage.seconds > 0
         if time.monotonic() >= self._next_record or self._is_away != was_away:
             self._next_record = time.monotonic() + RECORD_SECONDS
+            self._look_at_folder()
             self._record_launcher()
+
+    def _look_at_folder(self) -> None:
+        self._folder.check_there()
+        if self._folder.writable() != self._writable:
+            self._writable = not self._writable
+            said = "can be written again" if self._writable else "is read-only: training goes on, its end waits"
+            log.warning("%s %s", self._folder.path, said)
 
     def _take_in(self, bus: Bus) -> None:
         while records := self._read(bus):

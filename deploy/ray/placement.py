@@ -96,16 +96,15 @@ def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[st
     if encrypted and config.replay.replay_shards > 1:  # one alone has a unix socket
         secret += ("--tls-folder", "{scratch}")
     learn, timeout = ("--folder", "{scratch}/checkpoints", "--device", device), config.env.env_timeout
+    evaluate = RoleCommand("evaluator", ("evaluator", *place), env_timeout=timeout)
+    evaluator = [RolePlacement(RoleActor, evaluate, EVALUATOR_CPUS, group="learner")] * (config.evaluator.episodes > 0)
     found = [
         *_replays(config, (*place, *secret)),
         RolePlacement(
             LearnerActor, RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
             learner_cpus(config), float(device.startswith("cuda")), group="learner",
         ),
-        RolePlacement(
-            RoleActor, RoleCommand("evaluator", ("evaluator", *place), env_timeout=timeout), EVALUATOR_CPUS,
-            group="learner",
-        ),
+        *evaluator,
         *(
             RolePlacement(
                 RoleActor,

@@ -73,15 +73,15 @@ class ClusterRun:
         self.config, self._folder, self._device, self._all_cpus = config, folder, device, all_cpus
         self._encrypted, self._ring_locations = encrypted, RingLocations(folder)
         self._leave = ExitStack()
-        sockets = SocketFolder()
-        self._leave.callback(sockets.close)
+        self._sockets = SocketFolder()
+        self._leave.callback(self._sockets.close)
         try:
             ip = ray.util.get_node_ip_address()
             if encrypted:
                 tls.make_certificate(folder.path, ip)
             number, self._moved = _port(folder, ip)
             port = Port(ip, number, folder.path if encrypted else None)
-            self._server = RedisServer(sockets.path, port=port, users=self._users())
+            self._server = RedisServer(self._sockets.path, port=port, users=self._users())
             self._leave.enter_context(self._server)
             self.bus = connect(self._server.url(), folder.name)
             self._registration = Registration(config, folder, self.bus)
@@ -157,8 +157,10 @@ class ClusterRun:
 
     def tend(self) -> None:
         """Hear every host, and place what is not. Raises RoleDied."""
+        if self._sockets.renew():
+            log.warning("%s was removed; it is made again", self._sockets.path)
         if not self._server.alive():
-            log.warning("the embedded Redis died; starting it again")
+            log.warning("the embedded Redis died or lost its socket; starting it again")
             self._server.start()
         self._registration.tend()
         for role_handle in list(self._hosts.values()):

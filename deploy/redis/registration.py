@@ -6,7 +6,7 @@ from contextlib import suppress
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusFull, BusUnavailable, RmcError
 from rmc.deploy.redis.progress_backup import ProgressBackup
-from rmc.deploy.run.config import RunConfig, to_json
+from rmc.deploy.run.config import RunConfig, to_registration
 from rmc.deploy.run.folder import RunFolder
 
 LOOK_SECONDS = 1.0
@@ -17,7 +17,7 @@ class Registration:
 
     def __init__(self, config: RunConfig, folder: RunFolder, bus: RedisBus) -> None:
         """Make the run known, afresh. Raises BusUnavailable, BusFull."""
-        self._config, self._bus = to_json(config).encode(), bus
+        self._config, self._bus = to_registration(config), bus
         self._progress_backup = ProgressBackup(folder, config.replay.replay_shards)
         self._look_at = 0.0
         bus.expire(None)
@@ -26,7 +26,7 @@ class Registration:
 
     def change(self, config: RunConfig) -> None:
         """From now on roles begin with this config. Raises BusUnavailable, BusFull."""
-        changed = to_json(config).encode()
+        changed = to_registration(config)
         self._bus.set_config(changed)
         self._config = changed
 

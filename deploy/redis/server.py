@@ -87,8 +87,8 @@ class RedisServer:
         return f"rediss://{place}?ssl_ca_certs={certificate}"
 
     def start(self) -> None:
-        """Start it, and wait until it answers."""
-        self.socket.unlink(missing_ok=True)
+        """Start it, in place of one that is not alive, and wait until it answers."""
+        self.close()
         if self.users is not None:
             self._write_users()
         tied = [sys.executable, "-I", parent_death.__file__, str(os.getpid()), server_binary(), "-"]
@@ -162,8 +162,8 @@ class RedisServer:
         raise ConfigError(name, None, f"the embedded Redis did not start ({' '.join(tail)}); {fix}")
 
     def alive(self) -> bool:
-        """Whether the server's process runs."""
-        return self.process is not None and self.process.poll() is None
+        """Whether the server's process runs, and its socket is there for who comes."""
+        return self.process is not None and self.process.poll() is None and self.socket.exists()
 
     def close(self) -> None:
         """End it; its socket goes, too."""

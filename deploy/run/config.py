@@ -15,6 +15,7 @@ from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import env_spaces
+from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 from rmc.common.shard import Shard
 from rmc.common.window import WindowSpec
@@ -95,7 +96,8 @@ class RunConfig:
     def roles(self) -> tuple[str, ...]:
         """The names of all roles."""
         actors = [f"actor-{index}" for index in range(self.actors)]
-        return ("learner", "evaluator", *(shard.role for shard in self.shards()), *actors)
+        evaluator = ("evaluator",) if self.evaluator.episodes else ()
+        return ("learner", *evaluator, *(shard.role for shard in self.shards()), *actors)
 
     def slack_steps(self) -> int:
         """How far actors may run ahead of the replay ratio: two windows of every environment.
@@ -109,17 +111,51 @@ class RunConfig:
 
 
 def to_json(config: RunConfig) -> str:
-    """The config as JSON, as in ``config.json`` and in Redis."""
+    """The config as JSON, as in ``config.json``."""
     return json.dumps(dataclasses.asdict(config), indent=2)
 
 
 def from_json(text: str | bytes) -> RunConfig:
     """The config again. Raises ConfigError on anything unknown, missing or of the wrong type."""
+    return _build(RunConfig, _read(text), "")
+
+
+def to_registration(config: RunConfig) -> bytes:
+    """The config as JSON for the roles: with it a role knows the environment's sizes without making one."""
+    return json.dumps(dataclasses.asdict(config) | {"spaces": config._spaces}).encode()
+
+
+def from_registration(text: bytes) -> RunConfig:
+    """The config again. Raises ConfigError."""
+    raw = _read(text)
+    spaces: Any = raw.pop("spaces", None) if isinstance(raw, dict) else None
+    config = _build(RunConfig, raw, "")
+    if type(spaces) is not list or len(spaces) != 3 or not all(_matches(int | None, size) for size in spaces):
+        raise ConfigError("config.json spaces", spaces, "must be three numbers")
+    config.__dict__["_spaces"] = tuple(spaces)  # where the cached property keeps it
+    return config
+
+
+def env_sizes(env: Env) -> dict[str, int]:
+    """An environment's sizes, as ``RunConfig.sizes`` names them."""
+    assert env.observation_space.shape
+    assert env.action_space.shape
+    return {"observations": env.observation_space.shape[0], "actions": env.action_space.shape[0]}
+
+
+def check_sizes(env_id: str, before: dict[str, Any], sizes: dict[str, int]) -> None:
+    """Raises ConfigError where the environment has other ``sizes`` than ``before``, when the run began."""
+    for name, now in sizes.items():
+        if before.get(name, now) != now:
+            fault = f"the environment now has {now} {name}, the run was trained with {before[name]}"
+            raise ConfigError("ENV", env_id, f"{fault}; undo that, or train another run")
+
+
+def _read(text: str | bytes) -> Any:
     try:
-        raw = json.loads(text)
+        return json.loads(text)
     except ValueError as error:
         raise ConfigError("config.json", str(error), "not JSON; restore the file or start a new run") from None
-    return _build(RunConfig, raw, "")
 
 
 def _build(kind: type[ConfigT], raw: Any, path: str) -> ConfigT:

@@ -23,7 +23,7 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import CheckpointError, ConfigError
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.config import RunConfig, from_json, option, to_json
+from rmc.deploy.run.config import RunConfig, check_sizes, from_json, option, to_json
 
 log = logging.getLogger(__name__)
 SECRET_LENGTH = 64  # hexadecimal characters
@@ -60,6 +60,7 @@ class RunFolder:
         self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
         self.initial_file, self.sizes_file = self.path / "initial.json", self.path / "sizes.json"
         self._lock: int | None = None
+        self._was: os.stat_result | None = None  # when it was locked
 
     @property
     def name(self) -> str:
@@ -99,7 +100,10 @@ class RunFolder:
             return None
 
     def write_result(self, result: dict[str, Any]) -> None:
-        """Write ``result.json``, whole or not at all."""
+        """Write ``result.json``, whole or not at all; where the folder is read-only, once it is not."""
+        while not self.writable():
+            self.check_there()
+            time.sleep(LOCK_SECONDS)
         write_whole(self.result_file, f"{json.dumps(result, indent=2)}\n".encode())
 
     def initial(self) -> dict[str, Any] | None:
@@ -119,10 +123,7 @@ class RunFolder:
             before = read_object(self.sizes_file, *sizes)
         except (OSError, ConfigError):  # damaged, it is as none
             return
-        for name, now in sizes.items():
-            if before[name] != now:
-                fault = f"the environment now has {now} {name}, the run was trained with {before[name]}"
-                raise ConfigError("ENV", env_id, f"{fault}; undo that, or train another run")
+        check_sizes(env_id, before, sizes)
 
     def write_sizes(self, sizes: dict[str, int]) -> None:
         """Write ``sizes.json``, whole or not at all."""
@@ -183,7 +184,22 @@ class RunFolder:
                 self._lock = None
                 raise ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first")
             time.sleep(0.05)
+        self._was = self.path.stat()
         self._note(f"training {os.getpid()} {socket.gethostname()}")
+
+    def check_there(self) -> None:
+        """Raises ConfigError where it is not the folder any more that was locked, or has lost what it goes on from."""
+        files = (self.path / "config.json", self.secret_file)
+        with suppress(FileNotFoundError, NotADirectoryError):
+            same = self._was is None or os.path.samestat(self._was, self.path.stat())
+            if same and all(map(Path.exists, files)):
+                return
+        fix = "was deleted or moved while it was trained; if it was moved, give its new place to go on"
+        raise ConfigError("--run-dir", str(self.path), fix)
+
+    def writable(self) -> bool:
+        """Whether files can be made in it."""
+        return os.access(self.path, os.W_OK, effective_ids=os.access in os.supports_effective_ids)
 
     def unlock(self, status: int | None = None) -> None:
         """Let another launcher in; ``status`` is how this one ended, if it trained."""

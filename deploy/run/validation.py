@@ -50,7 +50,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "learner.checkpoint_steps": (1, 2**53),
     "learner.keep_checkpoints": (1, 1_000_000),
     "learner.threads": (0, 1024),
-    "evaluator.episodes": (1, 10_000),
+    "evaluator.episodes": (0, 10_000),
     "evaluator.evaluation_seconds": (0, 1e9),
 }
 

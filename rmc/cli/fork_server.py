@@ -18,7 +18,7 @@ import msgpack
 import numpy as np
 import setproctitle
 
-from rmc.common.process import parent_death
+from rmc.common.process import descendants, parent_death
 from rmc.deploy.local.fork_server import LARGEST
 from rmc.deploy.local.role_environment import command_line
 
@@ -26,16 +26,20 @@ from rmc.deploy.local.role_environment import command_line
 def serve(requests: socket.socket) -> None:
     """Fork what is asked for, until the other end is closed."""
     _import_all()
+    descendants.adopt_orphans()
+    parent_death.outlive_parent()
+    roles: set[int] = set()
     while True:
         raw, descriptors, _, _ = socket.recv_fds(requests, LARGEST, 1)
         if not raw:
             return
         request = msgpack.unpackb(raw)
         if isinstance(request, int):
-            requests.send(msgpack.packb(_status(request)))
+            requests.send(msgpack.packb(_status(request, roles)))
             continue
         for log in descriptors:
-            requests.send(msgpack.packb(_forked(requests, request, log)))
+            roles.add(pid := _forked(requests, request, log))
+            requests.send(msgpack.packb(pid))
             os.close(log)
 
 
@@ -68,9 +72,14 @@ def _import_all() -> None:
     gc.freeze()  # the collector does not write to these pages, so that they stay shared
 
 
-def _status(pid: int) -> int | str:
+def _status(pid: int, roles: set[int]) -> int | str:
+    """Of a role; with one that has ended goes what its environments started, which has come to us."""
     found, status = os.waitpid(pid, os.WNOHANG)
-    return os.waitstatus_to_exitcode(status) if found else "running"
+    if not found:
+        return "running"
+    roles.discard(pid)
+    descendants.end_children(roles)
+    return os.waitstatus_to_exitcode(status)
 
 
 def _be(words: list[str], environment: dict[str, str], log: int) -> None:
@@ -109,4 +118,5 @@ if __name__ == "__main__":
     except BaseException:
         traceback.print_exc()
     finally:
+        descendants.end_children()
         os._exit(0)  # at once: Python's own clearing up takes seconds here

@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 
-from rmc.common.process import watchdog
+from rmc.common.process import descendants, watchdog
 from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
 from rmc.deploy.monitor import output
 
@@ -26,6 +26,7 @@ def main() -> None:
     output.take_over()
     watchdog.start()
     status = run(sys.argv[1:])
+    descendants.end_children()
     logging.shutdown()
     os._exit(status or _unwritten())
 
@@ -45,6 +46,7 @@ def run(words: list[str]) -> int:
     parent = os.environ.pop(PARENT_VARIABLE, None)
     if parent is not None:  # before the slow imports, so that there is no time in which a role could be left behind
         exit_with_parent(int(parent))
+        descendants.adopt_orphans()
     if words and words[0] in SINGLE_THREADED:  # before numpy and torch are imported, which read these once
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")

@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -464,6 +465,20 @@ def test_a_broken_episode_is_dropped_and_training_goes_on(fault: str) -> None:
     sent = {step.step for step in found.trained if step.episode % 3 == 2}
     assert {0, SPEC.train - 1} <= sent
     actor.close()
+
+
+def test_a_fault_is_logged_with_its_place_in_the_users_file(caplog: pytest.LogCaptureFixture) -> None:
+    bus = MemoryBus()
+    publish(bus, 0)
+    actor = make_broken(bus, "Broken-raise-v0")
+    play(bus, actor, Reader(bus), 500)
+    actor.close()
+    said = [record.getMessage() for record in caplog.records if "broke in step" in record.getMessage()]
+    assert said
+    fault = r"the environment's step raises RuntimeError: the simulation is unstable \(broken_env.py, line \d+\)$"
+    assert all(
+        re.search(f"^actor-0: environment [0-9] broke in step [0-9]+ of an episode: {fault}", line) for line in said
+    )
 
 
 class Scaling(CountingEnv):

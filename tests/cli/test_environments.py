@@ -101,7 +101,7 @@ def test_a_run_of_whole_episodes_keeps_their_length(tmp_path: Path) -> None:
     ("env", "says"),
     [
         ("Stumbles", "the environment's step raises LinAlgError: Singular matrix (habits.py, line "),
-        ("Untyped", "the environment's reward is 'much', not made of numbers"),
+        ("Untyped", "the environment's reward is 'much'; return a number"),
     ],
 )
 def test_check_env_train_and_evaluate_say_the_same(

@@ -6,17 +6,23 @@ import json
 import os
 import resource
 import stat
+import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Barrier
 
 import pytest
+from rich.console import Console
 
 from rmc.analysis.history import of_run
 from rmc.cli.main import run
+from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.run.config import to_json
 from rmc.deploy.run.folder import RESULT, IfExists, RunFolder, open_run
 from rmc.deploy.run.presets import debug
@@ -121,6 +127,48 @@ def test_a_place_for_runs_that_is_none_is_one_line(tmp_path: Path, monkeypatch: 
     (tmp_path / "runs").touch()
     with pytest.raises(ConfigError, match=r"--run-dir='.*runs.*cannot be made \(.+\); give another"):
         open_run(debug(EnvConfig("InvertedPendulum-v5")), None, "resume")
+
+
+def test_a_folder_that_turns_read_only_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is said once each way, and the result comes when there is a place for it."""
+    monkeypatch.setattr("rmc.deploy.monitor.monitor.RECORD_SECONDS", 0.0)
+    config = debug(EnvConfig("InvertedPendulum-v5"))
+    folder = open_run(config, tmp_path / "run", "fail")
+    for path in (tmp_path, *tmp_path.parents[:3]):  # for who is not root, whom no mode keeps from writing
+        path.chmod(0o711)
+    os.chown(folder.path, 65534, -1)
+    monitor = Monitor(folder, config, Console(quiet=True))
+    monitor.watch(MemoryBus())
+    folder.path.chmod(0o500)
+    with ThreadPoolExecutor(1) as pool, as_nobody():
+        for _ in range(3):
+            monitor.watch(MemoryBus())
+        written = pool.submit(folder.write_result, {"env_steps": 1})
+        time.sleep(0.2)
+        assert not written.done()
+        folder.path.chmod(0o700)
+        written.result(5.0)
+    monitor.watch(MemoryBus())
+    assert folder.result_file.exists()
+    said = [message.partition("run ")[2] for message in caplog.messages]
+    assert said == ["is read-only: training goes on, its end waits", "can be written again"]
+    monitor.close()
+    folder.unlock()
+
+
+@contextmanager
+def as_nobody() -> Iterator[None]:
+    """Where this process is root, for as long as this lasts."""
+    if os.getuid():
+        yield
+        return
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
 
 
 def test_odd_lines_of_metrics_are_passed_over(tmp_path: Path) -> None:

@@ -1,20 +1,25 @@
 """A run stays known in a Redis that forgets."""
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import redis
+from gymnasium.spaces import Box
 
 from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
-from rmc.common.errors import BusUnavailable
+from rmc.common.errors import BusUnavailable, ConfigError
+from rmc.deploy.local.role_process import Process
 from rmc.deploy.redis import registration
 from rmc.deploy.redis.registration import Registration
-from rmc.deploy.run.config import from_json
+from rmc.deploy.run.config import from_registration, to_registration
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import debug
 from rmc.replay_server.commit_record import Progress
+from tests import habits
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
 COUNTED = Progress(3, env_steps=7).publish()
@@ -33,7 +38,7 @@ def test_a_redis_that_forgot_is_told_again_what_it_must_know(tmp_path: Path, red
     _forget(redis_url, run_name)
     assert bus.config() is None
     registered.tend()
-    assert from_json(bus.config() or b"") == CONFIG
+    assert from_registration(bus.config() or b"") == CONFIG
     assert bus.progress("replay") == COUNTED
     bus.request_stop("so it shall be")  # which is no reason to begin afresh
     registered.tend()
@@ -56,6 +61,28 @@ def test_a_redis_that_is_away_is_told_later(
     assert bus.config() is None
     registered.tend()
     assert bus.config() is not None
+
+
+def test_a_role_whose_environment_has_other_sizes_than_the_launchers_does_not_begin(
+    tmp_path: Path, redis_url: str, run_name: str
+) -> None:
+    bus, config = RedisBus(redis_url, run_name), debug(EnvConfig("tests.habits:Slide-v0"))
+    Registration(config, RunFolder(tmp_path), bus)
+    role = Process.__new__(Process)
+    role.config = from_registration(bus.config() or b"")
+    assert role.config == config
+    role.make_env().close()
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(habits.Slide, "observation_space", Box(-99.0, 99.0, (4,), np.float32))
+        with pytest.raises(ConfigError, match="the environment now has 4 observations, the run was trained with 3"):
+            role.make_env()
+
+
+@pytest.mark.parametrize("spaces", [3, None, [1, 2], [1, 2, "3"], [1.0, 2, 3]])
+def test_sizes_that_are_none_are_refused(spaces: object) -> None:
+    registered = json.loads(to_registration(CONFIG)) | {"spaces": spaces}
+    with pytest.raises(ConfigError, match="must be three numbers"):
+        from_registration(json.dumps(registered).encode())
 
 
 def _forget(redis_url: str, run_name: str) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import stat
 import subprocess
 import sys
 import tempfile
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rmc.common.errors import ConfigError
+from rmc.common.errors import ConfigError, RoleDied
 from rmc.deploy.local import socket_folder
 from rmc.deploy.local.socket_folder import LONGEST_NAME, SocketFolder, place_for_sockets, sweep
 from rmc.deploy.redis.server import SOCKET_PATH_LIMIT, RedisServer
@@ -130,6 +131,21 @@ def test_starts_at_once_leave_each_other_alone(temporary: Path) -> None:
     assert all(folder.is_dir() for _, folder in holders)
     for process, _ in holders:
         end(process)
+
+
+def test_one_that_others_removed_is_made_again_and_locked(temporary: Path) -> None:
+    folder = SocketFolder()
+    assert not folder.renew()
+    folder.path.rmdir()
+    assert folder.renew()
+    sweep(temporary)
+    assert stat.S_IMODE(folder.path.stat().st_mode) == 0o700
+    folder.path.rmdir()
+    folder.path.touch()
+    with pytest.raises(RoleDied, match=r"was removed, and cannot be made again \(File exists\)"):
+        folder.renew()
+    folder.path.unlink()
+    folder.close()
 
 
 def test_one_that_others_removed_is_closed_in_silence(temporary: Path) -> None:

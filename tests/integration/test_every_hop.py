@@ -20,7 +20,7 @@ from rmc.common.bus.protocol import Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.replay import SampleStatus
-from rmc.deploy.run.config import to_json
+from rmc.deploy.run.config import to_registration
 from rmc.deploy.run.presets import debug
 from rmc.learner.replay_client import ReplayClient
 from rmc.replay_server.config import ReplayConfig
@@ -42,7 +42,7 @@ CONFIG = dataclasses.replace(
 @pytest.fixture
 def bus(redis_url: str, run_name: str) -> RedisBus:
     made = RedisBus(redis_url, run_name)
-    made.set_config(to_json(CONFIG).encode())
+    made.set_config(to_registration(CONFIG))
     made.publish_weights(Version(made.take_epoch("learner"), 1), initial_policy(CONFIG))
     return made
 

@@ -1,0 +1,104 @@
+"""What an environment starts ends with its role, on every way out."""
+
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from rmc.deploy.local.socket_folder import sweep
+from tests.integration.running import Training, alive
+from tests.integration.spawning_env import SPAWNED
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere, those of its process group do")
+ENDLESS = ("--total-steps", "100000000", "--env-timeout", "3")
+SPAWNING = "tests.integration.spawning_env:Spawning-v0"
+
+
+class Spawner(Training):
+    """A run whose environments tell what they started."""
+
+    def simulators(self, pid: int | None = None) -> list[psutil.Process]:
+        """Those that run, of one process or of all."""
+        told = self.told.iterdir() if pid is None else [self.told / str(pid)]
+        pids = [int(word) for path in told if not path.name.startswith("hang") for word in path.read_text().split()]
+        return alive([psutil.Process(one) for one in pids if psutil.pid_exists(one)])
+
+    @property
+    def told(self) -> Path:
+        return self.folder.parent / "told"
+
+    def pid_of(self, name: str) -> int:
+        """Of a role that plays."""
+        self.wait_for(lambda: (role := self.role(name)) is not None and (self.told / str(role.pid)).exists())
+        role = self.role(name)
+        assert role is not None
+        return role.pid
+
+    def fork_server(self) -> psutil.Process:
+        return next(one for one in self.launcher.children() if "rmc.cli.fork_server" in one.cmdline())
+
+
+@pytest.fixture
+def training(tmp_path: Path) -> Iterator[Spawner]:
+    (tmp_path / "told").mkdir()
+    with Spawner(tmp_path / "run", *ENDLESS, env=SPAWNING, environment={SPAWNED: str(tmp_path / "told")}) as run:
+        run.wait_for_updates()
+        yield run
+        run.process.kill()
+        run.process.wait()
+        end_all(run)
+        sweep(Path(tempfile.gettempdir()))
+
+
+def end_all(run: Spawner) -> None:
+    deadline = time.monotonic() + 5.0
+    while left := run.simulators():
+        if time.monotonic() > deadline:
+            for one in left:
+                one.kill()
+            raise AssertionError(f"left: {left}")
+        time.sleep(0.05)
+
+
+def test_they_end_with_a_role_that_is_killed_or_hangs_and_with_the_run(training: Spawner) -> None:
+    actor, evaluator = training.pid_of("actor"), training.pid_of("evaluator")
+    theirs = len(training.simulators(evaluator))
+    assert len(training.simulators(actor)) >= 3
+    psutil.Process(actor).kill()
+    training.wait_for(lambda: not training.simulators(actor), 5.0)
+    assert len(training.simulators(evaluator)) == theirs >= 3  # which plays on
+
+    training.wait_for(lambda: (role := training.role("actor")) is not None and role.pid != actor)
+    again = training.pid_of("actor")
+    (training.told / f"hang-{again}").touch()
+    training.wait_for(lambda: not psutil.pid_exists(again), 20.0)
+    training.wait_for(lambda: not training.simulators(again), 5.0)
+
+    training.pid_of("actor")
+    training.interrupt()
+    assert training.simulators() == []
+
+
+def test_they_end_where_the_launcher_is_killed(training: Spawner) -> None:
+    training.pid_of("actor")
+    assert training.simulators()
+    training.process.send_signal(signal.SIGKILL)
+    training.process.wait()
+    end_all(training)
+
+
+def test_those_of_a_group_end_where_the_fork_server_is_killed(training: Spawner) -> None:
+    actor = training.pid_of("actor")
+    own = training.simulators(actor)
+    training.fork_server().kill()
+    training.wait_for(lambda: not alive(own[:1]), 5.0)
+    for left in alive(own):  # these have left the group
+        left.kill()
+    training.interrupt()
+    for left in training.simulators():
+        left.kill()

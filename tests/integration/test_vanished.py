@@ -1,0 +1,58 @@
+"""Folders that vanish while a run is trained."""
+
+import shutil
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.integration.running import Training, alive
+
+
+def test_a_temporary_folder_that_vanishes_is_made_again(tmp_path: Path) -> None:
+    """Roles that die later find Redis, the learner finds the replay server, and the run has its result."""
+    with Training(tmp_path / "run", "--total-steps", "12000") as training:
+        training.wait_for_updates()
+        (folder,) = (path for path in training.sockets() if path.is_dir())
+        shutil.rmtree(folder)
+        training.wait_for(lambda: (folder / "redis.sock").exists() and (folder / "replay.sock").exists(), 30.0)
+        actor = training.role("actor")
+        assert actor is not None
+        actor.kill()
+        training.wait_for_updates(20)
+        (folder / "replay.sock").unlink()
+        training.wait_for(lambda: (folder / "replay.sock").exists(), 30.0)
+        training.wait_for_updates(20)
+        assert training.finish(120) == 0, training.text()
+    assert (training.folder / "result.json").exists()
+    assert "was removed; it is made again" in training.text()
+
+
+def replaced(folder: Path) -> None:
+    folder.rename(folder.with_name("elsewhere"))
+    shutil.copytree(folder.with_name("elsewhere"), folder)
+
+
+def emptied(folder: Path) -> None:
+    subprocess.run(f"rm -rf {folder}/*", shell=True, check=True)
+
+
+@pytest.mark.parametrize("vanish", [shutil.rmtree, replaced, emptied])
+def test_a_runs_folder_that_vanishes_ends_it_in_one_line(vanish: Callable[[Path], None], tmp_path: Path) -> None:
+    """Also where a role dies before that is noticed."""
+    with Training(tmp_path / "run", "--total-steps", "100000000") as training:
+        training.wait_for_updates()
+        processes, actor = training.launcher.children(recursive=True), training.role("actor")
+        assert actor is not None
+        vanish(training.folder)
+        actor.kill()
+        began = time.monotonic()
+        assert training.finish(30) == 2
+        assert time.monotonic() - began < 15.0
+        assert not alive(processes)
+    last = training.text().splitlines()[-1]
+    assert last.startswith(f"rmc: --run-dir='{training.folder}': was deleted or moved while it was trained")
+    assert "Traceback" not in training.text()
+    assert vanish is not shutil.rmtree or not training.folder.exists()
