@@ -13,6 +13,11 @@ class OutageLog:
         self._role = role
         self._since: float | None = None
 
+    @property
+    def seconds(self) -> float:
+        """For how long it has lasted; 0 where there is none."""
+        return 0.0 if self._since is None else time.monotonic() - self._since
+
     def begin(self, error: Exception) -> None:
         """Redis was away or full just now."""
         if self._since is None:

@@ -137,10 +137,10 @@ def train(
         run.supervisor.start()
         while not stop.requested and not run.finished():
             run.tend()
-            watch(monitor, run.bus)
+            monitor.watch(run.bus)
             time.sleep(TICK_SECONDS)
         run.supervisor.stop()
-        watch(monitor, run.bus)  # what the roles said last
+        monitor.watch(run.bus)  # what the roles said last
         return monitor.learner_finished()
     finally:
         run.close()
@@ -153,22 +153,13 @@ def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monito
     monitor.skip_old(bus)
     while not stop.requested and not monitor.learner_finished():
         registration.tend()
-        watch(monitor, bus)
+        monitor.watch(bus)
         time.sleep(TICK_SECONDS)
     with suppress(BusUnavailable, BusFull):
         bus.request_stop("stopped by its launcher" if stop.requested else "finished")
     deadline = time.monotonic() + CheckpointFolder(folder.checkpoints).patience(STOP_SECONDS)
     while stop.requested and time.monotonic() < deadline:  # the learner saves; what it says then is still recorded
-        watch(monitor, bus)
+        monitor.watch(bus)
         time.sleep(TICK_SECONDS)
     _expire(bus)
     return monitor.learner_finished()
-
-
-def watch(monitor: Monitor, bus: RedisBus) -> None:
-    """Let the monitor see what is new; a Redis that is away for a while costs nothing but that."""
-    try:
-        monitor.watch(bus)
-        monitor.outage.end()
-    except (BusUnavailable, BusFull) as error:
-        monitor.outage.begin(error)

@@ -42,13 +42,13 @@ class Tail:
 def watch(folder: RunFolder, console: Console, gone: Callable[[], bool]) -> int | None:
     """Show a run until its launcher ends, and give its exit status; None where it is ``gone`` without one."""
     config = folder.config()
-    board = RunStatus(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
+    ratio, roles = config.replay.replay_ratio, (*config.roles(), "launcher")
+    board = RunStatus(config.env.id, config.preset, config.seed, config.total_steps, ratio, roles)
     tail, view = Tail(folder.metrics), View(board, console)
     try:
         while folder.ended() is None and not gone():
             for found in tail.take():
                 board.take(found)
-            view.refresh()
             time.sleep(LOOK_SECONDS)
     finally:
         for found in tail.take():

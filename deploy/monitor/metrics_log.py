@@ -35,7 +35,8 @@ class MetricsLog:
         if self._retry_at is not None and time.monotonic() < self._retry_at:
             return
         try:
-            _append(self._lines, (json.dumps(record) + "\n").encode())
+            before = b"\n" if _ends_in_a_torn_line(self._lines) else b""
+            _append(self._lines, before + json.dumps(record).encode() + b"\n")
             self._add_event(record, env_steps)
         except OSError as error:
             if self._retry_at is None:
@@ -80,15 +81,18 @@ def _framed(event: Event) -> bytes:
     return frame.getvalue()
 
 
-def _append(file: int, line: bytes) -> None:
-    """The whole line or none of it, after a torn one as a line of its own. Raises OSError."""
+def _append(file: int, content: bytes) -> None:
+    """All of it or nothing. Raises OSError."""
     size = os.fstat(file).st_size
-    if size and os.pread(file, 1, size - 1) != b"\n":
-        line = b"\n" + line
     try:
-        if os.write(file, line) < len(line):
+        if os.write(file, content) < len(content):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     except OSError:
         with suppress(OSError):
             os.ftruncate(file, size)
         raise
+
+
+def _ends_in_a_torn_line(file: int) -> bool:
+    size = os.fstat(file).st_size
+    return size > 0 and os.pread(file, 1, size - 1) != b"\n"

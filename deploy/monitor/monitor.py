@@ -11,6 +11,7 @@ from rich.console import Console
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.protocol import Bus
 from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.process.outage import OutageLog
 from rmc.deploy.monitor.metrics_log import MetricsLog
 from rmc.deploy.monitor.view import RunStatus, View
@@ -26,7 +27,12 @@ class Monitor:
 
     def __init__(self, folder: RunFolder, config: RunConfig, console: Console) -> None:
         self.board = RunStatus(
-            config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio
+            config.env.id,
+            config.preset,
+            config.seed,
+            config.total_steps,
+            config.replay.replay_ratio,
+            config.roles(),
         )
         self.restarts: Callable[[], dict[str, int]] = dict  # how often each role was started again
         self.unplaced: Callable[[], list[str]] = list  # roles that run nowhere now
@@ -35,7 +41,7 @@ class Monitor:
         self._cursors: dict[str, str] = {}
         self._refused = 0  # records and values that could not be read
         self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
-        self._next_record = 0.0
+        self._next_record, self._is_away = 0.0, False
         self._metrics_log = MetricsLog(folder)
         self._folder, self._writable = folder, True
         self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
@@ -56,17 +62,21 @@ class Monitor:
             pass
 
     def watch(self, bus: Bus) -> None:
-        """Take in what is new, and refresh the view when it is due.
+        """Take in what is new. A Redis that is away costs nothing but that, and is noted at once.
 
         Raises ConfigError where the run's folder was deleted or moved.
         """
-        self._take_in(bus)
-        now = time.monotonic()
-        if now >= self._next_record:
-            self._next_record = now + RECORD_SECONDS
+        was_away = self._is_away
+        try:
+            self._take_in(bus)
+            self.outage.end()
+        except (BusUnavailable, BusFull) as error:
+            self.outage.begin(error)
+        self._is_away = self.outage.seconds > 0
+        if time.monotonic() >= self._next_record or self._is_away != was_away:
+            self._next_record = time.monotonic() + RECORD_SECONDS
             self._look_at_folder()
             self._record_launcher()
-        self.view.refresh()
 
     def _look_at_folder(self) -> None:
         self._folder.check_there()
@@ -114,6 +124,7 @@ class Monitor:
                 "restarts": total,
                 **restarts,
                 "refused_values": self._refused,
+                "redis_away_s": self.outage.seconds,
                 "not_running": " ".join(self.unplaced()),
             }
         )

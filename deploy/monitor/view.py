@@ -1,6 +1,7 @@
 """The newest state of a run as a table for a terminal, or as one plain line."""
 
 import sys
+import threading
 import time
 from collections.abc import Callable
 from statistics import mean
@@ -19,7 +20,10 @@ REFRESH_SECONDS = 0.5  # of a live view
 LINE_SECONDS = 10.0  # between plain lines
 MOST_NAMES = 1000
 LARGEST_STEP = 2**63 - 1  # that TensorBoard takes
-SILENT_SECONDS = 5.0  # after which a role's silence is shown
+SILENT_SECONDS = 5.0  # after which a role's silence is shown; it speaks every second
+LAUNCHER_SECONDS = 15.0  # the same of the launcher, which speaks every 5
+UNHEARD_SECONDS = 30.0  # of a role that has not spoken yet: it imports, and makes its environments
+MOST_SILENT = 3  # that are named
 
 
 def terminal(width: int | None = None) -> Console:
@@ -30,16 +34,43 @@ def terminal(width: int | None = None) -> Console:
 class RunStatus:
     """The newest value of everything, by role."""
 
-    def __init__(self, env: str, preset: str, seed: int, total_steps: int, replay_ratio: float) -> None:
+    def __init__(
+        self,
+        env: str,
+        preset: str,
+        seed: int,
+        total_steps: int,
+        replay_ratio: float,
+        expected: tuple[str, ...] = (),
+    ) -> None:
+        """``expected`` are the roles that are about to speak."""
+        self._since = dict.fromkeys(expected, time.time())  # of those that have not spoken
+        self.is_over = False  # then nobody is expected to speak
         self.env, self.preset, self.seed, self.total_steps = env, preset, seed, total_steps
         self.replay_ratio = replay_ratio
         self.roles: dict[str, dict[str, Any]] = {}
 
     def take(self, record: dict[str, Any]) -> None:
         """Take in a record; what it does not name stays as it was, and of a role there are ``MOST_NAMES`` at most."""
-        known = self.roles.setdefault(record["role"], {})
+        known = self.roles.get(record["role"], {})
         room = MOST_NAMES - len(known)
-        known.update(record if len(record) <= room else {name: record[name] for name in record if name in known})
+        new = record if len(record) <= room else {name: record[name] for name in record if name in known}
+        self.roles = {**self.roles, record["role"]: known | new}  # afresh: another thread may be reading the old one
+
+    def silent(self) -> dict[str, float]:
+        """Who has said nothing for long, and for how many seconds. While Redis is away, which is why, it alone."""
+        if self.is_over:
+            return {}
+        now, launcher = time.time(), self.roles.get("launcher", {})
+        if launcher.get("redis_away_s"):
+            return {"Redis": launcher["redis_away_s"] + now - launcher.get("time", now)}
+        unheard = {role: now - since for role, since in self._since.items() if role not in self.roles}
+        quiet = {role: now - record.get("time", now) for role, record in self.roles.items()}
+        return {role: seconds for role, seconds in unheard.items() if seconds > UNHEARD_SECONDS} | {
+            role: seconds
+            for role, seconds in sorted(quiet.items())
+            if seconds > (LAUNCHER_SECONDS if role == "launcher" else SILENT_SECONDS)
+        }
 
     def get(self, role: str, name: str) -> Any:
         """The newest value, or None."""
@@ -133,15 +164,15 @@ def _facts(board: RunStatus) -> list[tuple[str, str]]:
 
 def _stages(board: RunStatus) -> Table:
     stages = Table("role", "busy", "waiting", "for", "restarts", box=None, padding=(0, 2, 0, 0), title_justify="left")
+    silent = board.silent()
     for role in sorted(role for role in board.roles if role != "launcher"):
         record = board.roles[role]
-        silent = time.time() - record.get("time", 0.0)
         reason = f"{record.get('waiting_for', '')}" if record.get("waiting_share", 0.0) > 0.005 else ""
         stages.add_row(
             role,
             number(record.get("busy_share"), ".0%"),
             number(record.get("waiting_share"), ".0%"),
-            f"silent for {silent:.0f} s" if silent > SILENT_SECONDS else reason,
+            f"silent for {silent[role]:.0f} s" if role in silent else reason,
             str(board.get("launcher", f"restarts_{role}") or 0),
         )
     return stages
@@ -154,11 +185,18 @@ def _damaged(board: RunStatus) -> str:
     return ", ".join(f"{number(count, ',')} {name}" for name, count in counts.items() if count)
 
 
+def _silent(board: RunStatus) -> str:
+    found = [f"{who} for {seconds:,.0f} s" for who, seconds in board.silent().items()]
+    more = len(found) - MOST_SILENT
+    return ", ".join(found[:MOST_SILENT]) + (f" and {more} more" if more > 0 else "")
+
+
 def notices(board: RunStatus) -> dict[str, str]:
     """What is not as it should be, by its heading."""
     off = board.replay("replay_ratio_off", max)
     found = {
         "not running": board.get("launcher", "not_running"),
+        "silent": _silent(board),
         "not saved": board.get("learner", "checkpoint_error"),
         "damaged": _damaged(board),
         "replay ratio": f"far from {board.replay_ratio:g}, see the troubleshooting page" if off else "",
@@ -181,11 +219,14 @@ def table(board: RunStatus) -> Group:
 
 def line(board: RunStatus) -> str:
     """The same in one line, shorter."""
-    learner = board.roles.get("learner", {})
+    learner, silent = board.roles.get("learner", {}), board.silent()
     waits = [
         f"{role} {record['waiting_share']:.0%} for {record['waiting_for']}"
         for role, record in sorted(board.roles.items())
-        if record.get("waiting_share", 0.0) > 0.5 and record.get("waiting_for") and role != "evaluator"
+        if role not in silent
+        and record.get("waiting_share", 0.0) > 0.5
+        and record.get("waiting_for")
+        and role != "evaluator"
     ]
     parts = [
         f"steps {board.env_steps}/{board.total_steps}",
@@ -208,20 +249,28 @@ def line(board: RunStatus) -> str:
 
 
 class View:
-    """A board shown on a console, live where that is a terminal. ``refresh`` as often as you like."""
+    """A board shown on a console, live where that is a terminal; by a thread, whatever its owner waits for."""
 
     def __init__(self, board: RunStatus, console: Console) -> None:
         self._board, self._console, self._due = board, console, 0.0
+        self._lock, self._over = threading.Lock(), threading.Event()
         self._live: Live | None = None
         if console.is_terminal:
             self._live = Live(table(board), console=console, auto_refresh=False)
             self._live.start()
+        self._thread = threading.Thread(target=self._draw, name="view", daemon=True)
+        self._thread.start()
+
+    def _draw(self) -> None:
+        while not self._over.wait(REFRESH_SECONDS):
+            self.refresh()
 
     def refresh(self) -> None:
         """Show the newest state if it is time."""
-        if time.monotonic() >= self._due:
-            self._due = time.monotonic() + (REFRESH_SECONDS if self._live else LINE_SECONDS)
-            self._show()
+        with self._lock:
+            if time.monotonic() >= self._due:
+                self._due = time.monotonic() + (REFRESH_SECONDS if self._live else LINE_SECONDS)
+                self._show()
 
     def _show(self) -> None:
         if getattr(self._console.file, "lost", False):  # nobody sees it
@@ -233,6 +282,9 @@ class View:
 
     def close(self) -> None:
         """Show the last state, and leave it there."""
+        self._over.set()
+        self._thread.join()
+        self._board.is_over = True
         self._show()
         if self._live is not None:
             self._live.stop()

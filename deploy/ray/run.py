@@ -29,7 +29,7 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RoleDied
 from rmc.common.process.role import StopSignal
 from rmc.common.shard import WHOLE
-from rmc.deploy.local.launcher import TICK_SECONDS, watch
+from rmc.deploy.local.launcher import TICK_SECONDS
 from rmc.deploy.local.role_environment import URL_VARIABLE
 from rmc.deploy.local.socket_folder import SocketFolder
 from rmc.deploy.local.supervisor import QUICK_DEATHS
@@ -342,10 +342,10 @@ def train(
         run.start()
         while not stop.requested and not run.finished():
             run.tend()
-            watch(monitor, run.bus)
+            monitor.watch(run.bus)
             time.sleep(TICK_SECONDS)
         run.stop("stopped by its launcher" if stop.requested else "finished")
-        watch(monitor, run.bus)  # what the roles said last
+        monitor.watch(run.bus)  # what the roles said last
         over = monitor.learner_finished()  # one that was stopped has ended in order, too
         return over
     finally:

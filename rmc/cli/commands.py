@@ -86,6 +86,7 @@ def stats(command: options.Stats) -> int:
     folder = RunFolder(command.run)
     config, result, console = folder.config(), folder.result(), terminal()
     board = RunStatus(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
+    board.is_over = folder.trainer() is None
     for record in folder.records():
         board.take(record)
     if not board.roles:

@@ -1,16 +1,22 @@
 """Who trains a run, seen from outside its launcher."""
 
+import io
+import itertools
 import json
 import os
+import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.monitor.attach import Tail, launcher_pid, stop
+from rmc.deploy.monitor import view
+from rmc.deploy.monitor.attach import Tail, launcher_pid, stop, watch
 from rmc.deploy.run.folder import RunFolder, open_run
 from rmc.deploy.run.presets import debug
 
@@ -99,3 +105,16 @@ def test_records_after_a_cut_are_taken(tmp_path: Path) -> None:
     with path.open("a") as file:
         file.write("\n" + json.dumps({"role": "b"}) + "\n")
     assert tail.take() == [{"role": "b"}]
+
+
+def test_who_attaches_hears_who_is_silent(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By what the launcher has written, and if that is nothing, that it is the launcher."""
+    monkeypatch.setattr(view, "LINE_SECONDS", 0.1)
+    monkeypatch.setattr(view, "REFRESH_SECONDS", 0.05)
+    printed, looks = io.StringIO(), itertools.count()
+    spoke = {"learner": 9.0, "launcher": 40.0}
+    folder.metrics.write_text(
+        "".join(json.dumps({"role": role, "time": time.time() - ago}) + "\n" for role, ago in spoke.items())
+    )
+    watch(folder, Console(file=printed, width=500), lambda: next(looks) > 2)
+    assert re.search("silent: launcher for 40 s, learner for (9|10) s", printed.getvalue())

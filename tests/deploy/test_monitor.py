@@ -4,21 +4,28 @@ import io
 import json
 import math
 import random
+import tempfile
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rmc.analysis import history
+from rmc.common.bus import redis_bus
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.metrics_record import decode_record, encode_record
+from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.monitor import view
 from rmc.deploy.monitor.monitor import Monitor
-from rmc.deploy.monitor.view import MOST_NAMES, RunStatus, _evaluation, line, table, terminal
+from rmc.deploy.monitor.view import MOST_NAMES, UNHEARD_SECONDS, RunStatus, _evaluation, line, table, terminal
+from rmc.deploy.redis.server import RedisServer
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder, open_run
 from rmc.deploy.run.presets import debug
@@ -58,7 +65,7 @@ def test_any_number_is_shown(monitor: Monitor, value: float) -> None:
     for role in ROLES:
         bus.emit(role, {"waiting_for": "credit", **dict.fromkeys(NAMES, value)})
     monitor.watch(bus)
-    assert "credit" in line(monitor.board) or not value > 0.5
+    assert any(said in line(monitor.board) for said in ("credit", "silent")) or not value > 0.5
     Console(quiet=True).print(table(monitor.board))
     monitor.close()
 
@@ -193,6 +200,84 @@ def test_what_is_not_as_it_should_be_is_shown(
     for sound in (False, True):
         record = dict.fromkeys(said, type(next(iter(said.values())))()) if sound else said
         monitor.board.take({"role": role, **record})
-        for view in shown(monitor.board):
-            assert (heading in view and text in view) is not sound
+        for text_of in shown(monitor.board):
+            assert (heading in text_of and text in text_of) is not sound
     monitor.close()
+
+
+def says(monitor: Monitor, ago: dict[str, float], **launcher: float) -> None:
+    """Records of roles, each from so many seconds ago."""
+    for role, seconds in ago.items():
+        monitor.board.take({"role": role, "time": time.time() - seconds, "waiting_share": 1.0, "waiting_for": "credit"})
+    monitor.board.take({"role": "launcher", "time": time.time(), "redis_away_s": 0.0, **launcher})
+
+
+def test_every_view_says_who_is_silent_and_for_how_long(monitor: Monitor) -> None:
+    says(monitor, {"learner": 12.2, "actor-0": 0.5, "replay": 4.0, "evaluator": 0.0})
+    for text_of in shown(monitor.board):
+        assert "learner for 12 s" in text_of
+        assert "actor-0 for" not in text_of
+    assert "waiting: actor-0 100% for credit, replay 100% for credit" in line(monitor.board)  # learner's is too old
+    says(monitor, {"learner": 0.0})
+    assert not any("silent" in text for text in shown(monitor.board))
+    monitor.close()
+
+
+def test_a_redis_that_is_away_is_who_is_silent(monitor: Monitor) -> None:
+    says(monitor, {"learner": 40.0, "actor-0": 41.0}, redis_away_s=38.0)
+    for text_of in shown(monitor.board):
+        assert "Redis for 38 s" in text_of
+    assert "learner for" not in line(monitor.board)
+    monitor.close()
+    assert not any("silent" in text for text in shown(monitor.board))  # a run that is over
+
+
+def test_a_role_that_never_spoke_is_silent_once_it_should_have(
+    monitor: Monitor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    says(monitor, {"learner": 0.0, "replay": 0.0, "evaluator": 0.0})
+    assert "silent" not in line(monitor.board)
+    now = time.time
+    monkeypatch.setattr(time, "time", lambda: now() + 2 * UNHEARD_SECONDS)
+    says(monitor, {"learner": 0.0, "replay": 0.0, "evaluator": 0.0})
+    assert "silent: actor-0 for 60 s" in line(monitor.board)
+    monitor.close()
+
+
+def test_many_that_are_silent_are_counted(monitor: Monitor) -> None:
+    says(monitor, {f"actor-{index}": 20.0 for index in range(9)})
+    assert "silent: actor-0 for 20 s, actor-1 for 20 s, actor-2 for 20 s and 6 more" in line(monitor.board)
+    monitor.close()
+
+
+def test_a_redis_that_stands_still_is_said_while_it_lasts_and_frames_go_on(
+    config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(redis_bus, "TIMEOUT_SECONDS", 1.0)
+    monkeypatch.setattr(view, "LINE_SECONDS", 0.1)
+    monkeypatch.setattr(view, "REFRESH_SECONDS", 0.05)
+    folder, printed = open_run(config, tmp_path / "run", "fail"), io.StringIO()
+    folder.unlock()
+    with tempfile.TemporaryDirectory() as short, RedisServer(Path(short)) as server:
+        bus, monitor = RedisBus(server.url(), "run"), Monitor(folder, config, Console(file=printed, width=500))
+        assert server.process is not None
+        for role in config.roles():
+            bus.emit(role, {"time": time.time()})
+        monitor.watch(bus)
+        process = psutil.Process(server.process.pid)
+        process.suspend()
+        before = len(printed.getvalue().splitlines())
+        monitor.watch(bus)  # waits for an answer
+        assert len(printed.getvalue().splitlines()) >= before + 4
+        time.sleep(0.3)
+        assert "silent: Redis for" in printed.getvalue().splitlines()[-1]
+        process.resume()
+        time.sleep(1.0)  # the bus lets it rest for as long as it took
+        for role in config.roles():
+            bus.emit(role, {"time": time.time()})
+        monitor.watch(bus)
+        time.sleep(0.3)
+        assert "silent" not in printed.getvalue().splitlines()[-1]
+        monitor.close()
+    away = [found["redis_away_s"] > 0 for found in folder.records() if "redis_away_s" in found]
+    assert away == [False, True, False, False]  # each change is noted at once, for those who watch the file
