@@ -29,7 +29,7 @@ sys.stdin.read()
 @pytest.fixture
 def temporary(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A temporary folder of the test's own, short and with an odd name."""
-    with tempfile.TemporaryDirectory(prefix="rmc-") as name:
+    with tempfile.TemporaryDirectory(prefix="rmc-", dir="/tmp") as name:  # TMPDIR may be long already
         place = Path(name) / ODD
         place.mkdir()
         set_temporary(monkeypatch, place)
