@@ -22,6 +22,8 @@ class EnvCall:
     """``with`` it, a call into an environment that must return within so many seconds; it costs under a microsecond."""
 
     current: "EnvCall | None" = None  # of this process
+    watched = False
+    armed = 0.0  # seconds of the call for which faulthandler is set; 0 where it is not
 
     def __init__(self, env_id: str, name: str, seconds: float) -> None:
         self.env_id, self.name, self.seconds = env_id, name, seconds
@@ -29,6 +31,8 @@ class EnvCall:
 
     def __enter__(self) -> Self:
         self._outer, EnvCall.current = EnvCall.current, self
+        if EnvCall.watched and not EnvCall.armed:  # at once: it may keep Python's lock before anybody looks
+            _arm(self.seconds)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -50,26 +54,32 @@ def start() -> None:
     """
     if signal.getsignal(signal.SIGTSTP) == signal.SIG_DFL:
         signal.signal(signal.SIGTSTP, _suspend)
+    EnvCall.watched = True
     threading.Thread(target=_watch, daemon=True, name="watchdog").start()
 
 
 def _watch() -> None:
     """Counts looks, not seconds: a process that was stopped for a while has not hung."""
-    seen, looks, seconds, arm_at = EnvCall.current, 0, 0.0, float("-inf")
+    seen, looks, arm_at = EnvCall.current, 0, float("-inf")
     while True:
         time.sleep(LOOK_SECONDS)
         call = EnvCall.current
         looks = looks + 1 if call is seen else 0
-        seen, seconds = call, seconds if call is None else call.seconds
-        over = seconds > 0.0 and looks * LOOK_SECONDS >= seconds
+        seen, seconds = call, EnvCall.armed if call is None else call.seconds
+        over = looks * LOOK_SECONDS >= seconds
         if over and call is not None:
             _end(call)
         if over:  # this process calls none any more
+            EnvCall.armed, arm_at = 0.0, float("-inf")
             faulthandler.cancel_dump_traceback_later()
-            seconds, arm_at = 0.0, float("-inf")
-        elif seconds and time.monotonic() >= arm_at:
+        elif time.monotonic() >= arm_at:
             arm_at = time.monotonic() + (SLACK - 1.0) * seconds
-            faulthandler.dump_traceback_later(SLACK * seconds + LOOK_SECONDS, exit=True)
+            _arm(seconds)
+
+
+def _arm(seconds: float) -> None:
+    EnvCall.armed = seconds
+    faulthandler.dump_traceback_later(SLACK * seconds + LOOK_SECONDS, exit=True)
 
 
 def _end(call: EnvCall) -> None:

@@ -6,6 +6,8 @@ import subprocess
 import sys
 import time
 
+import pytest
+
 from rmc.common.process.watchdog import HUNG_STATUS
 
 IMPORTS = "import ctypes, os, time\nfrom rmc.common.process.watchdog import *\n"
@@ -32,8 +34,9 @@ def test_what_was_printed_before_is_not_lost() -> None:
     assert subprocess.run(words, stdout=subprocess.PIPE, timeout=60, check=False).stdout == b"before\n"
 
 
-def test_one_that_hangs_in_c_with_pythons_lock_leaves_a_traceback() -> None:
-    status, said, seconds = run(WATCHED + "with call: time.sleep(0.3)\ntime.sleep(0.3)\n" + STUCK)
+@pytest.mark.parametrize("before", ["", "with call: time.sleep(0.3)\ntime.sleep(0.3)\n"], ids=["at once", "later"])
+def test_one_that_hangs_in_c_with_pythons_lock_leaves_a_traceback(before: str) -> None:
+    status, said, seconds = run(WATCHED + before + STUCK)
     assert status == 1
     assert "Timeout" in said
     assert "in stuck" in said
@@ -41,6 +44,7 @@ def test_one_that_hangs_in_c_with_pythons_lock_leaves_a_traceback() -> None:
 
 
 def test_calls_that_return_may_be_many_and_time_between_them_does_not_count() -> None:
+    assert run(WATCHED + "with call: pass\ntime.sleep(1.5)")[:2] == (0, "")
     code = "for _ in range(12):\n    with EnvCall('', 'reset', 0.5): time.sleep(0.1)\ntime.sleep(1.5)\n"
     assert run(WATCHED + code)[:2] == (0, "")
     assert run(
