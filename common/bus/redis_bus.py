@@ -31,6 +31,7 @@ from rmc.common.checksum import crc32
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
 
 TIMEOUT_SECONDS = 3.0  # that Redis may take for an answer; two of them are less than a learner waits for a batch
+TIMEOUTS, TIMEOUT_LIMIT = ("socket_timeout", "socket_connect_timeout"), 1e6  # that a URL may name; seconds
 DEAD_LETTERS_KEPT = 1_000
 INTEGER = re.compile(rb"-?[0-9]{1,18}")
 KINDS = ("weights", "evaluate")  # of policies: what acts, and what is evaluated
@@ -71,10 +72,10 @@ class RedisBus:
             )
             pool = self._redis.connection_pool
             pool.connection_class(**pool.connection_kwargs)  # knows what may stand behind the question mark
+            if not all(0 < pool.connection_kwargs.get(name, 1) < TIMEOUT_LIMIT for name in TIMEOUTS):
+                raise ValueError
         except (ValueError, TypeError, redis.exceptions.RedisError):  # whose words may quote a password
-            raise ConfigError(
-                "--redis-url", shown(url), "its options are not redis-py's; mend what follows ?"
-            ) from None
+            raise ConfigError("--redis-url", shown(url), "its options are no good; mend what follows ?") from None
         self.url, self._prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
         self._rests_until = 0.0  # by the monotonic clock: a Redis that hangs is left alone for as long as it took

@@ -13,7 +13,7 @@ import msgpack
 
 from rmc.common.errors import RoleDied
 from rmc.common.process import parent_death
-from rmc.deploy.local.role_environment import SINGLE_THREAD, inherited
+from rmc.deploy.local.role_environment import SINGLE_THREAD, inherited, working_folder
 
 POLL_SECONDS = 0.01
 END_SECONDS = 2.0
@@ -95,7 +95,7 @@ class ForkServer:
         with theirs, open_log(self._log) as log:
             self._program = subprocess.Popen(
                 words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0,
-                pass_fds=(theirs.fileno(),),
+                pass_fds=(theirs.fileno(),), cwd=working_folder(),
             )  # fmt: skip
         self._generation += 1
         self._ours.settimeout(IMPORT_SECONDS)

@@ -16,3 +16,11 @@ def command_line(words: Sequence[str]) -> list[str]:
 def inherited() -> dict[str, str]:
     """What a role's process has of this one's environment: no secret, whoever set it here."""
     return {name: value for name, value in os.environ.items() if name not in (SECRET_VARIABLE, URL_VARIABLE)}
+
+
+def working_folder() -> str:
+    """Where a role's process starts: here, or at the root where this folder was deleted, in which MKL is not loaded."""
+    try:
+        return os.getcwd()
+    except FileNotFoundError:
+        return "/"

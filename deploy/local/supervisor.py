@@ -15,7 +15,7 @@ from rmc.common.errors import RoleDied
 from rmc.common.process.parent_death import PARENT_VARIABLE
 from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.local.fork_server import ForkedProcess, ForkServer, open_log
-from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inherited
+from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inherited, working_folder
 
 # So many deaths of a role's own in a row, each within so long of its start, end the run.
 QUICK_DEATHS, QUICK_SECONDS = 3, 60.0
@@ -85,8 +85,9 @@ class RoleProcess:
         environment = {**inherited(), **self._environment, PARENT_VARIABLE: str(os.getpid())}
         words = command_line(self.command.words)
         return subprocess.Popen(
-            words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0
-        )
+            words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0,
+            cwd=working_folder(),
+        )  # fmt: skip
 
     def tend(self) -> None:
         """Note a death, or start again when it is time. Raises RoleDied."""

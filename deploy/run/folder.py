@@ -268,6 +268,8 @@ def parse_record(line: bytes) -> dict[str, Any] | None:
 def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> RunFolder:
     """Make or take up a run's folder, locked. Raises ConfigError before anything is written where it may not be."""
     folder = RunFolder(run_dir or Path("runs") / _new_name(config))
+    if os.fsencode(folder.path).decode(errors="replace") != str(folder.path):
+        raise ConfigError("--run-dir", str(folder.path), "is no UTF-8; give another")
     if run_dir is None or if_exists == "new":
         folder = new_folder(folder.path)
     if (folder.path / "config.json").exists():

@@ -61,7 +61,13 @@ def test_one_that_redis_cannot_read_is_named_without_its_parts(url: str) -> None
 
 @pytest.mark.parametrize(
     ("rest", "named"),
-    [("/abc", "database"), ("/1/2", "database"), ("/-1", "database"), ("?db=abc", "options"), ("?nope=1", "options")],
+    [
+        *((path, "database") for path in ("/abc", "/1/2", "/-1")),
+        *(
+            (f"?{option}", "options")
+            for option in ("db=abc", "nope=1", "socket_timeout=-1", "socket_connect_timeout=nan")
+        ),
+    ],
 )
 def test_what_its_client_would_pass_over_or_fail_of_later_is_refused(rest: str, named: str) -> None:
     with pytest.raises(ConfigError, match=rf"--redis-url='redis://host:1': its {named}"):

@@ -171,6 +171,13 @@ def as_nobody() -> Iterator[None]:
         os.seteuid(0)
 
 
+def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    """It stands in keys, and in what roles are started with."""
+    with pytest.raises(ConfigError, match=r"--run-dir='.*\\udcff/run': is no UTF-8; give another"):
+        open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / os.fsdecode(b"\xff") / "run", "fail")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_odd_lines_of_metrics_are_passed_over(tmp_path: Path) -> None:
     folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
     folder.unlock()

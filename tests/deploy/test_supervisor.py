@@ -48,6 +48,18 @@ def test_what_was_exported_for_one_role_is_not_passed_on(quick: Path, monkeypatc
     assert (told.get("RMC_SECRET"), told["RMC_REDIS_URL"], told["ANOTHER"]) == (None, "own", "exported")
 
 
+def test_a_role_starts_where_the_working_folder_is_gone(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In one that is there: MKL, for one, is not loaded in one that is not."""
+    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\npwd -P > {quick}/told\n")
+    (gone := quick / "gone").mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {}, quick)
+    role.start()
+    tend_until(role)
+    assert (quick / "told").read_text() == "/\n"
+
+
 def test_any_other_role_that_ends_unasked_is_started_again(quick: Path) -> None:
     role = RoleProcess(RoleCommand("actor-0", ("actor",)), {}, quick)
     role.start()
