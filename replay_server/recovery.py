@@ -107,6 +107,7 @@ def _map_priorities(path: Path, ring: Ring) -> NDArray[np.float32]:
         reserve(path, size, ring.capacity)
         priorities = np.memmap(path, np.float32, "r+", shape=(ring.capacity,))
         priorities[:] = ring.progress.max_priority
-    unusable = ~(np.isfinite(priorities) & (priorities > 0))  # zeros where a power cut kept them from the disk
+    # Zeros where a power cut kept them from the disk, and what is larger than any that was seen.
+    unusable = ~((priorities > 0) & (priorities <= np.float32(ring.progress.max_priority)))
     priorities[unusable] = ring.progress.max_priority
     return priorities

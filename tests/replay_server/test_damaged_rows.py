@@ -126,3 +126,18 @@ def test_a_fault_has_its_name(name: str, value: float, fault: str) -> None:
     rows = make_rows(5)
     rows[name][2] = value
     assert [FAULTS[found] for found in row_faults(rows, SPEC)] == ["", "", fault, "", ""]
+
+
+@pytest.mark.parametrize("value", [3e38, np.nan, np.inf, -1.0, 0.0, 9.0])
+def test_a_priority_beyond_the_largest_seen_is_not_believed_after_a_restart(
+    make: Make, bus: MemoryBus, value: float
+) -> None:
+    """It would be all that is drawn."""
+    server = filled(make, bus)
+    server.update_priorities(np.arange(20), np.linspace(1.0, 8.0, 20).astype(np.float32))
+    server._store.priorities[3] = value
+    close(server)
+    again = make()
+    assert again._store.priorities[3] == 8.0
+    assert again._store.priorities[19] == 8.0
+    assert again._store.priorities[0] == 1.0

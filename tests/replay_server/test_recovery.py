@@ -144,6 +144,7 @@ def finish(bus: RedisBus, url: str, run: str, folder: Path, senders: list[Sender
 def test_rows_torn_by_a_power_cut_hold_no_window(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with opened(tmp_path, 10) as store:
         store.set_priorities(store.ring.write(make_rows(14)), np.full(10, 2.0, np.float32))
+        store.ring.progress.max_priority = 2.0
         store.ring.commit()
         store.ring.rows["serial"][[5, 7]] = 0
     with opened(tmp_path, 10) as store:
