@@ -14,6 +14,7 @@ from typing import Self
 from rmc.common.process import descendants
 
 LOOK_SECONDS = 0.1
+STDERR = 2  # an environment may have put something else in sys.stderr's place
 HUNG_STATUS = 3  # of a process that ended so
 SLACK = 1.1  # of the time that a call has, until it counts as one that cannot even be told
 
@@ -79,12 +80,12 @@ def _watch() -> None:
 
 def _arm(seconds: float) -> None:
     EnvCall.armed = seconds
-    faulthandler.dump_traceback_later(SLACK * seconds + LOOK_SECONDS, exit=True)
+    faulthandler.dump_traceback_later(SLACK * seconds + LOOK_SECONDS, exit=True, file=STDERR)
 
 
 def _end(call: EnvCall) -> None:
     with suppress(OSError, ValueError):
-        os.write(2, f"rmc: {call.told()}\n".encode())
+        os.write(STDERR, f"rmc: {call.told()}\n".encode())
         sys.stdout.flush()
     descendants.end_children()  # a simulator that the environment has started
     os._exit(HUNG_STATUS)

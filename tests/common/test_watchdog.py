@@ -29,6 +29,11 @@ def test_a_hanging_call_is_named_and_ends_its_process() -> None:
     assert seconds < 30
 
 
+def test_another_stderr_does_not_keep_it_from_looking() -> None:
+    code = "for _ in range(12):\n    with EnvCall('', 'reset', 0.5): time.sleep(0.1)"
+    assert run(WATCHED + "import io, sys\nsys.stderr = io.StringIO()\n" + code)[:2] == (0, "")
+
+
 def test_what_was_printed_before_is_not_lost() -> None:
     words = [sys.executable, "-c", IMPORTS + WATCHED + "print('before')\nwith call: time.sleep(50)"]
     assert subprocess.run(words, stdout=subprocess.PIPE, timeout=60, check=False).stdout == b"before\n"
