@@ -23,7 +23,8 @@ from rmc.common.bus.protocol import (
     ReplayOwner,
     Version,
 )
-from rmc.common.bus.redis_bus import RECORDS_READ, UNPUBLISHED_SECONDS, RedisBus
+from rmc.common.bus.redis_bus import RECORDS_READ, RedisBus
+from rmc.common.bus.weight_store import UNPUBLISHED_SECONDS
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from rmc.deploy.redis.server import RedisServer
 
@@ -73,7 +74,7 @@ def test_a_redis_that_lost_its_data_hears_of_the_learners_epoch_again(redis_url)
     bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
     for _ in range(3):
         epoch = bus.take_epoch("learner")
-    bus._redis.delete(bus._key("epoch", "learner"))
+    bus.redis.delete(bus.key("epoch", "learner"))
     bus.publish_weights(Version(epoch, 7), b"weights")
     assert bus.take_epoch("learner") == epoch + 1
 
@@ -93,8 +94,8 @@ def test_an_entry_of_an_epoch_that_nobody_can_have_taken_fences_nobody(redis_url
     epoch = [bus.take_epoch("actor-0") for _ in range(2)][-1]
     for seq in range(2):
         bus.append(0, EntryId(epoch, seq), b"%d" % seq)
-    bus._redis.xadd(bus._key("windows", 0), {"p": b"x"}, id=f"{forged[0]}-{forged[1]}")
-    bus._redis.set(bus._key("epoch", "actor-0"), counted)
+    bus.redis.xadd(bus.key("windows", 0), {"p": b"x"}, id=f"{forged[0]}-{forged[1]}")
+    bus.redis.set(bus.key("epoch", "actor-0"), counted)
     is_lawful = forged[0] == 3 and counted > 2  # a life that was begun
     for seq in (0, 2):
         with pytest.raises(FencedError if is_lawful else BusUnavailable, match="epoch"):
@@ -152,7 +153,7 @@ def test_a_dropped_stream_is_sent_again_from_its_hello(bus):
 @pytest.mark.parametrize("seq", [0, 1])
 def test_a_stream_that_is_dropped_while_it_refuses_is_gone(redis_url, monkeypatch, seq):
     bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
-    owner, ask = ReplayOwner("replay", bus.take_epoch("replay")), bus._redis.xinfo_stream
+    owner, ask = ReplayOwner("replay", bus.take_epoch("replay")), bus.redis.xinfo_stream
     for number in range(2):
         bus.append(0, EntryId(1, number), b"x")
 
@@ -160,7 +161,7 @@ def test_a_stream_that_is_dropped_while_it_refuses_is_gone(redis_url, monkeypatc
         bus.drop_stream(owner, 0)
         return ask(stream)
 
-    monkeypatch.setattr(bus._redis, "xinfo_stream", drop_and_ask)
+    monkeypatch.setattr(bus.redis, "xinfo_stream", drop_and_ask)
     with pytest.raises(BusUnavailable, match="gone"):
         bus.append(0, EntryId(1, seq), b"x")
 
@@ -192,9 +193,9 @@ def test_a_replaced_learner_cannot_publish(bus):
 def piece_lives(bus: RedisBus, kind: str = "weights") -> dict[Version, list[int]]:
     """Seconds until each piece there expires, by version; -1 where it does not."""
     found: dict[Version, list[int]] = {}
-    for key in bus._redis.scan_iter(match=bus._key(kind, "*")):
+    for key in bus.redis.scan_iter(match=bus.key(kind, "*")):
         epoch, update, _ = map(int, key.decode().rsplit(":", 3)[1:])
-        found.setdefault(Version(epoch, update), []).append(bus._redis.ttl(key))
+        found.setdefault(Version(epoch, update), []).append(bus.redis.ttl(key))
     return found
 
 
@@ -223,13 +224,13 @@ def test_what_was_published_stays_and_what_was_fenced_expires(redis_url):
 def test_weights_that_went_before_they_were_the_newest_are_not_named(redis_url, monkeypatch):
     bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
     bus.publish_weights(Version(1, 1), b"one")
-    transaction = bus._redis.transaction
+    transaction = bus.redis.transaction
 
     def empty_and_go_on(*args):
-        bus._redis.delete(bus._key("weights", 1, 2, 0))
+        bus.redis.delete(bus.key("weights", 1, 2, 0))
         return transaction(*args)
 
-    monkeypatch.setattr(bus._redis, "transaction", empty_and_go_on)
+    monkeypatch.setattr(bus.redis, "transaction", empty_and_go_on)
     with pytest.raises(BusUnavailable, match="gone before"):
         bus.publish_weights(Version(1, 2), b"two")
     assert bus.weights() == (Version(1, 1), b"one")
@@ -250,7 +251,7 @@ def test_metrics_by_role(bus):
 
 def test_what_is_no_record_is_left_out_and_a_flood_is_trimmed(redis_url):
     bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
-    client, key = bus._redis, bus._key("metrics", "actor-0")
+    client, key = bus.redis, bus.key("metrics", "actor-0")
     client.xadd(key, {"x": b"no record"})
     for packed in (b"", b"\xff", b"\x81\xa1a\xa1b"):
         client.xadd(key, {"r": packed})
@@ -268,22 +269,22 @@ def test_what_is_no_record_is_left_out_and_a_flood_is_trimmed(redis_url):
 @pytest.mark.parametrize("value", [b"a b c d", b"1 2 3", b"1 2 3 4 5", b"1 2 3 \xff", b"9" * 40, b"1 2 3 4.0", b"\x00"])
 def test_what_is_no_control_message_is_none_and_counted(redis_url, value):
     bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
-    bus._redis.set(bus._key("weights"), value)
-    bus._redis.hset(bus._key("acks"), "0", value)
-    bus._redis.hset(bus._key("replay"), "replay", b"x" + value)
+    bus.redis.set(bus.key("weights"), value)
+    bus.redis.hset(bus.key("acks"), "0", value)
+    bus.redis.hset(bus.key("replay"), "replay", b"x" + value)
     assert (bus.latest_version(), bus.weights(), bus.ack(0), bus.replay_address("replay")) == (None, None, None, None)
     assert bus.refused["control"] == 4
 
 
 def test_weights_of_too_many_pieces_are_not_asked_for(redis_url):
     bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
-    bus._redis.set(bus._key("weights"), b"1 2 1000000000 4")
+    bus.redis.set(bus.key("weights"), b"1 2 1000000000 4")
     assert bus.weights() is None
 
 
 def test_only_numbers_are_actors(redis_url):
     bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
-    bus._redis.sadd(bus._key("actors"), "3", "-1", "10000", "no", "", "²", "1e3")
+    bus.redis.sadd(bus.key("actors"), "3", "-1", "10000", "no", "", "²", "1e3")
     assert bus.actors() == [3]
 
 
@@ -327,18 +328,18 @@ def test_a_full_redis_trims_in_no_transaction_that_says_acks():
         bus = RedisBus(server.url(), "full")
         for seq in range(20):
             bus.append(0, EntryId(1, seq), b"x" * 200_000)
-        bus._redis.config_set("maxmemory", 2 << 20)
-        pipe = bus._redis.pipeline()
-        pipe.xtrim(bus._key("windows", 0), maxlen=1, approximate=False)
-        pipe.hset(bus._key("acks"), "0", b"")  # trimming alone is refused by Redis 7.0, not by Valkey 7.2
+        bus.redis.config_set("maxmemory", 2 << 20)
+        pipe = bus.redis.pipeline()
+        pipe.xtrim(bus.key("windows", 0), maxlen=1, approximate=False)
+        pipe.hset(bus.key("acks"), "0", b"")  # trimming alone is refused by Redis 7.0, not by Valkey 7.2
         with pytest.raises(redis.exceptions.OutOfMemoryError):
             pipe.execute()
-        assert bus._redis.xlen(bus._key("windows", 0)) == 20
+        assert bus.redis.xlen(bus.key("windows", 0)) == 20
         bus.commit(ReplayOwner("replay", 1), {0: Ack(EntryId(1, 18), 5)})
-        assert bus._redis.xlen(bus._key("windows", 0)) == 1
-        bus._redis.config_set("maxmemory", 1)
+        assert bus.redis.xlen(bus.key("windows", 0)) == 1
+        bus.redis.config_set("maxmemory", 1)
         bus.drop_stream(ReplayOwner("replay", 1), 0)
-        assert not bus._redis.exists(bus._key("windows", 0))
+        assert not bus.redis.exists(bus.key("windows", 0))
 
 
 def fill(bus: Bus, start: int = 0) -> int:

@@ -135,9 +135,9 @@ def test_too_few_replicas(server: RedisServer, bus: RedisBus, call: Call) -> Non
 
 @pytest.mark.parametrize(("key", "call"), OF_ANOTHER_TYPE.items(), ids=OF_ANOTHER_TYPE)
 def test_a_key_of_another_type_is_named_in_one_line(bus: RedisBus, key: str, call: Call) -> None:
-    name = bus._key(*key.strip().split(":"))
-    bus._redis.delete(name)
-    bus._redis.rpush(name, "a list")
+    name = bus.key(*key.strip().split(":"))
+    bus.redis.delete(name)
+    bus.redis.rpush(name, "a list")
     with pytest.raises(ConfigError, match="WRONGTYPE") as error:
         call(bus)
     assert name in str(error.value)
@@ -146,8 +146,8 @@ def test_a_key_of_another_type_is_named_in_one_line(bus: RedisBus, key: str, cal
 
 
 def test_an_answer_shows_no_value(bus: RedisBus) -> None:
-    bus._redis.delete(bus._key("acks"))
-    bus._redis.rpush(bus._key("acks"), "a list")
+    bus.redis.delete(bus.key("acks"))
+    bus.redis.rpush(bus.key("acks"), "a list")
     with pytest.raises(ConfigError) as error:
         bus.commit(ReplayOwner("replay", 1), ACK, b"\x00secret\n")
     assert "secret" not in str(error.value)
@@ -156,11 +156,11 @@ def test_an_answer_shows_no_value(bus: RedisBus) -> None:
 @pytest.mark.parametrize("value", ["many", "", 2**63 - 1, 2**62, 10**6, -7, "1.5"])
 def test_an_epoch_that_none_can_be_is_mended(bus: RedisBus, value: str | int) -> None:
     """By who takes the next; those that look meanwhile, or commit, are not kept from it."""
-    bus._redis.set(bus._key("epoch", "actor-0"), value)
+    bus.redis.set(bus.key("epoch", "actor-0"), value)
     bus.current_epoch("actor-0")
     bus.check_room("actor-0")
     assert [bus.take_epoch("actor-0", floor=9) for _ in range(2)] == [10, 11]
-    bus._redis.set(bus._key("epoch", "replay"), "many")
+    bus.redis.set(bus.key("epoch", "replay"), "many")
     bus.commit(ReplayOwner("replay", 1), ACK)
     assert bus.current_epoch("replay") == 1
 

@@ -129,7 +129,7 @@ def test_one_that_answers_that_it_is_full_is_there(short: Path) -> None:
         def full(*words: object) -> None:
             raise redis.exceptions.ResponseError("MISCONF Errors writing to the AOF file: No space left on device")
 
-        bus._redis.ping = full
+        bus.redis.ping = full
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("rmc.deploy.redis.connect.RedisBus", lambda url, run: bus)
             assert connect(server.url(), "run") is bus

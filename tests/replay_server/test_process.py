@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rmc.common.bus.redis_bus import TIMEOUT_SECONDS, RedisBus
+from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.bus.redis_connection import TIMEOUT_SECONDS
 from rmc.common.errors import BusUnavailable, FencedError
 from rmc.common.process.role import StopSignal, run_role
 from rmc.common.replay import SampleStatus

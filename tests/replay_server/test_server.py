@@ -306,7 +306,7 @@ def test_bad_entries_are_put_aside_counted_and_cost_no_credit(make: Make, redis_
         sender.send(1)
     drain(server)
     stats = server.stats()
-    assert stats["dead_letters"] == len(bad) == bus._redis.xlen(f"rmc:{run_name}:dead")
+    assert stats["dead_letters"] == len(bad) == bus.redis.xlen(f"rmc:{run_name}:dead")
     assert stats["dead_letters_crc"] == 1
     assert stats["dead_letters_window"] == 2
     assert stats["dead_letters_too-large"] == 1
@@ -315,7 +315,7 @@ def test_bad_entries_are_put_aside_counted_and_cost_no_credit(make: Make, redis_
     lost = 4 * 3 * SPEC.train  # what the sender counts in the four that were whole in size, at least
     assert sender.granted() >= lost + stats["env_steps"] + 116 - stats["env_steps"]
     assert bus.ack(0) is not None
-    assert bus._redis.xlen(f"rmc:{run_name}:windows:0") == 0  # trimmed
+    assert bus.redis.xlen(f"rmc:{run_name}:windows:0") == 0  # trimmed
 
 
 @pytest.mark.parametrize("kind", ["memory", "redis"])
@@ -344,8 +344,8 @@ def test_what_a_stream_lacks_is_sent_again(make: Make, kind: str, redis_url: str
 
 def forge(bus: RedisBus, entry_id: EntryId) -> None:
     """An entry as whoever has the actor's login can add one."""
-    bus._redis.xadd(
-        f"{bus._prefix}:windows:0", {"p": encode_windows(make_rows(1), SPEC)}, id=f"{entry_id.epoch}-{entry_id.seq}"
+    bus.redis.xadd(
+        f"{bus.prefix}:windows:0", {"p": encode_windows(make_rows(1), SPEC)}, id=f"{entry_id.epoch}-{entry_id.seq}"
     )
 
 
@@ -372,7 +372,7 @@ def test_an_id_that_no_life_can_have_reached_is_refused_and_the_actor_goes_on(
     drain(server)
     sender.send(1)
     for _ in range(2):  # as often as somebody does it
-        bus._redis.set(f"{bus._prefix}:epoch:actor-0", counted)
+        bus.redis.set(f"{bus.prefix}:epoch:actor-0", counted)
         forge(bus, EntryId(*forged))
         if forged == (2, 0) and counted > 1:
             return  # that is a life which was begun
