@@ -40,10 +40,9 @@ return 0
 class RedisBus(RedisConnection):
     """All roles of one run over one Redis. Not thread-safe: one per thread."""
 
-    def __init__(self, url: str, run: str) -> None:
-        """``url``: ``unix:///path``, ``redis://host:port`` or ``rediss://…``. Raises ConfigError."""
-        super().__init__(url, run)
-        self._weights = WeightStore(self)
+    @property
+    def _weights(self) -> WeightStore:
+        return WeightStore(self)  # not kept: a circle of references would keep its sockets open
 
     def expire(self, seconds: int | None) -> None:
         """Let all that this run has in Redis vanish after so many seconds; None takes that back."""
