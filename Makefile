@@ -27,7 +27,7 @@ test: $(STAMP)
 # never imports it, in an environment of its own.
 NEWEST := 3.13
 NEWEST_PYTHON ?= $(firstword $(wildcard $(HOME)/.pyenv/versions/$(NEWEST).*/bin/python) $(shell command -v python$(NEWEST)))
-NEEDS_TORCH := common/test_wire.py replay_server/test_process.py replay_server/test_recovery.py replay_server/test_server.py \
+NEEDS_TORCH := common/test_process_state.py common/test_wire.py replay_server/test_process.py replay_server/test_recovery.py replay_server/test_server.py \
 	replay_server/test_socket_server.py
 WITHOUT_TORCH := import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; print(*(one for one in project["dependencies"] if not one.startswith("torch")), sep="\n")
 

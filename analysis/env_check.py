@@ -159,8 +159,7 @@ def _second(config: EnvConfig) -> Iterator[str]:
         env.step(np.zeros(env.action_space.shape or (), np.float32))
         env.close()
     except Exception as error:
-        found = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        yield f"note: no second one can be beside it ({found}); take --actors 1 --envs-per-actor 1 --episodes 0"
+        yield f"note: no second one can be beside it ({told(error)}); take --actors 1 --envs-per-actor 1 --episodes 0"
 
 
 def _reward_notes(sizes: NDArray[np.float64]) -> Iterator[str]:

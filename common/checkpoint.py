@@ -66,7 +66,8 @@ class CheckpointFolder:
         _check_names(final, files)
         shutil.rmtree(temporary, ignore_errors=True)
         try:
-            self.folder.mkdir(exist_ok=True)  # not its parents: a run's folder that was moved is not begun anew
+            with suppress(FileExistsError):
+                self.folder.mkdir()  # not its parents: a run's folder that was moved is not begun anew
             temporary.mkdir()
             for name, content in {**files, MANIFEST: _manifest(number, files)}.items():
                 write_synced(temporary / name, content)

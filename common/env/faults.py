@@ -30,6 +30,8 @@ def told(error: BaseException) -> str:
     while error.__cause__ is not None and not _users_places(error):  # gymnasium raises some errors anew
         error = error.__cause__
     text, places = one_line(error), _users_places(error)
+    if isinstance(error, EnvFault):  # it has its place already
+        return text
     name = f"{type(error).__name__}: {text}" if text else type(error).__name__
     return name if isinstance(error, SyntaxError) or not places else f"{name} ({places[-1]})"
 

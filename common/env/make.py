@@ -136,7 +136,7 @@ def further_env(make_env: Callable[[], Env], what: str) -> Env:
         return make_env()
     except Exception as error:
         fix = "where only one can exist, take --actors 1 --envs-per-actor 1 --episodes 0"
-        raise RmcError(f"{what} cannot be made beside the others ({type(error).__name__}: {error}); {fix}") from error
+        raise RmcError(f"{what} cannot be made beside the others ({told(error)}); {fix}") from error
 
 
 def first_env(config: EnvConfig) -> Env:

@@ -136,8 +136,9 @@ def test_a_folder_that_turns_read_only_is_waited_for(
     monkeypatch.setattr("rmc.deploy.monitor.monitor.RECORD_SECONDS", 0.0)
     config = debug(EnvConfig("InvertedPendulum-v5"))
     folder = open_run(config, tmp_path / "run", "fail")
-    for path in (tmp_path, *tmp_path.parents[:3]):  # for who is not root, whom no mode keeps from writing
-        path.chmod(0o711)
+    for path in (tmp_path, *tmp_path.parents):  # for who is not root, whom no mode keeps from writing
+        if not path.stat().st_mode & 0o001:
+            path.chmod(0o711)
     os.chown(folder.path, 65534, -1)
     monitor = Monitor(folder, config, Console(quiet=True))
     monitor.watch(MemoryBus())
