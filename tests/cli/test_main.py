@@ -15,6 +15,7 @@ from rmc.cli import main, options
 from rmc.cli.training import open_folder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.redis.connect import PATIENCE_VARIABLE
 from rmc.deploy.run.config import to_json
 from rmc.deploy.run.folder import RunFolder, open_run
 from rmc.deploy.run.launch_options import LaunchOptions
@@ -131,6 +132,7 @@ def test_errors_are_one_line(
     tmp_path: Path,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(PATIENCE_VARIABLE, "1")
     line = complaint(words, capsys)
     assert named in line
     assert "hush" not in line
