@@ -16,7 +16,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rmc.analysis import history
-from rmc.common.bus import redis_bus
+from rmc.common.bus import redis_connection
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.metrics_record import decode_record, encode_record
 from rmc.common.bus.redis_bus import RedisBus
@@ -253,7 +253,7 @@ def test_many_that_are_silent_are_counted(monitor: Monitor) -> None:
 def test_a_redis_that_stands_still_is_said_while_it_lasts_and_frames_go_on(
     config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(redis_bus, "TIMEOUT_SECONDS", 1.0)
+    monkeypatch.setattr(redis_connection, "TIMEOUT_SECONDS", 1.0)
     monkeypatch.setattr(view, "LINE_SECONDS", 0.1)
     monkeypatch.setattr(view, "REFRESH_SECONDS", 0.05)
     folder, printed = open_run(config, tmp_path / "run", "fail"), io.StringIO()
