@@ -83,7 +83,6 @@ class Rollout:
         self.cut = False
         self._prev_action, self._state = runner.start()
         self._length = -1  # of the episode; it has not begun
-        self._prev_action, self._state = runner.start()
 
     @property
     def episode(self) -> int:

@@ -35,7 +35,8 @@ from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.folder import RunFolder, make, new_folder, read_object
+from rmc.deploy.run.folder import RunFolder, read_object
+from rmc.deploy.run.opening import make, new_folder
 
 CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
 STOPPED = 130  # exit status after Ctrl-C, as shells have it

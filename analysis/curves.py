@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from rmc.analysis.history import History
+from rmc.analysis.out_file import check_writable
 from rmc.analysis.statistics import (
     ENOUGH_SEEDS,
     Scores,
@@ -23,7 +24,6 @@ from rmc.analysis.statistics import (
 )
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
-from rmc.deploy.run.folder import check_writable
 
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 Axis = Literal["env_steps", "updates", "wall_s"]

@@ -17,10 +17,11 @@ import torch
 from torch import Tensor, nn
 
 from rmc.analysis.evaluation import load_checkpoint
+from rmc.analysis.out_file import check_writable
 from rmc.common.agent import Agent
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
-from rmc.deploy.run.folder import RunFolder, check_writable
+from rmc.deploy.run.folder import RunFolder
 
 INPUTS, OUTPUTS = ("observation", "previous_action", "missing", "state"), ("action", "next_state")
 NEEDED = ("onnx", "onnxscript")

@@ -17,8 +17,9 @@ from rmc.analysis import baseline_settings
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.env.config import EnvConfig, write_kwargs
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig, option
-from rmc.deploy.run.folder import MAY_CHANGE, RunFolder, flat
+from rmc.deploy.run.config import RunConfig, flat, option
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import MAY_CHANGE
 from rmc.deploy.run.presets import preset_config
 
 UNTOLD = MAY_CHANGE | {"seed", "preset", "evaluator.episodes", "env.id"}  # makes no other agent

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.actors.evaluator import LONGEST_EPISODE
+from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.faults import asked
@@ -21,7 +22,6 @@ from rmc.common.env.make import entry_point, find_spec, make_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError, EnvFault
 from rmc.common.extra import how_to_install
-from rmc.deploy.run.folder import check_writable
 
 VIDEOS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
 BACKENDS = ("egl", "osmesa", "glfw")  # MuJoCo's, the ones that need no screen first

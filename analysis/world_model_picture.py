@@ -17,13 +17,14 @@ from torch import Tensor
 
 from rmc.actors.evaluator import LONGEST_EPISODE
 from rmc.analysis.evaluation import load_state
+from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import load_policy
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import RunFolder, check_writable
+from rmc.deploy.run.folder import RunFolder
 from rmc.learner.diagnostics import relative_l1_error
 from rmc.learner.losses import model_error
 

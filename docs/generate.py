@@ -11,7 +11,7 @@ from typing import Any
 from rmc.cli.options import Train
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import option
-from rmc.deploy.run.folder import MAY_CHANGE
+from rmc.deploy.run.opening import MAY_CHANGE
 from rmc.deploy.run.presets import paper, robust
 
 PAGE = Path(__file__).parent / "configuration.md"

@@ -99,7 +99,7 @@ def grounding_loss(
 
 
 def fill_loss(expected: Tensor, observation: Tensor, seen: Tensor, m: Tensor) -> Tensor:
-    """L1 of o_{t+1} (mean over O) that is to fill a missing frame, where ``seen``: it was none."""
+    """L1 of o_{t+1} (mean over O) that is to fill a missing frame, where ``seen``: it was not missing."""
     return masked_mean((expected - observation).abs().mean(-1), m * seen)
 
 

@@ -8,15 +8,13 @@ listens there proves nothing, draws answer WAIT. Statistics travel on a connecti
 queue behind batches.
 """
 
-import hmac
 import logging
 import os
-import socket
 import ssl
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,136 +24,17 @@ from rmc.common.errors import AuthenticationError, FencedError, MessageError, Rm
 from rmc.common.replay import EMPTY_SAMPLE, EPISODE_BYTES, ObservationStatistics, Sample, SampleStatus
 from rmc.common.shared_batches import SharedBatches
 from rmc.common.window import Rows, WindowSpec
-from rmc.common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame, proof
+from rmc.common.wire import Kind
+from rmc.learner.replay_connection import ReplayConnection
 
 log = logging.getLogger(__name__)
 AHEAD = 2  # draws in flight, so that the server gathers while the learner computes
-NONCE_BYTES = 32
-TIMEOUT = 10.0  # seconds until a silent server counts as gone
-RECEIVE_BUFFER = 8 << 20
 # What a server that is gone, another that has taken its port, or an address that is none can lead to.
 AWAY = (OSError, MessageError, AuthenticationError, ValueError, OverflowError)
 
 
-class ReplayConnection:
-    """One authenticated connection. Blocking, with a timeout."""
-
-    def __init__(
-        self,
-        address: str,
-        secret: bytes,
-        fingerprint: str,
-        max_body: int,
-        tls: ssl.SSLContext | None = None,
-        epoch: int = 0,
-    ) -> None:
-        """``address``: ``unix:PATH`` or ``tcp:HOST:PORT``; ``epoch``: the learner's.
-
-        Raises OSError, MessageError, AuthenticationError, FencedError.
-        """
-        self._max_body = max_body
-        self._socket = _connect(address, tls)
-        self._reader = self._socket.makefile("rb")  # a small frame comes by one call
-        self._unsent: list[bytes | memoryview] = []
-        try:
-            self._authenticate(secret, fingerprint, epoch)
-        except BaseException:
-            self.close()
-            raise
-
-    def _authenticate(self, secret: bytes, fingerprint: str, epoch: int) -> None:
-        header, meta = self.receive_small()
-        challenge = meta.get("nonce")
-        if header.kind is not Kind.CHALLENGE or not isinstance(challenge, bytes):
-            raise AuthenticationError("the replay server sent no challenge")
-        nonce = os.urandom(NONCE_BYTES)
-        self._fenced = proof(secret, b"fenced", nonce, challenge)
-        self.send(Kind.PROOF, {"nonce": nonce, "proof": proof(secret, b"client", challenge, nonce), "epoch": epoch})
-        header, meta = self.receive_small()
-        if header.kind is Kind.ERROR:
-            self._check_not_fenced(meta)
-            raise AuthenticationError(f"it said {meta.get('error')!r:.200}")
-        known = _equal(meta.get("proof"), proof(secret, b"server", nonce, challenge))
-        if header.kind is not Kind.WELCOME or not known:
-            raise AuthenticationError("the replay server does not know this run's secret")
-        if meta.get("fingerprint") != fingerprint:
-            raise MessageError("fingerprint", f"{meta.get('fingerprint')}, this learner has {fingerprint}")
-
-    def _check_not_fenced(self, meta: dict[str, Any]) -> None:
-        """It ends the learner, so it is believed with a proof for this connection alone, at any time of it."""
-        if _equal(meta.get("fenced"), self._fenced):
-            raise FencedError(str(meta.get("error")))
-
-    def raise_error(self, meta: dict[str, Any]) -> NoReturn:
-        """What an ERROR of a server that has proved itself says."""
-        self._check_not_fenced(meta)
-        raise MessageError("replay", f"{meta.get('error')!s:.200}")
-
-    def send(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...] = ()) -> None:
-        """Send a frame whose body is the parts in order, after what was put off."""
-        self.enqueue(kind, meta, parts)
-        self.flush()
-
-    def flush(self) -> None:
-        """Send what was put off."""
-        if self._unsent:
-            self._socket.sendall(b"".join(self._unsent))
-            self._unsent.clear()
-
-    def enqueue(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...]) -> None:
-        """Let a frame go with the next that is sent: the server is woken once for both."""
-        self._unsent += [encode_frame(kind, meta, parts), *parts]
-
-    def share(self, spec: WindowSpec, batch_size: int) -> SharedBatches | None:
-        """Memory in which the server puts batches from now on; None where it shares none."""
-        self.send(Kind.SHARE, {"batch_size": batch_size})
-        raw, descriptors, _, _ = socket.recv_fds(self._socket, HEADER.size, 1)
-        try:
-            header = decode_header(raw + self._exactly(HEADER.size - len(raw)), 0)
-            meta = decode_meta(self._exactly(header.meta_length), b"", header)
-            if header.kind is not Kind.SHARE:
-                self.raise_error(meta)
-            return SharedBatches(descriptors[0], spec, batch_size) if descriptors else None
-        finally:
-            for descriptor in descriptors:
-                os.close(descriptor)
-
-    def receive(self, body_buffer: memoryview) -> tuple[FrameHeader, dict[str, Any], memoryview]:
-        """The next frame, its body in the buffer given. Raises MessageError, OSError."""
-        header = decode_header(self._exactly(HEADER.size), min(self._max_body, len(body_buffer)))
-        raw_meta = self._exactly(header.meta_length)
-        body = body_buffer[: header.body_length]
-        self._fill(body)
-        return header, decode_meta(raw_meta, body, header), body
-
-    def receive_small(self) -> tuple[FrameHeader, dict[str, Any]]:
-        """The next frame, which has no body."""
-        header, meta, _ = self.receive(memoryview(bytearray()))
-        return header, meta
-
-    def _exactly(self, length: int) -> bytes:
-        raw = bytearray(length)
-        self._fill(memoryview(raw))
-        return bytes(raw)
-
-    def _fill(self, view: memoryview) -> None:
-        while len(view):
-            received = self._reader.readinto(view)
-            if not received:
-                raise ConnectionError("the replay server closed the connection")
-            view = view[received:]
-
-    def close(self) -> None:
-        self._reader.close()
-        self._socket.close()
-
-
-def _equal(given: Any, expected: bytes) -> bool:
-    return isinstance(given, bytes) and hmac.compare_digest(given, expected)
-
-
-def _progress_backup(meta: dict[str, Any]) -> tuple[float, int, int, int]:
-    """Mass, windows, env_steps and drawn_steps of an answer to a draw. Raises MessageError."""
+def _totals(meta: dict[str, Any]) -> tuple[float, int, int, int]:
+    """Total weight, windows, env_steps and drawn_steps of an answer to a draw. Raises MessageError."""
     total_weight = meta.get("total_weight")
     if type(total_weight) is not float or not 0.0 <= total_weight < float("inf"):
         raise MessageError("total_weight", f"{total_weight!r:.80}, want a finite number from 0.0 on")
@@ -167,24 +46,6 @@ def _count(meta: dict[str, Any], name: str) -> int:
     if type(count) is not int or count < 0:
         raise MessageError(name, f"{count!r:.80}, want a whole number from 0 on")
     return count
-
-
-def _connect(address: str, tls: ssl.SSLContext | None) -> socket.socket:
-    scheme, _, rest = address.partition(":")
-    host, _, port = rest.rpartition(":")
-    target: Any = rest if scheme == "unix" else (host, int(port))
-    connection = socket.socket(socket.AF_UNIX if scheme == "unix" else socket.AF_INET, socket.SOCK_STREAM)
-    if scheme != "unix":
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    with suppress(OSError):  # macOS refuses more than its limit, Linux takes what it allows
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-    connection.settimeout(TIMEOUT)
-    try:
-        connection.connect(target)
-        return connection if tls is None else tls.wrap_socket(connection)
-    except BaseException:
-        connection.close()
-        raise
 
 
 class ReplayClient:
@@ -247,7 +108,7 @@ class ReplayClient:
         self._in_flight -= 1
         if header.kind is Kind.ERROR:
             connection.raise_error(meta)
-        about = _progress_backup(meta)
+        about = _totals(meta)
         draw, rows, weights = SampleStatus.BATCH, None, None
         if header.kind is Kind.SHARED and self._shared is not None:
             rows, weights = self._shared.take(meta)

@@ -9,8 +9,8 @@ from rmc.cli.ending import STOPPED
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import IfExists, RunFolder
-from rmc.deploy.run.launch_options import Launcher, LaunchOptions
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import IfExists, Launcher, LaunchOptions
 
 
 def train(

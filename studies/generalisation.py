@@ -14,9 +14,10 @@ from rmc.analysis.baselines import evaluate
 from rmc.analysis.curves import PICTURES
 from rmc.analysis.evaluation import evaluate_checkpoint
 from rmc.analysis.history import objects
+from rmc.analysis.out_file import check_writable
 from rmc.analysis.statistics import ENOUGH_SEEDS, interquartile_mean, interval
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.folder import RunFolder, check_writable
+from rmc.deploy.run.folder import RunFolder
 from studies.study import Job, Play, Scale, Study
 
 ENVS = ("HalfCheetah-v5", "Walker2d-v5", "Ant-v5")

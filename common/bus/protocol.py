@@ -138,7 +138,7 @@ class Bus(Protocol):
         """What that replay server last committed, as it said then."""
 
     def set_progress(self, role: str, progress: bytes) -> None:
-        """Say it in its place, where Redis has nothing."""
+        """Restore the counters of a replay server where Redis has none."""
 
     def drop_stream(self, owner: ReplayOwner, actor: int) -> None:
         """Make an actor send everything again from its hello on, unless a newer replay has come. Raises FencedError."""

@@ -1,5 +1,7 @@
 """The client of a bus: what Redis answers in error names the command and its keys, and is waited out or told."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import redis
@@ -42,13 +44,19 @@ def _name(error: ResponseError, command: tuple[Any, ...]) -> None:
     error.args = (" ".join(f"{code} {error.args[0]} ({' '.join(words[:1] + keys)})".split()),)
 
 
+@contextmanager
+def _naming(command: tuple[Any, ...]) -> Iterator[None]:
+    try:
+        yield
+    except ResponseError as error:
+        _name(error, command)
+        raise
+
+
 class _Pipeline(Pipeline):
     def immediate_execute_command(self, *args: Any, **options: Any) -> Any:
-        try:
+        with _naming(args):
             return super().immediate_execute_command(*args, **options)  # type: ignore[no-untyped-call]
-        except ResponseError as error:
-            _name(error, args)
-            raise
 
     def annotate_exception(self, exception: Any, _: int, command: Any) -> None:
         _name(exception, tuple(command))
@@ -61,8 +69,5 @@ class RedisClient(redis.Redis):
         return _Pipeline(self.connection_pool, self.response_callbacks, transaction, shard_hint)
 
     def execute_command(self, *args: Any, **options: Any) -> Any:
-        try:
+        with _naming(args):
             return super().execute_command(*args, **options)  # type: ignore[no-untyped-call]
-        except ResponseError as error:
-            _name(error, args)
-            raise

@@ -60,10 +60,8 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
 def _make(known: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
     """As gymnasium makes it, without a limit."""
     spec = copy(known)
-    spec.max_episode_steps, spec.order_enforce = (
-        None,
-        False,
-    )  # roles reset and step in order; the check costs time at every step
+    spec.max_episode_steps = None
+    spec.order_enforce = False  # roles reset and step in order; the check costs time at every step
     spec.kwargs = {**spec.kwargs, **config.env_kwargs, **({"render_mode": "rgb_array"} if render else {})}
     try:
         return gym.make(spec, disable_env_checker=True)

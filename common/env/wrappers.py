@@ -94,7 +94,7 @@ def _bool(name: str, value: Any) -> bool:
 
 
 def _own(info: Any) -> dict[str, Any]:
-    """A copy of ``info``, its missing frame as a bool, also under the name that it had until 0.2."""
+    """A copy of ``info``, its missing frame as a bool, also under the name that it had in 0.1."""
     if not isinstance(info, dict):
         raise EnvFault(f"the environment's info is {reprlib.repr(info)}; return a dict, {{}} if it says nothing")
     own = info.copy()

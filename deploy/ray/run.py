@@ -101,7 +101,7 @@ class ClusterRun:
     # -- placing --------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """RolePlacement every role, or find again those that an earlier launcher of the run has placed."""
+        """Place every role, or find again those that an earlier launcher of the run has placed."""
         if self._moved:
             self._end_left_hosts()
         near = self._ring_locations.node(WHOLE.role)

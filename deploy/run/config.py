@@ -200,7 +200,16 @@ def _matches(kind: Any, value: Any) -> bool:
     return type(value) is kind
 
 
-# -- What may not be ----------------------------------------------------------------------------------
+def flat(config: Any, prefix: str = "") -> dict[str, Any]:
+    """A config's values by dotted path."""
+    values: dict[str, Any] = {}
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            values |= flat(value, f"{prefix}{item.name}.")
+        else:
+            values[prefix + item.name] = value
+    return values
 
 
 def option(path: str) -> str:

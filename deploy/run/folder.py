@@ -3,11 +3,9 @@
 ``runs/<env>__<preset>__<seed>__<time>/``
 """
 
-import dataclasses
 import fcntl
 import hashlib
 import json
-import logging
 import os
 import secrets
 import socket
@@ -15,20 +13,16 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import count
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite
-from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.errors import CheckpointError, ConfigError
+from rmc.common.errors import ConfigError
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.config import RunConfig, check_sizes, from_json, option, to_json
+from rmc.deploy.run.config import RunConfig, check_sizes, from_json, to_json
 
-log = logging.getLogger(__name__)
 SECRET_LENGTH = 64  # hexadecimal characters
 LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
-IfExists = Literal["resume", "fail", "new"]
 RESULT = (
     "env_steps",
     "updates",
@@ -39,15 +33,6 @@ RESULT = (
     "initial_return_mean",
 )
 INITIAL = ("eval_return_mean", "eval_return_std", "eval_episodes")
-MAY_CHANGE = {
-    "total_steps",
-    "actors",
-    "env.env_timeout",
-    "learner.threads",
-    "learner.keep_checkpoints",
-    "learner.checkpoint_steps",
-    "evaluator.evaluation_seconds",
-}
 
 
 class RunFolder:
@@ -263,117 +248,3 @@ def parse_record(line: bytes) -> dict[str, Any] | None:
         if isinstance(found, dict) and isinstance(found.get("role"), str):
             return found
     return None
-
-
-def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> RunFolder:
-    """Make or take up a run's folder, locked. Raises ConfigError before anything is written where it may not be."""
-    folder = RunFolder(run_dir or Path("runs") / _new_name(config))
-    if os.fsencode(folder.path).decode(errors="replace") != str(folder.path):
-        raise ConfigError("--run-dir", str(folder.path), "is no UTF-8; give another")
-    if run_dir is None or if_exists == "new":
-        folder = new_folder(folder.path)
-    if (folder.path / "config.json").exists():
-        if if_exists == "fail":
-            raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")
-        _check_resumable(folder, config)
-    elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
-        raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
-    make(folder)
-    folder.lock()
-    folder.reopen(config.total_steps)
-    folder.write_config(config)
-    folder.write_sizes(config.sizes())
-    folder.secret()
-    return folder
-
-
-def _new_name(config: RunConfig) -> str:
-    env = config.env.id.replace(":", "_").replace("/", "_")
-    return f"{env}__{config.preset}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
-
-
-def new_folder(path: Path) -> RunFolder:
-    """A folder of that name that was not there, or beside it: two starts in the same second get one each."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for number in count(1):
-            with suppress(FileExistsError):
-                folder = RunFolder(path if number == 1 else path.with_name(f"{path.name}-{number}"))
-                folder.path.mkdir(0o700)
-                break
-    except OSError as error:
-        raise _cannot_be_made(path, error) from None
-    return folder
-
-
-def _cannot_be_made(path: Path, error: OSError) -> ConfigError:
-    return ConfigError("--run-dir", str(path), f"cannot be made ({error.strerror}); give another")
-
-
-def make(folder: RunFolder) -> None:
-    """Its folders, its owner's alone. Raises ConfigError."""
-    try:
-        folder.path.mkdir(parents=True, exist_ok=True)
-        if not (folder.path / "config.json").exists():
-            folder.path.chmod(0o700)  # what a later owner opens to others stays open
-        for path in (folder.checkpoints, folder.logs):
-            path.mkdir(exist_ok=True)
-    except OSError as error:
-        raise _cannot_be_made(folder.path, error) from None
-
-
-def _check_resumable(folder: RunFolder, config: RunConfig) -> None:
-    was, now = flat(folder.config()), flat(config)
-    for path in ["env.id", "preset", *was]:
-        if was[path] != now[path] and path not in MAY_CHANGE:
-            name = "ENV" if path == "env.id" else option(path)
-            fix = f"the run in {folder.path} has {was[path]!r}; use that, or another --run-dir"
-            raise ConfigError(name, now[path], fix)
-    folder.check_sizes(config.env.id, config.sizes())
-    check_checkpoints(folder)
-
-
-def check_checkpoints(folder: RunFolder) -> None:
-    """Raises ConfigError where there are checkpoints but none is whole; damaged newer ones are told."""
-    checkpoints = CheckpointFolder(folder.checkpoints)
-    faults = []
-    for number in reversed(checkpoints.numbers()):
-        try:
-            checkpoints.load(number)
-        except CheckpointError as error:
-            faults.append(str(error))
-            continue
-        for fault in faults:
-            log.warning("%s; the run goes on from the checkpoint of update %d", fault, number)
-        return
-    if faults:
-        raise ConfigError("--run-dir", str(folder.path), f"{faults[0]}; none is whole, so use another --run-dir")
-
-
-def check_writable(name: str, path: Path, suffixes: tuple[str, ...]) -> None:
-    """Raises ConfigError where a file of one of these kinds cannot be written there; tries, and changes nothing."""
-    if not path.parent.is_dir():
-        raise ConfigError(name, str(path), "its folder is not there; make it, or give another")
-    if path.is_dir():
-        raise ConfigError(name, str(path), f"is a folder; give a file in it, like {path / f'out{suffixes[0]}'}")
-    if path.suffix.lower() not in suffixes:
-        raise ConfigError(name, str(path), f"give a name that ends in {' or '.join(suffixes)}")
-    there = path.exists()
-    try:
-        path.open("ab").close()
-        if not there:
-            path.unlink()
-    except OSError as error:
-        raise ConfigError(name, str(path), f"cannot be written ({error.strerror}); give another") from None
-
-
-def flat(config: Any, prefix: str = "") -> dict[str, Any]:
-    """A config's values by dotted path."""
-    values: dict[str, Any] = {}
-    for item in dataclasses.fields(config):
-        value = getattr(config, item.name)
-        if dataclasses.is_dataclass(value):
-            values |= flat(value, f"{prefix}{item.name}.")
-        else:
-            values[prefix + item.name] = value
-    return values

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rmc.deploy.run.folder import IfExists
-
+IfExists = Literal["resume", "fail", "new"]
 Launcher = Literal["local", "ray", "lockstep", "manual"]
 
 

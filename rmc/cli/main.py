@@ -12,6 +12,7 @@ from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
 from rmc.deploy.monitor import output
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
+PLAYS = {"train", "baseline", "check-env", "evaluate", "inspect"}  # environments, in this process
 ROLES = SINGLE_THREADED | {"learner", "launcher"}
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
@@ -46,7 +47,8 @@ def run(words: list[str]) -> int:
     parent = os.environ.pop(PARENT_VARIABLE, None)
     if parent is not None:  # before the slow imports, so that there is no time in which a role could be left behind
         exit_with_parent(int(parent))
-        descendants.adopt_orphans()
+    if parent is not None or (words and words[0] in PLAYS):
+        descendants.adopt_orphans()  # of what environments start
     if words and words[0] in SINGLE_THREADED:  # before numpy and torch are imported, which read these once
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")

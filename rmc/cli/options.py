@@ -17,8 +17,7 @@ from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig, read_kwargs, write_kwargs
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig, WindowConfig
-from rmc.deploy.run.folder import IfExists
-from rmc.deploy.run.launch_options import Launcher, LaunchOptions
+from rmc.deploy.run.launch_options import IfExists, Launcher, LaunchOptions
 from rmc.deploy.run.presets import preset_config
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig

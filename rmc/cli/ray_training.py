@@ -15,8 +15,9 @@ from rmc.deploy.local.socket_folder import place_for_sockets
 from rmc.deploy.monitor import attach
 from rmc.deploy.ray import launcher, placement
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine, cores
 from rmc.deploy.run.validation import validate, validate_launch
 

@@ -17,8 +17,9 @@ from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.monitor.output import Output
 from rmc.deploy.redis.connect import connect
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.validation import validate, validate_launch
 

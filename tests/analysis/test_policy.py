@@ -20,7 +20,8 @@ from rmc.common.agent_config import AgentConfig
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 
 AGENTS = {

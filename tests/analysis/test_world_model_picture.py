@@ -18,7 +18,8 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from tests.analysis.test_policy import AGENTS
 from tests.hostile import hostile_state

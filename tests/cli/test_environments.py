@@ -14,7 +14,8 @@ from rmc.cli import main, options
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import from_json, to_json
-from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from tests import habits
 from tests.analysis.test_policy import AGENTS, make_run

@@ -17,8 +17,9 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.redis.connect import PATIENCE_VARIABLE
 from rmc.deploy.run.config import to_json
-from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug, paper
 
 PENDULUM = "InvertedPendulum-v5"

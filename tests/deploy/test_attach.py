@@ -17,7 +17,8 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor import view
 from rmc.deploy.monitor.attach import Tail, launcher_pid, stop, watch
-from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 
 HOLDER = """

@@ -24,7 +24,9 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.run.config import to_json
-from rmc.deploy.run.folder import RESULT, IfExists, RunFolder, open_run
+from rmc.deploy.run.folder import RESULT, RunFolder
+from rmc.deploy.run.launch_options import IfExists
+from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 
 

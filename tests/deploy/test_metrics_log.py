@@ -14,7 +14,8 @@ from rmc.deploy.monitor import metrics_log
 from rmc.deploy.monitor.metrics_log import MetricsLog
 from rmc.deploy.monitor.output import unfailing
 from rmc.deploy.monitor.view import RunStatus, View
-from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 
 

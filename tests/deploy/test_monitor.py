@@ -27,7 +27,8 @@ from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.monitor.view import MOST_NAMES, UNHEARD_SECONDS, RunStatus, _evaluation, line, table, terminal
 from rmc.deploy.redis.server import RedisServer
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import RunFolder, open_run
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))

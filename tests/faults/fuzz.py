@@ -33,7 +33,7 @@ from rmc.common.wire import (
     encode_frame,
     encode_windows,
 )
-from rmc.deploy.run.config import from_json, to_json
+from rmc.deploy.run.config import from_json, from_registration, to_json, to_registration
 from rmc.deploy.run.presets import robust
 from rmc.replay_server.commit_record import Progress, decode_published
 from tests.faults.asked import LAWFUL_PROOF, Asked
@@ -130,6 +130,10 @@ def config(raw: bytes) -> None:
     from_json(raw)
 
 
+def registration(raw: bytes) -> None:
+    from_registration(raw)
+
+
 def published(raw: bytes) -> None:
     """Counters that a replay server begins with."""
     decode_published(raw, SPEC.obs_dim)
@@ -159,6 +163,7 @@ KINDS: dict[str, tuple[bytes, Reader]] = {
     "share": (_request(Kind.SHARE, {"batch_size": 4}), request),
     "record": (encode_record({"time": 1.5, "updates": 7, "waiting_for": "credit"}), decode_record),
     "config": (to_json(robust(EnvConfig("HalfCheetah-v5"))).encode(), config),
+    "registration": (to_registration(robust(EnvConfig("HalfCheetah-v5"))), registration),
     "counters": (Progress(SPEC.obs_dim).publish(), published),
 }
 

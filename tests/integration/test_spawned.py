@@ -1,6 +1,8 @@
 """What an environment starts ends with its role, on every way out."""
 
+import os
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -10,6 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.local.socket_folder import sweep
 from tests.integration.running import Training, alive
 from tests.integration.spawning_env import SPAWNED
@@ -102,3 +105,17 @@ def test_those_of_a_group_end_where_the_fork_server_is_killed(training: Spawner)
     training.interrupt()
     for left in training.simulators():
         left.kill()
+
+
+def test_they_end_with_a_command_in_which_a_call_hangs(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "rmc.cli.main", "check-env", SPAWNING, "--steps", "1000000", "--env-timeout", "1"]
+    process = subprocess.Popen(words, env={**os.environ, SPAWNED: str(tmp_path)}, stderr=subprocess.DEVNULL)
+    told = tmp_path / str(process.pid)
+    while not told.exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    theirs = alive([psutil.Process(int(pid)) for pid in told.read_text().split()])
+    assert len(theirs) == 3
+    (tmp_path / f"hang-{process.pid}").touch()
+    assert process.wait(60.0) == HUNG_STATUS
+    assert alive(theirs) == []

@@ -21,7 +21,8 @@ from rmc.common.errors import AuthenticationError, ConfigError, FencedError, Mes
 from rmc.common.replay import Sample, SampleStatus
 from rmc.common.shared_batches import TURNS
 from rmc.common.wire import HEADER, MAGIC, VERSION, Kind, decode_header, decode_meta, encode_frame, proof
-from rmc.learner.replay_client import ReplayClient, ReplayConnection
+from rmc.learner.replay_client import ReplayClient
+from rmc.learner.replay_connection import ReplayConnection
 from rmc.replay_server import socket_server
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.server import ReplayServer

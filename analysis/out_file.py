@@ -1,0 +1,22 @@
+"""Where a command writes a picture, a video or a model: judged before the work begins."""
+
+from pathlib import Path
+
+from rmc.common.errors import ConfigError
+
+
+def check_writable(name: str, path: Path, suffixes: tuple[str, ...]) -> None:
+    """Raises ConfigError where a file of one of these kinds cannot be written there; tries, and changes nothing."""
+    if not path.parent.is_dir():
+        raise ConfigError(name, str(path), "its folder is not there; make it, or give another")
+    if path.is_dir():
+        raise ConfigError(name, str(path), f"is a folder; give a file in it, like {path / f'out{suffixes[0]}'}")
+    if path.suffix.lower() not in suffixes:
+        raise ConfigError(name, str(path), f"give a name that ends in {' or '.join(suffixes)}")
+    there = path.exists()
+    try:
+        path.open("ab").close()
+        if not there:
+            path.unlink()
+    except OSError as error:
+        raise ConfigError(name, str(path), f"cannot be written ({error.strerror}); give another") from None
