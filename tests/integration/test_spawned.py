@@ -43,7 +43,8 @@ class Spawner(Training):
         return role.pid
 
     def fork_server(self) -> psutil.Process:
-        return next(one for one in self.launcher.children() if "rmc.cli.fork_server" in one.cmdline())
+        living = alive(self.launcher.children())  # not the daemons that its first evaluation has ended
+        return next(one for one in living if "rmc.cli.fork_server" in one.cmdline())
 
 
 @pytest.fixture
