@@ -91,9 +91,11 @@ def test_they_end_with_a_role_that_is_killed_or_hangs_and_with_the_run(training:
 def test_they_end_where_the_launcher_is_killed(training: Spawner) -> None:
     training.pid_of("actor")
     assert training.simulators()
+    fork_server = training.fork_server()
     training.process.send_signal(signal.SIGKILL)
     training.process.wait()
     end_all(training)
+    fork_server.wait(5.0)  # which has ended them
 
 
 def test_those_of_a_group_end_where_the_fork_server_is_killed(training: Spawner) -> None:
