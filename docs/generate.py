@@ -8,7 +8,7 @@ import itertools
 from pathlib import Path
 from typing import Any
 
-from rmc.cli.options import Train
+from rmc.cli.train_options import Train
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import option
 from rmc.deploy.run.opening import MAY_CHANGE

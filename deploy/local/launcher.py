@@ -10,10 +10,16 @@ from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable, RmcError
 from rmc.common.process.role import StopSignal
-from rmc.common.shard import Shard
+from rmc.deploy.local.role_command import (
+    RoleCommand,
+    actor_commands,
+    evaluator_commands,
+    learner_command,
+    replay_command,
+)
 from rmc.deploy.local.role_environment import URL_VARIABLE
 from rmc.deploy.local.socket_folder import SocketFolder
-from rmc.deploy.local.supervisor import STOP_SECONDS, RoleCommand, Supervisor
+from rmc.deploy.local.supervisor import STOP_SECONDS, Supervisor
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.redis.connect import PATIENCE_VARIABLE, connect
 from rmc.deploy.redis.registration import Registration
@@ -30,27 +36,13 @@ log = logging.getLogger(__name__)
 
 def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -> list[RoleCommand]:
     """How each role of the run is started here; the same commands start them by hand."""
-    place = ("--run", folder.name)
-    secret = ("--secret-file", str(folder.secret_file))
-    learn = ("--folder", str(folder.checkpoints), "--device", device)
-    timeout = config.env.env_timeout
-    evaluator = [RoleCommand("evaluator", ("evaluator", *place), env_timeout=timeout)] * (config.evaluator.episodes > 0)
-    actors = [
-        RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index)), env_timeout=timeout)
-        for index in range(config.actors)
+    run, secrets = folder.name, ("--secret-file", str(folder.secret_file))
+    replays = [
+        replay_command(shard, run, str(folder.path / shard.role), f"unix:{sockets / shard.role}.sock", secrets)
+        for shard in config.shards()
     ]
-    return [
-        *(_replay_command(shard, folder, sockets, (*place, *secret)) for shard in config.shards()),
-        RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
-        *evaluator,
-        *actors,
-    ]
-
-
-def _replay_command(shard: Shard, folder: RunFolder, sockets: Path, place: tuple[str, ...]) -> RoleCommand:
-    listen = f"unix:{sockets / shard.role}.sock"
-    words = ("--folder", str(folder.path / shard.role), "--listen", listen, "--shard", str(shard.index))
-    return RoleCommand(shard.role, ("replay", *place, *words), forked=False)
+    learner = learner_command(run, str(folder.checkpoints), device, secrets)
+    return [*replays, learner, *evaluator_commands(config, run), *actor_commands(config, run)]
 
 
 def _redis(config: RunConfig, folder: RunFolder, sockets: Path) -> RedisServer:

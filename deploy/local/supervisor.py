@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,6 +14,7 @@ from rmc.common.errors import RoleDied
 from rmc.common.process.parent_death import PARENT_VARIABLE
 from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.local.fork_server import ForkedProcess, ForkServer, open_log
+from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inherited, working_folder
 
 # So many deaths of a role's own in a row, each within so long of its start, end the run.
@@ -28,18 +28,6 @@ TRACEBACK_BYTES = 8192
 def from_outside(status: int) -> bool:
     """Whether somebody else ended it, for whom it can do nothing: it is started again, however often."""
     return status in (-signal.SIGKILL, -signal.SIGTERM)
-
-
-@dataclass(frozen=True)
-class RoleCommand:
-    """How a role is started: ``rmc`` and its words."""
-
-    name: str
-    words: tuple[str, ...]
-    single_thread: bool = True
-    forked: bool = True  # if of a single thread: by the fork server, which has torch in memory
-    ends: bool = False  # in order, once the run is done; any other that ends unasked is started again
-    env_timeout: float = 0.0  # seconds, of one that plays: what it hung for is no part of its life
 
 
 class RoleProcess:

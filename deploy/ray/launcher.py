@@ -17,7 +17,7 @@ except ImportError as missing:
     raise ConfigError("--launcher", "ray", f"Ray is not installed; {how_to_install('ray')}") from missing
 
 from rmc.common.errors import ConfigError
-from rmc.deploy.local.supervisor import RoleCommand
+from rmc.deploy.local.role_command import launcher_command
 from rmc.deploy.ray.launcher_actor import LauncherActor
 from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, last_line
 from rmc.deploy.run import tls
@@ -63,9 +63,7 @@ def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, en
         )
     for file in (tls.CERTIFICATE, tls.KEY):  # for the address that the head has now
         (folder.path / file).unlink(missing_ok=True)
-    words = ["launcher", str(folder.path), "--ray-address", context.gcs_address, "--device", device]
-    words += ["--all-cpus"] * all_cpus + ["--tls"] * encrypted
-    command = RoleCommand("launcher", tuple(words), single_thread=False, ends=True)
+    command = launcher_command(str(folder.path), context.gcs_address, device, all_cpus, encrypted)
     options = ray.remote(LauncherActor).options(
         name=actor_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
         max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),

@@ -8,7 +8,13 @@ from typing import Any
 import ray
 
 from rmc.common.errors import ConfigError
-from rmc.deploy.local.supervisor import RoleCommand
+from rmc.deploy.local.role_command import (
+    RoleCommand,
+    actor_commands,
+    evaluator_commands,
+    learner_command,
+    replay_command,
+)
 from rmc.deploy.ray.learner_actor import LearnerActor
 from rmc.deploy.ray.role_actor import RoleActor
 from rmc.deploy.run.config import RunConfig
@@ -91,39 +97,30 @@ class RolePlacement:
 
 def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[str, RolePlacement]:
     """All roles of a run but its launcher, by name."""
-    place = ("--run", run)
-    secret: tuple[str, ...] = ("--secret-file", "{scratch}/secret")
+    secrets = ["--secret-file", "{scratch}/secret"]
     if encrypted and config.replay.replay_shards > 1:  # one alone has a unix socket
-        secret += ("--tls-folder", "{scratch}")
-    learn, timeout = ("--folder", "{scratch}/checkpoints", "--device", device), config.env.env_timeout
-    evaluate = RoleCommand("evaluator", ("evaluator", *place), env_timeout=timeout)
-    evaluator = [RolePlacement(RoleActor, evaluate, EVALUATOR_CPUS, group="learner")] * (config.evaluator.episodes > 0)
+        secrets += ["--tls-folder", "{scratch}"]
+    learner, gpus = learner_command(run, "{scratch}/checkpoints", device, secrets), float(device.startswith("cuda"))
     found = [
-        *_replays(config, (*place, *secret)),
-        RolePlacement(
-            LearnerActor, RoleCommand("learner", ("learner", *place, *secret, *learn), single_thread=False, ends=True),
-            learner_cpus(config), float(device.startswith("cuda")), group="learner",
-        ),
-        *evaluator,
+        *_replays(config, run, secrets),
+        RolePlacement(LearnerActor, learner, learner_cpus(config), gpus, "learner"),
         *(
-            RolePlacement(
-                RoleActor,
-                RoleCommand(f"actor-{index}", ("actor", *place, "--index", str(index)), env_timeout=timeout), 1.0,
-            )
-            for index in range(config.actors)
+            RolePlacement(RoleActor, command, EVALUATOR_CPUS, group="learner")
+            for command in evaluator_commands(config, run)
         ),
-    ]  # fmt: skip
+        *(RolePlacement(RoleActor, command, 1.0) for command in actor_commands(config, run)),
+    ]
     return {place.command.name: place for place in found}
 
 
-def _replays(config: RunConfig, words: tuple[str, ...]) -> list[RolePlacement]:
+def _replays(config: RunConfig, run: str, secrets: list[str]) -> list[RolePlacement]:
     """One beside the learner on a unix socket, or several anywhere on the cluster's network."""
-    count = config.replay.replay_shards
-    found = []
-    for shard in config.shards():
-        listen = "unix:{scratch}/replay.sock" if count == 1 else "tcp:{ip}:0"
-        rest = ("--folder", f"{{scratch}}/{shard.role}", "--listen", listen, "--shard", str(shard.index))
-        command = RoleCommand(shard.role, ("replay", *words, *rest))
-        cpus, group = (REPLAY_CPUS, "learner") if count == 1 else (SHARD_CPUS, "replay")
-        found.append(RolePlacement(RoleActor, command, cpus, group=group))
-    return found
+    alone = config.replay.replay_shards == 1
+    listen = "unix:{scratch}/replay.sock" if alone else "tcp:{ip}:0"
+    cpus, group = (REPLAY_CPUS, "learner") if alone else (SHARD_CPUS, "replay")
+    return [
+        RolePlacement(
+            RoleActor, replay_command(shard, run, f"{{scratch}}/{shard.role}", listen, secrets), cpus, group=group
+        )
+        for shard in config.shards()
+    ]

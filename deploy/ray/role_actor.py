@@ -14,7 +14,8 @@ from urllib.parse import quote
 import ray
 
 from rmc.common.errors import CheckpointError
-from rmc.deploy.local.supervisor import EXIT_CONFIG, RoleCommand, RoleProcess
+from rmc.deploy.local.role_command import RoleCommand
+from rmc.deploy.local.supervisor import EXIT_CONFIG, RoleProcess
 
 NAMESPACE = "rmc"
 LAST_WORDS_SECONDS = 1.5  # a host outlives its role so long, for the launcher to hear why it died

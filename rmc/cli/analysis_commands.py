@@ -4,7 +4,7 @@ import dataclasses
 import importlib.util
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from rich.console import Console
 from rmc.analysis import curves, env_check, export, history, video, world_model_picture
 from rmc.analysis.evaluation import Progress, evaluate_checkpoint
 from rmc.analysis.policy import load_policy
-from rmc.cli import options
+from rmc.cli import run_options
 from rmc.cli.ending import cut_note
 from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
@@ -25,7 +25,7 @@ from rmc.deploy.run.folder import RunFolder
 log = logging.getLogger(__name__)
 
 
-def evaluate(command: options.Evaluate) -> int:
+def evaluate(command: run_options.Evaluate) -> int:
     """Play a checkpoint and print how it did."""
     if not 1 <= command.episodes <= 10_000:
         raise ConfigError("--episodes", command.episodes, "take 1 to 10_000")
@@ -52,7 +52,7 @@ def evaluate(command: options.Evaluate) -> int:
     return 0
 
 
-def _played(folder: RunFolder, command: options.Evaluate, flicker: float | None) -> dict[str, Any]:
+def _played(folder: RunFolder, command: run_options.Evaluate, flicker: float | None) -> dict[str, Any]:
     watch = Progress(Console(stderr=True), str(command.run))
     if not folder.is_baseline():
         return evaluate_checkpoint(
@@ -79,14 +79,14 @@ def _said(played: dict[str, Any]) -> str:
     return f"{text}{cut_note(played)}, after {played['env_steps']:,} environment steps"
 
 
-def export_policy(command: options.Export) -> int:
+def export_policy(command: run_options.Export) -> int:
     """Write a policy as ONNX."""
     export.export(RunFolder(command.run), command.checkpoint, command.out)
     terminal().print(f"{command.out}: inputs {', '.join(export.INPUTS)}; outputs {', '.join(export.OUTPUTS)}")
     return 0
 
 
-def inspect(command: options.Inspect) -> int:
+def inspect(command: run_options.Inspect) -> int:
     """Write a picture of what the world model knows, and say it in numbers."""
     found, console = world_model_picture.inspect(command.run, command.checkpoint, command.out), terminal()
     ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in found.open_loop.items())
@@ -101,14 +101,14 @@ def inspect(command: options.Inspect) -> int:
     return 0
 
 
-def check_env(command: options.CheckEnv) -> int:
+def check_env(command: run_options.CheckEnv) -> int:
     """Say what the agent will make of an environment."""
     if not 1 <= command.steps <= 10_000_000:
         raise ConfigError("--steps", command.steps, "take 1 to 10_000_000")
     return env_check.check(command.env.config(), command.steps, terminal())
 
 
-def baseline(command: options.Baseline) -> int:
+def baseline(command: run_options.Baseline) -> int:
     """Train an agent of stable-baselines3."""
     _check_baselines(command.algorithm)
     from rmc.analysis import baselines  # an extra, and slow to import
@@ -117,7 +117,7 @@ def baseline(command: options.Baseline) -> int:
         return baselines.train(command.config(), command.run_dir, terminal(), stop)
 
 
-def plot(command: options.Plot) -> int:
+def plot(command: run_options.Plot) -> int:
     """Draw curves and print their table."""
     if not command.runs:
         raise ConfigError("RUNS", "", "give folders of runs, or files of JSON lines")
@@ -141,13 +141,3 @@ def _histories(paths: Sequence[Path]) -> list[history.History]:
     if not found:
         raise ConfigError("RUNS", " ".join(map(str, paths)), "no history in there; give runs that were evaluated")
     return found
-
-
-ACTIONS: dict[type, Callable[[Any], int]] = {
-    options.Evaluate: evaluate,
-    options.Export: export_policy,
-    options.Inspect: inspect,
-    options.CheckEnv: check_env,
-    options.Baseline: baseline,
-    options.Plot: plot,
-}

@@ -62,10 +62,10 @@ def _import_all() -> None:
     """What the roles import, and what gymnasium imports when it makes one of MuJoCo's environments."""
     import gymnasium.envs.mujoco.mujoco_env
 
-    import rmc.cli.commands
+    import rmc.cli.role_commands
     import rmc.deploy.local.actor_process
 
-    assert rmc.cli.commands
+    assert rmc.cli.role_commands
     assert rmc.deploy.local.actor_process
     assert gymnasium.envs.mujoco.mujoco_env
     gc.collect()

@@ -13,7 +13,6 @@ from rmc.deploy.monitor import output
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
 PLAYS = {"train", "baseline", "check-env", "evaluate", "inspect"}  # environments, in this process
-ROLES = SINGLE_THREADED | {"learner", "launcher"}
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 
@@ -49,7 +48,8 @@ def run(words: list[str]) -> int:
         exit_with_parent(int(parent))
     if parent is not None or (words and words[0] in PLAYS):
         descendants.adopt_orphans()  # of what environments start
-    if words and words[0] in SINGLE_THREADED:  # before numpy and torch are imported, which read these once
+    if words[:1] == ["role"] and SINGLE_THREADED.intersection(words[1:2]):
+        # before numpy and torch are imported, which read these once
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
@@ -69,8 +69,8 @@ def run(words: list[str]) -> int:
     except KeyboardInterrupt:  # before the command took the signal over
         return INTERRUPTED_STATUS
     except RmcError as error:
-        if words[0] in ROLES:
-            raise  # a role: the supervisor shows its traceback
+        if words[0] == "role":
+            raise  # the supervisor shows its traceback
         return _complain(str(error), FAILED_STATUS)
     except OSError as error:
         if error.errno not in NO_ROOM:
@@ -87,25 +87,25 @@ def _say_version() -> int:
 
 
 def _parse_and_run(words: list[str]) -> int:
-    from rmc.cli import commands, options
+    from rmc.cli import parser
     from rmc.common.bus.redis_url import without_passwords
 
     try:
         with contextlib.redirect_stderr(io.StringIO()):
-            command = options.parse(words)
+            command = parser.parse(words)
     except SystemExit as ending:
         if not ending.code:  # --help
             return 0
         return _complain(_complaint([without_passwords(word) for word in words]), CONFIG_STATUS)
-    return commands.execute(command)
+    return parser.ACTIONS[type(command)](command)
 
 
 def _complaint(words: list[str]) -> str:
     """What is wrong with words that cannot be parsed; it quotes them."""
-    from rmc.cli import options
+    from rmc.cli import parser
 
     with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.suppress(SystemExit):
-        options.parse(words)
+        parser.parse(words)
     return _as_line(said.getvalue())
 
 

@@ -10,7 +10,7 @@ import pytest
 from gymnasium.spaces import Box
 
 from rmc.analysis.policy import load_policy
-from rmc.cli import main, options
+from rmc.cli import main, parser, train_options
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import from_json, to_json
@@ -30,8 +30,8 @@ def wanting_run(folder: Path) -> RunFolder:
 
 
 def test_keywords_go_from_the_command_line_into_config_json() -> None:
-    command = options.parse(["train", WANTS, "--env-kwargs", "goal=1.5", "size=4", "name=hall", "--seed", "3"])
-    assert isinstance(command, options.Train)
+    command = parser.parse(["train", WANTS, "--env-kwargs", "goal=1.5", "size=4", "name=hall", "--seed", "3"])
+    assert isinstance(command, train_options.Train)
     config = command.config()
     assert config.env.env_kwargs == {"goal": 1.5, "size": 4, "name": "hall"}
     assert json.loads(to_json(config))["env"]["env_kwargs"] == config.env.env_kwargs

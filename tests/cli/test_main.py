@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rmc.cli import main, options
+from rmc.cli import main, parser, train_options
 from rmc.cli.training import open_folder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
@@ -57,16 +57,16 @@ OTHER_FLAGS = {
     "attach": [],
     "stop": [],
     "cluster": [],
-    "launcher": ["--ray-address", "--device", "--all-cpus", "--tls"],
-    "actor": ["--run", "--redis-url", "--index"],
-    "replay": ["--run", "--redis-url", "--folder", "--listen", "--shard", "--secret-file", "--tls-folder"],
-    "learner": ["--run", "--redis-url", "--folder", "--device", "--secret-file", "--tls-folder"],
-    "evaluator": ["--run", "--redis-url"],
+    "role launcher": ["--ray-address", "--device", "--all-cpus", "--tls"],
+    "role actor": ["--run", "--redis-url", "--index"],
+    "role replay": ["--run", "--redis-url", "--folder", "--listen", "--shard", "--secret-file", "--tls-folder"],
+    "role learner": ["--run", "--redis-url", "--folder", "--device", "--secret-file", "--tls-folder"],
+    "role evaluator": ["--run", "--redis-url"],
 }
 
 
 def flags(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
-    assert main.run([command, "--help"]) == 0
+    assert main.run([*command.split(), "--help"]) == 0
     found = re.findall(r"--[a-z][a-z-]*[a-z]", capsys.readouterr().out)
     return set(found) - {"--help"}
 
@@ -121,8 +121,8 @@ def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         (["train"], "train"),
         (["stats", "/nowhere"], "/nowhere"),
         (["evaluate", "/nowhere"], "/nowhere"),
-        (["actor", "--run", "x", "--redis-url", "unix:///nowhere/redis.sock"], "--redis-url"),
-        (["actor"], "--run"),
+        (["role", "actor", "--run", "x", "--redis-url", "unix:///nowhere/redis.sock"], "--redis-url"),
+        (["role", "actor"], "--run"),
     ],
 )
 def test_errors_are_one_line(
@@ -140,7 +140,7 @@ def test_errors_are_one_line(
     assert not list(tmp_path.iterdir())  # nothing was started or written
 
 
-@pytest.mark.parametrize("words", [DEBUG, ["actor", "--run", "x"]])
+@pytest.mark.parametrize("words", [DEBUG, ["role", "actor", "--run", "x"]])
 @pytest.mark.parametrize("login", ["", ":hush@"])
 def test_a_password_on_the_command_line_is_warned_of_once(words: list[str], login: str) -> None:
     done = subprocess.run(
@@ -246,7 +246,7 @@ def test_a_role_needs_its_runs_secret(
     redis_url: str, run_name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RMC_PATIENCE", "0.2")
-    words = ["replay", "--run", run_name, "--redis-url", redis_url, "--folder", str(tmp_path / "replay")]
+    words = ["role", "replay", "--run", run_name, "--redis-url", redis_url, "--folder", str(tmp_path / "replay")]
     assert "RMC_SECRET" in complaint(words, capsys)
     assert "cannot be read" in complaint([*words, "--secret-file", str(tmp_path / "none")], capsys)
     secret = tmp_path / "secret"
@@ -282,8 +282,8 @@ def test_a_runs_folder_is_its_owners_alone_until_they_open_it(tmp_path: Path) ->
 
 def test_options_become_the_config() -> None:
     words = ["train", PENDULUM, "--preset", "paper", "--seed", "4", "--envs-per-actor", "3", "--heads", "64", "32"]
-    command = options.parse([*words, "--replay-ratio", "64", "--flicker", "0.5", "--head-input", "hidden+embedding"])
-    assert isinstance(command, options.Train)
+    command = parser.parse([*words, "--replay-ratio", "64", "--flicker", "0.5", "--head-input", "hidden+embedding"])
+    assert isinstance(command, train_options.Train)
     config = command.config()
     expected = paper(EnvConfig(PENDULUM, 0.5))
     assert (config.seed, config.actor.envs_per_actor, config.agent.heads) == (4, 3, (64, 32))

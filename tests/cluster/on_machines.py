@@ -205,7 +205,7 @@ def endless(site: Site) -> Run:
 
 def where(run: Run, role: str) -> Machine:
     """The machine whose processes a role's is one of."""
-    found = [machine for machine in run.site.machines.machines if machine.processes(f"rmc.cli.main {role}")]
+    found = [machine for machine in run.site.machines.machines if machine.processes(f"rmc.cli.main role {role}")]
     assert len(found) == 1, (role, [machine.name for machine in found])
     return found[0]
 
@@ -219,7 +219,7 @@ def test_a_run_learns_is_stopped_and_goes_on(site: Site) -> None:
     began = time.monotonic()
     run = Run(site, "learning", *LEARNING, "--actors", "2")
     run.wait_for(lambda: run.newest("evaluator", "eval_return_mean") >= 1000.0, seconds=600)
-    workers = [machine for machine in (site.alpha, site.beta) if machine.processes("rmc.cli.main actor")]
+    workers = [machine for machine in (site.alpha, site.beta) if machine.processes("rmc.cli.main role actor")]
     assert len(workers) == 2
     note(test="reached 1000", seconds=time.monotonic() - began, updates=run.newest("evaluator", "eval_update"))
     steps = run.newest("replay", "env_steps")
@@ -241,10 +241,10 @@ def test_a_killed_raylet_costs_no_acknowledged_window(endless: Run) -> None:
     worker = site.beta if learner is site.alpha else site.alpha
     before, epochs = endless.newest("replay", "env_steps"), endless.epochs()
     worker.kill("raylet/raylet")
-    ended = endless.wait_for(lambda: not worker.processes("rmc.cli.main actor"))
+    ended = endless.wait_for(lambda: not worker.processes("rmc.cli.main role actor"))
     endless.wait_for_updates(20)
     site.join(worker)
-    back = endless.wait_for(lambda: len(worker.processes("rmc.cli.main actor")) >= ON_A_WORKER)
+    back = endless.wait_for(lambda: len(worker.processes("rmc.cli.main role actor")) >= ON_A_WORKER)
     endless.wait_for(lambda: endless.newest("replay", "env_steps") > before + 500)
     endless.check_counters()
     replaced = endless.check_replaced_are_fenced(epochs, least=ON_A_WORKER)
@@ -261,7 +261,7 @@ def test_a_cut_network_heals(endless: Run, seconds: int) -> None:
     given_up = seconds >= 90  # by Ray, whose autoscaler starts it again there
     healed = time.monotonic()
     if given_up:  # those there find out, and end
-        endless.wait_for(lambda: not worker.processes("rmc.cli.main actor"))
+        endless.wait_for(lambda: not worker.processes("rmc.cli.main role actor"))
     heard = time.time()
 
     def all_there() -> bool:
@@ -279,9 +279,9 @@ def test_a_cut_network_heals(endless: Run, seconds: int) -> None:
 @pytest.mark.parametrize("role", ["learner", "replay"])
 def test_a_killed_process_resumes(endless: Run, role: str) -> None:
     machine = where(endless, role)
-    before = machine.processes(f"rmc.cli.main {role}")
-    machine.kill(f"rmc.cli.main {role}")
-    back = endless.wait_for(lambda: (now := machine.processes(f"rmc.cli.main {role}")) and now != before)
+    before = machine.processes(f"rmc.cli.main role {role}")
+    machine.kill(f"rmc.cli.main role {role}")
+    back = endless.wait_for(lambda: (now := machine.processes(f"rmc.cli.main role {role}")) and now != before)
     endless.wait_for_updates(50)
     endless.check_counters()
     note(test=f"{role} killed", back_s=back)
@@ -292,7 +292,7 @@ def test_a_node_that_joins_gets_actors(endless: Run) -> None:
     new = site.machines.add("gamma")
     began = time.monotonic()
     site.join(new)
-    endless.wait_for(lambda: len(new.processes("rmc.cli.main actor")) >= 1)
+    endless.wait_for(lambda: len(new.processes("rmc.cli.main role actor")) >= 1)
     joined = time.monotonic() - began
     assert joined < 30.0
     endless.wait_for(lambda: endless.newest("launcher", "not_running", "x") == "")

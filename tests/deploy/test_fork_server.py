@@ -42,6 +42,7 @@ def test_it_is_rmc_with_its_words(shared: ForkServer, tmp_path: Path) -> None:
     role = fork(
         shared,
         tmp_path / "log",
+        "role",
         "actor",
         "--run",
         "x",
@@ -57,19 +58,29 @@ def test_it_is_rmc_with_its_words(shared: ForkServer, tmp_path: Path) -> None:
 
 def test_it_leads_a_group_has_its_title_and_dies_of_a_signal(shared: ForkServer, tmp_path: Path) -> None:
     role = fork(
-        shared, tmp_path / "log", "actor", "--run", "x", "--index", "7", RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99"
+        shared,
+        tmp_path / "log",
+        "role",
+        "role",
+        "actor",
+        "--run",
+        "x",
+        "--index",
+        "7",
+        RMC_REDIS_URL="unix:///a",
+        RMC_PATIENCE="99",
     )
     assert os.getpgid(role.pid) == role.pid
     assert role.poll() is None
     with pytest.raises(subprocess.TimeoutExpired):
         role.wait(0.2)
-    assert " ".join(psutil.Process(role.pid).cmdline()).endswith("-P -m rmc.cli.main actor --run x --index 7")
+    assert " ".join(psutil.Process(role.pid).cmdline()).endswith("-P -m rmc.cli.main role actor --run x --index 7")
     os.killpg(role.pid, signal.SIGKILL)
     assert role.wait(5) == -signal.SIGKILL
 
 
 def test_with_the_fork_server_go_those_it_forked_and_another_begins(shared: ForkServer, tmp_path: Path) -> None:
-    words = ("actor", "--run", "x", "--index", "0")
+    words = ("role", "actor", "--run", "x", "--index", "0")
     role = fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99")
     process = psutil.Process(role.pid)
     assert shared._program is not None
@@ -98,7 +109,7 @@ def test_one_that_hangs_is_given_up_for_another(
     shared: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rmc.deploy.local.fork_server.REPLY_SECONDS", 0.3)
-    words = ("actor", "--run", "x", "--index", "0")
+    words = ("role", "actor", "--run", "x", "--index", "0")
     role = fork(shared, tmp_path / "log", *words, RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99")
     process, hung = psutil.Process(role.pid), shared._program
     assert hung is not None

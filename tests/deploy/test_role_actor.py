@@ -12,7 +12,7 @@ pytest.importorskip("ray")
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.local import supervisor
-from rmc.deploy.local.supervisor import RoleCommand
+from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.ray import role_actor
 from rmc.deploy.ray.learner_actor import LearnerActor
 from rmc.deploy.ray.role_actor import RoleActor, Task

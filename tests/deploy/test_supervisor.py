@@ -8,7 +8,8 @@ import pytest
 from rmc.common.errors import RoleDied
 from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.local import supervisor
-from rmc.deploy.local.supervisor import RoleCommand, RoleProcess, Supervisor
+from rmc.deploy.local.role_command import RoleCommand
+from rmc.deploy.local.supervisor import RoleProcess, Supervisor
 
 
 @pytest.fixture

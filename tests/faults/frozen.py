@@ -97,13 +97,13 @@ def _words(run: Loaded, role: str) -> list[str]:
     other = run.folder.parent / f"other-{role}"
     shutil.rmtree(other, ignore_errors=True)
     if role.startswith("actor"):
-        return ["actor", *place, "--index", role.partition("-")[2]]
+        return ["role", "actor", *place, "--index", role.partition("-")[2]]
     if role == "learner":
         shutil.copytree(run.folder / "checkpoints", other)
-        return ["learner", *place, *secret, "--folder", str(other), "--device", "cpu"]
+        return ["role", "learner", *place, *secret, "--folder", str(other), "--device", "cpu"]
     (socket,) = (path for path in run.sockets() if path.name == "replay.sock")
     listen = f"unix:{socket.with_name('other.sock')}"
-    return ["replay", *place, *secret, "--folder", str(other), "--listen", listen, "--shard", "0"]
+    return ["role", "replay", *place, *secret, "--folder", str(other), "--listen", listen, "--shard", "0"]
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ class Loaded(Training):
             return self.launcher
         word, _, index = role.partition("-")
         others = {"redis": "unixsocket", "fork server": r"rmc\.cli\.fork_server"}
-        pattern = others.get(role, rf"rmc\.cli\.main {word} .*{f'--index {index}' if index else ''}")
+        pattern = others.get(role, rf"rmc\.cli\.main role {word} .*{f'--index {index}' if index else ''}")
         found: list[psutil.Process] = []
 
         def there() -> bool:

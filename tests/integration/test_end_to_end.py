@@ -68,7 +68,7 @@ def test_roles_by_hand_over_tcp(told: str, redis_url: str, run_name: str, tmp_pa
     begin, *commands = re.findall(r"^rmc (.*)$", MANUAL.read_text(), re.MULTILINE)
     options = ("--launcher", "manual", "--redis-url", f"file:{tmp_path}/redis-url")
     assert " ".join(options[:3]) in begin
-    assert [command.split()[0] for command in commands] == ["replay", "learner", "actor", "evaluator"]
+    assert [command.split()[1] for command in commands] == ["replay", "learner", "actor", "evaluator"]
     environment, said = dict(os.environ), r"$^"
     with ExitStack() as stack:
         training = stack.enter_context(Training(folder, "--total-steps", "1200", "--checkpoint-steps", "600", *options))
@@ -83,7 +83,7 @@ def test_roles_by_hand_over_tcp(told: str, redis_url: str, run_name: str, tmp_pa
             words = re.sub(said, "", command)
             for word, place in places.items():
                 words = words.replace(word, place)
-            log = stack.enter_context((tmp_path / f"{words.split()[0]}.log").open("wb"))
+            log = stack.enter_context((tmp_path / f"{words.split()[1]}.log").open("wb"))
             line = [sys.executable, "-m", "rmc.cli.main", *words.split()]
             roles.append(subprocess.Popen(line, env=environment, stdout=subprocess.DEVNULL, stderr=log))
         for role in roles:

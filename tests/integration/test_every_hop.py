@@ -59,7 +59,10 @@ def client(bus: RedisBus, redis_url: str, run_name: str, tmp_path: Path) -> Iter
         "--secret-file",
         str(tmp_path / "secret"),
     ]
-    roles = [["replay", *place, *listen], *(["actor", *place, "--index", str(index)] for index in range(CONFIG.actors))]
+    roles = [
+        ["role", "replay", *place, *listen],
+        *(["role", "actor", *place, "--index", str(index)] for index in range(CONFIG.actors)),
+    ]
     processes = [subprocess.Popen([sys.executable, "-m", "rmc.cli.main", *words], env=os.environ) for words in roles]
     found = ReplayClient(lambda: f"unix:{tmp_path}/s", b"every hop", CONFIG.window_spec(), BATCH)
     found.register_learner(bus.current_epoch("learner"))  # only the newest learner is served

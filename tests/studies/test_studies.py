@@ -14,7 +14,7 @@ import pytest
 
 import studies
 from rmc.analysis import history
-from rmc.cli import options
+from rmc.cli import parser, run_options, train_options
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RESULT, RunFolder
 from rmc.deploy.run.validation import validate
@@ -36,11 +36,11 @@ def test_every_run_is_one_that_rmc_takes(name, scale):
         assert job.words[job.words.index("--seed") + 1] == str(job.seed)
         if job.seed != jobs[0].seed:  # the same words but for that
             continue
-        command = options.parse(job.words)
-        assert isinstance(command, options.Train | options.Baseline)
+        command = parser.parse(job.words)
+        assert isinstance(command, train_options.Train | run_options.Baseline)
         assert (command.seed, command.run_dir, command.env.id) == (job.seed, job.folder, job.env)
         config = command.config()
-        if isinstance(command, options.Train):
+        if isinstance(command, train_options.Train):
             validate(config)
         seen.add(repr(dataclasses.replace(config, seed=0)))
     assert len(seen) == len(jobs) / len({job.seed for job in jobs})  # no two agents are the same
@@ -85,7 +85,7 @@ def test_of_so_many_steps_it_has_runs_and_a_file_of_its_own(tmp_path, monkeypatc
     with pytest.raises(SystemExit, match="ended with 1"):
         tiny.main()
     (job,) = begun
-    command = options.parse(job.words)
+    command = parser.parse(job.words)
     assert (command.total_steps, command.seed, command.env.id) == (3000, 4, "InvertedPendulum-v5")
     assert job.folder.parent.name == "tiny-3000"
     assert tiny.results("3000") == tmp_path / "tiny-3000.jsonl"

@@ -1,0 +1,69 @@
+"""``rmc role``: this process is one role of a run."""
+
+import logging
+import os
+import signal
+import sys
+
+from rmc.cli import training
+from rmc.cli.redis_password import warn_of_password
+from rmc.cli.role_options import ActorRole, EvaluatorRole, LauncherRole, ReplayRole, Role
+from rmc.common.errors import ConfigError
+from rmc.deploy.local.role_environment import SECRET_VARIABLE, URL_VARIABLE
+from rmc.deploy.local.role_process import RunConnection
+from rmc.deploy.monitor.view import terminal
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
+
+
+class RoleSecrets:
+    """What the environment told this process alone: taken out of it, before anything is started that would inherit."""
+
+    def __init__(self) -> None:
+        self.redis_url, self.secret = (os.environ.pop(name, "") for name in (URL_VARIABLE, SECRET_VARIABLE))
+
+
+def run_role(command: Role) -> int:
+    """Be one role of a run until it ends."""
+    role, given = command.role, RoleSecrets()
+    if isinstance(role, LauncherRole):
+        return launch(role)
+    warn_of_password(role.redis_url)
+    url = role.redis_url or given.redis_url
+    if not url:
+        raise ConfigError("--redis-url", url, f"say where the run's Redis is, or set {URL_VARIABLE}")
+    if isinstance(role, ActorRole | EvaluatorRole):
+        _play(role, RunConnection(role.run, url))
+        return 0
+    place = RunConnection(role.run, url, given.secret, role.secret_file, role.tls_folder)
+    if isinstance(role, ReplayRole):
+        from rmc.deploy.local import replay_process
+
+        replay_process.run_replay(place, role.folder, role.listen, role.shard)
+    else:
+        from rmc.deploy.local import learner_process
+
+        learner_process.run_learner(place, role.folder, role.device)
+    return 0
+
+
+def _play(role: ActorRole | EvaluatorRole, place: RunConnection) -> None:
+    from rmc.deploy.local import actor_process
+
+    if isinstance(role, ActorRole):
+        actor_process.run_actor(place, role.index)
+    else:
+        actor_process.run_evaluator(place)
+
+
+def launch(command: LauncherRole) -> int:
+    """Be the launcher of a run on Ray."""
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends it in order while no role is there yet, too
+    folder = RunFolder(command.run)
+    config = folder.config()
+    folder.lock()
+    launch_options = LaunchOptions(
+        folder.path, "resume", "ray", command.device, None, command.ray_address, command.all_cpus, command.tls
+    )
+    return training.conduct(config, folder, launch_options, terminal(400))

@@ -1,0 +1,130 @@
+"""The commands that look at a run or an environment, stop a run, or start a cluster, as dataclasses."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from rmc.analysis.baseline_settings import Algorithm, BaselineConfig
+from rmc.analysis.curves import Axis
+from rmc.cli.train_options import EnvOptions
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Play deterministic episodes with a run's checkpoint."""
+
+    run: Positional[Path]
+    """The run's folder."""
+    episodes: int = 10
+    """Episodes to play."""
+    seconds: float = 0.0
+    """Seconds after which no more are played: those that are over count, or else the first as far as it came. 0 plays
+    all."""
+    flicker: tuple[float, ...] = ()
+    """Probabilities of a missing observation, each of which is played; by default the run's own."""
+    checkpoint: str = "latest"
+    """latest, best of those evaluated while it trained, or the number of a checkpoint."""
+    video: Path | None = None
+    """Also write an episode to this file, like episode.mp4, with the first of the flicker probabilities."""
+    json: bool = False
+    """Print one line of JSON."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a run's policy as an ONNX file, for programs without torch."""
+
+    run: Positional[Path]
+    """The run's folder."""
+    out: Path = Path("policy.onnx")
+    """The file to write."""
+    checkpoint: str = "latest"
+    """latest, best of those evaluated while it trained, or the number of a checkpoint."""
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Show what a run's world model knows: a picture of one episode, predicted against real."""
+
+    run: Positional[Path]
+    """The run's folder."""
+    out: Path = Path("inspect.png")
+    """The picture to write."""
+    checkpoint: str = "latest"
+    """latest, best of those evaluated while it trained, or the number of a checkpoint."""
+
+
+@dataclass(frozen=True)
+class CheckEnv:
+    """Play an environment at random, and say whether it can be trained on and what to mend."""
+
+    env: EnvOptions
+    steps: int = 2_000
+    """Random steps to play."""
+
+
+@dataclass(frozen=True)
+class Baseline(BaselineConfig):
+    """Train an agent of stable-baselines3 in the same environment, to compare with; or go on with such a run."""
+
+    algorithm: Positional[Algorithm]
+    """Which one."""
+    env: EnvOptions
+    run_dir: Path | None = None
+    """The run's folder; by default runs/<env>__<algorithm>-<settings>__<seed>__<time>. The same one goes on."""
+
+    def config(self) -> BaselineConfig:
+        """The run's config."""
+        own = {item.name: getattr(self, item.name) for item in dataclasses.fields(BaselineConfig)}
+        return BaselineConfig(**own | {"env": self.env.config()})
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Draw the returns of runs as curves, and print them as a table, by environment and agent."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Folders of runs, or files of JSON lines as a study writes them."""
+    out: Path = Path("curves.png")
+    """The picture to write."""
+    by: Axis = "env_steps"
+    """What returns are drawn over."""
+    reference: str | None = None
+    """The agent, by its name in the table, that the others are scaled by and compared with."""
+
+
+@dataclass(frozen=True)
+class Stats:
+    """Show the newest metrics of a run."""
+
+    run: Positional[Path]
+    """The run's folder."""
+
+
+@dataclass(frozen=True)
+class Attach:
+    """Watch a run that is being trained; Ctrl-C only stops watching."""
+
+    run: Positional[Path]
+    """The run's folder."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """End a run in order; rmc train with its folder goes on with it."""
+
+    run: Positional[Path]
+    """The run's folder."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Bring the machines of a Ray cluster up, or take them down, and see that all of them are."""
+
+    action: Positional[Literal["up", "down"]]
+    """What to do."""
+    config: Positional[Path]
+    """The cluster's file; deploy/cluster/ has some to start from."""

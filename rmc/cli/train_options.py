@@ -1,0 +1,98 @@
+"""``rmc train`` as a dataclass; tyro makes ``--help`` of it. Options of the roles' configs are flat."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.constructors import PrimitiveConstructorSpec
+
+from rmc.actors.config import ActorConfig, EvaluatorConfig
+from rmc.common.agent_config import AgentConfig
+from rmc.common.env.config import EnvConfig, read_kwargs, write_kwargs
+from rmc.deploy.run.config import Preset, RunConfig, WindowConfig
+from rmc.deploy.run.launch_options import IfExists, Launcher, LaunchOptions
+from rmc.learner.config import LearnerConfig, UpdateConfig
+from rmc.replay_server.config import ReplayConfig
+
+KEYWORDS = PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="NAME=VALUE",
+    instance_from_str=read_kwargs,
+    is_instance=lambda value: isinstance(value, dict),
+    str_from_instance=write_kwargs,
+)
+
+
+@dataclass(frozen=True)
+class EnvOptions(EnvConfig):
+    """The environment, its id without a flag."""
+
+    id: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
+    """Gymnasium id, like HalfCheetah-v5 or dm_control/walker-walk-v0, or module:EnvId-v0 for your own."""
+    env_kwargs: Annotated[dict[str, Any], KEYWORDS] = field(default_factory=dict)
+    """Keywords that the environment is made with, like goal=1.5 map=maze pose=[0,1]: numbers, words, JSON."""
+
+    def config(self) -> EnvConfig:
+        """The same, as the roles know it."""
+        return EnvConfig(**dataclasses.asdict(self))
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train an agent, or go on with a run."""
+
+    env: EnvOptions
+    window: WindowConfig
+    agent: AgentConfig
+    actor: ActorConfig
+    replay: ReplayConfig
+    update: UpdateConfig
+    learner: LearnerConfig
+    evaluator: EvaluatorConfig
+    preset: Preset = "robust"
+    """Where the other options' defaults come from."""
+    seed: int = 0
+    """Seed of networks, environments, noise and sampling."""
+    total_steps: int = 1_000_000
+    """Environment steps of the run, over all actors."""
+    actors: int = 1
+    """Actor processes."""
+    run_dir: Path | None = None
+    """The run's folder; by default runs/<env>__<preset>__<seed>__<time>."""
+    if_exists: IfExists = "resume"
+    """What to do if the run's folder is there: go on, refuse, or take a new one beside it."""
+    launcher: Launcher = "local"
+    """Processes on this machine; on a Ray cluster; every role in one thread, the same seed giving the same bits; or
+    by hand."""
+    device: str = "cpu"
+    """The learner's device: cpu or cuda."""
+    redis_url: str | None = None
+    """A Redis of your own: unix:///path, redis://host:port, rediss://… or file:PATH, which holds such a line; by
+    default an embedded one."""
+    ray_address: str = "auto"
+    """With --launcher ray: auto finds the cluster that this machine is in, local starts one for this run alone."""
+    all_cpus: bool = False
+    """With --launcher ray: an actor for every CPU left, also of nodes that join later, in place of --actors."""
+    tls: bool = False
+    """With --launcher ray: encrypt what the roles say across machines; needs a Redis server built with TLS on the
+    head."""
+
+    def config(self) -> RunConfig:
+        """The run's config."""
+        own = {item.name: getattr(self, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
+        return RunConfig(env=self.env.config(), **own)
+
+    def launch_options(self) -> LaunchOptions:
+        """Where and on what it runs."""
+        return LaunchOptions(
+            self.run_dir,
+            self.if_exists,
+            self.launcher,
+            self.device,
+            self.redis_url,
+            self.ray_address,
+            self.all_cpus,
+            self.tls,
+        )
