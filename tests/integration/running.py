@@ -74,7 +74,7 @@ class Training:
 
     def role(self, name: str) -> psutil.Process | None:
         """A role's process; the role's name is ``actor``, ``replay``, ``learner``, ``evaluator`` or ``redis``."""
-        pattern = "unixsocket" if name == "redis" else rf"rmc\.cli\.main {name} "
+        pattern = "unixsocket" if name == "redis" else rf"rmc\.cli\.main role {name} "
         for child in self.launcher.children(recursive=True):
             try:
                 if re.search(pattern, " ".join(child.cmdline())):
