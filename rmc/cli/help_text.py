@@ -1,8 +1,9 @@
 """``rmc train --help`` shows the basic options; ``--help-all`` shows all of them."""
 
 import dataclasses
+import functools
 import typing
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -22,13 +23,17 @@ def only_basic(command: Any) -> Any:
     hints = typing.get_type_hints(kind, include_extras=True)
     values = {item.name: getattr(command, item.name) for item in dataclasses.fields(command)}
     values |= {name: only_basic(value) for name, value in values.items() if dataclasses.is_dataclass(value)}
-    changed = [
-        (name, type(value), dataclasses.field(default=value))
-        if dataclasses.is_dataclass(value)
-        else (name, tyro.conf.Suppress[hints[name]], dataclasses.field(default_factory=lambda value=value: value))
-        for name, value in values.items()
-        if dataclasses.is_dataclass(value) or name not in BASIC
-    ]
+    changed: list[tuple[str, Any, Any]] = []
+    for name, value in values.items():
+        if dataclasses.is_dataclass(value):
+            changed.append((name, type(value), dataclasses.field(default=value)))
+        elif name not in BASIC:
+            default = dataclasses.field(default_factory=functools.partial(_same, value))
+            changed.append((name, Annotated[hints[name], tyro.conf.Suppress], default))
     shown = dataclasses.make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True)
     shown.__doc__ = kind.__doc__
     return shown(**values)
+
+
+def _same(value: Any) -> Any:
+    return value
