@@ -98,6 +98,8 @@ class HostCopy:
 class DeviceUpdate:
     """An update of batches of one size. A checkpoint must be taken up before the first call, not after."""
 
+    pending = 0  # batches whose results are not given back yet
+
     def __init__(self, update: JointUpdate, spec: WindowSpec, batch_size: int) -> None:
         device = update.agent.log_alpha.device
         self._update, self._spec = update, spec
@@ -109,14 +111,24 @@ class DeviceUpdate:
             self._copy = CopiesAhead([self._raw, self._importance])
             self.in_flight = 1
 
-    def __call__(self, raw: Tensor, importance: Tensor, beta: float) -> UpdateResult:
-        """(B, row bytes) uint8 without padding, (B,) float32. What it returns is overwritten by the next call.
+    def __call__(self, raw: Tensor, importance: Tensor, beta: float, number: int) -> list[UpdateResult]:
+        """(B, row bytes) uint8 without padding, (B,) float32, and the update's number; its result, which the next call
+        overwrites.
 
         On a GPU this only launches. ``raw`` may be written again once the update's priorities are on the host.
         """
         self._copy([raw, importance])
         self._beta.fill_(beta)
-        return self._work()
+        result = self._work()
+        self._update.update_ema(number)
+        return [result]
+
+    def drain(self) -> list[UpdateResult]:
+        """Nothing is pending."""
+        return []
+
+    def close(self) -> None:
+        """Nothing is to be ended."""
 
     def _once(self) -> UpdateResult:
         return self._update(view_batch(self._raw, self._importance, self._spec), self._beta)

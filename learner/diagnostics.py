@@ -20,7 +20,7 @@ SLICE = 4  # windows of a batch that are looked at
 
 
 class Trace(NamedTuple):
-    """What a forward pass computed on its way, without gradient, to be measured."""
+    """What critics, policy and temperature computed on their way, without gradient, to be measured."""
 
     losses: dict[str, Tensor]  # scalars
     alpha: Tensor  # scalar
@@ -28,24 +28,31 @@ class Trace(NamedTuple):
     q: Tensor  # (2, B, L_t)
     td_error: Tensor  # (B, L_t)
     curiosity: Tensor  # (B, L_t)
-    hidden_change: Tensor  # (B, L_t, H), what the world model predicts
     reward: Tensor  # (B, L_t)
-    terminated: Tensor  # (B, L_t)
     m: Tensor  # (B, L_t), which steps are real
 
 
-def update_metrics(trace: Trace, beta: Tensor, model_norm: Literal["l1", "l2"]) -> dict[str, Tensor]:
-    """Scalars of one update, on its device."""
+def model_metrics(
+    of_losses: dict[str, Tensor], hidden_change: Tensor, curiosity: Tensor, terminated: Tensor, m: Tensor,
+    norm: Literal["l1", "l2"],
+) -> dict[str, Tensor]:  # fmt: skip
+    """Scalars of the model's pass; ``hidden_change`` (B, L_t, H) is what it predicts, the others (B, L_t)."""
+    unmoved = losses.model_error(torch.zeros_like(hidden_change), hidden_change, norm)
+    no_change = losses.model_loss(unmoved, terminated, m)
+    return of_losses | {
+        "model_unexplained": of_losses["model_loss"] / no_change.clamp(min=1e-8),
+        "curiosity_mean": losses.masked_mean(curiosity, m),
+    }
+
+
+def value_metrics(trace: Trace, beta: Tensor) -> dict[str, Tensor]:
+    """Scalars of the critics' and the policy's pass."""
     m, i = trace.m, trace.curiosity
-    unmoved = losses.model_error(torch.zeros_like(trace.hidden_change), trace.hidden_change, model_norm)
-    no_change = losses.model_loss(unmoved, trace.terminated, m)
     return trace.losses | {
         "alpha": trace.alpha,
         "entropy": -losses.masked_mean(trace.log_pi, m),
         "q_mean": losses.masked_mean(trace.q.mean(0), m),
         "td_error": losses.masked_mean(trace.td_error, m),
-        "model_unexplained": trace.losses["model_loss"] / no_change.clamp(min=1e-8),
-        "curiosity_mean": losses.masked_mean(i, m),
         "curiosity_share": beta * i.sum() / (beta * i.sum() + (m * trace.reward.abs()).sum()).clamp(min=1e-8),
     }
 

@@ -7,7 +7,7 @@ import pickle
 import time
 from collections import deque
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import safetensors.torch
@@ -22,12 +22,13 @@ from rmc.common.checkpoint import POLICY, PROGRESS, STATE, CheckpointFolder
 from rmc.common.errors import CheckpointError, FencedError, RmcError
 from rmc.common.metrics import Means, Rate
 from rmc.common.replay import Replay, Sample, SampleStatus
-from rmc.common.window import Rows, WindowSpec
+from rmc.common.window import BoolArray, WindowSpec
 from rmc.learner.batch import clear_padding, importance_weights
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.learner.device_update import DeviceUpdate, HostCopy
 from rmc.learner.diagnostics import SLICE, latent_rank, measurable, staleness
-from rmc.learner.update import AVERAGE_UPDATES, UpdateResult, make_update
+from rmc.learner.pipelined_update import PipelinedUpdate
+from rmc.learner.update import UpdateResult, make_update
 
 log = logging.getLogger(__name__)
 NOT_OURS = (pickle.UnpicklingError, EOFError, RuntimeError, LookupError, ValueError, TypeError, AttributeError)
@@ -43,6 +44,14 @@ def bf16_is_native(device: torch.device) -> bool:
     if device.type == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
+
+
+class Drawn(NamedTuple):
+    """What is kept of a batch while it is learnt from; (B,) each."""
+
+    serial: NDArray[np.int64]
+    weights_update: NDArray[np.int64]
+    measurable: BoolArray
 
 
 class Learner:
@@ -65,7 +74,9 @@ class Learner:
         checkpoints: CheckpointFolder,
         seed: int,
         device: str = "cpu",
+        threads: tuple[int, int] = (0, 0),
     ) -> None:
+        """``threads`` are those of an update's two halves, value and model, if each is to have a process."""
         self.spec, self.config, self.replay, self.bus, self.checkpoints = spec, config, replay, bus, checkpoints
         self.device = torch.device(device)
         self.updates = self.env_steps = self.last_checkpoint = self._checkpoint_steps = 0
@@ -81,7 +92,12 @@ class Learner:
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent).to(self.device)
         bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_is_native(self.device))
         self.update = make_update(self.agent, spec.burn_in, update, seed, bf16)
-        self._updated = DeviceUpdate(self.update, spec, config.batch_size)
+        self._updated: DeviceUpdate | PipelinedUpdate = (
+            PipelinedUpdate(self.update, spec, config.batch_size, threads)
+            if threads[1]
+            else DeviceUpdate(self.update, spec, config.batch_size)
+        )
+        self._drawn: deque[Drawn] = deque()  # what is being learnt from
         self._returning: deque[tuple[NDArray[np.int64], HostCopy]] = deque()  # priorities, and of which windows
         checkpoints.lock()
         floor = max(self._resume(), checkpoints.last_epoch())
@@ -106,7 +122,7 @@ class Learner:
         sample = self.replay.sample(self.config.batch_size)
         self.env_steps = max(self.env_steps, sample.env_steps)
         if sample.draw is not SampleStatus.BATCH:
-            self._return_priorities(leave=0)
+            self._settle()
         if sample.draw is SampleStatus.WAIT:
             self._waiting = "experience"
             self._publish_if_forgotten()
@@ -115,12 +131,11 @@ class Learner:
             self._waiting = "disk"
             self.finished = self.checkpoint()
             return self.finished
-        if self.updates == 0:
+        if self.updates + len(self._drawn) == 0:
             self._freeze_statistics()
         self._learn(sample)
-        if self.updates % self.config.publish_updates == 0:
-            self.publish()
         if self.env_steps >= self._next_checkpoint:
+            self._settle()
             self.checkpoint()
         return True
 
@@ -132,14 +147,33 @@ class Learner:
         self._largest_reward = max(self._largest_reward, float(np.abs(rows["reward"]).max()))
         weights = importance_weights(values, sample.total_weight, sample.windows, self.config.importance_exponent)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
-        updated = self._updated(raw, torch.from_numpy(weights), self.update.config.beta(self.env_steps))
+        self._drawn.append(Drawn(rows["serial"].copy(), rows["weights_update"].copy(), measurable(rows, self.spec)))
+        number = self.updates + len(self._drawn)
+        beta = self.update.config.beta(self.env_steps)
+        for updated in self._updated(raw, torch.from_numpy(weights), beta, number):
+            self._finish(updated)
+        if number % self.config.publish_updates == 0 or number % INSIGHT_UPDATES == 1:
+            self._finish_pending()
+
+    def _finish_pending(self) -> None:
+        for updated in self._updated.drain():
+            self._finish(updated)
+
+    def _finish(self, updated: UpdateResult) -> None:
+        """All that follows an update. Weights are read only where none is pending."""
         self.updates += 1
-        if self.update.config.policy_average and self.updates % AVERAGE_UPDATES == 0:
-            self.update.update_ema(self.updates)
-        self._returning.append((rows["serial"].copy(), HostCopy(updated.priorities)))
+        drawn = self._drawn.popleft()
+        self._returning.append((drawn.serial, HostCopy(updated.priorities)))
         self._return_priorities(leave=self._updated.in_flight)
         self._measure(updated)
-        self._measure_age(rows)
+        self._measure_age(drawn)
+        if self.updates % self.config.publish_updates == 0:
+            self.publish()
+
+    def _settle(self) -> None:
+        """Finish what is pending and give all priorities back."""
+        self._finish_pending()
+        self._return_priorities(leave=0)
 
     def _return_priorities(self, leave: int) -> None:
         """To the replay server, but for the newest so many, which a GPU still works on."""
@@ -157,14 +191,14 @@ class Learner:
             self._means.add("latent_deviation", deviation)
             self._unexplained = [round(share, 4) for share in updated.observation_unexplained.tolist()]
 
-    def _measure_age(self, rows: Rows) -> None:
+    def _measure_age(self, drawn: Drawn) -> None:
         """How old what was sampled is: in weight versions, and in what today's weights would remember instead."""
         if self.updates % METRICS_UPDATES == 0:
-            age = self.updates - rows["weights_update"]
+            age = self.updates - drawn.weights_update
             self._means.add("sample_age_mean", float(age.mean()))
             self._means.add("sample_age_max", float(age.max()))
         if self.updates % INSIGHT_UPDATES == 1:
-            for serial in rows["serial"][measurable(rows, self.spec)][:SLICE].tolist():
+            for serial in drawn.serial[drawn.measurable][:SLICE].tolist():
                 episode = self.replay.episode(serial)
                 for name, value in (staleness(self.agent, self.spec, episode) if episode is not None else {}).items():
                     self._means.add(name, value)
@@ -299,12 +333,14 @@ class Learner:
 
     def close(self) -> None:
         """Save what a resumed run needs, unless that is done, a newer learner has taken over, or training diverged."""
-        spoilt = self._fenced or self._diverged
-        if not self.finished and not spoilt and self.updates > self.last_checkpoint:
-            try:
-                self.save()
-            except RmcError as error:  # diverged since the last look, or no room: the checkpoint before is kept
-                log.warning("%s; the checkpoint of update %d is the last", error, self.last_checkpoint)
+        try:
+            if not (self.finished or self._fenced or self._diverged):
+                self._settle()
+                if self.updates > self.last_checkpoint:
+                    self.save()
+        except RmcError as error:  # diverged since the last look, or no room: the checkpoint before is kept
+            log.warning("%s; the checkpoint of update %d is the last", error, self.last_checkpoint)
+        self._updated.close()
         self.checkpoints.unlock()
 
 

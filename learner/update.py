@@ -18,11 +18,13 @@ from rmc.common.agent import Agent, MemoryOutput, Prediction, squashed_sample
 from rmc.learner import losses
 from rmc.learner.batch import Batch
 from rmc.learner.config import UpdateConfig
-from rmc.learner.diagnostics import Trace, unexplained_change, update_metrics
+from rmc.learner.diagnostics import Trace, model_metrics, unexplained_change, value_metrics
 from rmc.learner.fused import fuse
 from rmc.learner.unroll import impute, unroll
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
+MODEL_PARTS = ("memory", "world_model", "next_frame")
+VALUE_PARTS = ("critic", "policy", "log_alpha")
 AVERAGE_UPDATES = 10  # updates between moves of the policy's average, which reads and writes all that acts
 TRAINS_MEMORY = {  # the paper's table 1
     1: {"model", "value"},
@@ -34,15 +36,36 @@ TRAINS_MEMORY = {  # the paper's table 1
 }
 
 
+class ModelPass(NamedTuple):
+    """What memory and world model make of a batch, for critics, policy and temperature."""
+
+    z: Tensor  # (B, L_t + 1, Z), what the heads read
+    next_z: Tensor  # (B, L_t, Z), what the target reads, without gradient
+    curiosity: Tensor  # (B, L_t), scaled where configured
+    curiosity_variance: Tensor  # (2,), as it is after this batch
+    hidden: Tensor  # (B, L_t + 1, H), for the latent's rank
+    observation_unexplained: Tensor  # (O,), see ``diagnostics.unexplained_change``; (0,) without grounding
+    metrics: dict[str, Tensor]  # scalars
+
+
+class ValuePass(NamedTuple):
+    """What critics, policy and temperature make of it."""
+
+    priorities: Tensor  # (B,)
+    metrics: dict[str, Tensor]  # scalars
+
+
 class UpdateResult(NamedTuple):
     """What an update gives back, all on the device and without gradient."""
 
     priorities: Tensor  # (B,)
     metrics: dict[str, Tensor]  # scalars
-    curiosity_variance: Tensor  # (2,), as it is after this batch
-    hidden: Tensor  # (B, L_t + 1, H), for the latent's rank
+    hidden: Tensor  # (B, L_t + 1, H)
     observed: Tensor  # (B, L_t + 1) bool, which of them are real
-    observation_unexplained: Tensor  # (O,), see ``diagnostics.unexplained_change``; (0,) without grounding
+    observation_unexplained: Tensor  # (O,)
+
+
+Losses = dict[str, Tensor]
 
 
 class JointUpdate:
@@ -62,22 +85,26 @@ class JointUpdate:
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
-        return [_adam(self.agent, self.config, "memory", "world_model", "next_frame", "critic", "policy", "log_alpha")]
+        return [_adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, VALUE_PARTS)]
 
     def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
         """One update from a Batch; ``beta`` is a scalar tensor."""
-        loss_values, updated = self.forward(batch, beta)
-        norm = self._step(self.optimizers[0], loss_values.values())
-        self._follow(updated)
-        return updated._replace(metrics=updated.metrics | {"grad_norm": norm})
+        loss_values, model, value = self.forward(batch, beta)
+        norm = self.step(self.optimizers, loss_values.values())
+        self.follow_model(model)
+        self.follow_value()
+        return self.result(batch, model, value, norm)
 
-    def forward(self, batch: Batch, beta: Tensor) -> tuple[dict[str, Tensor], UpdateResult]:
+    def forward(self, batch: Batch, beta: Tensor) -> tuple[Losses, ModelPass, ValuePass]:
         """Every loss from the parameters as they stand, in the order of the paper's section 3."""
+        model_losses, model = self.model_pass(batch)
+        value_losses, value = self.value_pass(batch, model, beta)
+        return model_losses | value_losses, model, value
+
+    def model_pass(self, batch: Batch) -> tuple[Losses, ModelPass]:
+        """Memory, prediction and curiosity; reads nothing of critics, policy and temperature."""
         agent, c = self.agent, self.config
-        steps = slice(self.burn_in, None)
-        a, r, d = batch.action[:, steps], batch.reward[:, steps], batch.terminated[:, steps]
-        m = batch.step_valid[:, steps].float()
-        alpha = agent.log_alpha.exp().detach()
+        a, _, d, m = _trained(batch, self.burn_in)
         with torch.no_grad():
             o = agent.normalizer(batch.observation, batch.missing)
         with self._autocast():
@@ -85,25 +112,34 @@ class JointUpdate:
             o = impute(agent, o, batch, self.burn_in)
             memory = unroll(agent.memory, o, batch, self.burn_in)
             z = self._to_bf16(agent.features(memory))
-            trains = TRAINS_MEMORY[c.scheme]
-            z_model, z_value, z_policy = (z if loss in trains else z.detach() for loss in ("model", "value", "policy"))
 
             # Prediction, and curiosity from its error
             target = self._unroll_target(o, batch) if self._has_target_memory else memory
             latent = (target if c.latent_target == "ema" else memory).hidden.detach().float()
-            prediction = agent.world_model(z_model[:, :-1], a)
+            prediction = agent.world_model((z if "model" in TRAINS_MEMORY[c.scheme] else z.detach())[:, :-1], a)
             change = latent[:, 1:] - latent[:, :-1]
             error = losses.model_error(prediction.hidden_change.float(), change, c.model_norm)
             i, curiosity_variance = self._scaled(losses.curiosity(error, d, m), m)
+            next_z = (self._to_bf16(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:].detach()
+        loss_values = {"model_loss": losses.model_loss(error, d, m)}
+        observation_losses, unexplained = self._observation_losses(o, memory, prediction, batch, m)
+        loss_values |= observation_losses
+        metrics = model_metrics(_detached(loss_values), change, i, d, m, c.model_norm)
+        return loss_values, ModelPass(z, next_z, i, curiosity_variance, memory.hidden.detach(), unexplained, metrics)
 
-            # Intuition: one policy sample for every step serves both the target and the policy loss
+    def value_pass(self, batch: Batch, model: ModelPass, beta: Tensor) -> tuple[Losses, ValuePass]:
+        """Intuition: one policy sample for every step serves both the target and the policy loss."""
+        agent, c, z = self.agent, self.config, model.z
+        a, r, d, m = _trained(batch, self.burn_in)
+        alpha = agent.log_alpha.exp().detach()
+        z_value, z_policy = (z if loss in TRAINS_MEMORY[c.scheme] else z.detach() for loss in ("value", "policy"))
+        with self._autocast():
             mean, log_std = agent.policy(z_policy)
             pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean))
             with torch.no_grad():
-                next_z = (self._to_bf16(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:]
-                next_q = self.target_critic(next_z, pi[:, 1:])
+                next_q = self.target_critic(model.next_z, pi[:, 1:])
                 next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:])
-                y = losses.td_target(r + beta * i, c.gamma, d, next_value, m, c.n_step)
+                y = losses.td_target(r + beta * model.curiosity, c.gamma, d, next_value, m, c.n_step)
             q = agent.critic(z_value[:, :-1], a)
             frozen = {name: value.detach() for name, value in agent.critic.named_parameters()}
             z_actor = z_policy if c.policy_through_q else z.detach()
@@ -112,23 +148,18 @@ class JointUpdate:
 
         log_pi, td_error = log_pi[:, :-1], (q.detach() - y).abs().mean(0)
         loss_values = {
-            "model_loss": losses.model_loss(error, d, m),
             "q_loss": losses.q_loss(q, y, batch.importance, m),
             "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, m),
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
-        observation_losses, unexplained = self._observation_losses(o, memory, prediction, batch, m)
-        loss_values |= observation_losses
-        detached = {name: value.detach() for name, value in loss_values.items()}
-        trace = Trace(detached, alpha, log_pi.detach(), q.detach(), td_error, i, change, r, d, m)
-        return loss_values, UpdateResult(
-            priorities=losses.priority(td_error, c.eta, m),
-            metrics=update_metrics(trace, beta, c.model_norm),
-            curiosity_variance=curiosity_variance,
-            hidden=memory.hidden.detach(),
-            observed=batch.observation_valid[:, steps],
-            observation_unexplained=unexplained,
-        )
+        trace = Trace(_detached(loss_values), alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m)
+        return loss_values, ValuePass(losses.priority(td_error, c.eta, m), value_metrics(trace, beta))
+
+    def result(self, batch: Batch, model: ModelPass, value: ValuePass, norm: Tensor) -> UpdateResult:
+        """What an update gives back of its passes; ``norm`` is the gradient's."""
+        metrics = model.metrics | value.metrics | {"grad_norm": norm}
+        observed = batch.observation_valid[:, self.burn_in :]
+        return UpdateResult(value.priorities, metrics, model.hidden, observed, model.observation_unexplained)
 
     def _observation_losses(
         self, o: Tensor, memory: MemoryOutput, prediction: Prediction, batch: Batch, m: Tensor
@@ -174,7 +205,7 @@ class JointUpdate:
         running, weight = moved.unbind()
         return i / (running / weight).sqrt().clamp(min=1e-6), moved
 
-    def _step(self, optimizer: torch.optim.Adam, loss_values: Iterable[Tensor]) -> Tensor:
+    def step(self, optimizers: Iterable[torch.optim.Adam], loss_values: Iterable[Tensor]) -> Tensor:
         """Backward from the losses' sum, clip, Adam; returns the gradient's norm before clipping."""
         self.agent.zero_grad(set_to_none=True)
         sum(loss_values, torch.zeros_like(self.agent.log_alpha)).backward()  # type: ignore[no-untyped-call]
@@ -182,25 +213,32 @@ class JointUpdate:
         norm = nn.utils.get_total_norm(gradients)
         if self.config.clip_norm:
             nn.utils.clip_grads_with_norm_(self.agent.parameters(), self.config.clip_norm, norm)
-        optimizer.step()
+        for optimizer in optimizers:
+            optimizer.step()
         return norm.detach()
 
-    def _follow(self, updated: UpdateResult) -> None:
-        """What follows the step: targets by Polyak, and the running variance."""
-        self._polyak(self.target_critic.parameters(), self.agent.critic.parameters())
+    def follow_model(self, model: ModelPass) -> None:
+        """What follows the memory's step: its target by Polyak, and the running variance."""
         if self._has_target_memory:
             self._polyak(self.target_memory.parameters(), self.agent.memory.parameters())
-        self.curiosity_variance.copy_(updated.curiosity_variance)
+        self.curiosity_variance.copy_(model.curiosity_variance)
+
+    def follow_value(self) -> None:
+        """What follows the critics' step: their target by Polyak."""
+        self._polyak(self.target_critic.parameters(), self.agent.critic.parameters())
 
     @torch.no_grad()
     def _polyak(self, target: Iterable[Tensor], source: Iterable[Tensor]) -> None:
         torch._foreach_lerp_(list(target), list(source), 1.0 - self.config.polyak)
 
     @torch.no_grad()
-    def update_ema(self, updates: int) -> None:
-        """Move theta-bar of algorithm 1 towards what acts; every ``AVERAGE_UPDATES``, the last time at ``updates``."""
-        over = min(self.config.policy_average, updates / 10) / AVERAGE_UPDATES
-        torch._foreach_lerp_(list(self.average.values()), list(self.agent.acting().values()), 1.0 / max(1.0, over))
+    def update_ema(self, updates: int, parts: tuple[str, ...] = MODEL_PARTS + VALUE_PARTS) -> None:
+        """Every ``AVERAGE_UPDATES``, move those ``parts`` of theta-bar of algorithm 1 towards what acts."""
+        if self.config.policy_average and updates % AVERAGE_UPDATES == 0:
+            over, acting = min(self.config.policy_average, updates / 10) / AVERAGE_UPDATES, self.agent.acting()
+            names = [name for name in self.average if name.startswith(parts)]
+            averaged, newest = [self.average[name] for name in names], [acting[name] for name in names]
+            torch._foreach_lerp_(averaged, newest, 1.0 / max(1.0, over))
 
     def policy_weights(self) -> dict[str, Tensor]:
         """What checkpoints hold and evaluations play: theta-bar, with what normalises observations now."""
@@ -226,7 +264,7 @@ class JointUpdate:
         self.target_memory.load_state_dict(state["target_memory"])
         for name, value in self.average.items():
             value.copy_(state["average"][name])
-        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
+        for optimizer, saved in zip(self.optimizers, _by_optimizer(state["optimizers"], self.optimizers), strict=True):
             capturable = optimizer.defaults["capturable"]
             optimizer.load_state_dict(saved)
             for group in optimizer.param_groups:
@@ -267,14 +305,17 @@ class AlternateUpdate(JointUpdate):
         metrics: dict[str, Tensor] = {}
         norms = []
         for optimizer, (part, names) in zip(self.optimizers, self._stages(), strict=True):
-            loss_values, stage = self.forward(batch, beta)
+            loss_values, model, value = self.forward(batch, beta)
             stage_losses = {name: loss for name, loss in loss_values.items() if name in names}
-            norms.append(self._step(optimizer, stage_losses.values()))
-            metrics |= {name: stage.metrics[name] for name in stage_losses}
+            norms.append(self.step([optimizer], stage_losses.values()))
+            metrics |= _detached(stage_losses)
             if part == "critic":
-                updated = stage
-        self._follow(updated)
-        return updated._replace(metrics=updated.metrics | metrics | {"grad_norm": torch.stack(norms).norm()})
+                of_critics = model, value
+        model, value = of_critics
+        self.follow_model(model)
+        self.follow_value()
+        updated = self.result(batch, model, value, torch.stack(norms).norm())
+        return updated._replace(metrics=updated.metrics | metrics)
 
 
 def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:
@@ -295,8 +336,9 @@ def _target_copy(module: ModuleT) -> ModuleT:
 def _adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
     """Adam for the parts of the agent that are named; memory and temperature have step sizes of their own."""
     heads = [part for part in parts if part not in ("memory", "log_alpha") and getattr(agent, part) is not None]
+    memory = list(agent.memory.parameters()) if "memory" in parts else []
     groups = [
-        {"params": list(agent.memory.parameters()), "lr": config.learning_rate * config.memory_learning_scale},
+        {"params": memory, "lr": config.learning_rate * config.memory_learning_scale},
         {
             "params": [value for part in heads for value in getattr(agent, part).parameters()],
             "lr": config.learning_rate,
@@ -305,6 +347,35 @@ def _adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
     ]
     on_gpu = agent.log_alpha.device.type == "cuda"
     return torch.optim.Adam([group for group in groups if group["params"]], fused=True, capturable=on_gpu)
+
+
+def _by_optimizer(saved: list[dict[str, Any]], optimizers: list[torch.optim.Adam]) -> list[dict[str, Any]]:
+    """The states of the optimizers; version 0.1.0 saved one for all parts, in the same order."""
+    if len(saved) == len(optimizers):
+        return saved
+    states, begin = [], 0
+    for optimizer in optimizers:
+        groups = optimizer.state_dict()["param_groups"]
+        end = begin + sum(len(group["params"]) for group in groups)
+        moments = {number - begin: moment for number, moment in saved[0]["state"].items() if begin <= number < end}
+        states.append({"state": moments, "param_groups": groups})
+        begin = end
+    return states
+
+
+def _trained(batch: Batch, burn_in: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """a_t, r_t, d_t and the mask m_t of the trained steps: (B, L_t, A), (B, L_t) each."""
+    steps = slice(burn_in, None)
+    return (
+        batch.action[:, steps],
+        batch.reward[:, steps],
+        batch.terminated[:, steps],
+        batch.step_valid[:, steps].float(),
+    )
+
+
+def _detached(values: Losses) -> Losses:
+    return {name: value.detach() for name, value in values.items()}
 
 
 def _seen(batch: Batch) -> Tensor:

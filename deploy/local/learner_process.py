@@ -16,6 +16,7 @@ from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.preflight import check_device, cores
 from rmc.learner.learner import Learner
+from rmc.learner.pipelined_update import can_be_apart
 from rmc.learner.replay_client import ReplayClient
 from rmc.learner.sharded_replay import ShardedReplay
 
@@ -24,7 +25,9 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
     """The learner's process; checkpoints go to ``folder``. Its last record says ``finished`` where the run is."""
     secret, process = place.secret(), Process(place)
     config, spec, bus = process.config, process.config.window_spec(), process.bus
-    torch.set_num_threads(config.learner.threads or max(1, cores() - 1))
+    threads = config.learner.threads or max(min(2, cores()), cores() - 1)
+    model_threads = (threads + 1) // 2 if device == "cpu" and can_be_apart(config.update) and threads > 1 else 0
+    torch.set_num_threads(1 if model_threads else threads)  # until the model's half has its process
     check_device(device)
     wait_for_room(bus, Learner.name, process.stop)
     pinned, batch = device.startswith("cuda"), config.learner.batch_size
@@ -32,7 +35,10 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
     clients = replay_clients(config, bus, secret, pinned, context)
     replay = clients[0] if len(clients) == 1 else ShardedReplay(clients, spec, batch, config.seed, pinned)
     checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
-    learner = Learner(spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device)
+    learner = Learner(
+        spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device,
+        (threads - model_threads, model_threads),
+    )  # fmt: skip
     run_role(learner, bus, process.stop, lambda: learner.finished)
     for client in clients:
         client.close()

@@ -89,7 +89,7 @@ def test_the_policy_reaches_the_memory_by_its_own_input_alone_if_told_so(scheme)
         if stop_own:
             act = update.agent.policy.forward
             update.agent.policy.forward = lambda z: act(z.detach())
-        parts, _ = update.forward(to_batch(random_rows(8)), BETA)
+        parts, *_ = update.forward(to_batch(random_rows(8)), BETA)
         (gradient,) = torch.autograd.grad(parts["policy_loss"], [update.agent.memory.gru.weight_hh_l0])
         return gradient
 
@@ -120,7 +120,7 @@ def test_grounding_reaches_memory_and_world_model(monkeypatch):
 def test_what_fills_blanks_trains_itself_alone():
     config = dataclasses.replace(ROBUST, fill_blanks=True)
     spec, update = dataclasses.replace(SPEC, state=config.state_size(SPEC.obs_dim)), make(config, scheme=4)
-    parts, _ = update.forward(to_batch(random_rows(8, spec=spec), spec), BETA)
+    parts, *_ = update.forward(to_batch(random_rows(8, spec=spec), spec), BETA)
     named = dict(update.agent.named_parameters())
     for loss in parts:
         found = torch.autograd.grad(parts[loss], list(named.values()), retain_graph=True, allow_unused=True)

@@ -1,0 +1,230 @@
+"""An update's two halves on two cores: memory and world model in a process of their own, some batches ahead.
+
+With scheme 3 no loss of memory and world model reads critics, policy or temperature. So nothing flows back, and all
+numbers are those of the halves one after the other. Weights and moments of both lie in memory that both processes see;
+whoever reads them calls ``drain`` first. Shapes: B batch.
+"""
+
+import mmap
+import os
+import signal
+import socket
+import struct
+import sys
+import traceback
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import cycle
+from typing import NoReturn
+
+import setproctitle
+import torch
+from torch import Tensor
+
+from rmc.common.errors import RmcError
+from rmc.common.process.parent_death import exit_with_parent
+from rmc.common.window import WindowSpec
+from rmc.learner.batch import Batch, view_batch
+from rmc.learner.config import UpdateConfig
+from rmc.learner.update import (
+    MODEL_PARTS,
+    TRAINS_MEMORY,
+    VALUE_PARTS,
+    JointUpdate,
+    ModelPass,
+    UpdateResult,
+)
+
+AHEAD = 2  # batches that the model's half may be ahead
+NUMBER = struct.Struct("q")
+ENDED = "the process of memory and world model has ended; the lines above say why"
+ALIGNMENT = 64  # bytes, a cache line
+
+
+def can_be_apart(config: UpdateConfig) -> bool:
+    """Whether nothing flows from the value's half of an update to the model's."""
+    online = config.latent_target == config.target_memory == "online"
+    return (
+        config.update_order == "joint" and TRAINS_MEMORY[config.scheme] == {"model"} and online and not config.clip_norm
+    )
+
+
+@dataclass(frozen=True)
+class Slot:
+    """A batch and what the model's half makes of it, in shared memory."""
+
+    raw: Tensor  # (B, row bytes) uint8
+    importance: Tensor  # (B,)
+    beta: Tensor
+    model: ModelPass
+    norm: Tensor  # of the model's gradient
+
+    def write(self, model: ModelPass, norm: Tensor) -> None:
+        """Put the model's half in."""
+        for place, tensor in zip(_tensors(self.model), _tensors(model), strict=True):
+            place.copy_(tensor.detach())
+        self.norm.copy_(norm)
+
+
+class PipelinedUpdate:
+    """An update of batches of one size. A checkpoint must be taken up before the first call, not after."""
+
+    in_flight = 0
+
+    def __init__(
+        self, update: JointUpdate, spec: WindowSpec, batch_size: int, threads: tuple[int, int] = (1, 1)
+    ) -> None:
+        """``threads`` are those of the value's half and of the model's."""
+        self._update, self._spec, self._batch_size, self._threads = update, spec, batch_size, threads
+        self._pending: deque[tuple[Slot, int]] = deque()
+        self._number = 0  # of batches handed in
+        self._slots: list[Slot] = []
+        self._child = 0
+        self._pipe: socket.socket | None = None
+
+    @property
+    def pending(self) -> int:
+        """Batches whose results are not given back yet."""
+        return len(self._pending)
+
+    def __call__(self, raw: Tensor, importance: Tensor, beta: float, number: int) -> list[UpdateResult]:
+        """(B, row bytes) uint8 without padding, (B,) float32, and the update's number; results, the oldest first.
+
+        What it returns is overwritten by a later call. Raises RmcError where the other process has ended.
+        """
+        if not self._slots:
+            self._start()
+        slot = self._slots[self._number % len(self._slots)]
+        slot.raw.copy_(raw)
+        slot.importance.copy_(importance)
+        slot.beta.fill_(beta)
+        self._number += 1
+        self._send(number)
+        self._pending.append((slot, number))
+        return [self._finish()] if len(self._pending) > AHEAD else []
+
+    def drain(self) -> list[UpdateResult]:
+        """The results of all that is pending; then no other process writes weights."""
+        return [self._finish() for _ in range(len(self._pending))]
+
+    def close(self) -> None:
+        """End the other process."""
+        if self._pipe is not None:
+            self._pipe.close()
+            os.waitpid(self._child, 0)
+            self._pipe = None
+
+    def _send(self, number: int) -> None:
+        assert self._pipe is not None
+        try:
+            self._pipe.sendall(NUMBER.pack(number))
+        except OSError:
+            raise RmcError(ENDED) from None
+
+    def _await_answer(self) -> None:
+        assert self._pipe is not None
+        try:
+            answered = self._pipe.recv(1)
+        except OSError:
+            answered = b""
+        if not answered:
+            raise RmcError(ENDED)
+
+    def _finish(self) -> UpdateResult:
+        self._await_answer()
+        (slot, number), update = self._pending.popleft(), self._update
+        batch = self._batch(slot)
+        loss_values, value = update.value_pass(batch, slot.model, slot.beta)
+        norm = update.step(update.optimizers[1:], loss_values.values())
+        update.follow_value()
+        update.update_ema(number, VALUE_PARTS)
+        return update.result(batch, slot.model, value, torch.hypot(norm, slot.norm))
+
+    def _batch(self, slot: Slot) -> Batch:
+        return view_batch(slot.raw, slot.importance, self._spec)
+
+    def _start(self) -> None:
+        """Share what both halves touch, and fork; before it, nothing may have run on several threads."""
+        update = self._update
+        _begin_moments(update.optimizers[0])
+        moments = [value for state in update.optimizers[0].state.values() for value in state.values()]
+        averages = [value for name, value in update.average.items() if name.startswith(MODEL_PARTS)]
+        own = [value for name, value in update.agent.named_parameters() if name.startswith(MODEL_PARTS)]
+        _share([*own, *moments, *averages, *update.agent.normalizer.buffers(), update.curiosity_variance])
+        self._slots = [self._make_slot() for _ in range(AHEAD + 1)]
+        ours, theirs = socket.socketpair()
+        parent, self._pipe = os.getpid(), ours
+        self._child = os.fork()
+        if self._child == 0:
+            self._be_the_other(parent, theirs)
+        theirs.close()
+        torch.set_num_threads(self._threads[0])
+
+    def _make_slot(self) -> Slot:
+        raw = torch.zeros(self._batch_size, self._spec.dtype.itemsize, dtype=torch.uint8)
+        importance, norm = torch.ones(self._batch_size), torch.zeros(())
+        with torch.no_grad():
+            model = self._update.model_pass(view_batch(raw, importance, self._spec))[1]  # for its shapes and types
+        slot = Slot(raw, importance, torch.zeros(()), model, norm)
+        _share([raw, importance, slot.beta, norm, *_tensors(model)])
+        return slot
+
+    def _be_the_other(self, parent: int, requests: socket.socket) -> NoReturn:
+        """In the new process, which ends with the other one, or once that closes its end."""
+        try:
+            exit_with_parent(parent)
+            for number in (signal.SIGINT, signal.SIGTERM):  # the other one hears them
+                signal.signal(number, signal.SIG_IGN)
+            setproctitle.setproctitle("rmc learner: memory and world model")
+            _close_all_but(requests.fileno())
+            torch.set_num_threads(self._threads[1])
+            slots = cycle(self._slots)
+            while request := requests.recv(NUMBER.size, socket.MSG_WAITALL):
+                self._model_half(next(slots), *NUMBER.unpack(request))
+                requests.sendall(b"\0")
+        except BrokenPipeError:
+            pass
+        except BaseException:
+            traceback.print_exc()
+            sys.stderr.flush()
+            os._exit(1)
+        os._exit(0)
+
+    def _model_half(self, slot: Slot, number: int) -> None:
+        update = self._update
+        loss_values, model = update.model_pass(self._batch(slot))
+        norm = update.step(update.optimizers[:1], loss_values.values())
+        update.follow_model(model)
+        update.update_ema(number, MODEL_PARTS)
+        slot.write(model, norm)
+
+
+def _tensors(model: ModelPass) -> list[Tensor]:
+    """In a fixed order."""
+    return [*model[:-1], *model.metrics.values()]
+
+
+def _begin_moments(optimizer: torch.optim.Adam) -> None:
+    """Adam's moments, which it would make in its first step: where they are not loaded."""
+    for parameter in (value for group in optimizer.param_groups for value in group["params"]):
+        if parameter not in optimizer.state:
+            zeros = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+            optimizer.state[parameter] = {"step": torch.zeros(()), **zeros}
+
+
+def _share(tensors: Iterable[Tensor]) -> None:
+    """Move each into memory that a forked process has, too: anonymous, as a container's /dev/shm may be small."""
+    tensors = list(tensors)
+    sizes = [-(-tensor.nbytes // ALIGNMENT) * ALIGNMENT for tensor in tensors]
+    block = torch.frombuffer(mmap.mmap(-1, sum(sizes)), dtype=torch.uint8)
+    for tensor, part in zip(tensors, block.split(sizes), strict=True):
+        shared = part[: tensor.nbytes].view(tensor.dtype).view(tensor.shape)
+        shared.copy_(tensor.detach())
+        tensor.data = shared
+
+
+def _close_all_but(kept: int) -> None:
+    """What belongs to the other process: Redis, replay servers, locks."""
+    os.closerange(3, kept)
+    os.closerange(kept + 1, os.sysconf("SC_OPEN_MAX"))

@@ -1,0 +1,123 @@
+"""An update whose halves run in two processes is the update, bit for bit; its process ends with it."""
+
+import copy
+import os
+import signal
+
+import pytest
+import torch
+
+from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
+from rmc.common.errors import RmcError
+from rmc.learner.config import UpdateConfig
+from rmc.learner.device_update import DeviceUpdate
+from rmc.learner.pipelined_update import PipelinedUpdate, can_be_apart
+from rmc.learner.update import JointUpdate, make_update
+from tests.learner.rows import SPEC
+from tests.learner.test_device_update import BATCH, host_batch
+
+ROBUST = UpdateConfig(scheme=3, curiosity=0.1, curiosity_scale="std", policy_average=100)
+AGENTS = {
+    "robust": AgentConfig(hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden"),
+    "embedding beside": AgentConfig(
+        hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden+embedding", grounding=False
+    ),
+}
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def make(agent: str, bf16: bool) -> JointUpdate:
+    torch.manual_seed(0)
+    return make_update(Agent(SPEC.obs_dim, SPEC.action_dim, AGENTS[agent]), SPEC.burn_in, ROBUST, 3, bf16)
+
+
+@pytest.mark.parametrize("bf16", [False, True])
+@pytest.mark.parametrize("agent", AGENTS)
+def test_it_is_the_same_update(agent, bf16):
+    plain, update = make(agent, bf16), make(agent, bf16)
+    in_turn, apart = DeviceUpdate(plain, SPEC, BATCH), PipelinedUpdate(update, SPEC, BATCH)
+    expected, found = [], []
+    for step in range(1, 41):
+        raw, importance = host_batch(step)
+        for updated, results in ((in_turn, expected), (apart, found)):
+            results += copy.deepcopy(updated(raw, importance, 0.1 * step, step))
+        if step % 15 == 0:  # as before weights are read
+            found += copy.deepcopy(apart.drain())
+            assert apart.pending == 0
+            assert_same(update.agent.state_dict(), plain.agent.state_dict())
+    found += copy.deepcopy(apart.drain())
+    apart.close()
+    assert len(found) == len(expected) == 40
+    for one, other in zip(found, expected, strict=True):
+        assert torch.equal(one.priorities, other.priorities)
+        assert torch.equal(one.hidden, other.hidden)
+        norm, of_both = one.metrics.pop("grad_norm"), other.metrics.pop("grad_norm")
+        assert norm == pytest.approx(float(of_both), rel=1e-5)  # of the halves' norms
+        assert_same(one.metrics, other.metrics)
+    assert_same(update.state_dict(), plain.state_dict())
+
+
+def assert_same(found: object, expected: object) -> None:
+    """Bit for bit, however they are nested."""
+    if isinstance(expected, torch.Tensor):
+        assert isinstance(found, torch.Tensor)
+        assert torch.equal(found, expected)
+    elif isinstance(expected, dict):
+        assert isinstance(found, dict)
+        assert found.keys() == expected.keys()
+        for name, value in expected.items():
+            assert_same(found[name], value)
+    elif isinstance(expected, list):
+        assert isinstance(found, list)
+        for one, other in zip(found, expected, strict=True):
+            assert_same(one, other)
+    else:
+        assert found == expected
+
+
+def test_it_goes_on_from_a_checkpoint_of_the_other_kind():
+    plain = make("robust", False)
+    first = DeviceUpdate(plain, SPEC, BATCH)
+    for step in range(1, 6):
+        first(*host_batch(step), 0.1, step)
+    update = make("robust", False)
+    update.load_state_dict(copy.deepcopy(plain.state_dict()))
+    apart = PipelinedUpdate(update, SPEC, BATCH)
+    for step in range(6, 12):
+        first(*host_batch(step), 0.1, step)
+        apart(*host_batch(step), 0.1, step)
+    apart.drain()
+    apart.close()
+    assert_same(update.state_dict(), plain.state_dict())
+
+
+def test_a_process_that_ends_is_told():
+    apart = PipelinedUpdate(make("robust", False), SPEC, BATCH)
+    apart(*host_batch(1), 0.1, 1)
+    os.kill(apart._child, signal.SIGKILL)
+    with pytest.raises(RmcError, match="memory and world model has ended"):
+        [apart(*host_batch(step), 0.1, step) for step in range(2, 5)]
+    apart.close()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"scheme": 1},
+        {"update_order": "alternate"},
+        {"clip_norm": 1.0},
+        {"target_memory": "ema"},
+        {"latent_target": "ema"},
+    ],
+)
+def test_what_flows_back_stays_in_one_process(other):
+    assert can_be_apart(ROBUST)
+    assert not can_be_apart(UpdateConfig(**{"scheme": 3, **other}))  # type: ignore[arg-type]
