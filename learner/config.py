@@ -74,5 +74,5 @@ class LearnerConfig:
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     """Matrix products in bfloat16 (auto: where this CPU or GPU has instructions for it) or float32."""
     threads: int = 0
-    """CPU threads of the learner; 0 takes all cores but one, which is left to the other roles; on Ray and in lockstep
-    it takes one."""
+    """CPU threads of the learner. 0 takes all cores but one, and two of two: then memory and world model train in a
+    process of their own, where the scheme is 3. 1 keeps one process. On Ray and in lockstep 0 takes one."""

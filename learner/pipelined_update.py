@@ -27,6 +27,7 @@ from rmc.common.process.parent_death import exit_with_parent
 from rmc.common.window import WindowSpec
 from rmc.learner.batch import Batch, view_batch
 from rmc.learner.config import UpdateConfig
+from rmc.learner.optimizers import begin_moments
 from rmc.learner.update import (
     MODEL_PARTS,
     TRAINS_MEMORY,
@@ -38,6 +39,7 @@ from rmc.learner.update import (
 
 AHEAD = 2  # batches that the model's half may be ahead
 NUMBER = struct.Struct("q")
+TITLE = "rmc learner: memory and world model"  # of the other process
 ENDED = "the process of memory and world model has ended; the lines above say why"
 ALIGNMENT = 64  # bytes, a cache line
 
@@ -147,7 +149,7 @@ class PipelinedUpdate:
     def _start(self) -> None:
         """Share what both halves touch, and fork; before it, nothing may have run on several threads."""
         update = self._update
-        _begin_moments(update.optimizers[0])
+        begin_moments(update.optimizers[0])
         moments = [value for state in update.optimizers[0].state.values() for value in state.values()]
         averages = [value for name, value in update.average.items() if name.startswith(MODEL_PARTS)]
         own = [value for name, value in update.agent.named_parameters() if name.startswith(MODEL_PARTS)]
@@ -176,7 +178,7 @@ class PipelinedUpdate:
             exit_with_parent(parent)
             for number in (signal.SIGINT, signal.SIGTERM):  # the other one hears them
                 signal.signal(number, signal.SIG_IGN)
-            setproctitle.setproctitle("rmc learner: memory and world model")
+            setproctitle.setproctitle(TITLE)
             _close_all_but(requests.fileno())
             torch.set_num_threads(self._threads[1])
             slots = cycle(self._slots)
@@ -203,14 +205,6 @@ class PipelinedUpdate:
 def _tensors(model: ModelPass) -> list[Tensor]:
     """In a fixed order."""
     return [*model[:-1], *model.metrics.values()]
-
-
-def _begin_moments(optimizer: torch.optim.Adam) -> None:
-    """Adam's moments, which it would make in its first step: where they are not loaded."""
-    for parameter in (value for group in optimizer.param_groups for value in group["params"]):
-        if parameter not in optimizer.state:
-            zeros = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
-            optimizer.state[parameter] = {"step": torch.zeros(()), **zeros}
 
 
 def _share(tensors: Iterable[Tensor]) -> None:

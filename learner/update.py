@@ -20,6 +20,7 @@ from rmc.learner.batch import Batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.diagnostics import Trace, model_metrics, unexplained_change, value_metrics
 from rmc.learner.fused import fuse
+from rmc.learner.optimizers import adam, by_optimizer
 from rmc.learner.unroll import impute, unroll
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
@@ -85,7 +86,7 @@ class JointUpdate:
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
-        return [_adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, VALUE_PARTS)]
+        return [adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, VALUE_PARTS)]
 
     def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
         """One update from a Batch; ``beta`` is a scalar tensor."""
@@ -264,7 +265,7 @@ class JointUpdate:
         self.target_memory.load_state_dict(state["target_memory"])
         for name, value in self.average.items():
             value.copy_(state["average"][name])
-        for optimizer, saved in zip(self.optimizers, _by_optimizer(state["optimizers"], self.optimizers), strict=True):
+        for optimizer, saved in zip(self.optimizers, by_optimizer(state["optimizers"], self.optimizers), strict=True):
             capturable = optimizer.defaults["capturable"]
             optimizer.load_state_dict(saved)
             for group in optimizer.param_groups:
@@ -295,7 +296,7 @@ class AlternateUpdate(JointUpdate):
     )
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
-        return [_adam(self.agent, self.config, "memory", part) for part, _ in self._stages()]
+        return [adam(self.agent, self.config, "memory", part) for part, _ in self._stages()]
 
     def _stages(self) -> list[tuple[str, tuple[str, ...]]]:
         return [(part, names) for part, names in self._STAGES if getattr(self.agent, part) is not None]
@@ -331,36 +332,6 @@ def _target_copy(module: ModuleT) -> ModuleT:
         if isinstance(part, nn.RNNBase):
             part.flatten_parameters()  # deepcopy scatters what cuDNN wants in one block
     return copied
-
-
-def _adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
-    """Adam for the parts of the agent that are named; memory and temperature have step sizes of their own."""
-    heads = [part for part in parts if part not in ("memory", "log_alpha") and getattr(agent, part) is not None]
-    memory = list(agent.memory.parameters()) if "memory" in parts else []
-    groups = [
-        {"params": memory, "lr": config.learning_rate * config.memory_learning_scale},
-        {
-            "params": [value for part in heads for value in getattr(agent, part).parameters()],
-            "lr": config.learning_rate,
-        },
-        {"params": [agent.log_alpha] if "log_alpha" in parts else [], "lr": config.alpha_learning_rate},
-    ]
-    on_gpu = agent.log_alpha.device.type == "cuda"
-    return torch.optim.Adam([group for group in groups if group["params"]], fused=True, capturable=on_gpu)
-
-
-def _by_optimizer(saved: list[dict[str, Any]], optimizers: list[torch.optim.Adam]) -> list[dict[str, Any]]:
-    """The states of the optimizers; version 0.1.0 saved one for all parts, in the same order."""
-    if len(saved) == len(optimizers):
-        return saved
-    states, begin = [], 0
-    for optimizer in optimizers:
-        groups = optimizer.state_dict()["param_groups"]
-        end = begin + sum(len(group["params"]) for group in groups)
-        moments = {number - begin: moment for number, moment in saved[0]["state"].items() if begin <= number < end}
-        states.append({"state": moments, "param_groups": groups})
-        begin = end
-    return states
 
 
 def _trained(batch: Batch, burn_in: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
