@@ -212,7 +212,7 @@ def _share(tensors: Iterable[Tensor]) -> None:
     tensors = list(tensors)
     sizes = [-(-tensor.nbytes // ALIGNMENT) * ALIGNMENT for tensor in tensors]
     block = torch.frombuffer(mmap.mmap(-1, sum(sizes)), dtype=torch.uint8)
-    for tensor, part in zip(tensors, block.split(sizes), strict=True):
+    for tensor, part in zip(tensors, torch.split(block, sizes), strict=True):
         shared = part[: tensor.nbytes].view(tensor.dtype).view(tensor.shape)
         shared.copy_(tensor.detach())
         tensor.data = shared

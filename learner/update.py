@@ -238,7 +238,7 @@ class JointUpdate:
         if self.config.policy_average and updates % AVERAGE_UPDATES == 0:
             over, acting = min(self.config.policy_average, updates / 10) / AVERAGE_UPDATES, self.agent.acting()
             names = [name for name in self.average if name.startswith(parts)]
-            averaged, newest = [self.average[name] for name in names], [acting[name] for name in names]
+            averaged, newest = ([source[name] for name in names] for source in (self.average, {**acting}))
             torch._foreach_lerp_(averaged, newest, 1.0 / max(1.0, over))
 
     def policy_weights(self) -> dict[str, Tensor]:
