@@ -134,7 +134,7 @@ class Learner:
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
         updated = self._updated(raw, torch.from_numpy(weights), self.update.config.beta(self.env_steps))
         self.updates += 1
-        if self.update.config.policy_average and self.updates % AVERAGE_UPDATES == 0:
+        if self.update.config.policy_ema_updates and self.updates % AVERAGE_UPDATES == 0:
             self.update.update_ema(self.updates)
         self._returning.append((rows["serial"].copy(), HostCopy(updated.priorities)))
         self._return_priorities(leave=self._updated.in_flight)

@@ -32,11 +32,11 @@ TRAIN_FLAGS = """
     --ray-address --all-cpus --tls
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
-    --blank-flag --fill-blanks --initial-priority
+    --missing-flag --impute-missing --initial-priority
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
     --capacity --replay-shards --replay-ratio --warmup-steps --priority-exponent --importance-exponent
     --learning-rate --memory-learning-scale
-    --alpha-learning-rate --gamma --polyak --clip-norm --policy-average --latent-target --target-memory --policy-q
+    --alpha-learning-rate --gamma --polyak --clip-norm --policy-ema-updates --latent-target --target-memory --policy-q
     --scheme --policy-through-q --update-order --model-norm --n-step --state-strategy
     --curiosity --curiosity-scale --curiosity-steps --eta
     --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads

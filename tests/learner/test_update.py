@@ -118,7 +118,7 @@ def test_grounding_reaches_memory_and_world_model(monkeypatch):
 
 
 def test_what_fills_blanks_trains_itself_alone():
-    config = dataclasses.replace(ROBUST, fill_blanks=True)
+    config = dataclasses.replace(ROBUST, impute_missing=True)
     spec, update = dataclasses.replace(SPEC, state=config.state_size(SPEC.obs_dim)), make(config, scheme=4)
     parts, _ = update.forward(to_batch(random_rows(8, spec=spec), spec), BETA)
     named = dict(update.agent.named_parameters())
@@ -135,7 +135,7 @@ def test_garbage_in_padding_changes_nothing():
     dirty = rows.copy()
     observed, stepped = observation_valid(rows), step_valid(rows)
     dirty["observation"][~observed] = np.nan
-    dirty["blank"][~observed] = 1
+    dirty["missing"][~observed] = 1
     dirty["action"][~stepped] = np.inf
     dirty["reward"][~stepped] = np.nan
     clean_update, dirty_update = make(ROBUST, latent_target="ema"), make(ROBUST, latent_target="ema")
@@ -211,7 +211,7 @@ def test_targets_follow_by_polyak_alone():
 
 def test_the_policys_average_is_over_the_last_tenth_and_then_over_so_many():
     """As a plain loop has it. What does not act has none."""
-    update = make(dataclasses.replace(ROBUST, fill_blanks=True), policy_average=40)
+    update = make(dataclasses.replace(ROBUST, impute_missing=True), policy_ema_updates=40)
     names = {name for name, _ in update.agent.named_parameters() if name.startswith(("memory", "policy", "next_frame"))}
     assert set(update.average) == names
     expected = {name: value.double() for name, value in update.average.items()}

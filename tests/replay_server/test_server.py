@@ -109,19 +109,19 @@ def test_statistics_against_a_loop_and_padding_changes_nothing() -> None:
     rows["last"] = rng.integers(SPEC.burn_in + 1, SPEC.steps + 1, 200)
     rows["new_steps"] = rng.integers(0, rows["last"] - SPEC.burn_in + 1)
     rows["new_observations"] = rows["new_steps"] + rng.integers(0, 2, 200)
-    rows["blank"] = rng.random(rows["blank"].shape) < 0.4
+    rows["missing"] = rng.random(rows["missing"].shape) < 0.4
     expected = [
         row["observation"][t].astype(float)
         for row in rows
         for t in range(row["last"] - row["new_observations"] + 1, row["last"] + 1)
-        if not row["blank"][t]
+        if not row["missing"][t]
     ]
     sums = observation_sums(rows, SPEC)
     assert sums.count == len(expected)
     np.testing.assert_allclose(sums.total, np.sum(expected, axis=0), rtol=1e-9)
     np.testing.assert_allclose(sums.total_square, np.sum(np.square(expected), axis=0), rtol=1e-9)
     rows["observation"][~observation_valid(rows, SPEC)] = np.nan
-    rows["observation"][rows["blank"] == 1] = 1e30
+    rows["observation"][rows["missing"] == 1] = 1e30
     again = observation_sums(rows, SPEC)
     assert again.count == sums.count
     assert np.array_equal(again.total, sums.total)
