@@ -108,5 +108,7 @@ def validate_launch(config: RunConfig, options: LaunchOptions) -> None:
     if launcher == "lockstep" and config.replay.replay_shards > 1:
         fix = "a lockstep run has one; use --launcher local"
         raise ConfigError("--replay-shards", config.replay.replay_shards, fix)
+    if options.init_parts != "all" and options.init_from is None:
+        raise ConfigError("--init-parts", options.init_parts, "say whose: give --init-from RUN, or leave it")
     if launcher == "manual" and options.redis_url is None:
         raise ConfigError("--redis-url", None, "say which Redis the roles that you start by hand will use")

@@ -1,9 +1,9 @@
 """The command line from words to a command's dataclass, and the table of all commands."""
 
-import dataclasses
 import functools
 import importlib
 import itertools
+import logging
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +15,12 @@ from rmc.cli import role_options, run_options, train_options
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.presets import preset_config
+from rmc.deploy.run.starts import last_launch
+
+log = logging.getLogger(__name__)
 
 FLAT = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 
@@ -35,6 +40,7 @@ class Action:
 
 COMMANDS: dict[str, tuple[type, Action]] = {
     "train": (train_options.Train, Action("commands", "train")),
+    "resume": (train_options.Resume, Action("commands", "train")),
     "evaluate": (run_options.Evaluate, Action("analysis_commands", "evaluate")),
     "export": (run_options.Export, Action("analysis_commands", "export_policy")),
     "inspect": (run_options.Inspect, Action("analysis_commands", "inspect")),
@@ -47,24 +53,65 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "cluster": (run_options.Cluster, Action("commands", "cluster")),
     "role": (role_options.Role, Action("role_commands", "run_role")),
 }
-ACTIONS = dict(COMMANDS.values())
+ACTIONS = dict(COMMANDS.values()) | {run_options.ResumeBaseline: COMMANDS["baseline"][1]}
+RENAMED = {"fill-blanks": "impute-missing", "blank-flag": "missing-flag", "policy-average": "policy-ema-updates"}
+Kinds = dict[str, tuple[type, Any]]  # by the command's name, its class and what it is where nothing is said
 
 
 def parse(words: list[str]) -> Any:
-    """The command line as a command's class. Raises ConfigError; SystemExit, its message on standard error."""
+    """The command line as a command's class. Raises ConfigError; SystemExit, its message on standard error.
+
+    A run that is there gives the defaults: it is known once the words are parsed with those of the preset.
+    """
     _check_once("--env-kwargs", words)
-    defaults = {"train": _train_defaults(_named_preset(words))}
+    command = _parsed(words, _kinds(preset_config(_named_preset(words), EnvConfig("")), LaunchOptions(None)))
+    folder = _known_run(command)
+    if folder is not None and isinstance(command, train_options.Resume) and folder.is_baseline():
+        return _parsed(words, {"resume": (run_options.ResumeBaseline, run_options.resuming_baseline(folder))})
+    if folder is not None:
+        return _parsed(words, _kinds(folder.config(), last_launch(folder)))
+    if isinstance(command, train_options.Train) and not command.env.id:
+        raise ConfigError("ENV", "", "rmc train takes an environment, like HalfCheetah-v5, or --run-dir with a run")
+    return command
+
+
+def _kinds(config: RunConfig, launch: LaunchOptions) -> Kinds:
+    return {
+        "train": (train_options.Train, train_options.from_config(config, launch)),
+        "resume": (train_options.Resume, train_options.resuming(config, launch)),
+    }
+
+
+def _known_run(command: Any) -> RunFolder | None:
+    """The run that the command goes on with. Raises ConfigError where it must, and there is none."""
+    if not isinstance(command, train_options.Train) or command.run_dir is None or command.if_exists != "resume":
+        return None
+    folder = RunFolder(command.run_dir)
+    if isinstance(command, train_options.Resume):
+        folder.settings()
+        return folder
+    return folder if (folder.path / "config.json").exists() else None
+
+
+def _parsed(words: list[str], known: Kinds) -> Any:
+    kinds = {name: (kind, tyro.MISSING_NONPROP) for name, (kind, _) in COMMANDS.items()} | known
     subcommands = [
-        Annotated[kind, tyro.conf.subcommand(name, default=defaults.get(name, tyro.MISSING_NONPROP))]
-        for name, (kind, _) in COMMANDS.items()
+        Annotated[kind, tyro.conf.subcommand(name, default=default)] for name, (kind, default) in kinds.items()
     ]
     return tyro.cli(functools.reduce(operator.or_, subcommands), prog="rmc", args=words, config=FLAT)  # type: ignore
 
 
-def _train_defaults(preset: Preset) -> train_options.Train:
-    start = preset_config(preset, EnvConfig(""))
-    shared = {item.name: getattr(start, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
-    return train_options.Train(env=train_options.EnvOptions(id=tyro.MISSING), **shared)
+def renamed(words: list[str]) -> list[str]:
+    """The words with the new names of options, each of whose old ones is warned of."""
+    found = []
+    for word in words:
+        flag, equals, value = word.partition("=")
+        no = "no-" if flag.startswith("--no-") else ""
+        new = RENAMED.get(flag.replace("_", "-").removeprefix(f"--{no}")) if flag.startswith("--") else None
+        if new is not None:
+            log.warning("%s is called --%s%s now; the old name goes in the next version", flag, no, new)
+        found.append(f"--{no}{new}{equals}{value}" if new is not None else word)
+    return found
 
 
 def _check_once(option: str, words: list[str]) -> None:
