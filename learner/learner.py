@@ -243,7 +243,12 @@ class Learner:
         learnt, state = self.update.state_dict(), io.BytesIO()
         self._check_finite(learnt)  # critics or moments may be spoilt while the policy, for one more update, is not
         torch.save(learnt, state)
-        progress = {"updates": self.updates, "env_steps": self.env_steps, "epoch": self.epoch, "time": time.time()}
+        progress: dict[str, Any] = {
+            "updates": self.updates,
+            "env_steps": self.env_steps,
+            "epoch": self.epoch,
+            "time": time.time(),
+        }
         if self._observed_before.count:
             progress["observed_before"] = self._observed_before.to_json()
         files = {

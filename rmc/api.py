@@ -53,7 +53,7 @@ def resume(
     device: str | None = None,
     redis_url: str | None = None,
 ) -> dict[str, Any]:
-    """Go on with the run in ``run_dir``; its ``result.json``. What is None stays as it was when the run was started last.
+    """Go on with the run in ``run_dir``; its ``result.json``. What is None stays as it was at the last start.
 
     Other options that may change are given to ``train``, with the run's whole config. Raises as ``train`` does.
     """

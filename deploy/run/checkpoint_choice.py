@@ -5,19 +5,19 @@ from rmc.common.errors import CheckpointError, ConfigError
 from rmc.deploy.run.folder import RunFolder
 
 
-def choose_checkpoint(folder: RunFolder, which: str, option: str = "--checkpoint") -> tuple[int, dict[str, bytes]]:
-    """Its number and files, verified. Raises ConfigError for the ``option`` where there is none or it is damaged."""
+def choose_checkpoint(folder: RunFolder, which: str) -> tuple[int, dict[str, bytes]]:
+    """Its number and files, verified. Raises ConfigError where there is none or it is damaged."""
     checkpoints = CheckpointFolder(folder.checkpoints)
-    number = _number(checkpoints, which, option)
+    number = _number(checkpoints, which)
     try:
         return number, checkpoints.load(number)
     except CheckpointError as error:
         others = [other for other in checkpoints.numbers() if other != number]
         fix = f"use one of {others}" if others else "there is no other"
-        raise ConfigError(option, which, f"{error}; {fix}") from None
+        raise ConfigError("--checkpoint", which, f"{error}; {fix}") from None
 
 
-def _number(checkpoints: CheckpointFolder, which: str, option: str) -> int:
+def _number(checkpoints: CheckpointFolder, which: str) -> int:
     numbers = checkpoints.numbers()
     if not numbers:
         raise ConfigError("RUN", str(checkpoints.folder.parent), "it has no checkpoint yet; train it for longer")
@@ -26,8 +26,8 @@ def _number(checkpoints: CheckpointFolder, which: str, option: str) -> int:
     if which == "best":
         best = checkpoints.best()
         if best is None or best not in numbers:
-            raise ConfigError(option, which, "none was evaluated yet; use latest")
+            raise ConfigError("--checkpoint", which, "none was evaluated yet; use latest")
         return best
     if which.isdecimal() and int(which) in numbers:
         return int(which)
-    raise ConfigError(option, which, f"use latest, best or one of {numbers}")
+    raise ConfigError("--checkpoint", which, f"use latest, best or one of {numbers}")

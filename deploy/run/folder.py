@@ -64,7 +64,8 @@ class RunFolder:
         except OSError:
             raise ConfigError("RUN", str(self.path), "no config.json there; give the folder of a run") from None
         try:
-            return migrated(raw)
+            found: dict[str, Any] = migrated(raw)
+            return found
         except ConfigError as error:
             raise ConfigError("RUN", str(self.path), str(error)) from None
 

@@ -8,6 +8,7 @@ import json
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import safetensors.torch
@@ -53,24 +54,26 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
     Raises ConfigError where there is no such checkpoint, or its networks have other sizes.
     """
     folder, which = _split(init_from)
-    number, files = choose_checkpoint(folder, which, OPTION)
     source = folder.config()
+    try:
+        number, files = choose_checkpoint(folder, which)
+    except ConfigError as error:
+        raise ConfigError(OPTION, init_from, error.fix) from None
     try:
         state = torch.load(io.BytesIO(files[STATE]), map_location="cpu", weights_only=True)
         _check_sizes(init_from, parts, source, config, state["agent"])
         update = _begun(config, state, parts, bool(source.update.policy_ema_updates))
         progress = _progress(state["agent"], json.loads(files[PROGRESS])["env_steps"])
-    except (KeyError, RuntimeError, ValueError, EOFError) as error:
+    except (KeyError, RuntimeError, ValueError, EOFError, UnpicklingError) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise ConfigError(
-            OPTION, init_from, f"its checkpoint {number} cannot be used ({reason}); use another"
-        ) from None
+        fix = f"its checkpoint {number} cannot be used ({reason}); use another"
+        raise ConfigError(OPTION, init_from, fix) from None
     learnt = io.BytesIO()
     torch.save(update.state_dict(), learnt)
     policy = safetensors.torch.save({name: value.contiguous() for name, value in update.policy_weights().items()})
-    origin = {"asked": [init_from, parts], "run": str(folder.path), "checkpoint": number, "parts": parts}
+    made = {STATE: learnt.getvalue(), POLICY: policy, PROGRESS: json.dumps(progress).encode()}
     return InitialCheckpoint(
-        {STATE: learnt.getvalue(), POLICY: policy, PROGRESS: json.dumps(progress).encode()}, origin
+        made, {"asked": [init_from, parts], "run": str(folder.path), "checkpoint": number, "parts": parts}
     )
 
 

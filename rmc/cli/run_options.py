@@ -91,7 +91,7 @@ class ResumeBaseline(Baseline):
 
     algorithm: Suppress[Algorithm]
     env: KnownEnvOptions
-    run_dir: Annotated[Path, Positional, arg(metavar="RUN")]
+    run_dir: Annotated[Path | None, Positional, arg(metavar="RUN")] = None
     """The run's folder."""
 
 

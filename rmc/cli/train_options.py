@@ -112,7 +112,7 @@ class Resume(Train):
     """Go on with a run: what is not said is as it was, whatever is called a default here."""
 
     env: KnownEnvOptions
-    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    run_dir: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
     """The run's folder."""
     if_exists: tyro.conf.Suppress[IfExists] = "resume"
     init_from: tyro.conf.Suppress[str | None] = None

@@ -27,6 +27,7 @@ DEBUG = ["train", PENDULUM, "--preset", "debug"]
 
 # Whoever changes this list changes what users have in their scripts.
 TRAIN_FLAGS = """
+    --init-from --init-parts
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
     --env-timeout --env-kwargs --run-dir --if-exists --launcher --device --redis-url
     --ray-address --all-cpus --tls
@@ -43,7 +44,9 @@ TRAIN_FLAGS = """
     --episodes --evaluation-seconds
 """.split()  # noqa: SIM905
 ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit --env-timeout --env-kwargs".split()  # noqa: SIM905
+RESUME_FLAGS = [flag for flag in TRAIN_FLAGS if flag not in ("--run-dir", "--if-exists", "--init-from", "--init-parts")]
 OTHER_FLAGS = {
+    "resume": RESUME_FLAGS,
     "evaluate": ["--episodes", "--seconds", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
     "inspect": ["--out", "--checkpoint"],
@@ -119,6 +122,11 @@ def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         ([], "train"),
         (["trian"], "trian"),
         (["train"], "train"),
+        (["train", "--run-dir", "nowhere"], "ENV='': rmc train takes an environment"),
+        (["resume"], "RUN"),
+        (["resume", "nowhere"], "nowhere': no config.json there"),
+        ([*DEBUG, "--init-from", "nowhere"], "--init-from='nowhere': no such run"),
+        ([*DEBUG, "--init-parts", "policy"], "--init-parts='policy': say whose"),
         (["stats", "/nowhere"], "/nowhere"),
         (["evaluate", "/nowhere"], "/nowhere"),
         (["role", "actor", "--run", "x", "--redis-url", "unix:///nowhere/redis.sock"], "--redis-url"),
@@ -200,7 +208,7 @@ def made_run(folder: Path) -> RunFolder:
         (["train", "InvertedDoublePendulum-v5", "--preset", "debug"], "ENV='InvertedDoublePendulum-v5'"),
         (["train", PENDULUM, "--preset", "paper"], "--preset='paper'"),
         ([*DEBUG, "--seed", "3"], "--seed=3"),
-        ([*DEBUG, "--gamma", "0.9"], "--gamma=0.9"),
+        ([*DEBUG, "--hidden", "9"], "--hidden=9"),
         ([*DEBUG, "--if-exists", "fail"], "--if-exists"),
     ],
 )

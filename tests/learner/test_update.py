@@ -301,3 +301,21 @@ def test_bf16_stays_near_fp32():
         assert p.grad is not None
         assert q.grad is not None
         assert (p.grad - q.grad).norm() <= 0.1 * p.grad.norm() + 1e-4, name
+
+
+@pytest.mark.parametrize("order", ["joint", "alternate"])
+def test_a_checkpoint_does_not_bring_its_step_sizes_along(order: str) -> None:
+    before, rates = make(ROBUST, update_order=order), {"learning_rate": 1e-5, "alpha_learning_rate": 2e-5}
+    before(to_batch(random_rows(8)), BETA)
+    after = make(ROBUST, update_order=order, memory_learning_scale=0.5, **rates)
+    after.load_state_dict(before.state_dict())
+    for optimizer in after.optimizers:
+        for group in optimizer.param_groups:
+            owner = group["params"][0]
+            in_memory = any(owner is value for value in after.agent.memory.parameters())
+            assert group["lr"] == (2e-5 if owner is after.agent.log_alpha else 5e-6 if in_memory else 1e-5)
+    assert all(optimizer.state for optimizer in after.optimizers)  # their moments go on
+    moved = [value.detach().clone() for value in after.agent.critic.parameters()]
+    after(to_batch(random_rows(8)), BETA)
+    steps = [(new - old).abs().max() for new, old in zip(after.agent.critic.parameters(), moved, strict=True)]
+    assert 0 < max(steps) < 2e-5
