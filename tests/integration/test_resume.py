@@ -1,5 +1,6 @@
 """The command that a stopped run prints goes on with it, typed as it is printed; what it changes counts from there."""
 
+import itertools
 import json
 import os
 import re
@@ -13,6 +14,7 @@ import torch
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.starts import starts
+from rmc.replay_server.recovery import open_store
 from tests.integration.running import ENVIRONMENT, Training
 
 SIZES = "--hidden 16 --embedding 16 --heads 16 16 --total-steps 2400 --actors 2 --replay-ratio 8".split()  # noqa: SIM905
@@ -25,6 +27,14 @@ def rmc(words: str, cwd) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         command, cwd=cwd, env={**ENVIRONMENT, "PYTHONPATH": path}, capture_output=True, text=True, timeout=240
     )
+
+
+def drawn_steps(folder: RunFolder) -> int:
+    """Trained steps that were drawn from the run's ring."""
+    config = folder.config()
+    store = open_store(folder.replay, config.window_spec(), config.replay.capacity, 0.0)
+    store.close()
+    return store.ring.progress.drawn_steps
 
 
 @pytest.mark.timeout(400)
@@ -60,13 +70,13 @@ def test_a_changed_ratio_and_rate_count_from_there(tmp_path):
     ):
         done = rmc(words, tmp_path)
         assert done.returncode == 0, done.stdout + done.stderr
-        drawn.append(RunFolder(folder).result()["updates"])
+        drawn.append(drawn_steps(RunFolder(folder)))
     config = RunFolder(folder).config()
     assert (config.total_steps, config.replay.replay_ratio, config.update.learning_rate) == (4_500, 16.0, 1e-5)
     batch, slack = 16 * 15, config.slack_steps()
-    more = [after - before for before, after in zip(drawn, drawn[1:], strict=False)]
-    for updates, ratio in zip(more, (4, 4, 16), strict=True):
-        assert 800 * ratio / batch < updates < (1_000 + 2 * slack) * ratio / batch * 2, more  # windows may be short
+    more = [after - before for before, after in itertools.pairwise(drawn)]
+    for steps, ratio in zip(more, (4, 4, 16), strict=True):
+        assert 1_000 * ratio - batch - 2 * slack * ratio <= steps <= (1_000 + 2 * slack) * ratio + batch, more
     _, files = CheckpointFolder(folder / "checkpoints").latest()
     (folder / "state").write_bytes(files["learner.pt"])
     state = torch.load(folder / "state", weights_only=True)
