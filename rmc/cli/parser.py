@@ -1,5 +1,6 @@
 """The command line from words to a command's dataclass, and the table of all commands."""
 
+import dataclasses
 import functools
 import importlib
 import itertools
@@ -7,11 +8,14 @@ import logging
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, cast, get_type_hints
 
 import tyro
 
 from rmc.cli import role_options, run_options, train_options
+from rmc.cli.config_file import KWARGS, with_file
+from rmc.cli.help_text import ALL_OPTIONS, only_basic
+from rmc.cli.numerals import NUMERALS
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig
@@ -21,7 +25,6 @@ from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.starts import last_launch
 
 log = logging.getLogger(__name__)
-
 FLAT = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 
 
@@ -51,11 +54,11 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "attach": (run_options.Attach, Action("commands", "attach")),
     "stop": (run_options.Stop, Action("commands", "stop")),
     "cluster": (run_options.Cluster, Action("commands", "cluster")),
+    "completion": (run_options.Completion, Action("completion", "print_script")),
     "role": (role_options.Role, Action("role_commands", "run_role")),
 }
 ACTIONS = dict(COMMANDS.values()) | {run_options.ResumeBaseline: COMMANDS["baseline"][1]}
 RENAMED = {"fill-blanks": "impute-missing", "blank-flag": "missing-flag", "policy-average": "policy-ema-updates"}
-Kinds = dict[str, tuple[type, Any]]  # by the command's name, its class and what it is where nothing is said
 
 
 def parse(words: list[str]) -> Any:
@@ -63,22 +66,25 @@ def parse(words: list[str]) -> Any:
 
     A run that is there gives the defaults: it is known once the words are parsed with those of the preset.
     """
-    _check_once("--env-kwargs", words)
-    command = _parsed(words, _kinds(preset_config(_named_preset(words), EnvConfig("")), LaunchOptions(None)))
+    words, env = with_file(words, option_names(train_options.Train)) if words[:1] == ["train"] else (words, "")
+    _check_once(KWARGS, words)
+    command = _parsed(words, _defaults(preset_config(_named_preset(words), EnvConfig(env)), LaunchOptions(None)))
     folder = _known_run(command)
     if folder is not None and isinstance(command, train_options.Resume) and folder.is_baseline():
-        return _parsed(words, {"resume": (run_options.ResumeBaseline, run_options.resuming_baseline(folder))})
+        return _parsed(words, {"resume": run_options.resuming_baseline(folder)})
     if folder is not None:
-        return _parsed(words, _kinds(folder.config(), last_launch(folder)))
+        config = folder.config()
+        named = dataclasses.replace(config.env, id=env or config.env.id)
+        return _parsed(words, _defaults(dataclasses.replace(config, env=named), last_launch(folder)))
     if isinstance(command, train_options.Train) and not command.env.id:
         raise ConfigError("ENV", "", "rmc train takes an environment, like HalfCheetah-v5, or --run-dir with a run")
     return command
 
 
-def _kinds(config: RunConfig, launch: LaunchOptions) -> Kinds:
+def _defaults(config: RunConfig, launch: LaunchOptions) -> dict[str, Any]:
     return {
-        "train": (train_options.Train, train_options.from_config(config, launch)),
-        "resume": (train_options.Resume, train_options.resuming(config, launch)),
+        "train": train_options.from_config(config, launch),
+        "resume": train_options.resuming(config, launch),
     }
 
 
@@ -93,12 +99,19 @@ def _known_run(command: Any) -> RunFolder | None:
     return folder if (folder.path / "config.json").exists() else None
 
 
-def _parsed(words: list[str], known: Kinds) -> Any:
-    kinds = {name: (kind, tyro.MISSING_NONPROP) for name, (kind, _) in COMMANDS.items()} | known
+def _parsed(words: list[str], defaults: dict[str, Any]) -> Any:
+    """The command, which is as by default where nothing is said."""
+    if {"-h", "--help"}.intersection(words):
+        defaults = {name: only_basic(command) for name, command in defaults.items()}
+    words = ["--help" if word == ALL_OPTIONS else word for word in words]
     subcommands = [
-        Annotated[kind, tyro.conf.subcommand(name, default=default)] for name, (kind, default) in kinds.items()
+        Annotated[type(defaults[name]), tyro.conf.subcommand(name, default=defaults[name])]
+        if name in defaults
+        else Annotated[kind, tyro.conf.subcommand(name)]
+        for name, (kind, _) in COMMANDS.items()
     ]
-    return tyro.cli(functools.reduce(operator.or_, subcommands), prog="rmc", args=words, config=FLAT)  # type: ignore
+    kinds: Any = functools.reduce(operator.or_, subcommands)
+    return tyro.cli(kinds, prog="rmc", args=words, config=FLAT, registry=NUMERALS)
 
 
 def renamed(words: list[str]) -> list[str]:
@@ -112,6 +125,14 @@ def renamed(words: list[str]) -> list[str]:
             log.warning("%s is called --%s%s now; the old name goes in the next version", flag, no, new)
         found.append(f"--{no}{new}{equals}{value}" if new is not None else word)
     return found
+
+
+def option_names(kind: type) -> list[str]:
+    """The names of a command's options, also of those in its parts; what has no flag is left out."""
+    names: list[str] = []
+    for name, hint in get_type_hints(kind).items():
+        names += option_names(cast(type, hint)) if dataclasses.is_dataclass(hint) else [name]
+    return [name for name in names if name not in ("id", "config_file")]
 
 
 def _check_once(option: str, words: list[str]) -> None:

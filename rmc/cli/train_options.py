@@ -48,7 +48,7 @@ class KnownEnvOptions(EnvOptions):
 
 @dataclass(frozen=True)
 class Train:
-    """Train an agent; or go on with the run in --run-dir, where all that is not said is as it was."""
+    """Train an agent, or go on with a run. --help shows the basic options, --help-all all of them."""
 
     env: EnvOptions
     window: WindowConfig
@@ -58,6 +58,8 @@ class Train:
     update: UpdateConfig
     learner: LearnerConfig
     evaluator: EvaluatorConfig
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    """A TOML file of options, like env = "HalfCheetah-v5" and learning_rate = 3e-4; those given beside it win."""
     preset: Preset = "robust"
     """Where the other options' defaults come from."""
     seed: int = 0
@@ -109,11 +111,13 @@ def from_config(config: RunConfig, launch: LaunchOptions) -> Train:
 
 @dataclass(frozen=True)
 class Resume(Train):
-    """Go on with a run: what is not said is as it was, whatever is called a default here."""
+    """Go on with a run: what is not said is as it was, whatever is called a default here. --help shows the basic
+    options, --help-all all of them."""
 
     env: KnownEnvOptions
     run_dir: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
     """The run's folder."""
+    config_file: tyro.conf.Suppress[Path | None] = None
     if_exists: tyro.conf.Suppress[IfExists] = "resume"
     init_from: tyro.conf.Suppress[str | None] = None
     init_parts: tyro.conf.Suppress[InitParts] = "all"

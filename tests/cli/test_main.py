@@ -29,7 +29,7 @@ DEBUG = ["train", PENDULUM, "--preset", "debug"]
 TRAIN_FLAGS = """
     --init-from --init-parts
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
-    --env-timeout --env-kwargs --run-dir --if-exists --launcher --device --redis-url
+    --env-timeout --env-kwargs --config --run-dir --if-exists --launcher --device --redis-url
     --ray-address --all-cpus --tls
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
@@ -44,7 +44,8 @@ TRAIN_FLAGS = """
     --episodes --evaluation-seconds
 """.split()  # noqa: SIM905
 ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit --env-timeout --env-kwargs".split()  # noqa: SIM905
-RESUME_FLAGS = [flag for flag in TRAIN_FLAGS if flag not in ("--run-dir", "--if-exists", "--init-from", "--init-parts")]
+NEW_RUN_FLAGS = {"--run-dir", "--config", "--if-exists", "--init-from", "--init-parts"}
+RESUME_FLAGS = [flag for flag in TRAIN_FLAGS if flag not in NEW_RUN_FLAGS]
 OTHER_FLAGS = {
     "resume": RESUME_FLAGS,
     "evaluate": ["--episodes", "--seconds", "--flicker", "--checkpoint", "--video", "--json"],
@@ -60,6 +61,7 @@ OTHER_FLAGS = {
     "attach": [],
     "stop": [],
     "cluster": [],
+    "completion": [],
     "role launcher": ["--ray-address", "--device", "--all-cpus", "--tls"],
     "role actor": ["--run", "--redis-url", "--index"],
     "role replay": ["--run", "--redis-url", "--folder", "--listen", "--shard", "--secret-file", "--tls-folder"],
@@ -69,9 +71,9 @@ OTHER_FLAGS = {
 
 
 def flags(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
-    assert main.run([*command.split(), "--help"]) == 0
+    assert main.run([*command.split(), "--help-all"]) == 0
     found = re.findall(r"--[a-z][a-z-]*[a-z]", capsys.readouterr().out)
-    return set(found) - {"--help"}
+    return set(found) - {"--help", "--help-all"}
 
 
 @pytest.mark.parametrize(("command", "expected"), [("train", TRAIN_FLAGS), *OTHER_FLAGS.items()])
