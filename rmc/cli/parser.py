@@ -14,13 +14,14 @@ import tyro
 
 from rmc.cli import role_options, run_options, train_options
 from rmc.cli.config_file import KWARGS, with_file
-from rmc.cli.help_text import ALL_OPTIONS, only_basic
+from rmc.cli.help_text import ALL_OPTIONS, BASIC, only_basic
 from rmc.cli.numerals import NUMERALS
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import Preset, RunConfig
+from rmc.deploy.run.config import Preset, RunConfig, flat
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.opening import MAY_CHANGE
 from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.starts import last_launch
 
@@ -102,7 +103,11 @@ def _known_run(command: Any) -> RunFolder | None:
 def _parsed(words: list[str], defaults: dict[str, Any]) -> Any:
     """The command, which is as by default where nothing is said."""
     if {"-h", "--help"}.intersection(words):
-        defaults = {name: only_basic(command) for name, command in defaults.items()}
+        fixed = {
+            path.rpartition(".")[2] for path in flat(preset_config("robust", EnvConfig(""))) if path not in MAY_CHANGE
+        }
+        shown = {"resume": BASIC - fixed}
+        defaults = {name: only_basic(command, shown.get(name, BASIC)) for name, command in defaults.items()}
     words = ["--help" if word == ALL_OPTIONS else word for word in words]
     subcommands = [
         Annotated[type(defaults[name]), tyro.conf.subcommand(name, default=defaults[name])]
