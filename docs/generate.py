@@ -11,7 +11,6 @@ from typing import Any
 from rmc.cli.train_options import Train
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import option
-from rmc.deploy.run.opening import MAY_CHANGE
 from rmc.deploy.run.presets import paper, robust
 
 PAGE = Path(__file__).parent / "configuration.md"
@@ -28,6 +27,7 @@ TITLES = {
 }
 HEAD, RULE = "| option | default | what it is | when to touch it |", "|---|---|---|---|"
 PLACEMENT = ["run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls"]
+BEGINNING = ["init_from", "init_parts"]
 # When a user should touch an option; what it does is said where it is defined.
 WHEN = {
     "preset": "`paper` to compare with the paper, `debug` to see everything run within a minute",
@@ -36,6 +36,8 @@ WHEN = {
     "actors": "when the learner waits for experience; on two cores one actor is enough",
     "run_dir": "to name a run, and to go on with one",
     "if_exists": "`fail` or `new` where a script must not go on with an old run by chance",
+    "init_from": "to begin with what another run has [learnt](warm-start.md); for a new run alone",
+    "init_parts": "`memory+world-model` for another reward, `policy` to begin with what acts",
     "launcher": "`ray` for several machines, `lockstep` for the same bits again, `manual` to start the roles yourself",
     "device": "`cuda` where there is a GPU; not tried on one yet, see [performance](performance.md)",
     "redis_url": "with `--launcher manual`, or to keep a run in a Redis of yours",
@@ -128,12 +130,9 @@ def page() -> str:
         configs = (ours, theirs) if part == "run" else (getattr(ours, part), getattr(theirs, part))
         lines += _rows(*configs)
         if part == "run":
-            changeable = ", ".join(f"`{option(name)}`" for name in sorted(MAY_CHANGE))
-            lines += [
-                "",
-                f"Where a run goes on, these may be others than before: {changeable}, and those of the next table.",
-            ]
-            lines += ["", "## Where it runs", "", HEAD, RULE, *_placement()]
+            lines += ["", "Which of them may change when a run goes on: [Resume a run](resume.md#what-may-change)."]
+            lines += ["", "## Where it runs", "", HEAD, RULE, *_launch_rows(PLACEMENT)]
+            lines += ["", "## What a new run begins with", "", HEAD, RULE, *_launch_rows(BEGINNING)]
     return "\n".join(lines) + "\n"
 
 
@@ -149,12 +148,11 @@ def _rows(ours: Any, theirs: Any) -> list[str]:
     return rows
 
 
-def _placement() -> list[str]:
+def _launch_rows(names: list[str]) -> list[str]:
     said = _docstrings(Train)
     defaults = {item.name: item.default for item in dataclasses.fields(Train)}
     return [
-        f"| `--{name.replace('_', '-')}` | {_text(defaults[name])} | {said[name]} | {WHEN[name]} |"
-        for name in PLACEMENT
+        f"| `--{name.replace('_', '-')}` | {_text(defaults[name])} | {said[name]} | {WHEN[name]} |" for name in names
     ]
 
 
