@@ -17,7 +17,7 @@ from rmc.learner.update import JointUpdate, make_update
 from tests.learner.rows import SPEC
 from tests.learner.test_device_update import BATCH, host_batch
 
-ROBUST = UpdateConfig(scheme=3, curiosity=0.1, curiosity_scale="std", policy_average=100)
+ROBUST = UpdateConfig(scheme=3, curiosity=0.1, curiosity_scale="std", policy_ema_updates=100)
 AGENTS = {
     "robust": AgentConfig(hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden"),
     "embedding beside": AgentConfig(
