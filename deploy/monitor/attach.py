@@ -76,8 +76,9 @@ def launcher_pid(folder: RunFolder) -> int:
     while (trainer := folder.trainer()) is None:
         if time.monotonic() >= deadline:
             folder.settings()
-            fix = "nobody trains it now; the command that began it goes on with it, given its --run-dir"
-            raise ConfigError("RUN", str(folder.path), fix)
+            raise ConfigError(
+                "RUN", str(folder.path), f"nobody trains it now; {resume_command(folder)} goes on with it"
+            )
         time.sleep(LOOK_SECONDS)
     return trainer
 

@@ -169,15 +169,6 @@ class RunFolder:
         said = (found.get("wall_s") for found in self.records() if found["role"] == "launcher")
         return max(filter(is_finite, said), default=0.0)
 
-    def env_steps(self) -> int:
-        """Environment steps that the run has, as its learner or all its replay servers said last."""
-        newest: dict[str, int] = {}
-        for found in self.records():
-            if found["role"].startswith(("learner", "replay")) and is_finite(found.get("env_steps")):
-                newest[found["role"]] = int(found["env_steps"])
-        learner = newest.pop("learner", 0)
-        return max(learner, sum(newest.values()))
-
     def lock(self) -> None:
         """Be the one launcher of this run. Raises ConfigError where another one is."""
         self._lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)

@@ -75,9 +75,9 @@ def test_a_run_is_watched_and_stopped_from_another_terminal(tmp_path: Path) -> N
             assert watcher.stdout.readline().startswith("steps ")
             done = subprocess.run([*words, "stop", str(tmp_path / "run")], capture_output=True, text=True, timeout=60)
             assert (done.returncode, done.stderr) == (0, "")
-            assert "to go on, give the same options" in done.stdout
+            assert "to go on:\n  rmc resume " in done.stdout
             assert training.finish(30) == 130
-            assert "to go on, give the same options" in watcher.stdout.read()
+            assert "to go on:\n  rmc resume " in watcher.stdout.read()
             assert watcher.wait(30) == 130
     done = subprocess.run([*words, "attach", str(tmp_path / "run")], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
