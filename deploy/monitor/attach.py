@@ -15,6 +15,7 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import RunStatus, View
 from rmc.deploy.run.folder import RunFolder, parse_record
+from rmc.deploy.run.starts import resume_command
 
 LOOK_SECONDS = 0.2
 AWAY_SECONDS = 30.0  # a launcher on Ray that was killed begins again within that
