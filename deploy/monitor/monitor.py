@@ -17,6 +17,7 @@ from rmc.deploy.monitor.metrics_log import MetricsLog
 from rmc.deploy.monitor.view import RunStatus, View
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.host import host_figures
 
 RECORD_SECONDS = 5.0  # between the launcher's own records, and looks at the run's folder
 log = logging.getLogger(__name__)
@@ -126,6 +127,7 @@ class Monitor:
                 "refused_values": self._refused,
                 "redis_away_s": self.outage.seconds,
                 "not_running": " ".join(self.unplaced()),
+                **host_figures(),
             }
         )
 

@@ -2,6 +2,7 @@
 
 import logging
 
+from rmc.analysis.doctor import examine_run
 from rmc.cli import run_options, train_options, training
 from rmc.cli.ending import say_end
 from rmc.cli.redis_password import warn_of_password
@@ -33,6 +34,18 @@ def stats(command: run_options.Stats) -> int:
     console.print(table(board))
     if result is not None:
         console.print_json(data=result)
+    return 0
+
+
+def doctor(command: run_options.Doctor) -> int:
+    """Say what holds a run back."""
+    findings, seconds = examine_run(RunFolder(command.run))
+    console = terminal()
+    for finding in findings:
+        console.print(str(finding), soft_wrap=True)
+    if not findings:
+        console.print("nothing found: no share of time was recorded that could be judged")
+    console.print(f"judged by the newest {seconds:,.0f} s of training")
     return 0
 
 

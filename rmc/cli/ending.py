@@ -5,6 +5,7 @@ from typing import Any
 
 from rich.console import Console
 
+from rmc.analysis.doctor import examine
 from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.errors import RoleDied
 from rmc.deploy.run.config import RunConfig
@@ -44,6 +45,7 @@ def say_stopped(folder: RunFolder, config: RunConfig, env_steps: int, console: C
     command = f"rmc train {config.env.id} --preset {config.preset} --seed {config.seed} --run-dir {folder.path}"
     console.print(f"stopped at environment step {env_steps:,}; to go on, give the same options and")
     console.print(f"  {command}", soft_wrap=True)
+    say_findings(folder, config, console)
     return STOPPED
 
 
@@ -53,4 +55,11 @@ def say_result(folder: RunFolder, console: Console) -> int:
     console.print(f"after training:  {format_evaluation(result)}")
     facts = f"{result['env_steps']:,} environment steps, {result['updates']:,} updates, {result['wall_s']:,.0f} s"
     console.print(f"{facts}; {folder.result_file}", soft_wrap=True)
+    say_findings(folder, folder.config(), console)
     return 0
+
+
+def say_findings(folder: RunFolder, config: RunConfig, console: Console) -> None:
+    """What ``rmc doctor`` would say; nothing of a run that was too short to judge."""
+    for finding in examine(list(folder.records()), config):
+        console.print(str(finding), soft_wrap=True)
