@@ -1,10 +1,49 @@
 """What the launcher's machine has left, cheap enough to be asked for with every record."""
 
 import os
+import resource
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import psutil
 
 from rmc.deploy.run.preflight import cores
+
+
+COPIED_BYTES, COPIES = 64 << 20, 3
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What a machine has for a run."""
+
+    cores: int
+    free_memory_bytes: int
+    free_disk_bytes: int
+    handles: int  # of a process
+    copied_bytes_per_s: float  # in memory, by one thread
+
+
+def this_machine(folder: Path) -> Machine:
+    """What there is now; the disk is the one that ``folder`` is or would be on."""
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    handles, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    memory, disk = psutil.virtual_memory().available, shutil.disk_usage(there).free
+    return Machine(cores(), memory, disk, handles, _copied_bytes_per_s())
+
+
+def _copied_bytes_per_s() -> float:
+    """The fastest of a few copies that no cache holds."""
+    source, target = np.ones(COPIED_BYTES, np.uint8), np.zeros(COPIED_BYTES, np.uint8)
+    seconds = []
+    for _ in range(COPIES):
+        began = time.perf_counter()
+        np.copyto(target, source)
+        seconds.append(time.perf_counter() - began)
+    return COPIED_BYTES / min(seconds)
 
 
 def host_figures() -> dict[str, float]:

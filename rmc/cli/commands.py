@@ -4,6 +4,7 @@ import logging
 
 from rmc.analysis.doctor import examine_run
 from rmc.cli import run_options, train_options, training
+from rmc.cli.dry_run import dry_run
 from rmc.cli.ending import say_end
 from rmc.cli.redis_password import warn_of_password
 from rmc.common.errors import ConfigError
@@ -18,6 +19,8 @@ def train(command: train_options.Train) -> int:
     """Train a run."""
     warn_of_password(command.redis_url or "")
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    if command.dry_run:
+        return dry_run(command.config(), command.launch_options(), terminal())
     return training.train(command.config(), command.launch_options(), terminal())
 
 
