@@ -10,7 +10,7 @@ STALLED_SECONDS = 60.0  # without a step and an update
 SILENT_SECONDS = 30.0  # without a word; roles speak every second
 PLAYED = 0.75  # of the checkpoints: fewer evaluations leave holes in the curve
 STALE_UPDATES = 1_000  # of lag; docs/metrics.md calls tens to hundreds healthy
-HALF_FULL, WORTH_BYTES = 0.5, 64 << 20  # of a ring, when a smaller one is worth a word
+HALF_FULL, WORTH_WINDOWS = 0.5, 10_000  # of a ring, when a smaller one is worth a word
 WARM_UP_SECONDS = 300.0  # that are left of it
 
 
@@ -98,10 +98,9 @@ def oversized_ring(vitals: Vitals, config: RunConfig) -> Finding | None:
     fills = vitals.values("replay", "ring_fill")
     if not steps or not fills or max(fills) >= HALF_FULL:
         return None
-    end = max(fills) * config.total_steps / steps
-    size = config.window_spec().dtype.itemsize * config.replay.capacity
-    if end >= HALF_FULL or size * (1.0 - end) < WORTH_BYTES:
+    capacity, end = config.replay.capacity, max(fills) * config.total_steps / steps
+    if end >= HALF_FULL or capacity * (1.0 - end) < WORTH_WINDOWS:
         return None
-    needed = ceil(end * config.replay.capacity * 1.1)
-    measured = f"it will be {end:.0%} full at the end of the run, of {size / 1e6:,.0f} MB of disk"
+    needed = ceil(end * capacity * 1.1)
+    measured = f"of {capacity:,} windows {end:.0%} will be used at the end of the run"
     return Finding("ring never fills", measured, f"--capacity {needed} holds the whole run")
