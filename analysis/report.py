@@ -112,7 +112,8 @@ def _course(run: ReportRun) -> dict[str, Any]:
         for title, unit, lines in CHARTS
     }
     figures = [{"alt": title, "uri": uri} for title, uri in drawn.items() if uri]
-    return {"name": run.name, "findings": run.findings, "waits": waits(run), "figures": figures}
+    baseline = run.folder.is_baseline()
+    return {"name": run.name, "is_baseline": baseline, "findings": run.findings, "waits": waits(run), "figures": figures}
 
 
 def differences(runs: Sequence[ReportRun]) -> dict[str, Any]:

@@ -25,6 +25,8 @@ class Medium:
 
 def film(run: ReportRun) -> Medium:
     """One deterministic episode of the newest policy, its first 1 000 steps."""
+    if run.folder.is_baseline():
+        return Medium(run.name, note="Of a baseline there is no video.")
     try:
         config = run.folder.config()
         with tempfile.TemporaryDirectory() as place:
@@ -39,13 +41,15 @@ def film(run: ReportRun) -> Medium:
 
 def rollouts(run: ReportRun) -> Medium:
     """The world model's predictions along an episode of the newest policy."""
+    if run.folder.is_baseline():
+        return Medium(run.name, note="A baseline has no world model.")
     picture = io.BytesIO()
     try:
         seen = world_model_picture.inspect_to(run.folder, "latest", picture)
     except RmcError as error:
         return Medium(run.name, note=f"No world-model rollouts: {_why(error)}.")
-    ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in seen.open_loop.items())
-    note = f"unexplained of the observation's change: {ahead} steps (100% is a guess of no change)"
+    ahead = ", ".join(f"{share:.0%} at {horizon}" for horizon, share in seen.open_loop.items())
+    note = f"unexplained of the observation's change, by steps ahead: {ahead} (100% is a guess of no change)"
     return Medium(run.name, data_uri(picture.getvalue(), "image/png"), note)
 
 

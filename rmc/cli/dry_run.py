@@ -28,9 +28,12 @@ def dry_run(config: RunConfig, options: LaunchOptions, console: Console) -> int:
         raise ConfigError("--dry-run", True, f"a trial needs --launcher local, not {options.launcher}")
     check_device(options.device)
     place_for_sockets()
+    from rmc.analysis import evaluation  # imports torch
+
     trial = trial_config(config)
     shorter = f"a warm-up of {trial.replay.warmup_steps:,} steps and a ring of {trial.replay.capacity:,} windows"
     console.print(f"a trial trains for {TRAINED_SECONDS:.0f} s in a temporary folder, with {shorter}", soft_wrap=True)
+    evaluation.initial_policy(config)  # as a run's launcher does before it trains, whose memory this is
     machine = this_machine((options.run_dir or Path("runs")).resolve())
     with signals_caught() as stop:
         measured = run_trial(trial, options.device, stop)
