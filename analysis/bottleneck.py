@@ -16,7 +16,7 @@ def bottleneck(vitals: Vitals, config: RunConfig) -> Finding | None:
     return next((found for stage in stages if (found := stage(vitals, config)) is not None), None)
 
 
-def redis_bound(vitals: Vitals, config: RunConfig) -> Finding | None:
+def redis_bound(vitals: Vitals, _: RunConfig) -> Finding | None:
     """Roles wait for Redis, which is away or full."""
     shares = {kind: vitals.waits(kind).get("redis", 0.0) for kind in ("actor", "learner", "replay")}
     kind = max(shares, key=lambda one: shares[one])
@@ -34,7 +34,8 @@ def replay_bound(vitals: Vitals, config: RunConfig) -> Finding | None:
     if busy is None or learner is None or not slow or learner > 1.0 - IDLE or sum(waits.values()) < IDLE:
         return None
     shards = 2 * config.replay.replay_shards
-    measured = f"the replay server was busy {busy:.0%} while the learner waited {1 - learner:.0%} and actors {sum(waits.values()):.0%}"
+    waiting = f"the learner waited {1 - learner:.0%} and actors {sum(waits.values()):.0%}"
+    measured = f"the replay server was busy {busy:.0%} while {waiting}"
     more = f" with --actors {shards * ceil(config.actors / shards)}" if config.actors % shards else ""
     return Finding("replay-bound", measured, f"--replay-shards {shards}{more}, or a larger --chunk-windows, would help")
 
@@ -83,11 +84,13 @@ def delivery_bound(vitals: Vitals, config: RunConfig) -> Finding | None:
     if learner < IDLE or actor < IDLE:
         return None
     measured = f"the learner waited {learner:.0%} for experience while actors waited {actor:.0%} for credit"
-    advice = f"windows are on their way; --envs-per-actor {2 * config.actor.envs_per_actor} lets actors run further ahead"
+    advice = (
+        f"windows are on their way; --envs-per-actor {2 * config.actor.envs_per_actor} lets actors run further ahead"
+    )
     return Finding("delivery-bound", measured, advice)
 
 
-def balanced(vitals: Vitals, config: RunConfig) -> Finding | None:
+def balanced(vitals: Vitals, _: RunConfig) -> Finding | None:
     """Nobody waits long."""
     learner, actor = vitals.busy("learner"), vitals.busy("actor")
     if learner is None or actor is None:

@@ -31,7 +31,9 @@ def threads_fight(vitals: Vitals, config: RunConfig) -> Finding | None:
     actors = max(1, int(config.actors - (busy - cores)))
     if actors < config.actors:
         return Finding("threads fight", measured, f"--actors {actors} with more --envs-per-actor would fit")
-    return Finding("threads fight", measured, "more cores, or another machine for the actors (--launcher ray), would help")
+    return Finding(
+        "threads fight", measured, "more cores, or another machine for the actors (--launcher ray), would help"
+    )
 
 
 def oversubscribed(vitals: Vitals, config: RunConfig) -> Finding | None:
@@ -46,7 +48,7 @@ def oversubscribed(vitals: Vitals, config: RunConfig) -> Finding | None:
     return Finding("oversubscribed", measured, "other programs take the rest: end them, or use another machine")
 
 
-def stolen(vitals: Vitals, config: RunConfig) -> Finding | None:
+def stolen(vitals: Vitals, _: RunConfig) -> Finding | None:
     """A hypervisor gives the CPUs to other guests."""
     share = vitals.mean("launcher", "host_steal_share")
     if share is None or share < STOLEN:
@@ -62,6 +64,8 @@ def little_memory(vitals: Vitals, config: RunConfig) -> Finding | None:
     swapped = swap[-1] - swap[0] if swap else 0.0
     if not free or not total or (min(free) > LITTLE_MEMORY * total and swapped < SWAPPED_BYTES):
         return None
-    measured = f"{min(free) / 1e6:,.0f} of {total / 1e6:,.0f} MB were free, {max(0.0, swapped) / 1e6:,.0f} MB were swapped"
+    measured = (
+        f"{min(free) / 1e6:,.0f} of {total / 1e6:,.0f} MB were free, {max(0.0, swapped) / 1e6:,.0f} MB were swapped"
+    )
     half = config.replay.capacity // 2
     return Finding("memory is short", measured, f"fewer --actors, or --capacity {half} in a new run, takes less")

@@ -12,6 +12,7 @@ from rmc.deploy.local.trial import RoleUse, Trial
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import Machine
 from rmc.deploy.run.preflight import DISK_RESERVE
+from rmc.replay_server import ring
 
 KEPT_BESIDE = 2  # checkpoints beside the newest: the best, and the one that is being written
 WIRE_SHARE = 0.2  # of the speed at which memory is copied: on its way a window is copied and checked some times
@@ -77,7 +78,8 @@ def needs(config: RunConfig, trial: Trial, machine: Machine) -> list[Need]:
 
 def ring_bytes(config: RunConfig) -> int:
     """Of the rings of all replay servers."""
-    return config.window_spec().dtype.itemsize * config.replay.capacity
+    shards = config.replay.replay_shards
+    return shards * ring.file_bytes(config.window_spec(), -(-config.replay.capacity // shards))
 
 
 def memory(config: RunConfig, roles: dict[str, RoleUse], machine: Machine) -> list[Need]:
@@ -85,11 +87,11 @@ def memory(config: RunConfig, roles: dict[str, RoleUse], machine: Machine) -> li
     uses: dict[str, list[int]] = defaultdict(list)
     for role, use in sorted(roles.items()):
         uses[role.partition("-")[0]].append(use.memory_bytes)
-    ring, total = ring_bytes(config), sum(map(sum, uses.values()))
+    pages, total = ring_bytes(config), sum(map(sum, uses.values()))
     rows = [_role_memory(kind, each) for kind, each in uses.items()]
-    rows.append(Need("memory, pages of the ring", megabytes(ring)))
-    fits = total + ring <= machine.free_memory_bytes
-    return [*rows, Need("memory, all", megabytes(total + ring), f"{megabytes(machine.free_memory_bytes)} free", fits)]
+    rows.append(Need("memory, pages of the ring", megabytes(pages)))
+    fits = total + pages <= machine.free_memory_bytes
+    return [*rows, Need("memory, all", megabytes(total + pages), f"{megabytes(machine.free_memory_bytes)} free", fits)]
 
 
 def _role_memory(kind: str, each: list[int]) -> Need:
@@ -99,15 +101,15 @@ def _role_memory(kind: str, each: list[int]) -> Need:
 
 def disk(config: RunConfig, trial: Trial, seconds: float, machine: Machine) -> list[Need]:
     """The ring, the checkpoints, what is recorded until the end, and all."""
-    ring, kept = ring_bytes(config), config.learner.keep_checkpoints + KEPT_BESIDE
+    rows, kept = ring_bytes(config), config.learner.keep_checkpoints + KEPT_BESIDE
     made = config.total_steps // config.learner.checkpoint_steps + 1
     saved, said = min(kept, made) * trial.checkpoint_bytes, trial.record_bytes_per_s * seconds
     free = max(0, machine.free_disk_bytes - DISK_RESERVE)
     return [
-        Need("disk, ring", megabytes(ring)),
+        Need("disk, ring", megabytes(rows)),
         Need(f"disk, {min(kept, made)} checkpoints", megabytes(saved)),
         Need("disk, metrics", megabytes(said)),
-        Need("disk, all", megabytes(ring + saved + said), f"{megabytes(free)} free", ring + saved + said <= free),
+        Need("disk, all", megabytes(rows + saved + said), f"{megabytes(free)} free", rows + saved + said <= free),
     ]
 
 
@@ -141,7 +143,10 @@ def threads(config: RunConfig, records: list[dict[str, Any]], machine: Machine) 
 
 def megabytes(size: float) -> str:
     """Bytes in the unit that suits them."""
-    return next((f"{size / unit:,.1f} {name}" for unit, name in ((1e9, "GB"), (1e6, "MB")) if size >= unit), f"{size / 1e3:.1f} kB")
+    return next(
+        (f"{size / unit:,.1f} {name}" for unit, name in ((1e9, "GB"), (1e6, "MB")) if size >= unit),
+        f"{size / 1e3:.1f} kB",
+    )
 
 
 def duration(seconds: float) -> str:

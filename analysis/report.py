@@ -25,7 +25,7 @@ CHARTS = (  # what is drawn over wall time: its name, its unit, and its lines by
     ("throughput of updates", "updates / s", {"learner": ("learner", "updates_per_s")}),
     (
         "staleness of policies", "updates behind",
-        {"acting, when inserted": ("replay", "policy_lag_mean"), "sampled, when trained on": ("learner", "sample_age_mean")},
+        {"when inserted": ("replay", "policy_lag_mean"), "when trained on": ("learner", "sample_age_mean")},
     ),
     (
         "staleness of replayed memories", "distance / norm",
@@ -100,7 +100,14 @@ def final_row(agent: str, past: list[History]) -> list[str]:
     numbers = [mean(getattr(run, name) for run in past) for name in ("env_steps", "updates", "wall_s")]
     deviation = f" ± {pstdev(last):,.1f}" if len(last) > 1 else ""
     each = ", ".join(f"{value:,.0f}" for value in last)
-    return [agent, f"{len(past)}", f"{mean(last):,.1f}{deviation}", each, f"{worst:,.1f}", *(f"{n:,.0f}" for n in numbers)]
+    return [
+        agent,
+        f"{len(past)}",
+        f"{mean(last):,.1f}{deviation}",
+        each,
+        f"{worst:,.1f}",
+        *(f"{n:,.0f}" for n in numbers),
+    ]
 
 
 def _course(run: ReportRun) -> dict[str, Any]:
@@ -113,7 +120,13 @@ def _course(run: ReportRun) -> dict[str, Any]:
     }
     figures = [{"alt": title, "uri": uri} for title, uri in drawn.items() if uri]
     baseline = run.folder.is_baseline()
-    return {"name": run.name, "is_baseline": baseline, "findings": run.findings, "waits": waits(run), "figures": figures}
+    return {
+        "name": run.name,
+        "is_baseline": baseline,
+        "findings": run.findings,
+        "waits": waits(run),
+        "figures": figures,
+    }
 
 
 def differences(runs: Sequence[ReportRun]) -> dict[str, Any]:
@@ -126,7 +139,7 @@ def differences(runs: Sequence[ReportRun]) -> dict[str, Any]:
     paths = list(dict.fromkeys(path for run in runs for path in run.options))
     values = {path: [run.options[path] for run in runs if path in run.options] for path in paths}
     differing = [path for path, found in values.items() if any(one != found[0] for one in found)]
-    rows = [[path, *(_text(run.options[path]) if path in run.options else "–" for run in runs)] for path in differing]
+    rows = [[path, *(_text(run.options[path]) if path in run.options else "-" for run in runs)] for path in differing]
     note = "Options that are not alike in all runs that have them." if rows else "All options are alike."
     return {"columns": [run.name for run in runs], "rows": rows, "note": note}
 

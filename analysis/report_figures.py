@@ -24,7 +24,7 @@ REASONS = {  # what roles wait for, in the same colour in every report
     "credit": "#8ab6d6", "experience": "#e76f51", "windows": "#f2a488", "draws": "#c5dcea", "weights": "#e9c46a",
     "acknowledgements": "#c97b9d", "a policy to evaluate": "#e3e0ee", "redis": "#b00020", "disk": "#7a6fac",
 }  # fmt: skip
-STYLE = {
+STYLE: Any = {
     "font.size": 9.0, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "grid.alpha": 0.25,
     "axes.axisbelow": True, "legend.frameon": False, "svg.hashsalt": "rmc",
 }  # fmt: skip
@@ -48,7 +48,9 @@ def returns(agents: dict[str, list[History]], colours: dict[str, str], by: Axis)
     with rc_context(STYLE):
         figure = Figure(figsize=SIZE, layout="constrained")
         panel = figure.subplots()
-        scale, unit = _time_unit([one.wall_s for runs in agents.values() for one in runs]) if by == "wall_s" else (1, "")
+        scale, unit = (
+            _time_unit([one.wall_s for runs in agents.values() for one in runs]) if by == "wall_s" else (1, "")
+        )
         for agent, runs in agents.items():
             lines = [(places / scale, values) for places, values in (curve(run, by) for run in runs)]
             _draw_agent(panel, lines, colours[agent])
@@ -75,7 +77,7 @@ def _draw_agent(panel: Any, lines: list[tuple[NDArray[np.float64], NDArray[np.fl
     panel.fill_between(places, mean - deviation, mean + deviation, color=colour, alpha=0.18, linewidth=0)
 
 
-def _steps(value: float, _: int) -> str:
+def _steps(value: float, _: float) -> str:
     units = ((1e6, "M"), (1e3, "k"))
     return next((f"{value / unit:g}{name}" for unit, name in units if abs(value) >= unit), f"{value:g}")
 
@@ -118,7 +120,8 @@ def _binned(places: list[float], values: list[float]) -> tuple[NDArray[np.float6
 def _bins(x: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     """In which of so many stretches of equal length each lies."""
     width = (x.max() - x.min()) / count or 1.0
-    return np.minimum(((x - x.min()) / width).astype(np.int64), count - 1)
+    found: NDArray[np.int64] = np.minimum(((x - x.min()) / width).astype(np.int64), count - 1)
+    return found
 
 
 def waits(run: ReportRun) -> str | None:
@@ -132,7 +135,11 @@ def waits(run: ReportRun) -> str | None:
         (float(walls[bins == at].mean()), Vitals([run.records[i] for i in np.flatnonzero(bins == at)], math.inf))
         for at in np.unique(bins)
     ]
-    kinds = [kind for kind in ("learner", "actor", "replay", "evaluator") if any(v.busy(kind) is not None for _, v in stretches)]
+    kinds = [
+        kind
+        for kind in ("learner", "actor", "replay", "evaluator")
+        if any(v.busy(kind) is not None for _, v in stretches)
+    ]
     reasons = list(dict.fromkeys(reason for _, v in stretches for kind in kinds for reason in v.waits(kind)))
     return _strips(stretches, kinds, [reason for reason in reasons if reason]) if kinds else None
 
@@ -146,12 +153,17 @@ def _strips(stretches: list[tuple[float, Vitals]], kinds: list[str], reasons: li
         panels = figure.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
         for panel, kind in zip(panels, kinds, strict=True):
             said = [(wall / scale, v) for wall, v in stretches if v.busy(kind) is not None]
-            shares = [[v.busy(kind) or 0.0 for _, v in said], *([v.waits(kind).get(r, 0.0) for _, v in said] for r in reasons)]
+            shares = [
+                [v.busy(kind) or 0.0 for _, v in said],
+                *([v.waits(kind).get(r, 0.0) for _, v in said] for r in reasons),
+            ]
             areas = panel.stackplot(
                 [wall for wall, _ in said], *shares, colors=[BUSY, *colours.values()], linewidth=0, step="mid"
             )
             handles |= {
-                name: area for name, area, share in zip(["busy", *reasons], areas, shares, strict=True) if max(share) > 0.01
+                name: area
+                for name, area, share in zip(["busy", *reasons], areas, shares, strict=True)
+                if max(share) > 0.01
             }
             panel.set_ylim(0.0, 1.0)
             panel.set_yticks([0.0, 1.0], ["0", "100 %"])

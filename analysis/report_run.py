@@ -100,8 +100,10 @@ class ReportRun:
         if not told:
             return [0.0] * len(times)
         began, wall = told[0]
-        found = np.interp(times, *zip(*told, strict=True))
-        return [max(0.0, wall - (began - at)) if at < began else float(one) for at, one in zip(times, found, strict=True)]
+        found = np.interp(times, [at for at, _ in told], [seconds for _, seconds in told])
+        return [
+            max(0.0, wall - (began - at)) if at < began else float(one) for at, one in zip(times, found, strict=True)
+        ]
 
 
 def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """What is wrong with a run beside its speed: pure functions of its records, one a fault."""
 
+from itertools import pairwise
 from math import ceil
 
 from rmc.analysis.finding import Finding
@@ -14,7 +15,7 @@ HALF_FULL, WORTH_WINDOWS = 0.5, 10_000  # of a ring, when a smaller one is worth
 WARM_UP_SECONDS = 300.0  # that are left of it
 
 
-def stalled(vitals: Vitals, config: RunConfig) -> Finding | None:
+def stalled(vitals: Vitals, _: RunConfig) -> Finding | None:
     """Deadlock: every role speaks, none gets on. A run that has finished is none."""
     if vitals.last("learner", "finished"):
         return None
@@ -31,12 +32,12 @@ def _still_seconds(vitals: Vitals) -> float:
     moved = []
     for role, name in [("learner", "updates"), *((role, "env_steps") for role in vitals.of("replay"))]:
         found = vitals.series(role, name)
-        changes = [now[0] for before, now in zip(found, found[1:], strict=False) if now[1] != before[1]]
+        changes = [now[0] for before, now in pairwise(found) if now[1] != before[1]]
         moved += changes[-1:] or [time for time, _ in found[:1]]
     return vitals.end - max(moved, default=vitals.end)
 
 
-def silent(vitals: Vitals, config: RunConfig) -> Finding | None:
+def silent(vitals: Vitals, _: RunConfig) -> Finding | None:
     """Roles that have stopped speaking while others go on."""
     ended = {role: vitals.end - vitals.series(role, "time")[-1][0] for role in vitals.roles if role != "launcher"}
     found = [f"{role} for {seconds:.0f} s" for role, seconds in ended.items() if seconds > SILENT_SECONDS]
@@ -56,8 +57,12 @@ def long_warm_up(vitals: Vitals, config: RunConfig) -> Finding | None:
     left = missing / sum(rates)
     if left < WARM_UP_SECONDS:
         return None
-    measured = f"{steps:,.0f} of {config.replay.warmup_steps:,} steps at {sum(rates):,.0f} a second, {left:,.0f} s to go"
-    return Finding("long warm-up", measured, f"--warmup-steps {config.replay.warmup_steps // 4}, or more --actors, would help")
+    measured = (
+        f"{steps:,.0f} of {config.replay.warmup_steps:,} steps at {sum(rates):,.0f} a second, {left:,.0f} s to go"
+    )
+    return Finding(
+        "long warm-up", measured, f"--warmup-steps {config.replay.warmup_steps // 4}, or more --actors, would help"
+    )
 
 
 def evaluator_starved(vitals: Vitals, config: RunConfig) -> Finding | None:

@@ -65,7 +65,7 @@ class Vitals:
         return mean(found) if found else None
 
     def busy(self, kind: str) -> float | None:
-        """Mean share of time spent working, 0 to 1; a run's last seconds, when actors wait for its end, do not count."""
+        """Mean share of time spent working, 0 to 1; the last seconds, when actors wait for the end, do not count."""
         shares = [one["busy_share"] for one in self._shared(kind) if one.get("waiting_for") != "the end"]
         return mean(shares) if shares else None
 

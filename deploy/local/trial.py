@@ -12,6 +12,7 @@ from typing import Any
 import psutil
 from rich.console import Console
 
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local.launcher import TICK_SECONDS, LocalRun
@@ -66,9 +67,7 @@ def run_trial(config: RunConfig, device: str, stop: StopSignal) -> Trial:
             watcher.close()
         records = list(folder.records())
         seconds = records[-1]["time"] - records[0]["time"] if records else 0.0
-        return Trial(
-            uses, records, _size(folder.checkpoints), _size(folder.metrics, folder.events) / max(seconds, 1.0)
-        )
+        return Trial(uses, records, _checkpoint_bytes(folder), _size(folder.metrics, folder.events) / max(seconds, 1.0))
 
 
 @contextmanager
@@ -80,9 +79,7 @@ def _folder(config: RunConfig, path: Path) -> Iterator[RunFolder]:
         folder.unlock()
 
 
-def _train(
-    config: RunConfig, folder: RunFolder, device: str, watcher: Monitor, stop: StopSignal
-) -> dict[str, RoleUse]:
+def _train(config: RunConfig, folder: RunFolder, device: str, watcher: Monitor, stop: StopSignal) -> dict[str, RoleUse]:
     run = LocalRun(config, folder, None, device)
     uses: dict[str, RoleUse] = {}
     commands = {name: role.command.words for name, role in run.supervisor.roles.items()}
@@ -110,7 +107,11 @@ def _train(
 
 
 def _unbegun(watcher: Monitor) -> str:
-    waits = [f"{role} for {record['waiting_for']}" for role, record in watcher.board.roles.items() if record.get("waiting_for")]
+    waits = [
+        f"{role} for {record['waiting_for']}"
+        for role, record in watcher.board.roles.items()
+        if record.get("waiting_for")
+    ]
     return f"no update within {LONGEST_SECONDS:.0f} s (waiting: {', '.join(waits)}); is the environment slow?"
 
 
@@ -140,6 +141,12 @@ def _memory(process: psutil.Process) -> int:
     """Where it can be told, pages that several processes map count in parts."""
     full = process.memory_full_info()
     return int(getattr(full, "pss", full.rss))
+
+
+def _checkpoint_bytes(folder: RunFolder) -> int:
+    """Of the largest."""
+    checkpoints = CheckpointFolder(folder.checkpoints)
+    return max((_size(checkpoints.path(number)) for number in checkpoints.numbers()), default=0)
 
 
 def _size(*paths: Path) -> int:

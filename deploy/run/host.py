@@ -12,7 +12,6 @@ import psutil
 
 from rmc.deploy.run.preflight import cores
 
-
 COPIED_BYTES, COPIES = 64 << 20, 3
 
 

@@ -46,7 +46,9 @@ HOST = {"host_cores": 4, "host_cpus": 4, "host_load": 2.0, "host_idle_share": 0.
 
 
 def test_the_learner_holds_the_actors_back() -> None:
-    found = bottleneck(vitals(learner=shares(0.99), actor_0=shares(0.03, "credit"), replay=shares(0.2, "draws")), CONFIG)
+    found = bottleneck(
+        vitals(learner=shares(0.99), actor_0=shares(0.03, "credit"), replay=shares(0.2, "draws")), CONFIG
+    )
     assert str(found) == (
         "learner-bound: actors waited 97% of the time for credit, the learner was busy 99%; more actors will not help; "
         "a GPU (--device cuda), or --replay-ratio 24, would: the latter takes half the updates for each step, "
@@ -55,7 +57,7 @@ def test_the_learner_holds_the_actors_back() -> None:
 
 
 def test_the_actors_hold_the_learner_back() -> None:
-    slow = dict(learner=shares(0.5, "experience"), actor_0=shares(0.97), replay=shares(0.1, "windows"))
+    slow = {"learner": shares(0.5, "experience"), "actor_0": shares(0.97), "replay": shares(0.1, "windows")}
     found = bottleneck(vitals(**slow, launcher=HOST), CONFIG)
     assert found is not None
     assert (found.name, found.advice) == (
@@ -125,13 +127,15 @@ def test_a_deadlock_is_named_with_its_waits() -> None:
 
 
 def test_a_role_that_fell_silent_is_named() -> None:
-    found = run_faults.silent(Vitals([one for one in records() if one["role"] != "actor-0" or one["time"] < 1010.0]), CONFIG)
+    found = run_faults.silent(
+        Vitals([one for one in records() if one["role"] != "actor-0" or one["time"] < 1010.0]), CONFIG
+    )
     assert str(found) == "silent: actor-0 for 50 s said nothing; it hangs, or its machine is away; see logs/actor-0.log"
     assert run_faults.silent(vitals(), CONFIG) is None
 
 
 def test_a_warm_up_that_takes_long_is_told() -> None:
-    said = dict(learner={"updates": 0}, replay={"env_steps": 1_000, "env_steps_per_s": 10.0})
+    said: Record = {"learner": {"updates": 0}, "replay": {"env_steps": 1_000, "env_steps_per_s": 10.0}}
     found = run_faults.long_warm_up(vitals(**said), CONFIG)
     assert found is not None
     assert "1,000 of 5,000 steps at 10 a second, 400 s to go" in found.measured
@@ -173,7 +177,8 @@ def test_a_ring_that_never_fills() -> None:
     little = vitals(replay={"env_steps": 50_000, "ring_fill": 0.05})
     found = run_faults.oversized_ring(little, short)
     assert str(found) == (
-        "ring never fills: of 70,000 windows 10% will be used at the end of the run; --capacity 7701 holds the whole run"
+        "ring never fills: of 70,000 windows 10% will be used at the end of the run; "
+        "--capacity 7701 holds the whole run"
     )
     assert run_faults.oversized_ring(little, CONFIG) is None  # a million steps fill it
 
@@ -181,9 +186,11 @@ def test_a_ring_that_never_fills() -> None:
 def test_threads_that_fight() -> None:
     greedy = dataclasses.replace(CONFIG, learner=dataclasses.replace(CONFIG.learner, threads=8))
     found = host_faults.threads_fight(vitals(launcher=HOST), greedy)
-    assert str(found) == "threads fight: the learner has 8 threads on 4 cores; --threads 3 leaves one to the other roles"
+    assert (
+        str(found) == "threads fight: the learner has 8 threads on 4 cores; --threads 3 leaves one to the other roles"
+    )
     full = HOST | {"host_idle_share": 0.01}
-    busy = dict(learner=shares(1.0), actor_0=shares(0.9), actor_1=shares(0.9), replay=shares(0.5))
+    busy = {"learner": shares(1.0), "actor_0": shares(0.9), "actor_1": shares(0.9), "replay": shares(0.5)}
     found = host_faults.threads_fight(vitals(launcher=full, **busy), CONFIG)
     assert found is not None
     assert found.measured == "5.3 threads of the run are busy at a time, on 4 cores"
