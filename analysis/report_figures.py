@@ -98,7 +98,8 @@ def over_time(lines: dict[str, Series], label: str) -> str | None:
         panel = figure.subplots()
         for (name, series), colour in zip(found.items(), COLOURS, strict=False):
             places, values = _binned(*series)
-            panel.plot(places / scale, values, color=colour, linewidth=1.4, label=name)
+            marker = "o" if len(values) == 1 else ""  # a line of one point is none
+            panel.plot(places / scale, values, color=colour, linewidth=1.4, marker=marker, label=name)
         panel.set_xlabel(f"wall time ({unit})")
         panel.set_ylabel(label)
         panel.set_ylim(bottom=0.0)
