@@ -50,7 +50,7 @@ def learner_bound(vitals: Vitals, config: RunConfig) -> Finding | None:
     faster = min(2.0, 1.0 / max(actor, 0.01))
     measured = f"actors waited {waits:.0%} of the time for credit, the learner was busy {learner:.0%}"
     advice = (
-        f"more actors will not help; a GPU (--device cuda), or --replay-ratio {ratio:g}, would: "
+        f"more actors will not help; a GPU (--device cuda) or a faster one, or --replay-ratio {ratio:g}, would: "
         f"the latter takes half the updates for each step, {faster:.1f} times the steps a second"
     )
     return Finding("learner-bound", measured, advice)

@@ -32,7 +32,8 @@ def examine(records: Sequence[Record], config: RunConfig) -> list[Finding]:
     training = vitals.training()
     if training.seconds >= LEAST_SECONDS and not any(found):
         found += [diagnosis(training, config) for diagnosis in IN_TRAINING]
-        found.append(run_faults.evaluator_starved(Vitals(records, math.inf), config))  # evaluations are rare
+        whole = Vitals(records, math.inf)  # for what is rare, or compared with the time before training
+        found += [run_faults.evaluator_starved(whole, config), host_faults.slow_memory(whole, config)]
     return [finding for finding in found if finding is not None]
 
 

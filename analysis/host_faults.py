@@ -1,5 +1,7 @@
 """What is wrong with the launcher's machine: pure functions of a run's records, one a fault."""
 
+from statistics import median
+
 from rmc.analysis.bottleneck import busy_threads, free_cores, host_cores, learner_threads
 from rmc.analysis.finding import Finding
 from rmc.analysis.vitals import Vitals
@@ -11,6 +13,7 @@ LOADED = 1.3  # processes that could run, for each CPU of the machine
 LITTLE_MEMORY = 0.05  # of all that is left
 SWAPPED_BYTES = 64 << 20  # within the span
 STOLEN = 0.1  # of the CPU time
+SLOWED, COPIES = 0.33, 6  # of the best speed of a copy in the same start; copies that it takes to judge
 
 
 def threads_fight(vitals: Vitals, config: RunConfig) -> Finding | None:
@@ -55,6 +58,18 @@ def stolen(vitals: Vitals, _: RunConfig) -> Finding | None:
         return None
     measured = f"the hypervisor gave {share:.0%} of the CPU time to others"
     return Finding("CPU stolen", measured, "another machine, or one with CPUs of its own, would help")
+
+
+def slow_memory(vitals: Vitals, _: RunConfig) -> Finding | None:
+    """The bandwidth of the memory is used up."""
+    copied = vitals.values("launcher", "host_copy_bytes_per_s")
+    if len(copied) < COPIES or median(copied) >= SLOWED * max(copied):
+        return None
+    measured = f"it was copied at {median(copied) / 1e9:.1f} GB/s, at best at {max(copied) / 1e9:.1f} GB/s"
+    advice = (
+        "roles and other programs take its bandwidth: fewer --actors or --threads here, or more machines, would help"
+    )
+    return Finding("memory is slow", measured, advice)
 
 
 def little_memory(vitals: Vitals, config: RunConfig) -> Finding | None:

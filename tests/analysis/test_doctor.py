@@ -51,8 +51,8 @@ def test_the_learner_holds_the_actors_back() -> None:
     )
     assert str(found) == (
         "learner-bound: actors waited 97% of the time for credit, the learner was busy 99%; more actors will not help; "
-        "a GPU (--device cuda), or --replay-ratio 24, would: the latter takes half the updates for each step, "
-        "2.0 times the steps a second"
+        "a GPU (--device cuda) or a faster one, or --replay-ratio 24, would: "
+        "the latter takes half the updates for each step, 2.0 times the steps a second"
     )
 
 
@@ -208,6 +208,15 @@ def test_a_machine_that_others_use() -> None:
     assert "25% of the CPU time" in stolen.measured
 
 
+def test_memory_that_is_slow() -> None:
+    copied = {"host_copy_bytes_per_s": lambda s: 12e9 if s < 10 else 3e9}
+    found = host_faults.slow_memory(vitals(launcher=copied), CONFIG)
+    assert found is not None
+    assert found.measured == "it was copied at 3.0 GB/s, at best at 12.0 GB/s"
+    steady = {"host_copy_bytes_per_s": lambda s: 12e9 if s < 10 else 6e9}
+    assert host_faults.slow_memory(vitals(launcher=steady), CONFIG) is None
+
+
 def test_memory_that_is_short() -> None:
     memory = {"host_memory_bytes": 16e9, "host_available_bytes": 8e9, "host_swap_bytes": 0.0}
     assert host_faults.little_memory(vitals(launcher=memory), CONFIG) is None
@@ -286,3 +295,4 @@ def test_a_real_run_records_its_host(tmp_path: Path) -> None:
     assert 1 <= last["host_cores"] <= last["host_cpus"]
     assert all(0.0 <= last[name] <= 1.0 for name in ("host_idle_share", "host_steal_share"))
     assert last["host_load"] >= 0.0
+    assert last["host_copy_bytes_per_s"] > 1e6

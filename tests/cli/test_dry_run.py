@@ -1,9 +1,12 @@
 """rmc train --dry-run: its figures beside a real run's, and its marks where a machine has too little."""
 
 import dataclasses
+import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -156,3 +159,20 @@ def test_a_trial_needs_processes(tmp_path: Path) -> None:
     told = dry_run(tmp_path / "run", "--launcher", "lockstep")
     assert (told.returncode, told.stdout) == (2, "")
     assert told.stderr == "rmc: --dry-run=True: a trial needs --launcher local, not lockstep\n"
+
+
+def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
+    words = [*COMMAND, "--dry-run", "--run-dir", str(tmp_path / "run")]
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 60.0
+        while not list(tmp_path.glob("rmc-trial-*/run/metrics.jsonl")):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60.0)
+    finally:
+        process.kill()
+    assert (process.returncode, said) == (130, "")
+    assert not list(tmp_path.glob("r*"))  # torch keeps a cache of its own
