@@ -1,6 +1,7 @@
 """What a diagnosis says: what it is, by how much, and the option that changes it."""
 
 from dataclasses import dataclass
+from math import ceil
 
 
 @dataclass(frozen=True)
@@ -16,3 +17,9 @@ class Finding:
 
     def __str__(self) -> str:
         return f"{self.name}: {self.measured}; {self.advice}"
+
+
+def typed_number(value: float) -> int:
+    """A number that is at least that and short to type: two digits, then zeros."""
+    unit: int = 10 ** max(0, len(str(ceil(value))) - 2)
+    return ceil(value / unit) * unit

@@ -1,9 +1,8 @@
 """What is wrong with a run beside its speed: pure functions of its records, one a fault."""
 
 from itertools import pairwise
-from math import ceil
 
-from rmc.analysis.finding import Finding
+from rmc.analysis.finding import Finding, typed_number
 from rmc.analysis.vitals import Vitals
 from rmc.deploy.run.config import RunConfig
 
@@ -74,7 +73,7 @@ def evaluator_starved(vitals: Vitals, config: RunConfig) -> Finding | None:
     missed = len(made - played)
     if len(made) - 1 <= 0 or len(made & played) >= PLAYED * (len(made) - 1):  # the newest may be on its way
         return None
-    every = 2 * ceil(config.learner.checkpoint_steps * len(made) / max(1, len(made) - missed) / 2)
+    every = typed_number(config.learner.checkpoint_steps * len(made) / max(1, len(made) - missed))
     fewer = max(1, config.evaluator.episodes * (len(made) - missed) // len(made))
     advice = f"--checkpoint-steps {every} gives it the time"
     if fewer < config.evaluator.episodes:
@@ -106,6 +105,6 @@ def oversized_ring(vitals: Vitals, config: RunConfig) -> Finding | None:
     capacity, end = config.replay.capacity, max(fills) * config.total_steps / steps
     if end >= HALF_FULL or capacity * (1.0 - end) < WORTH_WINDOWS:
         return None
-    needed = ceil(end * capacity * 1.1)
+    needed = typed_number(1.1 * end * capacity)
     measured = f"of {capacity:,} windows {end:.0%} will be used at the end of the run"
     return Finding("ring never fills", measured, f"--capacity {needed} holds the whole run")

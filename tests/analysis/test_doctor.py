@@ -178,7 +178,7 @@ def test_a_ring_that_never_fills() -> None:
     found = run_faults.oversized_ring(little, short)
     assert str(found) == (
         "ring never fills: of 70,000 windows 10% will be used at the end of the run; "
-        "--capacity 7701 holds the whole run"
+        "--capacity 7800 holds the whole run"
     )
     assert run_faults.oversized_ring(little, CONFIG) is None  # a million steps fill it
 
