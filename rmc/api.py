@@ -58,9 +58,9 @@ def resume(
     Other options that may change are given to ``train``, with the run's whole config. Raises as ``train`` does.
     """
     folder = RunFolder(Path(run_dir))
-    config, options = folder.config(), last_launch(folder)
+    config, options = folder.config(), last_launch(folder, launcher)
     said: dict[str, Any] = {"total_steps": total_steps, "actors": actors}
-    how: dict[str, Any] = {"launcher": launcher, "device": device, "redis_url": redis_url}
+    how: dict[str, Any] = {"device": device, "redis_url": redis_url}
     if replay_ratio is not None:
         said["replay"] = replace(config.replay, replay_ratio=replay_ratio)
     if learning_rate is not None:

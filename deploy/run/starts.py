@@ -16,7 +16,7 @@ from rmc.common.checkpoint import PROGRESS
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import option
 from rmc.deploy.run.folder import RunFolder, read_object
-from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.launch_options import Launcher, LaunchOptions
 
 KEPT = ("launcher", "device", "redis_url", "ray_address", "all_cpus", "tls")  # of how a run was started last
 
@@ -77,11 +77,14 @@ def resume_command(folder: RunFolder) -> str:
     return f"rmc resume {shlex.quote(str(folder.path))}"
 
 
-def last_launch(folder: RunFolder) -> LaunchOptions:
-    """How the run was started last; as by default where that is not known."""
+def last_launch(folder: RunFolder, launcher: Launcher | None = None) -> LaunchOptions:
+    """How the run was started last; with another ``launcher`` only its device is taken. As by default if not known."""
     known = starts(folder)
     kept = {name: value for name, value in known[-1].launch.items() if name in KEPT} if known else {}
-    return dataclasses.replace(LaunchOptions(folder.path), **kept)
+    last = dataclasses.replace(LaunchOptions(folder.path), **kept)
+    if launcher in (None, last.launcher):
+        return last
+    return LaunchOptions(folder.path, launcher=launcher, device=last.device)
 
 
 def format_starts(folder: RunFolder) -> str:

@@ -78,7 +78,9 @@ def parse(words: list[str]) -> Any:
     if folder is not None:
         config = folder.config()
         named = dataclasses.replace(config.env, id=env or config.env.id)
-        return _parsed(words, _defaults(dataclasses.replace(config, env=named), last_launch(folder)))
+        config = dataclasses.replace(config, env=named)
+        as_before = _parsed(words, _defaults(config, last_launch(folder)))
+        return _parsed(words, _defaults(config, last_launch(folder, as_before.launcher)))
     if isinstance(command, train_options.Train) and not command.env.id:
         raise ConfigError("ENV", "", "rmc train takes an environment, like HalfCheetah-v5, or --run-dir with a run")
     return command
