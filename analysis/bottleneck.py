@@ -114,7 +114,7 @@ def learner_threads(config: RunConfig, cores: int) -> int:
 
 def host_cores(vitals: Vitals) -> int:
     """Cores that the run may use; 0 where it was recorded without."""
-    return int(vitals.last("launcher", "host_cores") or 0)
+    return int(vitals.last("launcher", "host_cores"))
 
 
 def free_cores(vitals: Vitals) -> float:

@@ -47,7 +47,7 @@ def oversubscribed(vitals: Vitals, config: RunConfig) -> Finding | None:
     busy = busy_threads(vitals, config, cores)
     if load <= busy + LOADED:  # it is this run's own, which threads_fight judges
         return None
-    measured = f"load {load:.1f} on {cpus} CPUs, of which this run is {busy:.1f}"
+    measured = f"load {load:.1f} on {cpus:.0f} CPUs, of which this run is {busy:.1f}"
     return Finding("oversubscribed", measured, "other programs take the rest: end them, or use another machine")
 
 
