@@ -69,6 +69,9 @@ def test_the_actors_hold_the_learner_back() -> None:
     full = bottleneck(vitals(**slow, launcher=HOST | {"host_idle_share": 0.02}), CONFIG)
     assert full is not None
     assert full.advice.startswith("all cores are taken: more machines (--launcher ray)")
+    unknown = bottleneck(vitals(**slow), CONFIG)
+    assert unknown is not None
+    assert unknown.advice.startswith("more --actors would help where cores are free")
 
 
 def test_the_replay_server_holds_both_back() -> None:
