@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rmc.actors.evaluator import LONGEST_EPISODE
-from rmc.analysis.evaluation import load_state
+from rmc.analysis.checkpoint_files import load_state
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import load_policy
 from rmc.common.agent import Agent, MemoryOutput

@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_checkpoint
+from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_policy
+from rmc.analysis.policy_file import read_policy
 from rmc.cli import training
 from rmc.cli.ending import STOPPED
 from rmc.common.errors import ConfigError
@@ -48,7 +49,7 @@ def train(
 def evaluate(
     run: str | Path, episodes: int = FINAL_EPISODES, *, checkpoint: str = "latest", flicker: float | None = None
 ) -> dict[str, Any]:
-    """Play deterministic episodes with a run's ``latest``, ``best`` or numbered checkpoint.
+    """Play deterministic episodes with a policy's file, or a run's ``latest``, ``best`` or numbered checkpoint.
 
     ``flicker`` is the probability of a missing observation, by default the run's own. The keys are those of
     ``rmc evaluate --json``: ``eval_return_mean``, ``eval_return_std``, ``eval_episodes``, ``env_steps`` and more.
@@ -59,5 +60,4 @@ def evaluate(
         raise ConfigError("episodes", episodes, "take 1 to 10_000")
     if flicker is not None and not 0.0 <= flicker <= 1.0:
         raise ConfigError("flicker", flicker, "take a probability from 0 to 1")
-    folder = RunFolder(Path(run))
-    return evaluate_checkpoint(folder, folder.config(), checkpoint, episodes, flicker)
+    return evaluate_policy(read_policy(run, checkpoint), episodes, flicker)
