@@ -76,7 +76,7 @@ def _facts(blob: bytes) -> Any:
     text = json.loads(blob[8 : 8 + length]).get("__metadata__", {}).get(METADATA_KEY)
     try:
         return None if text is None else json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise MessageError("damaged header", f"no JSON ({error}); copy it again") from None
 
 
@@ -100,8 +100,12 @@ def _header(facts: Any) -> PolicyHeader:
 
 def _check_shapes(header: PolicyHeader, found: dict[str, tuple[int, ...]]) -> None:
     """Before any memory is taken for what a header says. Raises MessageError."""
-    with torch.device("meta"):
-        wanted = Agent(header.obs_dim, header.action_dim, header.agent).policy_shapes()
+    try:
+        with torch.device("meta"):
+            wanted = Agent(header.obs_dim, header.action_dim, header.agent).policy_shapes()
+    except (RuntimeError, OverflowError, TypeError) as error:  # of torch, for sizes that nothing can have
+        reason = str(error).splitlines()[0]
+        raise MessageError("damaged header", f"no networks have its sizes ({reason}); copy it again") from None
     for name in sorted(wanted.keys() | found.keys()):
         if wanted.get(name) != found.get(name):
             fault = f"{name} has shape {found.get(name)}, its header says {wanted.get(name)}; copy it again"
