@@ -30,9 +30,9 @@ UNITS = ("agent", "environment")
 
 
 def load_policy(source: str | Path, checkpoint: str = "latest") -> "Policy":
-    """The policy of a file, or of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError.
+    """The policy of a file, of ``hf://owner/name``, or of a run's ``latest``, ``best`` or numbered checkpoint.
 
-    A file is all that it takes: neither its run nor the module of its environment need be there.
+    A file is all that it takes: neither its run nor the module of its environment need be there. Raises ConfigError.
     """
     return Policy(read_policy(source, checkpoint))
 

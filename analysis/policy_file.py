@@ -10,6 +10,7 @@ import torch
 from safetensors import SafetensorError
 
 from rmc.actors.policy_runner import PolicyRunner
+from rmc.analysis import hub
 from rmc.analysis.checkpoint_files import load_files
 from rmc.common.agent import Agent
 from rmc.common.bus.metrics_record import is_finite
@@ -34,7 +35,12 @@ class PolicyFile:
 
 
 def read_policy(source: str | Path, checkpoint: str = "latest") -> PolicyFile:
-    """A policy's file, or that of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
+    """A policy's file, that of ``hf://owner/name``, or of a run's ``latest``, ``best`` or numbered checkpoint.
+
+    Raises ConfigError.
+    """
+    if str(source).startswith(hub.SCHEME):
+        source = hub.pull(str(source).removeprefix(hub.SCHEME))
     path = Path(source)
     if path.is_dir():
         return _of_run(RunFolder(path), checkpoint)

@@ -58,6 +58,14 @@ class PolicyHeader:
             "state": self.agent.state_size(self.obs_dim),
         }
 
+    def summary(self) -> str:
+        """Where it comes from and how good it is, in a line."""
+        judged = "not evaluated"
+        if self.eval_return_mean is not None and self.eval_return_std is not None:
+            mean, deviation = self.eval_return_mean, self.eval_return_std
+            judged = f"return {mean:,.1f} ± {deviation:,.1f} over {self.eval_episodes} episodes"
+        return f"{self.env.id} after {self.env_steps:,} environment steps, {judged}"
+
     def metadata(self) -> dict[str, str]:
         """For a file's own metadata, which holds text."""
         facts: dict[str, Any] = {"format": FORMAT, "sizes": self.sizes(), **dataclasses.asdict(self)}

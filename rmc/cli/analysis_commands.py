@@ -21,7 +21,6 @@ from rmc.cli.ending import cut_note
 from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
-from rmc.common.policy_header import PolicyHeader
 from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.folder import RunFolder
@@ -93,21 +92,11 @@ def export_policy(command: run_options.Export) -> int:
     policy, console = read_policy(command.run, command.checkpoint), terminal()
     if command.out.suffix.lower() == ".safetensors":
         write_whole(command.out, policy.encode())
-        console.print(f"{command.out}: {_about(policy.header)}", soft_wrap=True)
+        console.print(f"{command.out}: {policy.header.summary()}", soft_wrap=True)
         return 0
     export.export(policy, command.out)
     console.print(f"{command.out}: inputs {', '.join(export.INPUTS)}; outputs {', '.join(export.OUTPUTS)}")
     return 0
-
-
-def _about(header: PolicyHeader) -> str:
-    """A policy's origin in words."""
-    if header.eval_return_mean is None or header.eval_return_std is None:
-        judged = "not evaluated"
-    else:
-        over = f"over {header.eval_episodes} episodes"
-        judged = f"return {header.eval_return_mean:,.1f} ± {header.eval_return_std:,.1f} {over}"
-    return f"{header.env.id} after {header.env_steps:,} environment steps, {judged}"
 
 
 def inspect(command: run_options.Inspect) -> int:

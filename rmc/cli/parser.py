@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from rmc.cli import role_options, run_options, train_options
+from rmc.cli import hub_options, role_options, run_options, train_options
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig
@@ -41,6 +41,7 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "check-env": (run_options.CheckEnv, Action("analysis_commands", "check_env")),
     "baseline": (run_options.Baseline, Action("analysis_commands", "baseline")),
     "plot": (run_options.Plot, Action("analysis_commands", "plot")),
+    "hub": (hub_options.Hub, Action("hub_commands", "run_hub")),
     "stats": (run_options.Stats, Action("commands", "stats")),
     "attach": (run_options.Attach, Action("commands", "attach")),
     "stop": (run_options.Stop, Action("commands", "stop")),
