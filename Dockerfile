@@ -14,9 +14,11 @@ COPY . /src/
 RUN /opt/rmc/bin/pip install --quiet /src -c /src/constraints.txt \
     && rm -rf /src \
     && useradd --uid 1000 --create-home rmc \
-    && mkdir /runs \
-    && chown rmc /runs
+    && mkdir /work \
+    && chown rmc /work
 
+# Sockets go where even a read-only root can be written. USER and HOME are for users whom the image does not know.
+ENV TMPDIR=/dev/shm USER=rmc HOME=/work
 USER rmc
-WORKDIR /runs
+WORKDIR /work
 ENTRYPOINT ["rmc"]

@@ -75,34 +75,31 @@ class Image:
         inside = ["chroot", str(self.root), "/usr/bin/env", "-i", *(f"{k}={v}" for k, v in environment.items()), *words]
         _in_namespace(f"{mounts} && exec {shlex.join(inside)}").check_returncode()
 
-    def run(self, words: list[str], runs: Path) -> subprocess.CompletedProcess[str]:
-        """The entry point as its user: the root read-only, little shared memory, no network, ``runs`` its folder.
+    def run(self, words: list[str], folder: Path, uid: int | None = None) -> subprocess.CompletedProcess[str]:
+        """The entry point, as its user or another: the root read-only, little shared memory, no network.
 
-        As ``docker run --read-only --network none --volume RUNS:/runs`` does; there is no other place to write to.
+        As ``docker run --read-only --network none --volume FOLDER:/work``, where ``folder`` is all that can be written.
         """
-        root = self.root
-        uid = self._id("/etc/passwd")
+        root, uid = self.root, self._uid() if uid is None else uid
         mounts = [
             f"mount --bind {root} {root}",
-            f"mount --bind {runs} {root}{self.folder}",
+            f"mount --bind {folder} {root}{self.folder}",
             f"mount -o remount,ro,bind {root}",
             f"mount -t proc proc {root}/proc",
             f"mount -t tmpfs -o size=64k,mode=755 tmpfs {root}/dev",
             *(f"mknod -m 666 {root}/dev/{name} c 1 {minor}" for name, minor in (("null", 3), ("zero", 5))),
             *(f"mknod -m 666 {root}/dev/{name} c 1 {minor}" for name, minor in (("random", 8), ("urandom", 9))),
             f"mkdir {root}/dev/shm",
-            f"mount -t tmpfs -o size={SHM_BYTES},mode=1777 tmpfs {root}/dev/shm",
+            f"mount -t tmpfs -o size={SHM_BYTES},mode=1777,noexec,nosuid,nodev tmpfs {root}/dev/shm",
         ]
         environment = [f"{name}={value}" for name, value in self.environment.items()]
-        inside = ["chroot", f"--userspec={uid}:{uid}", str(root), "/usr/bin/env", "-i", *environment]
+        inside = ["chroot", f"--userspec={uid}:{uid}", "--groups=", str(root), "/usr/bin/env", "-i", *environment]
         inside += ["/bin/sh", "-c", f"cd {self.folder} && exec {shlex.join([*self.entrypoint, *words])}"]
         return _in_namespace(" && ".join([*mounts, f"exec {shlex.join(inside)}"]), "--net")
 
-    def _id(self, table: str) -> str:
-        (line,) = (
-            line for line in (self.root / table[1:]).read_text().splitlines() if line.startswith(f"{self.user}:")
-        )
-        return line.split(":")[2]
+    def _uid(self) -> int:
+        users = [line.split(":") for line in (self.root / "etc" / "passwd").read_text().splitlines()]
+        return next(int(user[2]) for user in users if user[0] == self.user)
 
 
 def kept(context: Path) -> set[str]:
