@@ -22,9 +22,7 @@ def check_installed(repo: str) -> None:
 def push(repo: str, files: Mapping[str, bytes], private: bool) -> str:
     """One commit of these files; a repository that is not there is made. Its address. Raises ConfigError."""
     from huggingface_hub import CommitOperationAdd, HfApi, get_token
-    from huggingface_hub.utils import disable_progress_bars
 
-    disable_progress_bars()
     if get_token() is None:
         raise ConfigError("HF_TOKEN", None, "no token; set it to one that may write, or run hf auth login")
     api = HfApi(library_name="rmc")
@@ -38,18 +36,19 @@ def pull(repo: str, revision: str | None = None) -> Path:
     """A repository's policy, in the hub's own cache. Raises ConfigError."""
     check_installed(repo)
     from huggingface_hub import hf_hub_download
-    from huggingface_hub.utils import disable_progress_bars
 
-    disable_progress_bars()
-    with _in_one_line(repo):
+    with _in_one_line(repo, revision):
         return Path(hf_hub_download(repo, POLICY, revision=revision, library_name="rmc"))
 
 
 @contextmanager
-def _in_one_line(repo: str) -> Iterator[None]:
-    """What the hub refuses, as a ConfigError."""
+def _in_one_line(repo: str, revision: str | None = None) -> Iterator[None]:
+    """What the hub refuses, as a ConfigError; its library says nothing beside that."""
     from huggingface_hub import constants, errors
+    from huggingface_hub.utils import disable_progress_bars, logging
 
+    disable_progress_bars()
+    logging.set_verbosity_error()
     try:
         yield
     except errors.HFValidationError:
@@ -60,7 +59,7 @@ def _in_one_line(repo: str) -> Iterator[None]:
         fix = "no such repository, or a private one; check its name, or run hf auth login"
         raise ConfigError("REPO", repo, fix) from None
     except errors.RevisionNotFoundError:
-        raise ConfigError("--revision", repo, "the repository has no such revision; leave it") from None
+        raise ConfigError("--revision", revision, f"{repo} has no such revision; leave it") from None
     except errors.RemoteEntryNotFoundError:
         raise ConfigError("REPO", repo, f"it holds no {POLICY}; rmc hub push puts one there") from None
     except errors.HfHubHTTPError as error:
@@ -70,5 +69,5 @@ def _in_one_line(repo: str) -> Iterator[None]:
     except (errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError, errors.HTTPError) as error:
         cause = error.__cause__ if isinstance(error, errors.LocalEntryNotFoundError) and error.__cause__ else error
         reason = (str(cause).splitlines() or [type(cause).__name__])[0]
-        fix = f"{constants.ENDPOINT} cannot be reached ({reason}); try again with a network"
+        fix = f"cannot be reached ({reason}); try again with a network"
         raise ConfigError("HF_ENDPOINT", constants.ENDPOINT, fix) from None
