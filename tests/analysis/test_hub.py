@@ -121,13 +121,17 @@ def test_what_goes_wrong_is_one_line(hub: Hub, call: Call, tmp_path: Path) -> No
     assert not (tmp_path / "policy.safetensors").exists()
 
 
-@pytest.mark.parametrize("more", [{"HF_HUB_OFFLINE": "1"}, {}], ids=["offline", "nobody there"])
-def test_without_a_network_one_line_says_what_was_tried(more: dict[str, str], call: Call, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("words", "more"),
+    [("push run me/x", {}), ("push run me/x", {"HF_HUB_OFFLINE": "1"}), ("pull x", {"HF_HUB_OFFLINE": "1"})],
+)
+def test_without_a_network_one_line_says_what_was_tried(
+    words: str, more: dict[str, str], call: Call, tmp_path: Path
+) -> None:
     make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
-    for words in (["push", "run", "me/x"], ["pull", "me/x"]):
-        done = call(*RMC, *words, folder=tmp_path, HF_ENDPOINT="http://127.0.0.1:9", **more)
-        (line,) = done.stderr.splitlines()
-        assert line.startswith("rmc: HF_ENDPOINT='http://127.0.0.1:9': cannot be reached ("), line
+    done = call(*RMC, *words.split(), folder=tmp_path, HF_ENDPOINT="http://127.0.0.1:9", **more)
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("rmc: HF_ENDPOINT='http://127.0.0.1:9': cannot be reached ("), line
 
 
 def test_without_the_extra_one_line_says_how_to_get_it(

@@ -136,6 +136,7 @@ def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureF
     assert "inputs observation, previous_action, missing, state" in capsys.readouterr().out
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     rng, policy = np.random.default_rng(0), load_policy(run.path)
+    assert session.get_modelmeta().custom_metadata_map == policy.header.metadata()
     feed = {
         "previous_action": np.zeros((3, 1), np.float32),
         "state": np.zeros((3, run.config().window_spec().state), np.float32),
