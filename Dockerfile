@@ -17,8 +17,8 @@ RUN /opt/rmc/bin/pip install --quiet /src -c /src/constraints.txt \
     && mkdir /work \
     && chown rmc /work
 
-# Sockets go where even a read-only root can be written. USER and HOME are for users whom the image does not know.
-ENV TMPDIR=/dev/shm USER=rmc HOME=/work
+# For users whom the image does not know.
+ENV HOME=/work
 USER rmc
 WORKDIR /work
 ENTRYPOINT ["rmc"]

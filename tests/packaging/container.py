@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 SHM_BYTES = 64 << 20  # what a container engine gives by default
+DEVICES = {"null": 3, "zero": 5, "random": 8, "urandom": 9}  # of major number 1
 Step = tuple[str, str]
 
 
@@ -32,6 +33,8 @@ class Image:
     user: str = "root"
     folder: str = "/"
     entrypoint: list[str] = field(default_factory=list)
+    bound: list[Path] = field(default_factory=list)
+    """What lies outside of ``root`` and is seen in there, at the same place."""
 
     def build(self, dockerfile: str, arguments: dict[str, str], hidden: dict[str, str]) -> None:
         """Do every step; ``hidden`` is what pip needs to know here, and is forgotten. Raises CalledProcessError."""
@@ -78,17 +81,18 @@ class Image:
     def run(self, words: list[str], folder: Path, uid: int | None = None) -> subprocess.CompletedProcess[str]:
         """The entry point, as its user or another: the root read-only, little shared memory, no network.
 
-        As ``docker run --read-only --network none --volume FOLDER:/work``, where ``folder`` is all that can be written.
+        As ``docker run --read-only --network none --cap-drop ALL --volume FOLDER:/work``: only ``folder`` and the
+        shared memory can be written.
         """
         root, uid = self.root, self._uid() if uid is None else uid
         mounts = [
             f"mount --bind {root} {root}",
+            *(f"mount --bind {path} {root}{path} && mount -o remount,ro,bind {root}{path}" for path in self.bound),
             f"mount --bind {folder} {root}{self.folder}",
             f"mount -o remount,ro,bind {root}",
             f"mount -t proc proc {root}/proc",
             f"mount -t tmpfs -o size=64k,mode=755 tmpfs {root}/dev",
-            *(f"mknod -m 666 {root}/dev/{name} c 1 {minor}" for name, minor in (("null", 3), ("zero", 5))),
-            *(f"mknod -m 666 {root}/dev/{name} c 1 {minor}" for name, minor in (("random", 8), ("urandom", 9))),
+            *(f"mknod -m 666 {root}/dev/{name} c 1 {minor}" for name, minor in DEVICES.items()),
             f"mkdir {root}/dev/shm",
             f"mount -t tmpfs -o size={SHM_BYTES},mode=1777,noexec,nosuid,nodev tmpfs {root}/dev/shm",
         ]
