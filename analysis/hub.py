@@ -1,6 +1,7 @@
 """Files to and from a repository of the Hugging Face hub; HF_ENDPOINT names another hub."""
 
 import importlib.util
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,10 +46,11 @@ def pull(repo: str, revision: str | None = None) -> Path:
 def _in_one_line(repo: str, revision: str | None = None) -> Iterator[None]:
     """What the hub refuses, as a ConfigError; its library says nothing beside that."""
     from huggingface_hub import constants, errors
-    from huggingface_hub.utils import disable_progress_bars, logging
+    from huggingface_hub.utils.logging import set_verbosity
+    from huggingface_hub.utils.tqdm import disable_progress_bars
 
     disable_progress_bars()
-    logging.set_verbosity_error()
+    set_verbosity(logging.ERROR)
     try:
         yield
     except errors.HFValidationError:
@@ -66,7 +68,7 @@ def _in_one_line(repo: str, revision: str | None = None) -> Iterator[None]:
         status = error.response.status_code
         fix = "use a token that may" if status in (401, 403) else "try again"
         raise ConfigError("REPO", repo, f"the hub refuses it (HTTP {status}); {fix}") from None
-    except (errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError, errors.HTTPError) as error:
+    except (errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError, errors.HTTPError) as error:  # type: ignore[attr-defined]
         cause = error.__cause__ if isinstance(error, errors.LocalEntryNotFoundError) and error.__cause__ else error
         reason = (str(cause).splitlines() or [type(cause).__name__])[0]
         fix = f"cannot be reached ({reason}); try again with a network"

@@ -48,7 +48,8 @@ class Policy:
         self._file, self._rng = file, np.random.default_rng(seed)
         layout = file.header.layout
         self._scale = ActionScale(np.array(layout.action_low), np.array(layout.action_high))
-        self.reset()
+        self._runner: PolicyRunner | None = None
+        self._prev_action = self._state = np.zeros((0, 0), np.float32)  # (N, A), (N, S), once it acts
 
     @property
     def header(self) -> PolicyHeader:
@@ -65,7 +66,7 @@ class Policy:
     def reset(self, index: int | None = None) -> None:
         """Forget: a new episode begins, in all of them or in that of one row. Raises ConfigError."""
         if index is None:
-            self._runner: PolicyRunner | None = None
+            self._runner = None
         elif self._runner is not None:
             rows = len(self._state)
             if not -rows <= index < rows:
@@ -102,7 +103,8 @@ class Policy:
             raise ConfigError("units", units, f"use one of {UNITS}")
         seen, absent = self._read(observation, missing)
         runner = self._begin(len(seen))
-        noise = self._rng.standard_normal(self._prev_action.shape, np.float32) if explore else None
+        shape = self._prev_action.shape
+        noise = self._rng.standard_normal(shape, np.float32) if explore else None
         action, state = runner.act(seen, self._prev_action, absent, self._state, noise)
         self._prev_action, self._state[:] = action, state
         found = action.copy() if units == "agent" else self._in_environment(action)

@@ -44,8 +44,8 @@ def evaluate(command: run_options.Evaluate) -> int:
     if command.video is not None:
         video.prepare(env, command.video)
     watch = Progress(Console(stderr=True), str(command.run))
-    for flicker in command.flicker or (None,):
-        _say_played(command, evaluate_policy(policy, command.episodes, flicker, command.seconds, watch))
+    for probability in command.flicker or (None,):
+        _say_played(command, evaluate_policy(policy, command.episodes, probability, command.seconds, watch))
     if command.video is not None:
         env = dataclasses.replace(env, flicker=command.flicker[0]) if command.flicker else env
         total = video.record(Policy(policy), env, policy.header.seed, command.video)

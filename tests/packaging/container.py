@@ -74,7 +74,8 @@ class Image:
                 shutil.copy(path, there)
 
     def _shell(self, words: list[str], environment: dict[str, str]) -> None:
-        mounts = f"mount -t proc proc {self.root}/proc && mount --rbind /dev {self.root}/dev"
+        seen = [f"mkdir -p {self.root}{path} && mount --bind {path} {self.root}{path}" for path in self.bound]
+        mounts = " && ".join(["mount -t proc proc {0}/proc", "mount --rbind /dev {0}/dev", *seen]).format(self.root)
         inside = ["chroot", str(self.root), "/usr/bin/env", "-i", *(f"{k}={v}" for k, v in environment.items()), *words]
         _in_namespace(f"{mounts} && exec {shlex.join(inside)}").check_returncode()
 
@@ -84,7 +85,7 @@ class Image:
         As ``docker run --read-only --network none --cap-drop ALL --volume FOLDER:/work``: only ``folder`` and the
         shared memory can be written.
         """
-        root, uid = self.root, self._uid() if uid is None else uid
+        root, uid = self.root, self.uid() if uid is None else uid
         mounts = [
             f"mount --bind {root} {root}",
             *(f"mount --bind {path} {root}{path} && mount -o remount,ro,bind {root}{path}" for path in self.bound),
@@ -101,7 +102,8 @@ class Image:
         inside += ["/bin/sh", "-c", f"cd {self.folder} && exec {shlex.join([*self.entrypoint, *words])}"]
         return _in_namespace(" && ".join([*mounts, f"exec {shlex.join(inside)}"]), "--net")
 
-    def _uid(self) -> int:
+    def uid(self) -> int:
+        """Its user's number."""
         users = [line.split(":") for line in (self.root / "etc" / "passwd").read_text().splitlines()]
         return next(int(user[2]) for user in users if user[0] == self.user)
 
