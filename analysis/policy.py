@@ -135,7 +135,7 @@ class Policy:
         absent = np.broadcast_to(absent, len(seen)).copy()
         odd = ~np.isfinite(seen) & ~absent[:, None]
         if odd.any():
-            if not self.header.agent.fill_blanks:
+            if not self.header.agent.impute_missing:
                 places = [place if len(seen) == 1 else (row, place) for row, place in np.argwhere(odd).tolist()]
                 values = dict(zip(places, seen[odd].tolist(), strict=True))
                 raise ConfigError("observation", values, "give finite numbers, or missing=True where there is none")

@@ -11,14 +11,15 @@ from safetensors import SafetensorError
 
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.analysis import hub
-from rmc.analysis.checkpoint_files import load_files
 from rmc.common.agent import Agent
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.checkpoint import POLICY, PROGRESS
 from rmc.common.errors import ConfigError, MessageError
-from rmc.common.policy_header import FORMAT, METADATA_KEY, PolicyHeader
+from rmc.common.policy_header import METADATA_KEY, PolicyHeader
+from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import from_dict
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.migrations import FORMAT, migrated
 
 
 @dataclass(frozen=True)
@@ -89,14 +90,14 @@ def _facts(blob: bytes) -> Any:
 def _header(facts: Any) -> PolicyHeader:
     if not isinstance(facts, dict):
         raise MessageError("damaged header", f"{facts!r} is no object; copy it again")
-    number, sizes, wrote = facts.pop("format", None), facts.pop("sizes", None), facts.get("rmc")
-    if not isinstance(number, int) or number < 1:
+    number, sizes, wrote = facts.get("format"), facts.pop("sizes", None), facts.get("rmc")
+    if type(number) is not int or number < 1:
         raise MessageError("damaged header", f"its format is {number!r}; copy it again")
     if number > FORMAT:
         fix = f"RMC {wrote} wrote format {number}, this one reads up to {FORMAT}; install that version"
         raise MessageError("newer policy", fix)
     try:
-        header = from_dict(PolicyHeader, facts, "")
+        header = from_dict(PolicyHeader, migrated(facts) | {"format": FORMAT}, "")
     except ConfigError as error:
         raise MessageError("header of another version", f"RMC {wrote} wrote it; {error}") from None
     if header.sizes() != sizes:
@@ -125,7 +126,7 @@ def _check_weights(header: PolicyHeader, blob: bytes) -> None:
 def _of_run(folder: RunFolder, checkpoint: str) -> PolicyFile:
     if folder.is_baseline():
         folder.config()  # says so
-    files = load_files(folder, checkpoint)
+    _, files = choose_checkpoint(folder, checkpoint)
     try:
         has_header = _shapes(files[POLICY]) and _facts(files[POLICY]) is not None
         policy = decode(files[POLICY]) if has_header else _of_older_run(folder, files)

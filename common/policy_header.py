@@ -7,13 +7,11 @@ Shapes: O observation, A action, S state.
 import dataclasses
 import json
 from dataclasses import dataclass
-from typing import Any
 
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.layout import EnvLayout
 
-FORMAT = 1  # one more where a reader of the one before would act otherwise
 METADATA_KEY = "rmc.policy"
 
 
@@ -21,6 +19,8 @@ METADATA_KEY = "rmc.policy"
 class PolicyHeader:
     """Sizes, options and origin of a policy."""
 
+    format: int
+    """Of these facts, as ``config.json`` counts its own: what is in both has the same names."""
     rmc: str
     """The version of RMC that wrote it."""
     env: EnvConfig
@@ -68,5 +68,4 @@ class PolicyHeader:
 
     def metadata(self) -> dict[str, str]:
         """For a file's own metadata, which holds text."""
-        facts: dict[str, Any] = {"format": FORMAT, "sizes": self.sizes(), **dataclasses.asdict(self)}
-        return {METADATA_KEY: json.dumps(facts)}
+        return {METADATA_KEY: json.dumps(dataclasses.asdict(self) | {"sizes": self.sizes()})}

@@ -155,7 +155,7 @@ def _check_identity(path: Path, spec: WindowSpec, capacity: int) -> None:
     magic, fingerprint, found, _ = _IDENTITY.unpack(raw[:-4])
     if magic != _MAGIC:
         raise _unusable(path, "made by another version")
-    if fingerprint != spec.fingerprint.encode():
+    if fingerprint not in (spec.fingerprint.encode(), spec.former_fingerprint.encode()):
         fix = f"its windows are of layout {fingerprint.decode()}, this run's of {spec.fingerprint}; use a new folder"
         raise ConfigError("--run-dir", str(path), fix)
     if found != capacity:

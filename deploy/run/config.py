@@ -22,6 +22,7 @@ from rmc.common.errors import ConfigError
 from rmc.common.policy_header import PolicyHeader
 from rmc.common.shard import Shard
 from rmc.common.window import WindowSpec
+from rmc.deploy.run.migrations import FORMAT, migrated
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
 
@@ -88,7 +89,7 @@ class RunConfig:
 
     def policy_header(self) -> PolicyHeader:
         """What the files of this run's policies say about themselves, before any step. Raises ConfigError."""
-        return PolicyHeader(version("rmc-rl"), self.env, self.layout, self.agent, self.preset, self.seed)
+        return PolicyHeader(FORMAT, version("rmc-rl"), self.env, self.layout, self.agent, self.preset, self.seed)
 
     def sizes(self) -> dict[str, int]:
         """What a run's networks and windows were made for, in words. Raises ConfigError."""
@@ -120,12 +121,12 @@ class RunConfig:
 
 def to_json(config: RunConfig) -> str:
     """The config as JSON, as in ``config.json``."""
-    return json.dumps(dataclasses.asdict(config), indent=2)
+    return json.dumps({"format": FORMAT} | dataclasses.asdict(config), indent=2)
 
 
 def from_json(text: str | bytes) -> RunConfig:
-    """The config again. Raises ConfigError on anything unknown, missing or of the wrong type."""
-    return from_dict(RunConfig, _read(text), "config.json ")
+    """The config again, also an older version's. Raises ConfigError on anything unknown, missing or of a wrong type."""
+    return from_dict(RunConfig, migrated(_read(text)), "config.json ")
 
 
 def to_registration(config: RunConfig) -> bytes:

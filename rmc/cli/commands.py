@@ -9,12 +9,13 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.monitor import attach as attachment
 from rmc.deploy.monitor.view import RunStatus, table, terminal
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.starts import format_starts
 
 log = logging.getLogger(__name__)
 
 
 def train(command: train_options.Train) -> int:
-    """Train a run."""
+    """Train a run, or go on with one."""
     warn_of_password(command.redis_url or "")
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     return training.train(command.config(), command.launch_options(), terminal())
@@ -31,6 +32,8 @@ def stats(command: run_options.Stats) -> int:
     if not board.roles:
         raise ConfigError("RUN", str(folder.path), "it has no metrics yet; train it first")
     console.print(table(board))
+    if history := format_starts(folder):
+        console.print(history, soft_wrap=True)
     if result is not None:
         console.print_json(data=result)
     return 0

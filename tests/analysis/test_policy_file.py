@@ -217,10 +217,8 @@ def _set(*path: Any, value: Any) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (
-            _set("format", value=2),
-            "newer policy: RMC 0.1.0 wrote format 2, this one reads up to 1; install that version",
-        ),
+        (_set("format", value=99), "newer policy: RMC 0.1.0 wrote format 99, this one reads up to "),
+        (_set("format", value=0), "damaged header: its format is 0"),
         (_set("format", value="1"), "damaged header: its format is '1'"),
         (_set("agent", "hidden", value=32), "damaged header: its sizes are"),
         (_set("sizes", value=None), "damaged header: its sizes are None"),
@@ -243,6 +241,20 @@ def test_a_header_that_does_not_fit_is_one_line(
     line = complaint(["evaluate", str(changed(file, change))], capsys)
     assert line.startswith(f"rmc: policy file='{file}': ")
     assert says in line
+
+
+def test_an_older_header_is_read_in_todays_words(file: Path) -> None:
+    """With the migrations of config.json: as if format 1 had had headers."""
+
+    def older(facts: dict[str, Any]) -> None:
+        facts["format"] = 1
+        facts["agent"]["fill_blanks"] = facts["agent"].pop("impute_missing")
+        facts["agent"]["blank_flag"] = facts["agent"].pop("missing_flag")
+        del facts["env"]["env_kwargs"]
+
+    before = load_policy(file).header
+    assert before.agent.impute_missing
+    assert load_policy(changed(file, older)).header == before
 
 
 @pytest.mark.parametrize(

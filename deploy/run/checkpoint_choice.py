@@ -1,28 +1,20 @@
-"""The files of a run's checkpoint, by what a user calls it: latest, best or its number."""
+"""Which of a run's checkpoints is meant: ``latest``, ``best`` or a number."""
 
-from rmc.common.checkpoint import STATE, CheckpointFolder
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import CheckpointError, ConfigError
 from rmc.deploy.run.folder import RunFolder
 
 
-def load_files(folder: RunFolder, checkpoint: str) -> dict[str, bytes]:
-    """All of them. Raises ConfigError, which names the checkpoints that there are.
-
-    The best is of those that were evaluated while it trained, which the last one need not be.
-    """
+def choose_checkpoint(folder: RunFolder, which: str) -> tuple[int, dict[str, bytes]]:
+    """Its number and files, verified. Raises ConfigError where there is none or it is damaged."""
     checkpoints = CheckpointFolder(folder.checkpoints)
-    number = _number(checkpoints, checkpoint)
+    number = _number(checkpoints, which)
     try:
-        return checkpoints.load(number)
+        return number, checkpoints.load(number)
     except CheckpointError as error:
         others = [other for other in checkpoints.numbers() if other != number]
         fix = f"use one of {others}" if others else "there is no other"
-        raise ConfigError("--checkpoint", checkpoint, f"{error}; {fix}") from None
-
-
-def load_state(folder: RunFolder, checkpoint: str) -> bytes:
-    """The learner's whole state of a checkpoint, for ``torch.load``. Raises ConfigError."""
-    return load_files(folder, checkpoint)[STATE]
+        raise ConfigError("--checkpoint", which, f"{error}; {fix}") from None
 
 
 def _number(checkpoints: CheckpointFolder, which: str) -> int:
