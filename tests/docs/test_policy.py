@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -39,6 +40,12 @@ def test_the_pages_run(tmp_path: Path) -> None:
     shown = "print(action.dtype, abs(action) <= 2, actions.shape, policy.header.eval_episodes)"
     assert python("-c", f"{loop}\n{batch}\n{shown}", folder=tmp_path) == "float32 [ True] (3, 1) 10\n"
     policy = load_policy(tmp_path / "policy.safetensors")
+    (checkpoint,) = tmp_path.glob(re.findall(r"`(runs/.*policy.safetensors)`", POLICY)[0])
+    shutil.copy(checkpoint, tmp_path / "copy.safetensors")
+    copied = load_policy(tmp_path / "copy.safetensors")
+    assert (copied.header.env_steps, copied.header.eval_return_mean) == (policy.header.env_steps, None)
+    assert copied.act([1.0, 0.0, 0.5]) == policy.act([1.0, 0.0, 0.5])
+    policy.reset()
     first = policy.act([1.0, 0.0, 0.5], units="environment")
     second = policy.act([0.0, 0.0, 0.0], missing=True, units="environment")
     ours = f"{alone}\nprint(act(start, [1.0, 0.0, 0.5])[0].round(4), action.round(4))"
