@@ -26,7 +26,7 @@ TITLES = {
     "evaluator": "Evaluation",
 }
 HEAD, RULE = "| option | default | what it is | when to touch it |", "|---|---|---|---|"
-PLACEMENT = ["run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls"]
+PLACEMENT = ["run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls", "dry_run"]
 BEGINNING = ["init_from", "init_parts"]
 # When a user should touch an option; what it does is said where it is defined.
 WHEN = {
@@ -44,6 +44,7 @@ WHEN = {
     "ray_address": "`local` to try Ray on one machine",
     "all_cpus": "on a cluster that is there for this run",
     "tls": "where others are on the cluster's network",
+    "dry_run": "before a long run, or on a machine that is new to it",
     "flicker": "for trials of partial observation",
     "hide": "for trials of partial observation",
     "noise": "for trials of partial observation",

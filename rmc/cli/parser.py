@@ -52,6 +52,8 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "baseline": (run_options.Baseline, Action("analysis_commands", "baseline")),
     "plot": (run_options.Plot, Action("analysis_commands", "plot")),
     "hub": (hub_options.Hub, Action("hub_commands", "run_hub")),
+    "report": (run_options.Report, Action("report_command", "report")),
+    "doctor": (run_options.Doctor, Action("commands", "doctor")),
     "stats": (run_options.Stats, Action("commands", "stats")),
     "attach": (run_options.Attach, Action("commands", "attach")),
     "stop": (run_options.Stop, Action("commands", "stop")),

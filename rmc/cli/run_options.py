@@ -126,6 +126,26 @@ class Stats:
 
 
 @dataclass(frozen=True)
+class Doctor:
+    """Say which stage holds a run back, by how much, and the option that changes it."""
+
+    run: Positional[Path]
+    """The run's folder."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write one file about runs, for a browser without a network: curves, tables, videos, waits, differences."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Folders of runs, also of baselines."""
+    out: Path = Path("report.html")
+    """The file to write."""
+    video: bool = True
+    """Film an episode of each agent's newest policy."""
+
+
+@dataclass(frozen=True)
 class Attach:
     """Watch a run that is being trained; Ctrl-C only stops watching."""
 

@@ -91,6 +91,9 @@ class Train:
     tls: bool = False
     """With --launcher ray: encrypt what the roles say across machines; needs a Redis server built with TLS on the
     head."""
+    dry_run: bool = False
+    """Train for some seconds in a temporary folder, and tell what the run needs beside what this machine has: memory,
+    disk, bandwidth, handles, threads, time. Exit status 1 where it does not fit."""
 
     def config(self) -> RunConfig:
         """The run's config."""

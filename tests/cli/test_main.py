@@ -30,7 +30,7 @@ TRAIN_FLAGS = """
     --init-from --init-parts
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
     --env-timeout --env-kwargs --config --run-dir --if-exists --launcher --device --redis-url
-    --ray-address --all-cpus --tls
+    --ray-address --all-cpus --tls --dry-run
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
     --missing-flag --impute-missing --initial-priority
@@ -59,6 +59,8 @@ OTHER_FLAGS = {
         *"--settings --seed --total-steps --checkpoint-steps --episodes --threads --run-dir".split(),  # noqa: SIM905
     ],
     "plot": ["--out", "--by", "--reference"],
+    "report": ["--out", "--video"],
+    "doctor": [],
     "stats": [],
     "attach": [],
     "stop": [],
