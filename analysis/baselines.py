@@ -30,7 +30,7 @@ from rmc.actors.config import EvaluatorConfig
 from rmc.actors.evaluator import first_start, play_episodes, told
 from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, read, validate
 from rmc.analysis.evaluation import FINAL_EPISODES, Progress, Watch
-from rmc.common.env.make import env_spaces, make_env
+from rmc.common.env.make import env_layout, make_env
 from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
@@ -85,8 +85,8 @@ def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: 
 
 def _sizes(config: BaselineConfig) -> dict[str, int]:
     """What its networks are made for. Raises ConfigError."""
-    observations, actions, _ = env_spaces(config.env)
-    return {"observations": observations, "actions": actions}
+    layout = env_layout(config.env)
+    return {"observations": layout.obs_dim, "actions": layout.action_dim}
 
 
 def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, int]) -> RunFolder:
@@ -331,7 +331,7 @@ def evaluate(
     seconds: float = 0.0,
     watch: Watch = lambda _: None,
 ) -> dict[str, Any]:
-    """Deterministic episodes of what a baseline's run saved last, as ``evaluate_checkpoint``. Raises ConfigError."""
+    """Deterministic episodes of what a baseline's run saved last, as ``evaluate_policy``. Raises ConfigError."""
     config, states = read(folder), _states(folder)
     if not states:
         raise ConfigError("RUN", str(folder.path), "it has no checkpoint yet; train it for longer")

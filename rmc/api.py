@@ -4,7 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_checkpoint
+from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_policy
+from rmc.analysis.policy_file import read_policy
 from rmc.cli import training
 from rmc.cli.ending import STOPPED
 from rmc.common.errors import ConfigError
@@ -90,7 +91,7 @@ def _train(config: RunConfig, options: LaunchOptions) -> dict[str, Any]:
 def evaluate(
     run: str | Path, episodes: int = FINAL_EPISODES, *, checkpoint: str = "latest", flicker: float | None = None
 ) -> dict[str, Any]:
-    """Play deterministic episodes with a run's ``latest``, ``best`` or numbered checkpoint.
+    """Play deterministic episodes with a policy's file, or a run's ``latest``, ``best`` or numbered checkpoint.
 
     ``flicker`` is the probability of a missing observation, by default the run's own. The keys are those of
     ``rmc evaluate --json``: ``eval_return_mean``, ``eval_return_std``, ``eval_episodes``, ``env_steps`` and more.
@@ -101,5 +102,4 @@ def evaluate(
         raise ConfigError("episodes", episodes, "take 1 to 10_000")
     if flicker is not None and not 0.0 <= flicker <= 1.0:
         raise ConfigError("flicker", flicker, "take a probability from 0 to 1")
-    folder = RunFolder(Path(run))
-    return evaluate_checkpoint(folder, folder.config(), checkpoint, episodes, flicker)
+    return evaluate_policy(read_policy(run, checkpoint), episodes, flicker)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, cast, get_type_hints
 
 import tyro
 
-from rmc.cli import role_options, run_options, train_options
+from rmc.cli import hub_options, role_options, run_options, train_options
 from rmc.cli.config_file import KWARGS, with_file
 from rmc.cli.help_text import ALL_OPTIONS, BASIC, only_basic
 from rmc.cli.numerals import NUMERALS
@@ -51,6 +51,7 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "check-env": (run_options.CheckEnv, Action("analysis_commands", "check_env")),
     "baseline": (run_options.Baseline, Action("analysis_commands", "baseline")),
     "plot": (run_options.Plot, Action("analysis_commands", "plot")),
+    "hub": (hub_options.Hub, Action("hub_commands", "run_hub")),
     "report": (run_options.Report, Action("report_command", "report")),
     "doctor": (run_options.Doctor, Action("commands", "doctor")),
     "stats": (run_options.Stats, Action("commands", "stats")),

@@ -51,6 +51,8 @@ OTHER_FLAGS = {
     "evaluate": ["--episodes", "--seconds", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
     "inspect": ["--out", "--checkpoint"],
+    "hub push": ["--checkpoint", "--license", "--private"],
+    "hub pull": ["--out", "--revision"],
     "check-env": [*ENV_FLAGS, "--steps"],
     "baseline": [
         *ENV_FLAGS,

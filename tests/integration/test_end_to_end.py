@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import redis
 
+from rmc.analysis.policy_file import decode
 from tests.integration.running import Training
 
 MANUAL = Path(__file__).parents[2] / "docs" / "manual.md"
@@ -43,6 +44,10 @@ def test_train_evaluate_stats_and_resume(tmp_path: Path) -> None:
     assert {"replay", "learner", "actor-0", "evaluator", "launcher"} <= {
         json.loads(line)["role"] for line in (folder / "metrics.jsonl").read_text().splitlines()
     }
+
+    *_, newest = sorted((folder / "checkpoints").glob("*/policy.safetensors"))  # a copy of which is enough
+    header = decode(newest.read_bytes()).header
+    assert (header.env.id, header.env_steps, header.updates) == (result["env"], 1500, result["updates"])
 
     played = rmc("evaluate", str(folder), "--json")
     assert played.returncode == 0, played.stderr
