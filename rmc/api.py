@@ -5,12 +5,12 @@ from typing import Any
 
 from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_checkpoint
 from rmc.cli import training
-from rmc.cli.ending import STOPPED
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import IfExists, Launcher, LaunchOptions
+from rmc.deploy.run.state import STOPPED
 
 
 def train(

@@ -41,7 +41,7 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path.resolve()
         self.checkpoints, self.replay, self.logs = self.path / "checkpoints", self.path / "replay", self.path / "logs"
-        self.metrics, self.events = self.path / "metrics.jsonl", self.path / "events"
+        self.metrics = self.path / "metrics.jsonl"
         self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
         self.initial_file, self.sizes_file = self.path / "initial.json", self.path / "sizes.json"
         self._lock: int | None = None

@@ -9,8 +9,7 @@ from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.errors import RoleDied
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-
-STOPPED = 130  # exit status after Ctrl-C, as shells have it
+from rmc.deploy.run.state import STOPPED
 
 
 def say_end(folder: RunFolder, console: Console) -> int:

@@ -42,6 +42,7 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "baseline": (run_options.Baseline, Action("analysis_commands", "baseline")),
     "plot": (run_options.Plot, Action("analysis_commands", "plot")),
     "stats": (run_options.Stats, Action("commands", "stats")),
+    "list": (run_options.List, Action("commands", "list_runs")),
     "attach": (run_options.Attach, Action("commands", "attach")),
     "stop": (run_options.Stop, Action("commands", "stop")),
     "cluster": (run_options.Cluster, Action("commands", "cluster")),

@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.console import Console
 
-from rmc.cli.ending import STOPPED, format_evaluation, say_result, say_stopped
+from rmc.cli.ending import format_evaluation, say_result, say_stopped
 from rmc.cli.signals import signals_caught
 from rmc.common.bus.protocol import Bus
 from rmc.common.errors import ConfigError
@@ -21,6 +21,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine
+from rmc.deploy.run.state import STOPPED
 from rmc.deploy.run.validation import validate, validate_launch
 
 

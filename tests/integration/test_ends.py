@@ -72,7 +72,7 @@ def test_a_run_is_watched_and_stopped_from_another_terminal(tmp_path: Path) -> N
         words = [sys.executable, "-m", "rmc.cli.main"]
         with subprocess.Popen([*words, "attach", str(tmp_path / "run")], stdout=subprocess.PIPE, text=True) as watcher:
             assert watcher.stdout is not None
-            assert watcher.stdout.readline().startswith("steps ")
+            assert watcher.stdout.readline().startswith("0% | ")
             done = subprocess.run([*words, "stop", str(tmp_path / "run")], capture_output=True, text=True, timeout=60)
             assert (done.returncode, done.stderr) == (0, "")
             assert "to go on, give the same options" in done.stdout
