@@ -1,7 +1,8 @@
 """What the commands ``rmc train`` and ``rmc evaluate`` do, as functions for scripts and notebooks."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_checkpoint
 from rmc.cli import training
@@ -9,7 +10,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import IfExists, Launcher, LaunchOptions
+from rmc.deploy.run.launch_options import IfExists, Launcher, LaunchOptions, Tracker
 from rmc.deploy.run.state import STOPPED
 
 
@@ -21,6 +22,9 @@ def train(
     device: str = "cpu",
     if_exists: IfExists = "resume",
     redis_url: str | None = None,
+    track: Tracker | Literal["off"] | None = None,
+    track_project: str | None = None,
+    track_tags: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Train a run to its ``total_steps``, or go on with the one in ``run_dir``; its ``result.json``.
 
@@ -31,7 +35,16 @@ def train(
     KeyboardInterrupt where the run was stopped, which the same call goes on with.
     """
     folder = Path(run_dir)
-    options = LaunchOptions(folder, if_exists, launcher, device, redis_url)
+    options = LaunchOptions(
+        folder,
+        if_exists,
+        launcher,
+        device,
+        redis_url,
+        track=track,
+        track_project=track_project,
+        track_tags=tuple(track_tags),
+    )
     console = terminal()
     if launcher == "ray":
         status = training.train(config, options, console)

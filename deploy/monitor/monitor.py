@@ -16,6 +16,7 @@ from rmc.common.process.outage import OutageLog
 from rmc.deploy.monitor.main_metrics import evaluation_metrics, main_metrics
 from rmc.deploy.monitor.metrics_log import MetricsLog
 from rmc.deploy.monitor.recorded import empty_status
+from rmc.deploy.monitor.tracker import Tracker
 from rmc.deploy.monitor.view import View
 from rmc.deploy.run.config import RunConfig, flat
 from rmc.deploy.run.folder import RunFolder
@@ -28,7 +29,7 @@ log = logging.getLogger(__name__)
 class Monitor:
     """Reads every role's records and shows them. ``watch`` as often as you like; ``close`` at the end."""
 
-    def __init__(self, folder: RunFolder, config: RunConfig, console: Console) -> None:
+    def __init__(self, folder: RunFolder, config: RunConfig, console: Console, tracker: Tracker | None = None) -> None:
         self.board = empty_status(folder, config.roles())
         for record in MetricsTail(folder.metrics).take():  # of earlier starts
             self.board.take_evaluation(record)
@@ -41,7 +42,7 @@ class Monitor:
         self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
         self._next_record, self._is_away = 0.0, False
         self._metrics_log = MetricsLog(folder, flat(config))
-        self._folder, self._writable = folder, True
+        self._folder, self._writable, self._tracker = folder, True, tracker
         self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
         self.view, self.outage = View(self.board, console), OutageLog("launcher")
 
@@ -75,6 +76,8 @@ class Monitor:
             self._next_record = time.monotonic() + RECORD_SECONDS
             self._look_at_folder()
             self._record_launcher()
+            if self._tracker is not None:
+                self._tracker.look()
 
     def _look_at_folder(self) -> None:
         self._folder.check_there()

@@ -6,6 +6,7 @@ from typing import Literal
 
 IfExists = Literal["resume", "fail", "new"]
 Launcher = Literal["local", "ray", "lockstep", "manual"]
+Tracker = Literal["wandb", "trackio"]
 
 
 @dataclass(frozen=True)
@@ -20,3 +21,6 @@ class LaunchOptions:
     ray_address: str = "auto"
     all_cpus: bool = False
     tls: bool = False
+    track: Tracker | Literal["off"] | None = None
+    track_project: str | None = None
+    track_tags: tuple[str, ...] = ()

@@ -15,8 +15,9 @@ EVALUATION = b'"eval_return_mean"'
 class MetricsTail:
     """The records of a file: first every evaluation and what is recent, then what is new at each look."""
 
-    def __init__(self, path: Path, recent_bytes: int = RECENT_BYTES) -> None:
-        self._path, self._recent_bytes, self._position = path, recent_bytes, 0
+    def __init__(self, path: Path, recent_bytes: int = RECENT_BYTES, read_from: int = 0) -> None:
+        """``read_from`` is the byte from which on records are wanted; then there are no evaluations before."""
+        self._path, self._recent_bytes, self._position = path, recent_bytes, read_from
 
     def take(self) -> list[dict[str, Any]]:
         """Those that are new since the last call."""
