@@ -29,7 +29,8 @@ class TrackioRun:
 
     def finish(self, summary: dict[str, Any], video: Path | None, env_steps: int) -> None:
         """Log the end, and return when all has arrived."""
-        end: dict[str, Any] = {f"result/{name}": value for name, value in summary.items() if isinstance(value, int | float)}
+        numbers = {name: value for name, value in summary.items() if isinstance(value, int | float)}
+        end: dict[str, Any] = {f"result/{name}": value for name, value in numbers.items()}
         if video is not None:
             end["video"] = trackio.Video(video)
         self._run.log(end, step=env_steps)

@@ -31,7 +31,7 @@ DEBUG = ["train", PENDULUM, "--preset", "debug"]
 TRAIN_FLAGS = """
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
     --env-timeout --env-kwargs --run-dir --if-exists --launcher --device --redis-url
-    --ray-address --all-cpus --tls
+    --ray-address --all-cpus --tls --track --track-project --track-tags
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
     --blank-flag --fill-blanks --initial-priority
@@ -119,6 +119,11 @@ def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         ([*DEBUG, "--device", "tpu"], "--device"),
         ([*DEBUG, "--preset", "best"], "--preset"),
         ([*DEBUG, "--sede", "1"], "--sede"),
+        ([*DEBUG, "--track", "mlflow"], "--track"),
+        ([*DEBUG, "--track-project", "mine"], "--track-project='mine': say which tracker"),
+        ([*DEBUG, "--track-tags", "a", "b"], "--track-tags"),
+        ([*DEBUG, "--track", "wandb", "--track-project", "a/b"], "--track-project='a/b'"),
+        ([*DEBUG, "--track", "trackio", "--track-tags", "x" * 65], "--track-tags"),
         ([], "train"),
         (["trian"], "trian"),
         (["train"], "train"),

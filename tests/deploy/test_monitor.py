@@ -14,6 +14,8 @@ import psutil
 import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from rmc.analysis import history
 from rmc.common.bus import redis_connection
@@ -153,6 +155,54 @@ def test_an_evaluation_stands_where_its_checkpoint_was(monitor: Monitor, tmp_pat
     assert [one.get("eval_env_steps") for one in lines if one["role"] == "evaluator"] == [None, 1_000]
     events = EventAccumulator(str(tmp_path / "run")).Reload().Scalars("evaluator/eval_return_mean")
     assert [(event.step, event.value) for event in events] == [(1_300, 1.0), (1_000, 2.0)]
+
+
+def test_tensorboard_has_the_main_metrics_and_the_options_under_the_runs_name(
+    monitor: Monitor, tmp_path: Path, config: RunConfig
+) -> None:
+    bus = MemoryBus()
+    bus.emit("learner", {"time": 1.0, "updates_per_s": 45.0, "q_loss": 0.5, "waiting_share": 0.25, "alpha": 0.1})
+    bus.emit("actor-0", {"time": 1.0, "waiting_share": 0.75, "episode_return_mean": 7.0})
+    bus.emit("replay", {"time": 1.0, "env_steps": 900, "env_steps_per_s": 95.0, "waiting_share": math.nan})
+    bus.emit("evaluator", {"time": 1.0, "eval_update": 3, "eval_return_mean": 12.0})
+    monitor.watch(bus)
+    monitor.close()
+    shown = EventMultiplexer().AddRunsFromDirectory(str(tmp_path)).Reload()
+    assert list(shown.Runs()) == ["run"]
+    main = {tag: shown.Scalars("run", tag)[-1].value for tag in shown.GetAccumulator("run").Tags()["scalars"]}
+    assert {tag.removeprefix("Main/"): value for tag, value in main.items() if tag.startswith("Main/")} == {
+        "env_steps_per_s": 95.0, "updates_per_s": 45.0, "episode_return": 7.0, "evaluation_return": 12.0,
+        "waiting_share_learner": 0.25, "waiting_share_actors": 0.75, "q_loss": 0.5,
+    }  # fmt: skip
+    assert min(main).startswith("Main/")  # as TensorBoard sorts
+    told = shown.SummaryMetadata("run", "_hparams_/session_start_info").plugin_data.content
+    hparams = HParamsPluginData.FromString(told).session_start_info.hparams
+    assert hparams["update.gamma"].number_value == config.update.gamma
+    assert hparams["env.id"].string_value == "Pendulum-v1"
+    experiment = HParamsPluginData.FromString(shown.SummaryMetadata("run", "_hparams_/experiment").plugin_data.content)
+    assert [one.name.tag for one in experiment.experiment.metric_infos] == ["Main/evaluation_return"]
+
+
+def test_events_of_earlier_versions_join_the_runs_own(config: RunConfig, tmp_path: Path) -> None:
+    folder = open_run(config, tmp_path / "run", "fail")
+    folder.unlock()
+    (folder.path / "events").mkdir()
+    (folder.path / "events" / "events.out.tfevents.1.host").write_bytes(b"")
+    Monitor(folder, config, Console(quiet=True)).close()
+    assert not list((folder.path / "events").iterdir())
+    assert len(list(folder.path.glob("events.out.tfevents.*"))) == 2
+
+
+def test_evaluations_of_earlier_starts_are_known(config: RunConfig, tmp_path: Path) -> None:
+    folder = open_run(config, tmp_path / "run", "fail")
+    folder.unlock()
+    scores = (3.0, 9.0, 5.0)
+    said = [{"role": "evaluator", "time": 1.0, "eval_return_mean": score, "eval_update": 3} for score in scores]
+    folder.metrics.write_text("".join(json.dumps(record) + "\n" for record in said))
+    monitor = Monitor(folder, config, Console(quiet=True))
+    assert "eval 5 (best 9)" in line(monitor.board)
+    assert "evaluator" not in monitor.board.roles  # it has not spoken in this start
+    monitor.close()
 
 
 def test_new_names_without_end_are_left_out(monitor: Monitor) -> None:
