@@ -27,7 +27,19 @@ TITLES = {
     "evaluator": "Evaluation",
 }
 HEAD, RULE = "| option | default | what it is | when to touch it |", "|---|---|---|---|"
-PLACEMENT = ["run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls"]
+PLACEMENT = [
+    "run_dir",
+    "if_exists",
+    "launcher",
+    "device",
+    "redis_url",
+    "ray_address",
+    "all_cpus",
+    "tls",
+    "track",
+    "track_project",
+    "track_tags",
+]
 # When a user should touch an option; what it does is said where it is defined.
 WHEN = {
     "preset": "`paper` to compare with the paper, `debug` to see everything run within a minute",
@@ -42,6 +54,9 @@ WHEN = {
     "ray_address": "`local` to try Ray on one machine",
     "all_cpus": "on a cluster that is there for this run",
     "tls": "where others are on the cluster's network",
+    "track": "to compare runs in a web service, or to keep their videos",
+    "track_project": "to keep kinds of runs apart",
+    "track_tags": "to find runs again",
     "flicker": "for trials of partial observation",
     "hide": "for trials of partial observation",
     "noise": "for trials of partial observation",
@@ -170,7 +185,7 @@ def _docstrings(kind: type[Any]) -> dict[str, str]:
 
 
 def _text(value: Any) -> str:
-    if value is None or value == {}:
+    if value in (None, {}, ()):
         return "none"
     if isinstance(value, bool):
         return "on" if value else "off"

@@ -21,6 +21,8 @@ def recorded_status(folder: RunFolder, recent_bytes: int = RECENT_BYTES) -> RunS
     except ValueError as error:
         raise ConfigError("RUN", str(folder.path), f".lock is damaged ({error}); remove that file") from None
     catch_up(board, MetricsTail(folder.metrics, recent_bytes))
+    if board.state == "finished" and (result := folder.result()) is not None:
+        board.final_steps = int(result["env_steps"])
     return board
 
 

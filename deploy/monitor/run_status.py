@@ -47,6 +47,7 @@ class RunStatus:
         self.roles: dict[str, dict[str, Any]] = {}
         self.last: Evaluation | None = None
         self.best: Evaluation | None = None
+        self.final_steps: int | None = None  # once the run has its result
         self._pace = Pace()
 
     @property
@@ -103,6 +104,8 @@ class RunStatus:
     @property
     def env_steps(self) -> int:
         """Environment steps committed to the ring."""
+        if self.final_steps is not None:
+            return self.final_steps
         steps = self.replay("env_steps", sum) or self.get("learner", "env_steps") or 0
         return _steps(steps) or 0
 

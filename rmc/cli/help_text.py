@@ -11,7 +11,7 @@ BASIC = frozenset(
     {
         "id", "flicker", "env_kwargs", "config_file", "preset", "seed", "total_steps", "actors", "run_dir", "if_exists",
         "launcher", "device", "redis_url", "ray_address", "capacity", "replay_ratio", "learning_rate", "curiosity",
-        "batch_size", "checkpoint_steps", "episodes", "threads",
+        "batch_size", "checkpoint_steps", "episodes", "threads", "track",
     }
 )  # fmt: skip
 ALL_OPTIONS = "--help-all"
