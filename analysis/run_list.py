@@ -62,6 +62,8 @@ def summary(path: Path) -> RunSummary:
         board, result = recorded_status(folder, RECENT_BYTES), folder.result() or {}
     except (ConfigError, OSError) as error:
         return RunSummary(str(path), fault=str(error))
+    returns = [one.return_mean for one in (board.best, board.last) if one is not None]
+    returns += [result["eval_return_mean"]] if result else []
     return RunSummary(
         str(path),
         str(board.state),
@@ -70,8 +72,8 @@ def summary(path: Path) -> RunSummary:
         board.seed,
         result.get("env_steps", board.env_steps),
         board.total_steps,
-        result.get("eval_return_mean", board.last.return_mean if board.last else None),
-        board.best.return_mean if board.best else None,
+        returns[-1] if returns else None,
+        max(returns, default=None),
         result.get("wall_s", board.elapsed_s),
     )
 
@@ -90,7 +92,7 @@ def table(found: Sequence[RunSummary], folder: Path, width: int) -> Table:
 
 
 def _cells(one: RunSummary, folder: Path) -> dict[str, str | Text]:
-    done = one.env_steps / max(1, one.total_steps) if one.env_steps is not None and one.total_steps else None
+    done = min(1.0, one.env_steps / one.total_steps) if one.env_steps is not None and one.total_steps else None
     return {
         "run": os.path.relpath(one.run, folder),
         "state": Text(one.state, STYLES.get(one.state, "red")),

@@ -1,5 +1,6 @@
 """The state of a run as a table that fits a terminal: where there is little room, what matters comes first."""
 
+import re
 import textwrap
 from statistics import mean
 from typing import Any
@@ -97,13 +98,14 @@ def _evaluation(found: Evaluation | None) -> str:
 
 
 def _details(board: RunStatus) -> list[Fact]:
-    learner = board.roles.get("learner", {})
+    """What is known of the rest."""
+    learner, ratio = board.roles.get("learner", {}), board.replay("replay_ratio", mean)
     losses = ", ".join(f"{name[:-5]} {number(learner[name])}" for name in learner if name.endswith("_loss"))
-    return [
+    facts = [
         ("episodes", f"return {number(board.episode_return, ',.1f')}, with exploration"),
         ("losses", losses or number(None)),
         ("replay", f"ring {number(board.replay('ring_fill', mean), '.0%')} full, "
-                   f"ratio {number(board.replay('replay_ratio', mean), ',.1f')} of {board.replay_ratio:g}"),
+                   f"ratio {number(ratio, ',.1f')}" + ("" if ratio is None else f" of {board.replay_ratio:g}")),
         ("alpha, beta", f"{number(learner.get('alpha'))}, {number(learner.get('beta'))}"),
         ("curiosity", f"{number(learner.get('curiosity_share'), '.1%')} of the reward"),
         ("latent rank", f"{number(learner.get('latent_rank'), '.1f')}, "
@@ -111,6 +113,7 @@ def _details(board: RunStatus) -> list[Fact]:
         ("staleness", _staleness(learner)),
         ("policy lag", f"{number(board.policy_lag, ',.1f')} updates"),
     ]  # fmt: skip
+    return [(name, text) for name, text in facts if re.search(r"\d|inf|nan", text)]
 
 
 def _staleness(learner: dict[str, Any]) -> str:

@@ -23,6 +23,7 @@ def board(actors: int = 2, start: float = 0.0) -> RunStatus:
         at = {"time": now - ago}
         made.take({"role": "launcher", **at, "wall_s": 1270.0 - ago, "start_s": start + SECONDS - ago})
         made.take({"role": "learner", **at, "updates": 45_123, "updates_per_s": 45.2, "q_loss": 0.3, "busy_share": 1.0})
+        made.take({"role": "learner", **at, "latent_rank": 31.0, "alpha": 0.1, "curiosity_share": 0.02})
         steps = {"env_steps": 120_000 - ago * RATE, "env_steps_per_s": float(RATE)}
         made.take({"role": "replay", **at, **steps, "waiting_share": 0.8, "waiting_for": "draws"})
     for index in range(actors):
