@@ -16,7 +16,7 @@ def notices(board: RunStatus) -> dict[str, str]:
     off = board.replay("replay_ratio_off", max)
     restarts, broken = board.get("launcher", "restarts"), board.broken_episodes
     found = {
-        "not running": board.get("launcher", "not_running"),
+        "not running": "" if board.is_over else board.get("launcher", "not_running"),
         "silent": _silent(board),
         "not saved": board.get("learner", "checkpoint_error"),
         "damaged": _damaged(board),

@@ -5,18 +5,15 @@ import logging
 import os
 import signal
 import sqlite3
-import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 from imageio_ffmpeg import write_frames
-from wandb.proto import wandb_internal_pb2
 
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.monitor import tracker as tracker_module
@@ -25,10 +22,10 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.tracking import Tracking, keep_tracking
+from tests import wandb_file
 
 CLOSED = "http://127.0.0.1:9"  # no service of anyone's
 RESULT = {"state": "finished", "env_steps": 1500, "eval_return_mean": 11.5, "env": "InvertedPendulum-v5"}
-BLOCK, HEAD = 32_768, 7  # bytes of wandb's files, which are LevelDB's logs
 
 
 @pytest.fixture
@@ -72,34 +69,13 @@ def video(path: Path) -> str:
     return str(path)
 
 
-def wandb_records(file: Path) -> Iterator[Any]:
-    content, at, whole = file.read_bytes(), HEAD, b""
-    while at + HEAD <= len(content):
-        if BLOCK - at % BLOCK < HEAD:
-            at += BLOCK - at % BLOCK
-            continue
-        _, length, kind = struct.unpack("<IHB", content[at : at + HEAD])
-        whole += content[at + HEAD : at + HEAD + length]
-        at += HEAD + length
-        if kind in (1, 4):  # whole, or the last part
-            record = wandb_internal_pb2.Record()
-            record.ParseFromString(whole)
-            yield record
-            whole = b""
-
-
-def items(found: Any) -> dict[str, Any]:
-    return {"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in found}
-
-
 def test_wandb_has_the_run_over_its_starts(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
     for env_steps, end in ((700, {"state": "stopped"}), (1500, {**RESULT, "video": video(folder.path / "video.mp4")})):
         tracker = started(folder, "wandb")
         trained(folder, env_steps, env_steps / 100)
         tracker.close(end)
     assert not caplog.messages
-    files = sorted(folder.path.glob("wandb/offline-run-*/*.wandb"), key=os.path.getmtime)
-    starts = [list(wandb_records(file)) for file in files]
+    starts = wandb_file.records(folder.path)
     assert len(starts) == 2
     for records, env_steps in zip(starts, (700, 1500), strict=True):
         (run,) = (record.run for record in records if record.HasField("run"))
@@ -109,18 +85,18 @@ def test_wandb_has_the_run_over_its_starts(folder: RunFolder, caplog: pytest.Log
             "my-project",
             ["a", "b"],
         )
-        config = {item.key: json.loads(item.value_json) for item in run.config.update}
+        config = wandb_file.items(run.config.update)
         assert config["env"]["id"] == "InvertedPendulum-v5"
         assert config["update"]["gamma"] == folder.config().update.gamma
-        rows = [items(record.history.item) for record in records if record.HasField("history")]
+        rows = wandb_file.rows(records)
         (evaluation,) = (row for row in rows if "Main/evaluation_return" in row)
         assert (evaluation["env_steps"], evaluation["Main/evaluation_return"]) == (env_steps, env_steps / 100)
         (newest,) = (row for row in rows if "Main/q_loss" in row)
         assert newest["Main/waiting_share_actors"] == 0.9
         assert newest["replay/env_steps_per_s"] == 95.0
         assert not any(name.startswith("actor-") for name in newest)
-        assert [record.exit.exit_code for record in records if record.HasField("exit")] == [0]
-    summary = {k: v for r in starts[1] if r.HasField("summary") for k, v in items(r.summary.update).items()}
+        assert wandb_file.exit_codes(records) == [0]
+    summary = wandb_file.summary(starts[1])
     assert (summary["state"], summary["eval_return_mean"]) == ("finished", 11.5)
     (film,) = folder.path.glob("wandb/offline-run-*/files/media/videos/*.mp4")
     assert film.read_bytes() == (folder.path / "video.mp4").read_bytes()
@@ -164,9 +140,8 @@ def test_without_login_or_network_wandb_is_recorded_offline_and_that_is_said_onc
     (said,) = caplog.messages
     assert said.startswith("wandb: ")
     assert said.endswith(f"; recorded offline, and wandb sync {folder.path}/wandb/offline-run-* sends it")
-    (file,) = folder.path.glob("wandb/offline-run-*/*.wandb")
-    rows = [items(record.history.item) for record in wandb_records(file) if record.HasField("history")]
-    assert any(row.get("Main/evaluation_return") == 7.0 for row in rows)
+    (records,) = wandb_file.records(folder.path)
+    assert any(row.get("Main/evaluation_return") == 7.0 for row in wandb_file.rows(records))
 
 
 def test_a_disk_that_takes_nothing_is_said_and_the_run_goes_on(
@@ -223,17 +198,17 @@ def test_one_whose_launcher_was_killed_ends_by_itself(folder: RunFolder) -> None
     while psutil.pid_exists(int(done.stdout)) and psutil.Process(int(done.stdout)).status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < deadline
         time.sleep(0.1)
-    (file,) = folder.path.glob("wandb/offline-run-*/*.wandb")
-    records = list(wandb_records(file))
-    assert [record.exit.exit_code for record in records if record.HasField("exit")] == [1]
-    summary = {k: v for r in records if r.HasField("summary") for k, v in items(r.summary.update).items()}
-    assert summary["state"] == "lost"
+    (records,) = wandb_file.records(folder.path)
+    assert wandb_file.exit_codes(records) == [1]
+    assert wandb_file.summary(records)["state"] == "lost"
 
 
 def test_it_is_told_no_secret_of_the_run(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RMC_SECRET", "hush")
     tracker = started(folder, "trackio")
-    environment = psutil.Process(tracker._process.pid).environ()
+    process = psutil.Process(tracker._process.pid)
+    while not (environment := process.environ()):  # the kernel has none to show amid the start of a program
+        time.sleep(0.01)
     tracker.close(RESULT)
     assert "hush" not in environment.values()
     assert environment["HOME"] == os.environ["HOME"]
