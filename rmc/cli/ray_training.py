@@ -43,7 +43,7 @@ def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> int
     check_machine(config, options)
     tracking = choose_tracking(options)
     place_for_sockets()
-    folder = open_run(config, options.run_dir, options.if_exists)
+    folder = open_run(config, options.run_dir, options.if_exists, options)
     keep_tracking(folder, tracking)
     folder.unlock()
     launcher.launch(config, folder, options.device, options.all_cpus, options.tls)
