@@ -55,6 +55,7 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "report": (run_options.Report, Action("report_command", "report")),
     "doctor": (run_options.Doctor, Action("commands", "doctor")),
     "stats": (run_options.Stats, Action("commands", "stats")),
+    "list": (run_options.List, Action("commands", "list_runs")),
     "attach": (run_options.Attach, Action("commands", "attach")),
     "stop": (run_options.Stop, Action("commands", "stop")),
     "cluster": (run_options.Cluster, Action("commands", "cluster")),

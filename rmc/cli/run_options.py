@@ -119,10 +119,22 @@ class Plot:
 
 @dataclass(frozen=True)
 class Stats:
-    """Show the newest metrics of a run."""
+    """Show how far a run is, how good, and its newest metrics."""
 
     run: Positional[Path]
     """The run's folder."""
+    json: bool = False
+    """Print one line of JSON, with every metric of every role."""
+
+
+@dataclass(frozen=True)
+class List:
+    """List the runs in a folder and below: state, steps, return."""
+
+    folder: Positional[Path] = Path("runs")
+    """Where to look."""
+    json: bool = False
+    """Print one line of JSON."""
 
 
 @dataclass(frozen=True)
