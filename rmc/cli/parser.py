@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from rmc.cli import role_options, run_options, train_options
+from rmc.cli import role_options, run_options, sweep_options, train_options
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig
@@ -35,6 +35,7 @@ class Action:
 
 COMMANDS: dict[str, tuple[type, Action]] = {
     "train": (train_options.Train, Action("commands", "train")),
+    "sweep": (sweep_options.Sweep, Action("sweep_command", "sweep")),
     "evaluate": (run_options.Evaluate, Action("analysis_commands", "evaluate")),
     "export": (run_options.Export, Action("analysis_commands", "export_policy")),
     "inspect": (run_options.Inspect, Action("analysis_commands", "inspect")),
@@ -58,7 +59,11 @@ def parse(words: list[str]) -> Any:
         Annotated[kind, tyro.conf.subcommand(name, default=defaults.get(name, tyro.MISSING_NONPROP))]
         for name, (kind, _) in COMMANDS.items()
     ]
-    return tyro.cli(functools.reduce(operator.or_, subcommands), prog="rmc", args=words, config=FLAT)  # type: ignore
+    read = functools.partial(tyro.cli, functools.reduce(operator.or_, subcommands), prog="rmc", args=words, config=FLAT)
+    if words[:1] == ["sweep"]:
+        command, others = read(return_unknown_args=True)
+        return dataclasses.replace(command, train_words=tuple(others))
+    return read()
 
 
 def _train_defaults(preset: Preset) -> train_options.Train:

@@ -1,0 +1,101 @@
+"""Whole runs spread over a Ray cluster, each on the cores of one node; what they leave comes to this machine."""
+
+import os
+import time
+from contextlib import suppress
+from typing import Any
+
+import ray
+
+from rmc.common.errors import ConfigError
+from rmc.deploy.ray.role_actor import last_line
+from rmc.sweep.job import Job
+from rmc.sweep.local_runs import last_line as last_log_line
+from rmc.sweep.node_run import NodeRun
+from rmc.sweep.parcel import Known, Parcel, pack, unpack
+
+SYNC_SECONDS = 2.0  # between a run's files and their copies here
+LOST = 1
+
+
+class RayRuns:
+    """As many at once as the nodes that are there hold, and at most ``at_once`` where that is above 0."""
+
+    def __init__(self, cores: int, memory: int, gpus: int, at_once: int) -> None:
+        """Raises ConfigError where no node can hold a run."""
+        self._cores, self._at_once, self._running = cores, at_once, 0
+        self._needs: dict[str, Any] = {"num_cpus": cores, "num_gpus": gpus, "memory": memory}
+        if not self._capacity():
+            fix = f"no node of the cluster has {cores} CPUs, which a run takes; start one that has"
+            raise ConfigError("--launcher", "ray", fix)
+
+    def _capacity(self) -> int:
+        nodes = (int(node["Resources"].get("CPU", 0.0)) for node in ray.nodes() if node["Alive"])
+        return sum(cpus // self._cores for cpus in nodes)
+
+    def has_room(self) -> bool:
+        """Whether the nodes hold another one. With no run at all one may wait for a node to come."""
+        most = min(self._capacity(), self._at_once or self._running + 1)
+        return self._running == 0 or self._running < most
+
+    def start(self, job: Job) -> "RayRun":
+        """Ask for a node, and send it what the job's folder has."""
+        self._running += 1
+        return RayRun(self, job, self._needs)
+
+    def release(self) -> None:
+        """One has ended."""
+        self._running -= 1
+
+
+class RayRun:
+    """A run on some node, whose files are copied here again and again; nothing here waits for the node."""
+
+    def __init__(self, runs: RayRuns, job: Job, needs: dict[str, Any]) -> None:
+        self._runs, self._job, self._lost = runs, job, ""
+        self._log = job.log.read_bytes() if job.log.exists() else b""
+        self._known: Known | None = None  # until it has begun
+        brought = pack(job.folder, {}) if job.folder.exists() else Parcel([], {}, b"")
+        self._actor = ray.remote(NodeRun).options(**needs).remote(job.words, job.name, brought, os.getcwd())
+        self._asked: Any = self._actor.look.remote(brought.known)
+        self._next = 0.0
+
+    def status(self) -> int | None:
+        """Its exit status, once that and all that it left are here."""
+        if self._asked is None:
+            if time.monotonic() < self._next:
+                return None
+            self._asked = self._actor.look.remote(self._known)
+        if not ray.wait([self._asked], timeout=0.0)[0]:
+            return None
+        try:
+            status, parcel, log = ray.get(self._asked)
+        except ray.exceptions.RayError as error:
+            self._lost = f"its node was lost, or could not start it ({last_line(error)})"
+            return self._end(LOST)
+        unpack(parcel, self._job.folder)
+        self._job.log.parent.mkdir(parents=True, exist_ok=True)
+        self._job.log.write_bytes(self._log + log)
+        self._asked, self._known, self._next = None, parcel.known, time.monotonic() + SYNC_SECONDS
+        return None if status is None else self._end(status)
+
+    def _end(self, status: int) -> int:
+        ray.kill(self._actor)
+        self._runs.release()
+        return status
+
+    def stop(self) -> None:
+        """In order, where it has begun; where it waits for a node, it waits no longer."""
+        if self._known is None:
+            self.kill()
+        else:
+            self._actor.stop.remote()
+
+    def kill(self) -> None:
+        """End it now, with what was copied last."""
+        with suppress(ray.exceptions.RayError):
+            ray.kill(self._actor)
+
+    def last_words(self) -> str:
+        """Why it failed."""
+        return self._lost or f"{last_log_line(self._job.log)}; see {self._job.log}"
