@@ -7,11 +7,14 @@ import itertools
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, cast, get_type_hints
 
 import tyro
 
 from rmc.cli import role_options, run_options, sweep_options, train_options
+from rmc.cli.config_file import KWARGS, with_file
+from rmc.cli.help_text import ALL_OPTIONS, only_basic
+from rmc.cli.numerals import NUMERALS
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig
@@ -46,6 +49,7 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "attach": (run_options.Attach, Action("commands", "attach")),
     "stop": (run_options.Stop, Action("commands", "stop")),
     "cluster": (run_options.Cluster, Action("commands", "cluster")),
+    "completion": (run_options.Completion, Action("completion", "print_script")),
     "role": (role_options.Role, Action("role_commands", "run_role")),
 }
 ACTIONS = dict(COMMANDS.values())
@@ -53,23 +57,38 @@ ACTIONS = dict(COMMANDS.values())
 
 def parse(words: list[str]) -> Any:
     """The command line as a command's class. Raises ConfigError; SystemExit, its message on standard error."""
-    _check_once("--env-kwargs", words)
-    defaults = {"train": _train_defaults(_named_preset(words))}
+    words, env = with_file(words, option_names(train_options.Train)) if words[:1] == ["train"] else (words, "")
+    _check_once(KWARGS, words)
+    defaults: dict[str, Any] = {"train": _train_defaults(_named_preset(words), env)}
+    if {"-h", "--help"}.intersection(words):
+        defaults["train"] = only_basic(defaults["train"])
+    words = ["--help" if word == ALL_OPTIONS else word for word in words]
     subcommands = [
-        Annotated[kind, tyro.conf.subcommand(name, default=defaults.get(name, tyro.MISSING_NONPROP))]
+        Annotated[type(defaults[name]), tyro.conf.subcommand(name, default=defaults[name])]
+        if name in defaults
+        else Annotated[kind, tyro.conf.subcommand(name)]
         for name, (kind, _) in COMMANDS.items()
     ]
-    read = functools.partial(tyro.cli, functools.reduce(operator.or_, subcommands), prog="rmc", args=words, config=FLAT)
-    if words[:1] == ["sweep"]:
+    kinds: Any = functools.reduce(operator.or_, subcommands)
+    read = functools.partial(tyro.cli, kinds, prog="rmc", args=words, config=FLAT, registry=NUMERALS)
+    if words[:1] == ["sweep"]:  # what it does not know, rmc train may
         command, others = read(return_unknown_args=True)
         return dataclasses.replace(command, train_words=tuple(others))
     return read()
 
 
-def _train_defaults(preset: Preset) -> train_options.Train:
+def option_names(kind: type) -> list[str]:
+    """The names of a command's options, also of those in its parts; what has no flag is left out."""
+    names: list[str] = []
+    for name, hint in get_type_hints(kind).items():
+        names += option_names(cast(type, hint)) if dataclasses.is_dataclass(hint) else [name]
+    return [name for name in names if name not in ("id", "config_file")]
+
+
+def _train_defaults(preset: Preset, env: str) -> train_options.Train:
     start = preset_config(preset, EnvConfig(""))
     shared = {item.name: getattr(start, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
-    return train_options.Train(env=train_options.EnvOptions(id=tyro.MISSING), **shared)
+    return train_options.Train(env=train_options.EnvOptions(id=env or tyro.MISSING), **shared)
 
 
 def _check_once(option: str, words: list[str]) -> None:

@@ -128,3 +128,11 @@ class Cluster:
     """What to do."""
     config: Positional[Path]
     """The cluster's file; deploy/cluster/ has some to start from."""
+
+
+@dataclass(frozen=True)
+class Completion:
+    """Print what makes a shell complete rmc's commands, options and folders."""
+
+    shell: Positional[Literal["bash", "zsh", "fish"]]
+    """Which shell."""

@@ -9,11 +9,11 @@ from typing import Any
 
 from rmc.cli import complaint, parser
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig, flat
+from rmc.deploy.run.config import RunConfig, flat, option_words
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.validation import validate, validate_launch
-from rmc.sweep.job import Job, option_words
+from rmc.sweep.job import Job
 from rmc.sweep.spec import Range, Spec
 
 RESERVED = ("run_dir", "if_exists", "redis_url", "ray_address", "all_cpus", "tls")  # that a sweep sets, or has no use for

@@ -41,7 +41,7 @@ class EnvOptions(EnvConfig):
 
 @dataclass(frozen=True)
 class Train:
-    """Train an agent, or go on with a run."""
+    """Train an agent, or go on with a run. --help shows the basic options, --help-all all of them."""
 
     env: EnvOptions
     window: WindowConfig
@@ -51,6 +51,8 @@ class Train:
     update: UpdateConfig
     learner: LearnerConfig
     evaluator: EvaluatorConfig
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    """A TOML file of options, like env = "HalfCheetah-v5" and learning_rate = 3e-4; those given beside it win."""
     preset: Preset = "robust"
     """Where the other options' defaults come from."""
     seed: int = 0

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig, flat, option
+from rmc.deploy.run.config import RunConfig, flat, option, option_words
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import MAY_CHANGE
-from rmc.sweep.job import Job, option_words, run_name
+from rmc.sweep.job import Job, run_name
 from rmc.sweep.pool import Ending
 from rmc.sweep.spec import Spec
 

@@ -40,16 +40,6 @@ class Job:
         return [*self.words, "--run-dir", str(folder)]
 
 
-def option_words(name: str, value: Any) -> list[str]:
-    """An option as it is typed."""
-    flag = name.replace("_", "-")
-    if isinstance(value, bool):
-        return [f"--{flag}" if value else f"--no-{flag}"]
-    if isinstance(value, dict):
-        return [f"--{flag}", *write_kwargs(value)]
-    return [f"--{flag}", *map(str, value if isinstance(value, list) else [value])]
-
-
 def shown(value: Any) -> str:
     """A value in a table and in a name."""
     if isinstance(value, list | dict):

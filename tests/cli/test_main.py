@@ -28,7 +28,7 @@ DEBUG = ["train", PENDULUM, "--preset", "debug"]
 # Whoever changes this list changes what users have in their scripts.
 TRAIN_FLAGS = """
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
-    --env-timeout --env-kwargs --run-dir --if-exists --launcher --device --redis-url
+    --env-timeout --env-kwargs --config --run-dir --if-exists --launcher --device --redis-url
     --ray-address --all-cpus --tls
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
@@ -57,6 +57,7 @@ OTHER_FLAGS = {
     "attach": [],
     "stop": [],
     "cluster": [],
+    "completion": [],
     "role launcher": ["--ray-address", "--device", "--all-cpus", "--tls"],
     "role actor": ["--run", "--redis-url", "--index"],
     "role replay": ["--run", "--redis-url", "--folder", "--listen", "--shard", "--secret-file", "--tls-folder"],
@@ -66,9 +67,9 @@ OTHER_FLAGS = {
 
 
 def flags(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
-    assert main.run([*command.split(), "--help"]) == 0
+    assert main.run([*command.split(), "--help-all"]) == 0
     found = re.findall(r"--[a-z][a-z-]*[a-z]", capsys.readouterr().out)
-    return set(found) - {"--help"}
+    return set(found) - {"--help", "--help-all"}
 
 
 @pytest.mark.parametrize(("command", "expected"), [("train", TRAIN_FLAGS), *OTHER_FLAGS.items()])

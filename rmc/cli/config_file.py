@@ -1,0 +1,64 @@
+"""``--config FILE.toml``: options of ``rmc train`` in a file; those of the command line win."""
+
+import difflib
+import itertools
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rmc.common.env.config import check_kwargs, write_kwargs
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import option_words
+
+OPTION, KWARGS = "--config", "--env-kwargs"
+
+
+def with_file(words: list[str], known: Sequence[str]) -> tuple[list[str], str]:
+    """The words with the options of the file that they name, if any, before their own; and the file's ENV.
+
+    ``known`` are the names of the options. Raises ConfigError.
+    """
+    path = _named(words)
+    if path is None:
+        return words, ""
+    options = {name.replace("-", "_"): value for name, value in _read(path).items()}
+    env, kwargs = options.pop("env", ""), options.pop("env_kwargs", {})
+    if not isinstance(env, str):
+        raise ConfigError(f"{OPTION} {path}: env", env, 'write the environment\'s id, like env = "HalfCheetah-v5"')
+    if not isinstance(kwargs, dict):
+        raise ConfigError(f"{OPTION} {path}: env_kwargs", kwargs, "write a table, like env_kwargs = { goal = 1.5 }")
+    for name, value in options.items():
+        _check(path, name, value, known)
+    given = [word for name, value in options.items() for word in option_words(name, value)]
+    check_kwargs(kwargs)
+    if any(word.partition("=")[0].replace("_", "-") == KWARGS for word in words):
+        kwargs = {}
+    last = [KWARGS, *write_kwargs(kwargs)] if kwargs else []
+    return [words[0], *given, *words[1:], *last], env
+
+
+def _named(words: Sequence[str]) -> Path | None:
+    named = [Path(word.partition("=")[2]) for word in words if word.startswith(f"{OPTION}=")]
+    named += [Path(after) for word, after in itertools.pairwise(words) if word == OPTION]
+    if len(named) > 1:
+        raise ConfigError(OPTION, " ".join(map(str, named)), "is there twice; give one file")
+    return named[0] if named else None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(OPTION, str(path), f"cannot be read ({error.strerror}); give a TOML file") from None
+    except ValueError as error:  # no TOML, or no UTF-8
+        raise ConfigError(OPTION, str(path), f"is not TOML ({error}); mend it") from None
+
+
+def _check(path: Path, name: str, value: Any, known: Sequence[str]) -> None:
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 1)
+        fix = f"did you mean {near[0]}?" if near else "rmc train --help-all lists them"
+        raise ConfigError(f"{OPTION} {path}: {name}", value, f"is no option; {fix}")
+    if not all(isinstance(one, str | bool | int | float) for one in (value if isinstance(value, list) else [value])):
+        raise ConfigError(f"{OPTION} {path}: {name}", value, "give a number, text, true, false or a list of such")

@@ -1,0 +1,39 @@
+"""``rmc train --help`` shows the basic options; ``--help-all`` shows all of them."""
+
+import dataclasses
+import functools
+import typing
+from typing import Annotated, Any
+
+import tyro
+
+BASIC = frozenset(
+    {
+        "id", "flicker", "env_kwargs", "config_file", "preset", "seed", "total_steps", "actors", "run_dir", "if_exists",
+        "launcher", "device", "redis_url", "ray_address", "capacity", "replay_ratio", "learning_rate", "curiosity",
+        "batch_size", "checkpoint_steps", "episodes", "threads",
+    }
+)  # fmt: skip
+ALL_OPTIONS = "--help-all"
+
+
+def only_basic(command: Any) -> Any:
+    """A command's dataclass of whose options the help names the ``BASIC`` ones; it is for showing help alone."""
+    kind = type(command)
+    hints = typing.get_type_hints(kind, include_extras=True)
+    values = {item.name: getattr(command, item.name) for item in dataclasses.fields(command)}
+    values |= {name: only_basic(value) for name, value in values.items() if dataclasses.is_dataclass(value)}
+    changed: list[tuple[str, Any, Any]] = []
+    for name, value in values.items():
+        if dataclasses.is_dataclass(value):
+            changed.append((name, type(value), dataclasses.field(default=value)))
+        elif name not in BASIC:
+            default = dataclasses.field(default_factory=functools.partial(_same, value))
+            changed.append((name, Annotated[hints[name], tyro.conf.Suppress], default))
+    shown = dataclasses.make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True)
+    shown.__doc__ = kind.__doc__
+    return shown(**values)
+
+
+def _same(value: Any) -> Any:
+    return value

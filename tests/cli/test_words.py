@@ -1,0 +1,103 @@
+"""Options from a file, numbers as people write them, the two lengths of help."""
+
+from pathlib import Path
+
+import pytest
+
+from rmc.cli import main, parser
+from rmc.cli.numerals import read_whole
+from rmc.common.errors import ConfigError
+from tests.cli.test_main import PENDULUM, complaint, flags
+
+FILE = """
+env = "InvertedPendulum-v5"
+preset = "debug"
+total-steps = 1_200
+learning_rate = 1e-3
+heads = [24, 16]
+layer_norm = true
+normalize_observations = false
+env_kwargs = { reset_noise_scale = 0.02 }
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    (tmp_path / "agent.toml").write_text(FILE)
+    return tmp_path / "agent.toml"
+
+
+def test_options_come_from_a_file(file: Path) -> None:
+    config = parser.parse(["train", "--config", str(file)]).config()
+    assert (config.env.id, config.preset, config.total_steps) == (PENDULUM, "debug", 1_200)
+    assert (config.agent.heads, config.agent.layer_norm, config.agent.normalize_observations) == ((24, 16), True, False)
+    assert config.update.learning_rate == 1e-3
+    assert config.agent.hidden == 32  # the preset's own
+    assert config.env.env_kwargs == {"reset_noise_scale": 0.02}
+
+
+def test_the_command_line_wins_over_the_file(file: Path) -> None:
+    given = ["Hopper-v5", "--total-steps", "500", "--preset", "paper", "--env-kwargs", "healthy_reward=2.0"]
+    config = parser.parse(["train", *given, f"--config={file}"]).config()
+    assert (config.env.id, config.preset, config.total_steps) == ("Hopper-v5", "paper", 500)
+    assert config.update.learning_rate == 1e-3
+    assert config.env.env_kwargs == {"healthy_reward": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "fix"),
+    [
+        ("learning_rat = 1.0", "learning_rat=1.0", "did you mean learning_rate"),
+        ("zzz = 1.0", "zzz=1.0", "--help-all"),
+        ("id = 'Hopper-v5'", "id=", "is no option"),
+        ("config = 'other.toml'", "config=", "is no option"),
+        ("env = 3", "env=3", "HalfCheetah-v5"),
+        ("env_kwargs = 'goal=1'", "env_kwargs=", "table"),
+        ("hidden = { a = 1 }", "hidden=", "give a number"),
+        ("hidden = [[1]]", "hidden=", "give a number"),
+        ("hidden = ", "agent.toml", "not TOML"),
+        ("hidden = 'many'", "--hidden", "'many' is no whole number"),
+        ("hidden = -3", "--hidden=-3", "take"),
+    ],
+)
+def test_a_wrong_file_is_refused(
+    text: str, name: str, fix: str, file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file.write_text(text)
+    said = complaint(["train", *([PENDULUM] if "env =" not in text else []), "--config", str(file)], capsys)
+    assert name in said
+    assert fix in said
+
+
+def test_a_file_that_is_not_there_or_is_two(tmp_path: Path, file: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.toml.*cannot be read"):
+        parser.parse(["train", PENDULUM, "--config", str(tmp_path / "none.toml")])
+    with pytest.raises(ConfigError, match="is there twice"):
+        parser.parse(["train", "--config", str(file), f"--config={file}"])
+    (tmp_path / "odd").write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match="is not TOML"):
+        parser.parse(["train", "--config", str(tmp_path / "odd")])
+
+
+@pytest.mark.parametrize("word", ["1000000", "1_000_000", "1e6", "1.0E6", "+1000000"])
+def test_whole_numbers(word: str) -> None:
+    assert read_whole(word) == 1_000_000
+    assert parser.parse(["train", PENDULUM, "--total-steps", word]).config().total_steps == 1_000_000
+
+
+@pytest.mark.parametrize("word", ["1.5", "1e-3", "inf", "nan", "", "a million", "0x10"])
+def test_what_is_no_whole_number(word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    said = complaint(["train", PENDULUM, f"--total-steps={word}"], capsys)
+    assert "--total-steps" in said
+    assert "is no whole number" in said
+
+
+def test_help_is_short_and_help_all_is_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    everything = flags("train", capsys)
+    assert main.run(["train", "--help"]) == 0
+    short = capsys.readouterr().out
+    assert "--total-steps" in short
+    assert "--help-all" in short
+    assert "--priority-exponent" in everything
+    assert "--priority-exponent" not in short
+    assert len(short.splitlines()) < 100
