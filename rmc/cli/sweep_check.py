@@ -34,7 +34,7 @@ def check_values(spec: Spec) -> None:
         flag = f"--{name.replace('_', '-')}"
         if any(word.partition("=")[0] == flag for word in spec.words):
             raise ConfigError(flag, " ".join(spec.words), "a sweep's runs are given none; leave it")
-    _check("options", " ".join(spec.words), spec, list(spec.words))
+    _check("options of rmc train", " ".join(spec.words), spec, list(spec.words))
     ranges = spec.search.ranges if spec.search is not None else {}
     ends = {name: [value.low, value.high] if isinstance(value, Range) else value for name, value in ranges.items()}
     for part, values in (("options", {name: [value] for name, value in spec.options.items()}), ("grid", spec.grid)):
@@ -66,6 +66,12 @@ def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:
         validate(config)
         checked.append(Checked(job, config, alike.options))
     return checked
+
+
+def config_of(job: Job) -> RunConfig:
+    """Of a run's words, which can be read."""
+    config: RunConfig = parser.parse(job.command(job.folder)).config()
+    return config
 
 
 def _checked(job: Job, on_this_machine: bool) -> Checked:

@@ -8,6 +8,7 @@ from typing import Any
 
 from rmc.common.env.config import write_kwargs
 
+TRIAL = "trial-"  # how the names of a search's runs begin
 LONGEST_NAME = 120  # of 255 that a file system takes
 
 
@@ -28,7 +29,8 @@ class Job:
     @property
     def title(self) -> str:
         """What it is, for a line."""
-        return ", ".join([*(f"{name} {shown(value)}" for name, value in self.values.items()), f"seed {self.seed}"])
+        last = self.name if self.name.startswith(TRIAL) else f"seed {self.seed}"
+        return ", ".join([*(f"{name} {shown(value)}" for name, value in self.values.items()), last])
 
     @property
     def log(self) -> Path:

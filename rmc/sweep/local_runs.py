@@ -52,8 +52,8 @@ class LocalRun:
         self._process.wait()
 
     def last_words(self) -> str:
-        """The last line of its log, and where that is."""
-        return f"{last_line(self._log)}; see {self._log}"
+        """The last line of its log."""
+        return last_line(self._log)
 
 
 def core_parts(count: int) -> list[set[int]]:

@@ -15,6 +15,7 @@ from rmc.sweep.job import Job
 LOOK_SECONDS = 0.2
 STOPPED = 130  # how a run ends that was asked to
 State = Literal["waiting", "running", "finished", "pruned", "stopped", "failed"]
+OVER = ("finished", "pruned")  # which are not run again
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,8 @@ class _AtWork:
             return Ending("pruned", seconds)
         if status == STOPPED or self.deadline is not None:
             return Ending("stopped", seconds)
-        how = f"ended by signal {-status}" if status < 0 else f"ended with {status}"
-        return Ending("failed", seconds, f"{how}: {self.run.last_words()}")
+        how = f"killed by signal {-status}" if status < 0 else f"ended with {status}: {self.run.last_words()}"
+        return Ending("failed", seconds, f"{how}; see {self.job.log}")
 
 
 def conduct(

@@ -25,18 +25,19 @@ class RayRuns:
         """Raises ConfigError where no node can hold a run."""
         self._cores, self._at_once, self._running = cores, at_once, 0
         self._needs: dict[str, Any] = {"num_cpus": cores, "num_gpus": gpus, "memory": memory}
-        if not self._capacity():
+        if not self.capacity():
             fix = f"no node of the cluster has {cores} CPUs, which a run takes; start one that has"
             raise ConfigError("--launcher", "ray", fix)
 
-    def _capacity(self) -> int:
+    def capacity(self) -> int:
+        """How many runs the nodes hold, of those that are there now."""
         nodes = (int(node["Resources"].get("CPU", 0.0)) for node in ray.nodes() if node["Alive"])
-        return sum(cpus // self._cores for cpus in nodes)
+        fit = sum(cpus // self._cores for cpus in nodes)
+        return min(fit, self._at_once) if self._at_once else fit
 
     def has_room(self) -> bool:
         """Whether the nodes hold another one. With no run at all one may wait for a node to come."""
-        most = min(self._capacity(), self._at_once or self._running + 1)
-        return self._running == 0 or self._running < most
+        return self._running == 0 or self._running < self.capacity()
 
     def start(self, job: Job) -> "RayRun":
         """Ask for a node, and send it what the job's folder has."""
@@ -98,4 +99,4 @@ class RayRun:
 
     def last_words(self) -> str:
         """Why it failed."""
-        return self._lost or f"{last_log_line(self._job.log)}; see {self._job.log}"
+        return self._lost or last_log_line(self._job.log)

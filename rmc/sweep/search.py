@@ -29,14 +29,13 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.attach import Tail
 from rmc.deploy.run.folder import RunFolder
 from rmc.sweep.index import Index, values_of
-from rmc.sweep.job import Job
+from rmc.sweep.job import TRIAL, Job
 from rmc.sweep.pool import Ending
 from rmc.sweep.spec import Range, Search
 
-PREFIX = "trial-"
 STARTUP_TRIALS = 4  # that are finished before any is pruned
 WARMUP_EVALUATIONS = 1  # of a trial, before it may be
-OVER = {"finished": TrialState.COMPLETE, "pruned": TrialState.PRUNED}
+TRIAL_STATES = {"finished": TrialState.COMPLETE, "pruned": TrialState.PRUNED}
 
 
 class SearchPlan:
@@ -61,9 +60,9 @@ class SearchPlan:
             direction="maximize", pruner=pruner if search.prune else optuna.pruners.NopPruner()
         )
         self._at_work: dict[str, _Trial] = {}
-        self._todo: list[str] = []
+        self.todo: list[Job] = []
         self._index = index
-        self.jobs = [self._known(line) for name, line in index.lines.items() if name.startswith(PREFIX)]
+        self.jobs = [self._known(line) for name, line in index.lines.items() if name.startswith(TRIAL)]
         self._names = self._all_names()
 
     def _known(self, line: dict[str, Any]) -> Job:
@@ -72,14 +71,14 @@ class SearchPlan:
         job = self._make(name, values)
         over = line["state"] == "pruned" or (line["state"] == "finished" and self._is_finished(job))
         try:
-            trial = self._frozen(job, line, OVER[line["state"]] if over else TrialState.FAIL)
+            trial = self._frozen(job, line, TRIAL_STATES[line["state"]] if over else TrialState.FAIL)
         except (KeyError, ValueError):
             fix = f"{name} has {values}, which these ranges do not hold; use those of before, or another --sweep-dir"
             raise ConfigError("search.ranges", sorted(self._distributions), fix) from None
         if over:
             self._study.add_trial(trial)
         else:
-            self._todo.append(name)
+            self.todo.append(job)
         return job
 
     def _frozen(self, job: Job, line: dict[str, Any], state: TrialState) -> optuna.trial.FrozenTrial:
@@ -105,10 +104,10 @@ class SearchPlan:
 
     def _all_names(self) -> Iterator[str]:
         """Of those that go on, then of new ones up to as many trials as there shall be."""
-        yield from self._todo
+        yield from [job.name for job in self.todo]
         for number in range(self._search.trials):
-            if f"{PREFIX}{number}" not in self._index.lines:
-                yield f"{PREFIX}{number}"
+            if f"{TRIAL}{number}" not in self._index.lines:
+                yield f"{TRIAL}{number}"
 
     def next(self) -> Job | None:
         """The next trial's run."""
@@ -118,7 +117,7 @@ class SearchPlan:
         line = self._index.lines.get(name)
         if line is not None:
             self._study.enqueue_trial(self._params(values_of(line)))
-        seed = self._search.sampler_seed + int(name.removeprefix(PREFIX))
+        seed = self._search.sampler_seed + int(name.removeprefix(TRIAL))
         self._study.sampler = optuna.samplers.TPESampler(seed=seed, constant_liar=True)
         trial = self._study.ask(self._distributions)
         job = self._make(name, self._values(trial.params))
@@ -155,7 +154,7 @@ class SearchPlan:
         if ending.state == "finished":
             self._study.tell(trial, _final_return(job))
         else:
-            self._study.tell(trial, state=OVER.get(ending.state, TrialState.FAIL))
+            self._study.tell(trial, state=TRIAL_STATES.get(ending.state, TrialState.FAIL))
 
 
 def _final_return(job: Job) -> float:

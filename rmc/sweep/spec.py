@@ -144,7 +144,7 @@ def _search(raw: dict[str, Any]) -> Search:
         if type(value) is not kinds[name]:
             wanted = {int: "a whole number", bool: "true or false", dict: "a table, [search.ranges]"}[kinds[name]]
             raise ConfigError(f"search.{name}", value, f"write {wanted}")
-    ranges = {name: _range(f"search.ranges.{name}", value) for name, value in raw.get("ranges", {}).items()}
+    ranges = {name: _range(f"search.{name}", value) for name, value in raw.get("ranges", {}).items()}
     return Search(**{**raw, "ranges": _plain_names(ranges)})
 
 

@@ -1,27 +1,28 @@
 """How a sweep's runs did, by their values, best first."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from rich.table import Table
 
 from rmc.sweep.index import Index
-from rmc.sweep.job import Job, shown
+from rmc.sweep.job import TRIAL, Job, shown
 
 
 def result_table(jobs: Sequence[Job], index: Index) -> Table:
-    """A row for each point of the grid or trial; the return is over finished runs alone."""
+    """A row for each point of the grid, or each trial; the return is over finished runs alone."""
     points: dict[str, list[Job]] = {}
     for job in jobs:
-        points.setdefault(repr(job.values), []).append(job)
-    rows = [_row(runs, index) for runs in points.values()]
-    rows.sort(key=lambda row: -row[0])
+        points.setdefault(job.name if job.name.startswith(TRIAL) else repr(job.values), []).append(job)
+    rows = sorted((_row(runs, index) for runs in points.values()), key=lambda row: -row[0])
     table = Table(box=None, pad_edge=False)
-    for name in [*jobs[0].values, "seeds", "return", "not finished"]:
-        table.add_column(name, justify="right" if name in ("seeds", "return") else "left", no_wrap=True)
+    whole = all(not cells[-1] for _, cells in rows)
+    columns = ["trial" if jobs[0].name.startswith(TRIAL) else "", *jobs[0].values, "seeds", "return", "not finished"]
+    shown_at = [at for at, name in enumerate(columns) if name and not (whole and name == "not finished")]
+    for at in shown_at:
+        table.add_column(columns[at], justify="right", no_wrap=True)
     for _, cells in rows:
-        table.add_row(*cells)
+        table.add_row(*(cells[at] for at in shown_at))
     return table
 
 
@@ -29,11 +30,12 @@ def _row(runs: list[Job], index: Index) -> tuple[float, list[str]]:
     """Its mean return, by which it is sorted, and its cells."""
     returns = [line["return"] for job in runs if (line := index.lines.get(job.name)) and line["state"] == "finished"]
     mean = float(np.mean(returns)) if returns else -np.inf
-    text = f"{mean:,.1f} ± {np.std(returns):,.1f}" if returns else "-"
+    deviation = f" ± {np.std(returns):,.1f}" if len(returns) > 1 else ""
     others = [index.state(job) for job in runs if index.state(job) != "finished"]
     counts = ", ".join(f"{others.count(state)} {state}" for state in dict.fromkeys(others))
-    values: dict[str, Any] = runs[0].values
-    return mean, [*map(shown, values.values()), str(len(returns)), text, counts]
+    values = (f"{one:.4g}" if isinstance(one, float) else shown(one) for one in runs[0].values.values())
+    text = f"{mean:,.1f}{deviation}" if returns else "-"
+    return mean, [runs[0].name.removeprefix(TRIAL), *values, str(len(returns)), text, counts]
 
 
 def run_line(job: Job, index: Index) -> str:
