@@ -14,6 +14,7 @@ from rich.console import Console
 from rmc.analysis import curves, env_check, export, history, video, world_model_picture
 from rmc.analysis.evaluation import Progress, evaluate_checkpoint
 from rmc.analysis.policy import load_policy
+from rmc.analysis.run_paths import expanded
 from rmc.cli import run_options
 from rmc.cli.ending import cut_note
 from rmc.cli.signals import signals_caught
@@ -130,12 +131,13 @@ def plot(command: run_options.Plot) -> int:
 
 def _histories(paths: Sequence[Path]) -> list[history.History]:
     """Of all that can be read; the others are told. Raises ConfigError where that is none."""
+    runs = list(dict.fromkeys(run for path in paths for run in expanded(path)))
     found = []
-    for path in paths:
+    for run in runs:
         try:
-            found += history.read(path)
+            found += history.read(run)
         except ConfigError as error:
-            if len(paths) == 1:
+            if len(runs) == 1:
                 raise
             log.warning("%s (left out)", error)
     if not found:
