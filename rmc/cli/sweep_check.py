@@ -16,7 +16,14 @@ from rmc.deploy.run.validation import validate, validate_launch
 from rmc.sweep.job import Job
 from rmc.sweep.spec import Range, Spec
 
-RESERVED = ("run_dir", "if_exists", "redis_url", "ray_address", "all_cpus", "tls")  # that a sweep sets, or has no use for
+RESERVED = (
+    "run_dir",
+    "if_exists",
+    "redis_url",
+    "ray_address",
+    "all_cpus",
+    "tls",
+)  # that a sweep sets, or has no use for
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """All runs of a grid, and which of them are over."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,7 @@ class Grid:
         """The next one; None where all have begun."""
         return next(self._jobs, None)
 
-    def is_hopeless(self, job: Job) -> bool:
+    def is_hopeless(self, job: Job) -> bool:  # noqa: ARG002 - none is
         """Each goes to its end."""
         return False
 

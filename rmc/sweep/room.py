@@ -32,7 +32,8 @@ def run_memory(config: RunConfig, lockstep: bool) -> int:
 
 def runs_that_fit(run_cores: int, memory: int) -> int:
     """How many runs this machine's cores and free memory hold, at least one."""
-    return max(1, min(cores() // run_cores, psutil.virtual_memory().available // memory))
+    free: int = psutil.virtual_memory().available
+    return max(1, min(cores() // run_cores, free // memory))
 
 
 def check_disk(folder: Path, jobs: Sequence[Job], ring: int, at_once: int, dropped: bool) -> None:
