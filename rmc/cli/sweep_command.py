@@ -1,7 +1,7 @@
 """``rmc sweep``: from its checks to its table."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,8 @@ from rmc.cli.sweep_check import Checked
 from rmc.cli.sweep_options import Sweep
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import terminal
-from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.config import RunConfig, option
+from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.preflight import cores as cores_here
 from rmc.sweep import room
 from rmc.sweep.grid import Grid, grid_jobs, is_finished, make_job
@@ -24,6 +25,8 @@ from rmc.sweep.local_runs import LocalRuns
 from rmc.sweep.pool import OVER, Ending, Place, Plan, State, conduct, drop_replay
 from rmc.sweep.spec import Range, Search, Spec, read_grid, read_ranges, read_seeds, read_spec
 from rmc.sweep.table import result_table, run_line
+
+log = logging.getLogger(__name__)
 
 
 def sweep(command: Sweep) -> int:
@@ -49,17 +52,23 @@ def sweep(command: Sweep) -> int:
 def read(command: Sweep) -> Spec:
     """What is asked for, on the command line or in a file. Raises ConfigError."""
     if command.what.endswith(".toml"):
-        usual = Sweep(command.what)
-        for name in ("seeds", "grid", "search", "trials", "sampler_seed", "prune"):
-            if (value := getattr(command, name)) != getattr(usual, name):
-                option = f"--{name.replace('_', '-')}"
-                raise ConfigError(option, value, f"belongs into {command.what}, beside the rest of the sweep")
+        names = ("seeds", "grid", "search", "trials", "sampler_seed", "prune")
+        _check_usual(command, names, f"belongs into {command.what}, beside the rest of the sweep")
         return read_spec(Path(command.what), command.train_words)
     search = None
-    if command.search:
+    if not command.search:
+        _check_usual(command, ("trials", "sampler_seed", "prune"), "is for a search; give --search, or leave it")
+    else:
         search = Search(read_ranges(command.search), command.trials, command.sampler_seed, command.prune)
     seeds = read_seeds(command.seeds or "0")
     return Spec(command.what, seeds, {}, read_grid(command.grid), search, command.train_words)
+
+
+def _check_usual(command: Sweep, names: Sequence[str], fix: str) -> None:
+    usual = Sweep(command.what)
+    for name in names:
+        if (value := getattr(command, name)) != getattr(usual, name):
+            raise ConfigError(option(name), value, fix)
 
 
 def default_folder(what: str) -> Path:
@@ -93,7 +102,7 @@ def grid_work(checked: list[Checked], index: Index) -> Work:
     missing = {job.name for job in todo}
     for job in jobs:
         state: State = "waiting" if job.name in missing else "finished"
-        if index.state(job) != state and (state == "finished" or job.name not in index.lines):
+        if job.name not in index.lines or (state == "finished" and index.state(job) != state):
             index.put(job, state)
     return Work(Grid(todo), jobs, todo, len(jobs))
 
@@ -114,8 +123,9 @@ def search_work(spec: Spec, search: Search, config: RunConfig, index: Index, fol
         return is_finished(job, sweep_check.config_of(job))
 
     plan = SearchPlan(search, distributions, index, make, finished, config.learner.checkpoint_steps)
-    new = search.trials - len(plan.jobs)
-    return Work(plan, plan.jobs, [*plan.todo, *(make(f"{TRIAL}{at}", {}) for at in range(new))], search.trials)
+    total = max(search.trials, len(plan.jobs))
+    new = [make(f"{TRIAL}{number}", {}) for number in range(len(plan.jobs), total)]
+    return Work(plan, plan.jobs, [*plan.todo, *new], total)
 
 
 def _conduct(command: Sweep, work: Work, checked: list[Checked], index: Index) -> int:
@@ -138,6 +148,7 @@ def _conduct(command: Sweep, work: Work, checked: list[Checked], index: Index) -
             with _place(command, work.todo, checked) as (place, about):
                 known = f"{work.total} runs in {folder}, {over} of them over; {about}"
                 console.print(known, soft_wrap=True)
+                _warn_of_empty_rings(work.todo)
                 conduct(work.plan, place, stop, index.begin, ended)
     console.print(result_table(work.jobs, index))
     unfinished = [job for job in work.jobs if index.state(job) not in OVER]
@@ -145,6 +156,14 @@ def _conduct(command: Sweep, work: Work, checked: list[Checked], index: Index) -
         words = f"{len(unfinished)} not over; the same command goes on with them; {folder / NAME} has their words"
         console.print(words, soft_wrap=True)
     return STOPPED if stop.requested else int(bool(unfinished))
+
+
+def _warn_of_empty_rings(todo: list[Job]) -> None:
+    begun = [job for job in todo if (job.folder / "checkpoints" / "epoch").exists()]
+    empty = [job.name for job in begun if not RunFolder(job.folder).replay.exists()]
+    if empty:
+        names = ", ".join(empty)
+        log.warning("without their replay ring, these go on with --warmup-steps that are not trained on: %s", names)
 
 
 @contextmanager

@@ -27,7 +27,7 @@ class Index:
         self._path = folder / NAME
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._lock = take_lock(folder / ".lock")
+            self._lock = take_lock(folder / ".lock", patience=0.0)
         except OSError as error:
             raise ConfigError("--sweep-dir", str(folder), f"cannot be used ({error.strerror}); give another") from None
         if self._lock is None:

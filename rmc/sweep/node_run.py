@@ -33,9 +33,14 @@ class NodeRun:
             unpack(brought, self._folder)
         self._process = spawn([*words, "--run-dir", str(self._folder)], self._log)
 
-    def look(self, known: Known) -> tuple[int | None, Parcel, bytes]:
-        """The run's exit status, if it has one, what has changed, and its log; after its end, nothing is kept here."""
+    def look(self, known: Known, copy: bool) -> tuple[int | None, Parcel | None, bytes]:
+        """The run's exit status, if it has one; where that is so, or a ``copy`` is due, what has changed, and its log.
+
+        After its end, nothing is kept here.
+        """
         status = self._process.poll()
+        if status is None and not copy:
+            return None, None, b""
         parcel, log = pack(self._folder, known), self._log.read_bytes()
         if status is not None:
             shutil.rmtree(self._place, ignore_errors=True)

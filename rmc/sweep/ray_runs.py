@@ -14,7 +14,8 @@ from rmc.sweep.local_runs import last_line as last_log_line
 from rmc.sweep.node_run import NodeRun
 from rmc.sweep.parcel import Known, Parcel, pack, unpack
 
-SYNC_SECONDS = 2.0  # between a run's files and their copies here
+LOOK_SECONDS = 2.0
+BYTES_PER_SECOND = 1e6  # that copies of a run's files take at most, but for the last
 LOST = 1
 
 
@@ -55,30 +56,35 @@ class RayRun:
     def __init__(self, runs: RayRuns, job: Job, needs: dict[str, Any]) -> None:
         self._runs, self._job, self._lost = runs, job, ""
         self._log = job.log.read_bytes() if job.log.exists() else b""
-        self._known: Known | None = None  # until it has begun
         brought = pack(job.folder, {}) if job.folder.exists() else Parcel([], {}, b"")
         self._actor = ray.remote(NodeRun).options(**needs).remote(job.words, job.name, brought, os.getcwd())
-        self._asked: Any = self._actor.look.remote(brought.known)
-        self._next = 0.0
+        self._known: Known = {}  # of its files, those that are here
+        self._asked: Any = self._actor.look.remote(self._known, True)
+        self._begun, self._look_at, self._copy_at = False, 0.0, 0.0
 
     def status(self) -> int | None:
         """Its exit status, once that and all that it left are here."""
-        if self._asked is None:
-            if time.monotonic() < self._next:
-                return None
-            self._asked = self._actor.look.remote(self._known)
-        if not ray.wait([self._asked], timeout=0.0)[0]:
+        now = time.monotonic()
+        if self._asked is None and now >= self._look_at:
+            self._asked = self._actor.look.remote(self._known, now >= self._copy_at)
+        if self._asked is None or not ray.wait([self._asked], timeout=0.0)[0]:
             return None
         try:
             status, parcel, log = ray.get(self._asked)
         except ray.exceptions.RayError as error:
             self._lost = f"its node was lost, or could not start it ({last_line(error)})"
             return self._end(LOST)
+        self._asked, self._begun, self._look_at = None, True, now + LOOK_SECONDS
+        if parcel is not None:
+            self._take(parcel, log)
+            self._copy_at = now + len(parcel.tar) / BYTES_PER_SECOND
+        return None if status is None else self._end(status)
+
+    def _take(self, parcel: Parcel, log: bytes) -> None:
         unpack(parcel, self._job.folder)
+        self._known = parcel.known
         self._job.log.parent.mkdir(parents=True, exist_ok=True)
         self._job.log.write_bytes(self._log + log)
-        self._asked, self._known, self._next = None, parcel.known, time.monotonic() + SYNC_SECONDS
-        return None if status is None else self._end(status)
 
     def _end(self, status: int) -> int:
         ray.kill(self._actor)
@@ -87,7 +93,7 @@ class RayRun:
 
     def stop(self) -> None:
         """In order, where it has begun; where it waits for a node, it waits no longer."""
-        if self._known is None:
+        if not self._begun:
             self.kill()
         else:
             self._actor.stop.remote()

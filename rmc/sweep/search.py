@@ -34,7 +34,7 @@ from rmc.sweep.pool import Ending
 from rmc.sweep.spec import Range, Search
 
 STARTUP_TRIALS = 4  # that are finished before any is pruned
-WARMUP_EVALUATIONS = 1  # of a trial, before it may be
+FIRST_JUDGED = 2  # evaluation of a trial
 TRIAL_STATES = {"finished": TrialState.COMPLETE, "pruned": TrialState.PRUNED}
 
 
@@ -55,7 +55,7 @@ class SearchPlan:
         self._search, self._distributions, self._make = search, dict(distributions), make
         self._is_finished = is_finished
         self._checkpoint_steps = checkpoint_steps
-        pruner = optuna.pruners.MedianPruner(STARTUP_TRIALS, WARMUP_EVALUATIONS)
+        pruner = optuna.pruners.MedianPruner(STARTUP_TRIALS, FIRST_JUDGED)
         self._study = optuna.create_study(
             direction="maximize", pruner=pruner if search.prune else optuna.pruners.NopPruner()
         )
@@ -133,11 +133,14 @@ class SearchPlan:
         at_work = self._at_work[job.name]
         if not any("eval_return_mean" in record for record in at_work.tail.take()):
             return False
+        self._report(at_work, job)
+        return bool(at_work.trial.should_prune())
+
+    def _report(self, at_work: "_Trial", job: Job) -> None:
         for step, one in self._evaluations(job):
             if step not in at_work.reported:
                 at_work.reported.add(step)
                 at_work.trial.report(one.return_mean, step)
-        return bool(at_work.trial.should_prune())
 
     def _evaluations(self, job: Job) -> list[tuple[int, Evaluation]]:
         """By which evaluation of a run it is: the steps themselves differ a little from run to run."""
@@ -150,11 +153,12 @@ class SearchPlan:
 
     def end(self, job: Job, ending: Ending) -> None:
         """Tell Optuna."""
-        trial = self._at_work.pop(job.name).trial
+        at_work = self._at_work.pop(job.name)
+        self._report(at_work, job)
         if ending.state == "finished":
-            self._study.tell(trial, _final_return(job))
+            self._study.tell(at_work.trial, _final_return(job))
         else:
-            self._study.tell(trial, state=TRIAL_STATES.get(ending.state, TrialState.FAIL))
+            self._study.tell(at_work.trial, state=TRIAL_STATES.get(ending.state, TrialState.FAIL))
 
 
 def _final_return(job: Job) -> float:
