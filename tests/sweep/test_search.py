@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from rmc.cli.main import run
-from rmc.cli.sweep_command import search_work
 from rmc.cli.sweep_check import config_of
+from rmc.cli.sweep_command import search_work
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
 from rmc.sweep.grid import make_job
