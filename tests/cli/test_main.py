@@ -44,6 +44,10 @@ TRAIN_FLAGS = """
 """.split()  # noqa: SIM905
 ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit --env-timeout --env-kwargs".split()  # noqa: SIM905
 OTHER_FLAGS = {
+    "sweep": [
+        *"--seeds --grid --search --trials --sampler-seed --prune --sweep-dir --jobs --drop-replay --launcher".split(),  # noqa: SIM905
+        "--ray-address",
+    ],
     "evaluate": ["--episodes", "--seconds", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
     "inspect": ["--out", "--checkpoint"],
