@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rmc.cli import sweep_check
+from rmc.cli.config_file import OPTION as CONFIG
 from rmc.cli.ending import STOPPED
 from rmc.cli.signals import signals_caught
 from rmc.cli.sweep_check import Checked
@@ -22,7 +23,7 @@ from rmc.sweep.grid import Grid, grid_jobs, is_finished, make_job
 from rmc.sweep.index import NAME, Index
 from rmc.sweep.job import TRIAL, Job
 from rmc.sweep.local_runs import LocalRuns
-from rmc.sweep.pool import OVER, Ending, Place, Plan, State, conduct, drop_replay
+from rmc.sweep.pool import OVER, Ending, Place, Plan, conduct, drop_replay
 from rmc.sweep.spec import Range, Search, Spec, read_grid, read_ranges, read_seeds, read_spec
 from rmc.sweep.table import result_table, run_line
 
@@ -39,6 +40,8 @@ def sweep(command: Sweep) -> int:
         raise ConfigError("--jobs", command.jobs, "take 1 or more, or 0 for as many as fit")
     sweep_check.check_values(spec)
     on_this_machine = command.launcher == "local"
+    if not on_this_machine and any(word.partition("=")[0] == CONFIG for word in spec.words):
+        raise ConfigError(CONFIG, " ".join(spec.words), "the nodes do not have that file; write it into [options]")
     jobs = grid_jobs(spec, folder) if spec.search is None else corner_jobs(spec, spec.search, folder)
     checked = sweep_check.check_jobs(jobs, on_this_machine)
     with closing(Index(folder)) as index:
@@ -99,11 +102,13 @@ def grid_work(checked: list[Checked], index: Index) -> Work:
     """All runs that have no result yet. Raises ConfigError."""
     jobs = [one.job for one in checked]
     todo = [one.job for one in checked if not is_finished(one.job, one.config)]
-    missing = {job.name for job in todo}
+    waiting = {job.name for job in todo}
     for job in jobs:
-        state: State = "waiting" if job.name in missing else "finished"
-        if job.name not in index.lines or (state == "finished" and index.state(job) != state):
-            index.put(job, state)
+        if job.name not in waiting:
+            index.put(job, "finished")
+        elif job.name not in index.lines:
+            index.put(job, "waiting")
+    index.write()
     return Work(Grid(todo), jobs, todo, len(jobs))
 
 
@@ -150,12 +155,12 @@ def _conduct(command: Sweep, work: Work, checked: list[Checked], index: Index) -
                 console.print(known, soft_wrap=True)
                 _warn_of_empty_rings(work.todo)
                 conduct(work.plan, place, stop, index.begin, ended)
-    console.print(result_table(work.jobs, index))
-    unfinished = [job for job in work.jobs if index.state(job) not in OVER]
-    if unfinished or stop.requested:
-        words = f"{len(unfinished)} not over; the same command goes on with them; {folder / NAME} has their words"
-        console.print(words, soft_wrap=True)
-    return STOPPED if stop.requested else int(bool(unfinished))
+    if work.jobs:
+        console.print(result_table(work.jobs, index))
+    left = work.total - sum(index.state(job) in OVER for job in work.jobs)
+    if left:
+        console.print(f"{left} not over; the same command goes on; {folder / NAME} has their words", soft_wrap=True)
+    return STOPPED if stop.requested else int(left > 0)
 
 
 def _warn_of_empty_rings(todo: list[Job]) -> None:
@@ -173,15 +178,16 @@ def _place(command: Sweep, todo: list[Job], checked: list[Checked]) -> Iterator[
     cores = max(room.run_cores(one.config, lockstep) for one in checked)
     ring = max(room.ring_bytes(one.config) for one in checked)
     memory = max(room.run_memory(one.config, lockstep) for one in checked)
+    gpus = int(any(one.options.device.startswith("cuda") for one in checked))
     if command.launcher == "local":
-        at_once = min(len(todo), command.jobs or room.runs_that_fit(cores, memory))
+        fit = 1 if gpus else room.runs_that_fit(cores, memory)
+        at_once = min(len(todo), command.jobs or fit)
         room.check_disk(todo[0].folder.parent, todo, ring, at_once, command.drop_replay)
         yield LocalRuns(at_once), f"{at_once} at a time, of {cores_here()} cores"
         return
     from rmc.deploy.ray.launcher import joined  # Ray is an extra, and slow to import
     from rmc.sweep.ray_runs import RayRuns
 
-    gpus = int(any(one.options.device.startswith("cuda") for one in checked))
     with joined(command.ray_address, max(cores, cores_here())):
         place = RayRuns(cores, memory, gpus, command.jobs)
         yield place, f"up to {place.capacity()} at a time, each with {cores} CPUs of a node"

@@ -33,7 +33,7 @@ class Sweep:
     sweep_dir: Path | None = None
     """The sweep's folder; by default runs/<SPEC's name>, or runs/<env>__sweep."""
     jobs: int = 0
-    """Runs at once; 0 for as many as cores and memory hold."""
+    """Runs at once; 0 for as many as cores and memory hold, or one where the device is cuda."""
     drop_replay: bool = False
     """Remove a run's replay ring once it is finished: evaluate, plot and export need none."""
     launcher: Literal["local", "ray"] = "local"

@@ -48,27 +48,36 @@ class Index:
     def begin(self, job: Job) -> None:
         """Note that it runs."""
         self.put(job, "running")
+        self.write()
 
     def end(self, job: Job, ending: Ending) -> None:
         """Note how it ended."""
         self.put(job, ending.state, ending.seconds, ending.reason)
+        self.write()
 
     def put(self, job: Job, state: State, seconds: float = 0.0, reason: str = "") -> None:
-        """Write its line, and with it the file, whole or not at all. Seconds are added up over its starts."""
+        """Make its line anew. Seconds are added up over its starts."""
         before = self.lines.get(job.name, {}).get("seconds", 0.0)
         returned, env_steps = newest_return(job)
         words = f"rmc {shlex.join(job.command(job.folder))}"
         cells = (job.name, state, words, job.seed, job.values, returned, env_steps, round(before + seconds, 1), reason)
         self.lines[job.name] = dict(zip(COLUMNS, cells, strict=True))
+
+    def write(self) -> None:
+        """All lines, whole or not at all."""
         write_whole(self._path, "".join(f"{json.dumps(line)}\n" for line in self.lines.values()).encode())
 
 
 def newest_return(job: Job) -> tuple[float | None, int]:
     """Of its result, or else of its newest evaluation, and the environment steps there."""
-    if not (job.folder / "config.json").exists():
+    folder = RunFolder(job.folder)
+    result = folder.result()
+    if result is not None:
+        return result["eval_return_mean"], result["env_steps"]
+    if not (folder.path / "config.json").exists():
         return None, 0
     try:
-        last = of_run(RunFolder(job.folder)).evaluations[-1]
+        last = of_run(folder).evaluations[-1]
     except ConfigError:  # not evaluated yet
         return None, 0
     return last.return_mean, last.env_steps
