@@ -98,7 +98,7 @@ class PolicyRunner:
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig, envs: int) -> None:
         self._config, self._envs = config, envs
         self._obs_dim, self._action_dim = obs_dim, action_dim
-        inputs = obs_dim + action_dim + config.blank_flag
+        inputs = obs_dim + action_dim + config.missing_flag
         embedding = config.embedding or inputs
         self._skip = {"hidden": 0, "hidden+embedding": embedding}.get(config.head_input, obs_dim)
         features = self._skip + (config.hidden if config.head_input != "observation" else 0)
@@ -112,7 +112,7 @@ class PolicyRunner:
         self._gru = _GRU(self._from_embedding, self._from_hidden, envs, config.hidden)
         self._head = _head(features, config.heads, 2 * action_dim, envs)
         known = config.hidden + obs_dim + action_dim
-        self._next_frame = _head(known, config.heads, obs_dim, envs) if config.fill_blanks else ()
+        self._next_frame = _head(known, config.heads, obs_dim, envs) if config.impute_missing else ()
 
     def start(self) -> tuple[Floats, Floats]:
         """Previous action (N, A) and state (N, S) at the start of episodes: new zeros."""
@@ -184,7 +184,7 @@ class PolicyRunner:
             normalized[:] = observation
         normalized[missing] = 0.0
         x[:, self._obs_dim : self._obs_dim + self._action_dim] = prev_action
-        if self._config.blank_flag:
+        if self._config.missing_flag:
             x[:, -1] = missing
         return torch.from_numpy(x)
 

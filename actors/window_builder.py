@@ -155,7 +155,7 @@ class WindowBuilder:
         fields["env"][row], fields["episode_step"][row] = env, block
         fields["weights_update"][row] = self._update[(self._time - last + burn_in + 1) % self._slots]
         fields["observation"][row, first : last + 1] = self._observation[slots, env]
-        fields["blank"][row, first : last + 1] = self._missing[slots, env]
+        fields["missing"][row, first : last + 1] = self._missing[slots, env]
         fields["action"][row, first:last] = self._prev_action[slots[1:], env]
         fields["reward"][row, first:last] = self._reward[slots[1:], env]
         fields["prev_action"][row] = self._prev_action[slots[0], env]

@@ -35,10 +35,15 @@ from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.common.whole_file import write_whole
+from rmc.deploy.run.config import flat, option
 from rmc.deploy.run.folder import RunFolder, read_object
+from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.opening import make, new_folder
+from rmc.deploy.run.starts import note_start, resume_command
 
 CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
+MAY_CHANGE = {"total_steps", "threads", "checkpoint_steps", "episodes", "env.env_timeout"}
 STOPPED = 130  # exit status after Ctrl-C, as shells have it
 SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
 RECORD_SECONDS = 5.0
@@ -68,8 +73,8 @@ def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: 
     with closing(_Run(config, folder, console)) as run:
         run.train(stop)
         if stop.requested:
-            words = f"the same command with --run-dir {folder.path} goes on"
-            console.print(f"stopped at environment step {run.steps:,}; {words}", soft_wrap=True)
+            console.print(f"stopped at environment step {run.steps:,}; to go on:")
+            console.print(f"  {resume_command(folder)}", soft_wrap=True)
             return STOPPED
         result = run.result()
     folder.write_result(result)
@@ -89,20 +94,23 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
     env = config.env.id.replace(":", "_").replace("/", "_")
     name = f"{env}__{config.algorithm}-{config.settings}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
     folder = RunFolder(run_dir) if run_dir is not None else new_folder(Path("runs").resolve() / name)
-    about, now = folder.path / "config.json", json.loads(json.dumps(asdict(config)))
-    if about.exists() and folder.is_baseline():
-        was = folder.settings()
-        for key in now:
-            if key not in ("total_steps", "threads") and was.get(key) != now[key]:
-                fix = f"the run in {folder.path} has {was.get(key)!r}; use that, or another --run-dir"
-                raise ConfigError(f"--{key.replace('_', '-')}", now[key], fix)
+    there = (folder.path / "config.json").exists() and folder.is_baseline()
+    before = read(folder) if there else config
+    was, now = flat(before), flat(config)
+    changes = {path: [was[path], now[path]] for path in now if was[path] != now[path]}
+    if refused := next((path for path in changes if path not in MAY_CHANGE), None):
+        fix = f"the run in {folder.path} has {was[refused]!r}; use that, or another --run-dir"
+        raise ConfigError("ENV" if refused == "env.id" else option(refused), now[refused], fix)
+    if there:
         folder.check_sizes(config.env.id, sizes)
     elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no baseline's; give another one")
     make(folder)
     folder.lock()
     folder.reopen(config.total_steps)
-    write_whole(about, f"{json.dumps(now, indent=2)}\n".encode())
+    note_start(folder, changes, LaunchOptions(folder.path), None)
+    written = json.dumps({"format": FORMAT} | asdict(config), indent=2)
+    write_whole(folder.path / "config.json", f"{written}\n".encode())
     folder.write_sizes(sizes)
     for left in set(folder.checkpoints.glob("[0-9]*")) - set(_states(folder)):  # by a crash amid a save
         shutil.rmtree(left)

@@ -14,9 +14,10 @@ from rich.console import Console
 from rmc.actors.evaluator import Rollout, first_start, play_episodes, told
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.common.agent import Agent
-from rmc.common.checkpoint import POLICY, PROGRESS, STATE, CheckpointFolder
+from rmc.common.checkpoint import POLICY, PROGRESS, STATE
 from rmc.common.env.make import make_env
-from rmc.common.errors import CheckpointError, ConfigError, MessageError
+from rmc.common.errors import ConfigError, MessageError
+from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
@@ -96,7 +97,7 @@ def load_checkpoint(folder: RunFolder, config: RunConfig, checkpoint: str) -> tu
 
     The best is of those that were evaluated while it trained, which the last one need not be.
     """
-    files, spec = _load(folder, checkpoint), config.window_spec()
+    (_, files), spec = choose_checkpoint(folder, checkpoint), config.window_spec()
     folder.check_sizes(config.env.id, config.sizes())
     try:
         PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, envs=1).load(files[POLICY])
@@ -107,34 +108,7 @@ def load_checkpoint(folder: RunFolder, config: RunConfig, checkpoint: str) -> tu
 
 def load_state(folder: RunFolder, checkpoint: str) -> bytes:
     """The learner's whole state of a checkpoint, for ``torch.load``. Raises ConfigError."""
-    return _load(folder, checkpoint)[STATE]
-
-
-def _load(folder: RunFolder, checkpoint: str) -> dict[str, bytes]:
-    checkpoints = CheckpointFolder(folder.checkpoints)
-    number = _number(checkpoints, checkpoint)
-    try:
-        return checkpoints.load(number)
-    except CheckpointError as error:
-        others = [other for other in checkpoints.numbers() if other != number]
-        fix = f"use one of {others}" if others else "there is no other"
-        raise ConfigError("--checkpoint", checkpoint, f"{error}; {fix}") from None
-
-
-def _number(checkpoints: CheckpointFolder, which: str) -> int:
-    numbers = checkpoints.numbers()
-    if not numbers:
-        raise ConfigError("RUN", str(checkpoints.folder.parent), "it has no checkpoint yet; train it for longer")
-    if which == "latest":
-        return numbers[-1]
-    if which == "best":
-        best = checkpoints.best()
-        if best is None or best not in numbers:
-            raise ConfigError("--checkpoint", which, "none was evaluated yet; use latest")
-        return best
-    if which.isdecimal() and int(which) in numbers:
-        return int(which)
-    raise ConfigError("--checkpoint", which, f"use latest, best or one of {numbers}")
+    return choose_checkpoint(folder, checkpoint)[1][STATE]
 
 
 def initial_policy(config: RunConfig) -> bytes:

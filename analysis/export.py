@@ -38,7 +38,7 @@ class _Step(nn.Module):
         self, observation: Tensor, previous_action: Tensor, missing: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor]:
         """See the module's docstring."""
-        if self.agent.config.fill_blanks:  # as ``Policy.act`` has it
+        if self.agent.config.impute_missing:  # as ``Policy.act`` has it
             missing = missing | ~torch.isfinite(observation).all(1)
         seen = self.agent.normalizer(observation, missing).unsqueeze(1)
         now = missing.unsqueeze(1), previous_action.unsqueeze(1), state

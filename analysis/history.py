@@ -19,10 +19,10 @@ from rmc.common.env.config import EnvConfig, write_kwargs
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, flat, option
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.opening import MAY_CHANGE
+from rmc.deploy.run.opening import SAME_AGENT
 from rmc.deploy.run.presets import preset_config
 
-UNTOLD = MAY_CHANGE | {"seed", "preset", "evaluator.episodes", "env.id"}  # makes no other agent
+UNTOLD = SAME_AGENT | {"seed", "preset", "env.id"}  # makes no other agent
 
 
 @dataclass(frozen=True)

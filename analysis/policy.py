@@ -72,7 +72,7 @@ class Policy:
             raise ConfigError("observation", f"of shape {seen.shape}", f"the policy reads shape {(self._obs_dim,)}")
         if not (missing or np.isfinite(seen).all()):
             missing = True
-            if not self.config.agent.fill_blanks:
+            if not self.config.agent.impute_missing:
                 odd = {i: float(seen[i]) for i in np.flatnonzero(~np.isfinite(seen)).tolist()}
                 raise ConfigError("observation", odd, "give finite numbers, or missing=True where there is none")
         return seen[None], missing

@@ -8,7 +8,7 @@ import io
 import pickle
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 import torch
@@ -163,17 +163,22 @@ def inspect(run: Path, checkpoint: str, out: Path) -> Insight:
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError("--out", str(out), f"matplotlib is missing; {how_to_install('plot')}")
     check_writable("--out", out, PICTURES)
-    folder = RunFolder(run)
+    return inspect_to(RunFolder(run), checkpoint, out)
+
+
+def inspect_to(folder: RunFolder, checkpoint: str, out: Path | BinaryIO) -> Insight:
+    """Play, look, and write the picture to a file, or as PNG to what is like one. Raises ConfigError."""
     config = folder.config()
     if not config.agent.grounding:
-        raise ConfigError("RUN", str(run), "its world model predicts no observations; train with --grounding")
+        fix = "its world model predicts no observations; train with --grounding"
+        raise ConfigError("RUN", str(folder.path), fix)
     agent = load_agent(folder, config, checkpoint)
     insight = look(agent, play(folder, agent, config, checkpoint), config.update.model_norm)
     draw(insight, f"{config.env.id}, {config.preset}, seed {config.seed}", out)
     return insight
 
 
-def draw(insight: Insight, title: str, out: Path) -> None:
+def draw(insight: Insight, title: str, out: Path | BinaryIO) -> None:
     """Predicted against real amid the episode, then curiosity and reward over all of it."""
     from matplotlib.figure import Figure  # an extra
 
@@ -187,7 +192,7 @@ def draw(insight: Insight, title: str, out: Path) -> None:
         for horizon, predicted in insight.ahead.items():
             label = f"{horizon} step{'s' * (horizon > 1)} ahead"
             axis.plot(time[horizon - 1 :], predicted[:, dimension], linewidth=1.0, label=label)
-        axis.set_xlim(start, start + SHOWN_STEPS)
+        axis.set_xlim(start, min(start + SHOWN_STEPS, len(time)))
         axis.set_ylabel(f"observation {dimension}")
     axes[-2].plot(time, insight.curiosity, color="tab:purple", linewidth=0.8)
     axes[-2].set_ylabel("curiosity")

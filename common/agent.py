@@ -60,8 +60,8 @@ class Memory(nn.Module):
 
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
-        width = obs_dim + action_dim + config.blank_flag
-        self.blank_flag, self.head_input = config.blank_flag, config.head_input
+        width = obs_dim + action_dim + config.missing_flag
+        self.missing_flag, self.head_input = config.missing_flag, config.head_input
         layers: list[nn.Module] = []
         if config.embedding:
             layers = [nn.Linear(width, config.embedding), nn.ReLU()]
@@ -93,7 +93,7 @@ class Memory(nn.Module):
 
     def inputs(self, observation: Tensor, missing: Tensor, prev_action: Tensor) -> Tensor:
         """What is embedded: (..., O) normalised, (...) bool, (..., A) -> (..., O + A), or one more with the flag."""
-        flag = [missing.unsqueeze(-1).to(observation.dtype)] if self.blank_flag else []
+        flag = [missing.unsqueeze(-1).to(observation.dtype)] if self.missing_flag else []
         return torch.cat([observation, prev_action, *flag], dim=-1)
 
     def _skip(self, observation: Tensor, embedding: Tensor) -> Tensor:
@@ -245,7 +245,7 @@ class Agent(nn.Module):
         self.critic = TwinQ(features, action_dim, config)
         self.policy = Policy(features, action_dim, config)
         self.log_alpha = nn.Parameter(torch.zeros(()))
-        self.next_frame = ObservationImputer(obs_dim, action_dim, config) if config.fill_blanks else None
+        self.next_frame = ObservationImputer(obs_dim, action_dim, config) if config.impute_missing else None
 
     def features(self, remembered: MemoryOutput) -> Tensor:
         """What the heads read: h_t, what is beside it, or both."""
@@ -290,7 +290,7 @@ class Agent(nn.Module):
     def fills(self, missing: Tensor) -> bool:
         """Whether there may be anything to fill; a GPU would have to wait to be asked, an export cannot ask."""
         cannot_ask = missing.device.type != "cpu" or torch.compiler.is_exporting()
-        return self.config.fill_blanks and (cannot_ask or bool(missing.any()))
+        return self.config.impute_missing and (cannot_ask or bool(missing.any()))
 
     def acting(self) -> dict[str, nn.Parameter]:
         """The parameters that it takes to act, by name."""
@@ -305,7 +305,7 @@ class Agent(nn.Module):
         return self._weights(self._acting() + (CRITIC_PARTS if self.config.initial_priority == "actor" else ()))
 
     def _acting(self) -> tuple[str, ...]:
-        return POLICY_PARTS + (FILL_PARTS if self.config.fill_blanks else ())
+        return POLICY_PARTS + (FILL_PARTS if self.config.impute_missing else ())
 
     def _weights(self, parts: tuple[str, ...]) -> dict[str, Tensor]:
         return {

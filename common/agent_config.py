@@ -32,9 +32,9 @@ class AgentConfig:
     """Observations are normalised by the replay server's running statistics."""
     grounding: bool = True
     """The world model also predicts the next observation's change and the reward."""
-    blank_flag: bool = False
+    missing_flag: bool = False
     """The memory has one more input, which says whether the observation is missing (flickered out)."""
-    fill_blanks: bool = False
+    impute_missing: bool = False
     """A missing observation is replaced, before the memory reads it, by what a small network predicts from the
     observation before (filled itself if it was missing), the memory and the last action. The stored state then is h and
     that observation. Needs normalized observations."""
@@ -44,4 +44,4 @@ class AgentConfig:
 
     def state_size(self, obs_dim: int) -> int:
         """S, numbers that an actor carries from step to step, and stores: h, and what was last seen where it fills."""
-        return self.hidden + self.fill_blanks * obs_dim
+        return self.hidden + self.impute_missing * obs_dim

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,25 @@ class ObservationStatistics:
     count: int
     total: NDArray[np.float64]
     total_square: NDArray[np.float64]
+
+    @classmethod
+    def none(cls, obs_dim: int) -> Self:
+        """Of no observation."""
+        return cls(0, np.zeros(obs_dim), np.zeros(obs_dim))
+
+    @classmethod
+    def from_json(cls, raw: dict[str, Any]) -> Self:
+        """The inverse of ``to_json``. Raises KeyError, TypeError, ValueError."""
+        return cls(int(raw["count"]), *(np.asarray(raw[name], np.float64) for name in ("total", "total_square")))
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain numbers and lists."""
+        return {"count": self.count, "total": self.total.tolist(), "total_square": self.total_square.tolist()}
+
+    def __add__(self, other: Self) -> Self:
+        """Of the observations of both."""
+        count, total = self.count + other.count, self.total + other.total
+        return type(self)(count, total, self.total_square + other.total_square)
 
 
 class Replay(Protocol):

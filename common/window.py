@@ -48,6 +48,10 @@ class WindowSpec:
     @cached_property
     def dtype(self) -> np.dtype[np.void]:
         """The row's structured dtype, padded to 64 bytes."""
+        return self._row("missing")
+
+    def _row(self, missing: str) -> np.dtype[np.void]:
+        """Of rows whose last field is called so."""
         fields: list[tuple[str, str, tuple[int, ...]]] = [
             ("serial", "<i8", ()),  # given by the ring; slot = serial mod capacity
             ("seq", "<i8", ()),  # origin: (actor, epoch, seq, k) names a window once and for all
@@ -68,7 +72,7 @@ class WindowSpec:
             ("prev_action", "<f4", (self.action_dim,)),
             ("reward", "<f4", (self.steps,)),  # extrinsic
             ("state", "<f4", (self.state,)),
-            ("blank", "u1", (self.observations,)),  # 1: a flickered-out frame
+            (missing, "u1", (self.observations,)),  # 1: a flickered-out frame
         ]
         packed = np.dtype(fields)
         itemsize = -(-packed.itemsize // ROW_ALIGNMENT) * ROW_ALIGNMENT
@@ -80,7 +84,15 @@ class WindowSpec:
     @cached_property
     def fingerprint(self) -> str:
         """16 hexadecimal digits that change with the window's split and any field, shape or offset of the dtype."""
-        return hashlib.sha256(repr((self.burn_in, self.train, self.dtype)).encode()).hexdigest()[:16]
+        return self._digest(self.dtype)
+
+    @cached_property
+    def former_fingerprint(self) -> str:
+        """The fingerprint in the rings of config format 1, where ``missing`` was called ``blank``: the same bytes."""
+        return self._digest(self._row("blank"))
+
+    def _digest(self, dtype: np.dtype[np.void]) -> str:
+        return hashlib.sha256(repr((self.burn_in, self.train, dtype)).encode()).hexdigest()[:16]
 
     def trained_steps(self, rows: Rows) -> int:
         """Real trained steps in all rows, what a draw spends of the replay ratio."""

@@ -11,7 +11,6 @@ from typing import Any
 from rmc.cli.train_options import Train
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import option
-from rmc.deploy.run.opening import MAY_CHANGE
 from rmc.deploy.run.presets import paper, robust
 
 PAGE = Path(__file__).parent / "configuration.md"
@@ -27,7 +26,8 @@ TITLES = {
     "evaluator": "Evaluation",
 }
 HEAD, RULE = "| option | default | what it is | when to touch it |", "|---|---|---|---|"
-PLACEMENT = ["run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls"]
+PLACEMENT = ["run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls", "dry_run"]
+BEGINNING = ["init_from", "init_parts"]
 # When a user should touch an option; what it does is said where it is defined.
 WHEN = {
     "preset": "`paper` to compare with the paper, `debug` to see everything run within a minute",
@@ -36,12 +36,15 @@ WHEN = {
     "actors": "when the learner waits for experience; on two cores one actor is enough",
     "run_dir": "to name a run, and to go on with one",
     "if_exists": "`fail` or `new` where a script must not go on with an old run by chance",
+    "init_from": "to begin with what another run has [learnt](warm-start.md); for a new run alone",
+    "init_parts": "`memory+world-model` for another reward, `policy` to begin with what acts",
     "launcher": "`ray` for several machines, `lockstep` for the same bits again, `manual` to start the roles yourself",
     "device": "`cuda` where there is a GPU; not tried on one yet, see [performance](performance.md)",
     "redis_url": "with `--launcher manual`, or to keep a run in a Redis of yours",
     "ray_address": "`local` to try Ray on one machine",
     "all_cpus": "on a cluster that is there for this run",
     "tls": "where others are on the cluster's network",
+    "dry_run": "before a long run, or on a machine that is new to it",
     "flicker": "for trials of partial observation",
     "hide": "for trials of partial observation",
     "noise": "for trials of partial observation",
@@ -60,10 +63,10 @@ WHEN = {
     "time counts: [level by 60 000 steps, far behind by 300 000](results.md); the embedding beside it cost return in "
     "a trial (`studies/notebook.md`)",
     "critic_norm": "rarely: it cost return in a trial (`studies/notebook.md`)",
-    "normalize_observations": "off, with `--no-fill-blanks`, where they are scaled and their statistics keep moving",
+    "normalize_observations": "off, with `--no-impute-missing`, where they are scaled and their statistics keep moving",
     "grounding": "off for the paper's model, with `--scheme 1`; with scheme 3 it keeps the memory from collapsing",
-    "fill_blanks": "rarely: without it missing frames cost far more return, see [results](results.md)",
-    "blank_flag": "with flicker, to see what the flag is worth; the paper has none",
+    "impute_missing": "rarely: without it missing frames cost far more return, see [results](results.md)",
+    "missing_flag": "with flicker, to see what the flag is worth; the paper has none",
     "initial_priority": "`actor` where new windows should not all be drawn soon; it costs the actors a forward pass",
     "envs_per_actor": "up where actors are the bottleneck: they share one forward pass",
     "stride": "down for overlapping windows, which train a step more than once (an episode's last ones less often)",
@@ -87,7 +90,8 @@ WHEN = {
     "clip_norm": "where single batches throw training off (`grad_norm` in the metrics); 40 cost [return](results.md)",
     "scheme": "to repeat the paper's table 1, where 1 is best; in our [results](results.md) 3 was ahead of 1",
     "policy_through_q": "with schemes 4 to 6",
-    "update_order": "`alternate` for algorithm 1 as printed, at five times the forwards (four with `--no-fill-blanks`)",
+    "update_order": "`alternate` for algorithm 1 as printed, at five times the forwards "
+    "(four with `--no-impute-missing`)",
     "model_norm": "to repeat the paper's comparison",
     "n_step": "up where rewards are rare; it is biased by old data",
     "latent_target": "`ema` where the latent rank in the metrics falls; it cost return (`studies/notebook.md`)",
@@ -96,7 +100,7 @@ WHEN = {
     "curiosity": "up where rewards are rare, 0 where observations flicker for long",
     "curiosity_scale": "`std` makes beta mean the same in every environment, `raw` is the paper's",
     "curiosity_steps": "as long as exploration should last",
-    "policy_average": "0 to evaluate and save what acts; up where evaluations swing",
+    "policy_ema_updates": "0 to evaluate and save what acts; up where evaluations swing",
     "eta": "rarely; only with prioritized replay",
     "batch_size": "up for steadier updates; at the same replay ratio, more and smaller ones learn sooner",
     "publish_updates": "rarely",
@@ -127,12 +131,9 @@ def page() -> str:
         configs = (ours, theirs) if part == "run" else (getattr(ours, part), getattr(theirs, part))
         lines += _rows(*configs)
         if part == "run":
-            changeable = ", ".join(f"`{option(name)}`" for name in sorted(MAY_CHANGE))
-            lines += [
-                "",
-                f"Where a run goes on, these may be others than before: {changeable}, and those of the next table.",
-            ]
-            lines += ["", "## Where it runs", "", HEAD, RULE, *_placement()]
+            lines += ["", "Which of them may change when a run goes on: [Resume a run](resume.md#what-may-change)."]
+            lines += ["", "## Where it runs", "", HEAD, RULE, *_launch_rows(PLACEMENT)]
+            lines += ["", "## What a new run begins with", "", HEAD, RULE, *_launch_rows(BEGINNING)]
     return "\n".join(lines) + "\n"
 
 
@@ -148,12 +149,11 @@ def _rows(ours: Any, theirs: Any) -> list[str]:
     return rows
 
 
-def _placement() -> list[str]:
+def _launch_rows(names: list[str]) -> list[str]:
     said = _docstrings(Train)
     defaults = {item.name: item.default for item in dataclasses.fields(Train)}
     return [
-        f"| `--{name.replace('_', '-')}` | {_text(defaults[name])} | {said[name]} | {WHEN[name]} |"
-        for name in PLACEMENT
+        f"| `--{name.replace('_', '-')}` | {_text(defaults[name])} | {said[name]} | {WHEN[name]} |" for name in names
     ]
 
 

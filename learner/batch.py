@@ -62,7 +62,7 @@ def clear_padding(rows: Rows, spec: WindowSpec) -> None:
     first, last = rows["first"][partial, None], rows["last"][partial, None]
     unobserved = (t < first) | (t > last)
     unstepped = (unobserved | (t == last))[:, :-1]
-    for absent, names in ((unobserved, ("observation", "blank")), (unstepped, ("action", "reward"))):
+    for absent, names in ((unobserved, ("observation", "missing")), (unstepped, ("action", "reward"))):
         window, step = np.nonzero(absent)
         for name in names:
             rows[name][partial[window], step] = 0
@@ -95,7 +95,7 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec) -> Batch:
         reward=field(floats, "reward"),
         terminated=ends.float(),
         state=field(floats, "state"),
-        missing=field(raw, "blank") > 0,
+        missing=field(raw, "missing") > 0,
         observation_valid=observation_valid,
         step_valid=step_valid,
         burned_in=first == 0,

@@ -48,7 +48,7 @@ class UpdateConfig:
     eta: float = 0.9
     """Weight of the largest against the mean absolute TD error in a window's priority."""
 
-    policy_average: int = 0
+    policy_ema_updates: int = 0
     """Updates over which the policy that checkpoints hold, and evaluations play, is averaged, at most a tenth of those
     made; actors have the newest. 0 does not average."""
 

@@ -133,6 +133,6 @@ def _joined(episode: Rows, spec: WindowSpec) -> tuple[Floats, BoolArray, Floats]
     for row, start in zip(episode, starts.tolist(), strict=True):
         first, last = int(row["first"]), int(row["last"])
         observation[start + first : start + last + 1] = row["observation"][first : last + 1]
-        missing[start + first : start + last + 1] = row["blank"][first : last + 1]
+        missing[start + first : start + last + 1] = row["missing"][first : last + 1]
         action[start + first : start + last] = row["action"][first:last]
     return observation, missing, action

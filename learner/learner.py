@@ -21,7 +21,7 @@ from rmc.common.bus.protocol import Bus, Version
 from rmc.common.checkpoint import POLICY, PROGRESS, STATE, CheckpointFolder
 from rmc.common.errors import CheckpointError, FencedError, RmcError
 from rmc.common.metrics import Means, Rate
-from rmc.common.replay import Replay, Sample, SampleStatus
+from rmc.common.replay import ObservationStatistics, Replay, Sample, SampleStatus
 from rmc.common.window import Rows, WindowSpec
 from rmc.learner.batch import clear_padding, importance_weights
 from rmc.learner.config import LearnerConfig, UpdateConfig
@@ -70,6 +70,7 @@ class Learner:
         self.device = torch.device(device)
         self.updates = self.env_steps = self.last_checkpoint = self._checkpoint_steps = 0
         self.finished = self._fenced = self._diverged = self._evaluation_due = False
+        self._observed_before = ObservationStatistics.none(spec.obs_dim)  # by the run that this one began with
         self._means, self._rate, self._waiting = Means(), Rate(), ""
         self._unexplained: list[float] = []  # of every observation dimension, since the last look at it
         self._largest_reward = 0.0  # that was learnt from, as it was scaled
@@ -134,7 +135,7 @@ class Learner:
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
         updated = self._updated(raw, torch.from_numpy(weights), self.update.config.beta(self.env_steps))
         self.updates += 1
-        if self.update.config.policy_average and self.updates % AVERAGE_UPDATES == 0:
+        if self.update.config.policy_ema_updates and self.updates % AVERAGE_UPDATES == 0:
             self.update.update_ema(self.updates)
         self._returning.append((rows["serial"].copy(), HostCopy(updated.priorities)))
         self._return_priorities(leave=self._updated.in_flight)
@@ -206,7 +207,7 @@ class Learner:
 
     def _freeze_statistics(self) -> None:
         if self.agent.config.normalize_observations and self.env_steps > 0:
-            statistics = self.replay.statistics()
+            statistics = self.replay.statistics() + self._observed_before
             total, square = torch.from_numpy(statistics.total), torch.from_numpy(statistics.total_square)
             self.agent.normalizer.freeze(statistics.count, total.to(self.device), square.to(self.device))
 
@@ -242,7 +243,14 @@ class Learner:
         learnt, state = self.update.state_dict(), io.BytesIO()
         self._check_finite(learnt)  # critics or moments may be spoilt while the policy, for one more update, is not
         torch.save(learnt, state)
-        progress = {"updates": self.updates, "env_steps": self.env_steps, "epoch": self.epoch, "time": time.time()}
+        progress: dict[str, Any] = {
+            "updates": self.updates,
+            "env_steps": self.env_steps,
+            "epoch": self.epoch,
+            "time": time.time(),
+        }
+        if self._observed_before.count:
+            progress["observed_before"] = self._observed_before.to_json()
         files = {
             STATE: state.getvalue(),
             POLICY: self._sound(self.update.policy_weights()),
@@ -271,6 +279,8 @@ class Learner:
             self.updates = self.last_checkpoint = int(progress["updates"])
             self.env_steps, epoch = int(progress["env_steps"]), int(progress["epoch"])
             self._checkpoint_steps = self.env_steps
+            if "observed_before" in progress:
+                self._observed_before = ObservationStatistics.from_json(progress["observed_before"])
         except NOT_OURS as error:
             reason = (str(error).strip() or "empty").splitlines()[0]
             raise CheckpointError(f"{self.checkpoints.path(number)}: {STATE} is not this run's ({reason})") from None

@@ -145,7 +145,7 @@ class JointUpdate:
         if not agent.config.grounding:
             return loss_values, o.new_zeros(0)
         predicted = now + prediction.observation_change.float()
-        grounded = seen_after if agent.config.fill_blanks else seen_after * seen_now
+        grounded = seen_after if agent.config.impute_missing else seen_after * seen_now
         loss_values["grounding_loss"] = losses.grounding_loss(
             predicted, after, prediction.reward.float(), r, grounded, m
         )
@@ -199,12 +199,12 @@ class JointUpdate:
     @torch.no_grad()
     def update_ema(self, updates: int) -> None:
         """Move theta-bar of algorithm 1 towards what acts; every ``AVERAGE_UPDATES``, the last time at ``updates``."""
-        over = min(self.config.policy_average, updates / 10) / AVERAGE_UPDATES
+        over = min(self.config.policy_ema_updates, updates / 10) / AVERAGE_UPDATES
         torch._foreach_lerp_(list(self.average.values()), list(self.agent.acting().values()), 1.0 / max(1.0, over))
 
     def policy_weights(self) -> dict[str, Tensor]:
         """What checkpoints hold and evaluations play: theta-bar, with what normalises observations now."""
-        averaged = self.average if self.config.policy_average else {}
+        averaged = self.average if self.config.policy_ema_updates else {}
         return self.agent.policy_weights() | {name: value.cpu() for name, value in averaged.items()}
 
     def state_dict(self) -> dict[str, Any]:
@@ -220,17 +220,17 @@ class JointUpdate:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from ``state_dict``, bit for bit."""
+        """Go on from ``state_dict``, bit for bit; with the step sizes of this run's config."""
         self.agent.load_state_dict(state["agent"])
         self.target_critic.load_state_dict(state["target_critic"])
         self.target_memory.load_state_dict(state["target_memory"])
         for name, value in self.average.items():
             value.copy_(state["average"][name])
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
-            capturable = optimizer.defaults["capturable"]
+            own = [{name: group[name] for name in ("lr", "capturable")} for group in optimizer.param_groups]
             optimizer.load_state_dict(saved)
-            for group in optimizer.param_groups:
-                group["capturable"] = capturable  # of this device, whatever wrote the checkpoint
+            for group, ours in zip(optimizer.param_groups, own, strict=True):
+                group.update(ours)  # of this config and this device, whatever wrote the checkpoint
         self.curiosity_variance.copy_(state["curiosity_variance"])
         self._resume_noise(state["generator"].cpu())
 

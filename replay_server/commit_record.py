@@ -1,7 +1,8 @@
 """The commit record: what one commit makes durable, in two alternating copies with a CRC.
 
 Copy = header "<QII" (sequence, length, crc32(sequence + length + payload)) + payload
-Payload = fixed counters | statistics total, square (O float64 each) | streams (n, 4) int64
+Payload = fixed counters | statistics total, square (O float64 each) | streams (n, 4) int64 | replay ratio, float64
+Rings of config format 1 end before the replay ratio.
 The copy with the larger valid sequence is the present state; a torn write only spoils the older one.
 """
 
@@ -20,6 +21,7 @@ MAX_STREAMS = 4096
 _HEADER = struct.Struct("<QII")
 _COUNTERS = struct.Struct("<10qdqq")  # the integers of Progress in order, largest priority, statistics count, streams
 _STREAM_BYTES = 4 * 8
+_RATIO = struct.Struct("<d")
 _CRC = struct.Struct("<I")
 
 
@@ -50,6 +52,7 @@ class Progress:
     total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (O,)
     total_square: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (O,)
     streams: dict[int, StreamPosition] = field(default_factory=dict)
+    replay_ratio: float = 0.0  # that the limiter held since this ring began; 0 where nobody has said it
 
     def __post_init__(self) -> None:
         if not self.total.size:
@@ -76,7 +79,7 @@ class Progress:
         )  # fmt: skip
         rows = [(actor, at.id.epoch, at.id.seq, at.settled_steps) for actor, at in self.streams.items()]
         streams = np.array(rows, np.int64).tobytes()
-        return counters + self.total.tobytes() + self.total_square.tobytes() + streams
+        return counters + self.total.tobytes() + self.total_square.tobytes() + streams + _RATIO.pack(self.replay_ratio)
 
     def publish(self) -> bytes:
         """The same for a bus and for files, with a CRC-32 in front."""
@@ -97,6 +100,8 @@ def decode_progress(payload: bytes, obs_dim: int) -> Progress:
     positions = {actor: StreamPosition(EntryId(epoch, seq), steps) for actor, epoch, seq, steps in table.tolist()}
     progress = Progress(obs_dim, *counters[:-1])
     progress.total, progress.total_square, progress.streams = sums[0], sums[1], positions
+    rest = payload[_COUNTERS.size + sums.nbytes + table.nbytes :]
+    progress.replay_ratio = _RATIO.unpack(rest)[0] if rest else 0.0
     return progress
 
 
@@ -106,13 +111,14 @@ def decode_published(published: bytes, obs_dim: int) -> Progress | None:
     if not is_whole(published) or len(payload) < _COUNTERS.size:
         return None
     streams = _COUNTERS.unpack_from(payload)[-1]
-    if len(payload) != _COUNTERS.size + 16 * obs_dim + streams * _STREAM_BYTES:
+    size = _COUNTERS.size + 16 * obs_dim + streams * _STREAM_BYTES
+    if len(payload) not in (size, size + _RATIO.size):
         return None
     return decode_progress(payload, obs_dim)
 
 
 def record_bytes(obs_dim: int) -> int:
-    """Room for one copy, in whole pages."""
+    """Room for one copy, in whole pages. A ratio always fits: without it the size is never a multiple of 16."""
     size = _HEADER.size + _COUNTERS.size + 16 * obs_dim + MAX_STREAMS * _STREAM_BYTES
     return -(-size // 4096) * 4096
 

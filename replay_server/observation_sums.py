@@ -42,5 +42,5 @@ def observation_sums(rows: Rows, spec: WindowSpec) -> ObservationStatistics:
     offset = spec.dtype.fields["observation"][1] // 4
     floats = rows.view(np.float32).reshape(len(rows), spec.dtype.itemsize // 4)
     new, last = np.minimum(rows["new_observations"], rows["last"] + 1), rows["last"]
-    count = _add_up(floats, offset, rows["blank"], new, last, total, total_square)
+    count = _add_up(floats, offset, rows["missing"], new, last, total, total_square)
     return ObservationStatistics(count, total, total_square)

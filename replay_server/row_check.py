@@ -65,7 +65,7 @@ def _columns(spec: WindowSpec) -> tuple[tuple[int, ...], slice, NDArray[np.float
     """Columns of ``INTEGERS`` and of all ``FLOATS`` among a row's words, and (F,) of ``TINY``."""
     assert spec.dtype.fields is not None
     column = {name: int(field[1]) // 4 for name, field in spec.dtype.fields.items()}
-    floats = slice(column[FLOATS[0]], column["blank"])
+    floats = slice(column[FLOATS[0]], column["missing"])
     return tuple(column[name] for name in INTEGERS), floats, np.full(floats.stop - floats.start, TINY)
 
 

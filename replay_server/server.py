@@ -65,6 +65,7 @@ class ReplayServer:
             raise
         self.owner = ReplayOwner(self.name, epoch)
         self._store.ring.progress.replay_epoch = epoch
+        self._hold_ratio(config.replay_ratio, shard.part(config.warmup_steps, actors))
         self._store.ring.commit()
         self._store.ring.flush_commit()  # by its epoch this ring is known again after a power cut, too
         self._limiter = RateLimiter(
@@ -128,6 +129,14 @@ class ReplayServer:
                 "%s: the ring of %d windows is lost; begins empty at environment step %d",
                 self.name, progress.next_serial, progress.env_steps,
             )  # fmt: skip
+
+    def _hold_ratio(self, replay_ratio: float, warmup_steps: int) -> None:
+        """A ratio other than before counts from here: nothing is owed for what was, and nobody waits for it."""
+        progress = self._store.ring.progress
+        if progress.replay_ratio != replay_ratio:
+            progress.replay_ratio = replay_ratio
+            progress.begun_drawn_steps = progress.drawn_steps + progress.elsewhere_steps
+            progress.begun_env_steps = progress.env_steps - min(self._inserted, warmup_steps)
 
     # -- in ---------------------------------------------------------------------------------------------
 

@@ -1,5 +1,6 @@
-"""What the commands ``rmc train`` and ``rmc evaluate`` do, as functions for scripts and notebooks."""
+"""What the commands ``rmc train``, ``rmc resume`` and ``rmc evaluate`` do, as functions for scripts and notebooks."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import IfExists, Launcher, LaunchOptions
+from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions
+from rmc.deploy.run.starts import last_launch
 
 
 def train(
@@ -21,18 +23,58 @@ def train(
     device: str = "cpu",
     if_exists: IfExists = "resume",
     redis_url: str | None = None,
+    init_from: str | Path | None = None,
+    init_parts: InitParts = "all",
 ) -> dict[str, Any]:
     """Train a run to its ``total_steps``, or go on with the one in ``run_dir``; its ``result.json``.
 
-    Progress goes to standard output. Call it from the main thread: Ctrl-C ends the run in order. With the launcher
-    ``local``, the roles are processes of their own, which import the environment by its id.
+    A new run begins with the networks and the normaliser of the run or ``RUN:CHECKPOINT`` in ``init_from``, or with
+    those of ``init_parts``. Progress goes to standard output. Call it from the main thread: Ctrl-C ends the run in
+    order. With the launcher ``local``, the roles are processes of their own, which import the environment by its id.
 
     Raises ConfigError for options that cannot work, before anything starts; RoleDied where a role keeps dying;
-    KeyboardInterrupt where the run was stopped, which the same call goes on with.
+    KeyboardInterrupt where the run was stopped, which ``resume`` goes on with.
     """
-    folder = Path(run_dir)
-    options = LaunchOptions(folder, if_exists, launcher, device, redis_url)
-    console = terminal()
+    start = None if init_from is None else str(init_from)
+    options = LaunchOptions(
+        Path(run_dir), if_exists, launcher, device, redis_url, init_from=start, init_parts=init_parts
+    )
+    return _train(config, options)
+
+
+def resume(
+    run_dir: str | Path,
+    *,
+    total_steps: int | None = None,
+    actors: int | None = None,
+    replay_ratio: float | None = None,
+    learning_rate: float | None = None,
+    launcher: Launcher | None = None,
+    device: str | None = None,
+    redis_url: str | None = None,
+) -> dict[str, Any]:
+    """Go on with the run in ``run_dir``; its ``result.json``. What is None stays as it was at the last start.
+
+    Other options that may change are given to ``train``, with the run's whole config. Raises as ``train`` does.
+    """
+    folder = RunFolder(Path(run_dir))
+    config, options = folder.config(), last_launch(folder)
+    said: dict[str, Any] = {"total_steps": total_steps, "actors": actors}
+    how: dict[str, Any] = {"launcher": launcher, "device": device, "redis_url": redis_url}
+    if replay_ratio is not None:
+        said["replay"] = replace(config.replay, replay_ratio=replay_ratio)
+    if learning_rate is not None:
+        said["update"] = replace(config.update, learning_rate=learning_rate)
+    return _train(replace(config, **_given(said)), replace(options, **_given(how)))
+
+
+def _given(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _train(config: RunConfig, options: LaunchOptions) -> dict[str, Any]:
+    assert options.run_dir is not None
+    folder, launcher, console = options.run_dir, options.launcher, terminal()
     if launcher == "ray":
         status = training.train(config, options, console)
     else:

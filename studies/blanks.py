@@ -4,17 +4,17 @@ from studies.study import Study
 
 WAYS = {
     "RMC": "",
-    "told": "--blank-flag",
-    "not filled": "--no-fill-blanks",
-    "not filled, told": "--no-fill-blanks --blank-flag",
+    "told": "--missing-flag",
+    "not filled": "--no-impute-missing",
+    "not filled, told": "--no-impute-missing --missing-flag",
     "longer burn-in": "--burn-in 30",
     "longer windows": "--burn-in 20 --trained-steps 30",
     "observation beside": "--head-input hidden+observation",
     "no memory": "--head-input observation --hidden 8 --embedding 0 --no-grounding --scheme 2",
     "no grounding": "--no-grounding --scheme 1",
-    "not averaged": "--policy-average 0",
-    "clipped": "--clip-norm 40 --policy-average 0",
-    "scheme 1": "--scheme 1 --clip-norm 40 --policy-average 0",
+    "not averaged": "--policy-ema-updates 0",
+    "clipped": "--clip-norm 40 --policy-ema-updates 0",
+    "scheme 1": "--scheme 1 --clip-norm 40 --policy-ema-updates 0",
 }
 STUDY = Study("blanks", {name: f"train ENV --flicker 0.5 {words}" for name, words in WAYS.items()})
 

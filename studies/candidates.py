@@ -58,7 +58,7 @@ TODAY = {
 }
 STUDY = Study(
     "candidates",
-    {name: f"train ENV --scheme 1 --clip-norm 40 --policy-average 0 {words}" for name, words in BEFORE.items()}
+    {name: f"train ENV --scheme 1 --clip-norm 40 --policy-ema-updates 0 {words}" for name, words in BEFORE.items()}
     | {name: f"train ENV {words}" for name, words in TODAY.items()},
     small=Scale(60_000, (1, 2)),
 )

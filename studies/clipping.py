@@ -4,7 +4,10 @@ from studies.study import Scale, Study
 
 STUDY = Study(
     "clipping",
-    {"not clipped": "train ENV --policy-average 0", "clipped at 40": "train ENV --policy-average 0 --clip-norm 40"},
+    {
+        "not clipped": "train ENV --policy-ema-updates 0",
+        "clipped at 40": "train ENV --policy-ema-updates 0 --clip-norm 40",
+    },
     small=Scale(100_000, (1, 2, 3), ("HalfCheetah-v5", "Hopper-v5")),
 )
 

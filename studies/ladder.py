@@ -7,10 +7,10 @@ and learner. Every later one keeps what the one before has, as far as it is not 
 from studies.study import Scale, Study
 
 ALONE = "--head-input observation --hidden 8 --embedding 0"  # the agent without a memory
-BARE = "--no-fill-blanks --no-grounding"
+BARE = "--no-impute-missing --no-grounding"
 RAW = f"--no-normalize-observations {BARE} --scheme 2 {ALONE}"
 FLAT = f"--heads 256 256 --burn-in 0 {RAW}"
-EVERY_STEP = "--policy-average 0 --envs-per-actor 1 --replay-ratio 256"
+EVERY_STEP = "--policy-ema-updates 0 --envs-per-actor 1 --replay-ratio 256"
 RUNGS = {
     "SAC": "baseline sac ENV --settings default",
     "through our pipeline": f"train ENV {FLAT} {EVERY_STEP} --batch-size 256 --trained-steps 1 "

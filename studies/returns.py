@@ -5,7 +5,7 @@ from studies.study import Scale, Study
 ENVS = ("Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Walker2d-v5", "HumanoidStandup-v5")
 OURS = {
     "RMC": "train ENV",
-    "RMC, not averaged": "train ENV --policy-average 0",
+    "RMC, not averaged": "train ENV --policy-ema-updates 0",
     "RMC paper": "train ENV --preset paper",
 }
 THEIRS = {name: f"baseline {name.lower()} ENV" for name in ("SAC", "TD3", "DDPG", "PPO")}

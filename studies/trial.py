@@ -10,7 +10,7 @@ CHANGES = {
     "EMA memory": "--target-memory ema",
     "curiosity": "--curiosity 0.1 --curiosity-scale std",
     "embedding beside": "--head-input hidden+embedding",
-    "raw observations": "--no-normalize-observations --no-fill-blanks",
+    "raw observations": "--no-normalize-observations --no-impute-missing",
 }
 STUDY = Study("trial", {name: f"train ENV {words}" for name, words in CHANGES.items()})
 

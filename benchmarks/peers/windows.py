@@ -30,7 +30,7 @@ def random_columns(sizes: Sizes, count: int) -> Columns:
         "hidden": (sizes.hidden,),
     }
     columns = {name: rng.uniform(-1.0, 1.0, (count, *shape)).astype(np.float32) for name, shape in shapes.items()}
-    columns["blank"] = np.zeros((count, STEPS + 1), np.uint8)
+    columns["missing"] = np.zeros((count, STEPS + 1), np.uint8)
     columns["marks"] = np.tile(np.array([0, STEPS, 0], np.int32), (count, 1))
     return columns
 

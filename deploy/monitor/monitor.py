@@ -17,6 +17,7 @@ from rmc.deploy.monitor.metrics_log import MetricsLog
 from rmc.deploy.monitor.view import RunStatus, View
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.host import HostFigures
 
 RECORD_SECONDS = 5.0  # between the launcher's own records, and looks at the run's folder
 log = logging.getLogger(__name__)
@@ -42,7 +43,7 @@ class Monitor:
         self._refused = 0  # records and values that could not be read
         self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
         self._next_record, self._is_away = 0.0, False
-        self._metrics_log = MetricsLog(folder)
+        self._metrics_log, self._host = MetricsLog(folder), HostFigures()
         self._folder, self._writable = folder, True
         self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
         self.view, self.outage = View(self.board, console), OutageLog("launcher")
@@ -126,6 +127,7 @@ class Monitor:
                 "refused_values": self._refused,
                 "redis_away_s": self.outage.seconds,
                 "not_running": " ".join(self.unplaced()),
+                **self._host.take(),
             }
         )
 

@@ -19,6 +19,7 @@ from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 from rmc.common.shard import Shard
 from rmc.common.window import WindowSpec
+from rmc.deploy.run.migrations import FORMAT, migrated
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
 
@@ -112,12 +113,12 @@ class RunConfig:
 
 def to_json(config: RunConfig) -> str:
     """The config as JSON, as in ``config.json``."""
-    return json.dumps(dataclasses.asdict(config), indent=2)
+    return json.dumps({"format": FORMAT} | dataclasses.asdict(config), indent=2)
 
 
 def from_json(text: str | bytes) -> RunConfig:
-    """The config again. Raises ConfigError on anything unknown, missing or of the wrong type."""
-    return _build(RunConfig, _read(text), "")
+    """The config again, also an older version's. Raises ConfigError on anything unknown, missing or of a wrong type."""
+    return _build(RunConfig, migrated(_read(text)), "")
 
 
 def to_registration(config: RunConfig) -> bytes:

@@ -20,6 +20,7 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.errors import ConfigError
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import RunConfig, check_sizes, from_json, to_json
+from rmc.deploy.run.migrations import migrated
 
 SECRET_LENGTH = 64  # hexadecimal characters
 LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
@@ -44,6 +45,7 @@ class RunFolder:
         self.metrics, self.events = self.path / "metrics.jsonl", self.path / "events"
         self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
         self.initial_file, self.sizes_file = self.path / "initial.json", self.path / "sizes.json"
+        self.history_file = self.path / "history.jsonl"
         self._lock: int | None = None
         self._was: os.stat_result | None = None  # when it was locked
 
@@ -53,11 +55,19 @@ class RunFolder:
         return f"{self.path.name}-{hashlib.sha256(self.secret()).hexdigest()[:8]}"
 
     def settings(self) -> dict[str, Any]:
-        """What ``config.json`` says, also that of a baseline. Raises ConfigError where this is no run's folder."""
+        """What ``config.json`` says, also that of a baseline or of an older version.
+
+        Raises ConfigError where this is no run's folder, or of a newer version.
+        """
         try:
-            return read_object(self.path / "config.json")
+            raw = read_object(self.path / "config.json")
         except OSError:
             raise ConfigError("RUN", str(self.path), "no config.json there; give the folder of a run") from None
+        try:
+            found: dict[str, Any] = migrated(raw)
+            return found
+        except ConfigError as error:
+            raise ConfigError("RUN", str(self.path), str(error)) from None
 
     def is_baseline(self) -> bool:
         """Whether ``rmc baseline`` made it. Raises ConfigError where this is no run's folder."""
@@ -66,7 +76,7 @@ class RunFolder:
     def config(self) -> RunConfig:
         """The run's config. Raises ConfigError, which names the folder, where it cannot be read or is a baseline's."""
         if self.is_baseline():
-            fix = "is a baseline's run; rmc baseline goes on with it, and rmc evaluate, plot and stop take it"
+            fix = "is a baseline's run; rmc resume goes on with it, and rmc evaluate, plot and stop take it"
             raise ConfigError("RUN", str(self.path), fix)
         try:
             return from_json((self.path / "config.json").read_bytes())
@@ -158,6 +168,15 @@ class RunFolder:
         """How long the run was trained before, over all its starts."""
         said = (found.get("wall_s") for found in self.records() if found["role"] == "launcher")
         return max(filter(is_finite, said), default=0.0)
+
+    def env_steps(self) -> int:
+        """Environment steps that the run has, as its learner or all its replay servers said last."""
+        newest: dict[str, int] = {}
+        for found in self.records():
+            if found["role"].startswith(("learner", "replay")) and is_finite(found.get("env_steps")):
+                newest[found["role"]] = int(found["env_steps"])
+        learner = newest.pop("learner", 0)
+        return max(learner, sum(newest.values()))
 
     def lock(self) -> None:
         """Be the one launcher of this run. Raises ConfigError where another one is."""

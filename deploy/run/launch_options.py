@@ -1,4 +1,4 @@
-"""Where and on what a run runs."""
+"""Where and on what a run runs, and what it begins with."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,17 +6,20 @@ from typing import Literal
 
 IfExists = Literal["resume", "fail", "new"]
 Launcher = Literal["local", "ray", "lockstep", "manual"]
+InitParts = Literal["all", "memory+world-model", "policy"]
 
 
 @dataclass(frozen=True)
 class LaunchOptions:
-    """Where and on what a run runs; nothing here changes what it learns."""
+    """Where and on what a run runs, which changes nothing of what it learns; and the weights that it begins with."""
 
     run_dir: Path | None
-    if_exists: IfExists
-    launcher: Launcher
-    device: str
-    redis_url: str | None
+    if_exists: IfExists = "resume"
+    launcher: Launcher = "local"
+    device: str = "cpu"
+    redis_url: str | None = None
     ray_address: str = "auto"
     all_cpus: bool = False
     tls: bool = False
+    init_from: str | None = None
+    init_parts: InitParts = "all"

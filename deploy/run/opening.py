@@ -6,45 +6,106 @@ import time
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import CheckpointError, ConfigError
 from rmc.deploy.run.config import RunConfig, flat, option
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import IfExists
+from rmc.deploy.run.launch_options import IfExists, LaunchOptions
+from rmc.deploy.run.starts import note_start, starts
 
 log = logging.getLogger(__name__)
-MAY_CHANGE = {
+SAME_AGENT = {  # what a run that goes on may have otherwise, and learns the same
     "total_steps",
     "actors",
     "env.env_timeout",
     "learner.threads",
     "learner.keep_checkpoints",
     "learner.checkpoint_steps",
+    "evaluator.episodes",
     "evaluator.evaluation_seconds",
+}
+MAY_CHANGE = SAME_AGENT | {  # that, and what is read afresh at every start: no stored state depends on it
+    "actor.envs_per_actor",
+    "actor.refresh_steps",
+    "actor.chunk_windows",
+    "actor.chunk_seconds",
+    "actor.unacked_bytes",
+    "replay.replay_ratio",
+    "replay.priority_exponent",
+    "update.learning_rate",
+    "update.memory_learning_scale",
+    "update.alpha_learning_rate",
+    "update.gamma",
+    "update.polyak",
+    "update.clip_norm",
+    "update.n_step",
+    "update.eta",
+    "update.curiosity",
+    "update.curiosity_steps",
+    "learner.batch_size",
+    "learner.importance_exponent",
+    "learner.publish_updates",
+    "learner.precision",
+}
+WHY_NOT = {  # by the part of the config, and then by the option
+    "env": "its experience is from that environment",
+    "window": "its ring holds windows of that length",
+    "agent": "its networks were made so",
+    "actor": "its ring holds windows that were made so",
+    "replay": "its ring was made so",
+    "update": "its networks and optimisers belong to that algorithm",
+    "seed": "its random numbers began with that",
+    "preset": "its other options came from that",
+    "replay.warmup_steps": "its first draw depends on it",
+    "actor.reward_scale": "the rewards in its ring are scaled by that",
+    "update.policy_ema_updates": "its average belongs to that",
 }
 
 
-def open_run(config: RunConfig, run_dir: Path | None, if_exists: IfExists) -> RunFolder:
-    """Make or take up a run's folder, locked. Raises ConfigError before anything is written where it may not be."""
+def open_run(
+    config: RunConfig, run_dir: Path | None, if_exists: IfExists, options: LaunchOptions | None = None
+) -> RunFolder:
+    """Make or take up a run's folder, locked. Raises ConfigError before anything is written where it may not be.
+
+    ``options`` say how it is started, for its history, and what a new one begins with.
+    """
+    options, initial = options or LaunchOptions(run_dir), None
     folder = RunFolder(run_dir or Path("runs") / _new_name(config))
     if os.fsencode(folder.path).decode(errors="replace") != str(folder.path):
         raise ConfigError("--run-dir", str(folder.path), "is no UTF-8; give another")
+    there = run_dir is not None and if_exists != "new" and (folder.path / "config.json").exists()
+    if there and if_exists == "fail":
+        raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")
+    before = folder.config() if there else config
+    if there:
+        _check_resumable(folder, before, config)
+        _check_begun(folder, options)
+    elif options.init_from is not None:
+        from rmc.deploy.run import warm_start  # imports torch
+
+        initial = warm_start.prepare(config, options.init_from, options.init_parts)
     if run_dir is None or if_exists == "new":
         folder = new_folder(folder.path)
-    if (folder.path / "config.json").exists():
-        if if_exists == "fail":
-            raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")
-        _check_resumable(folder, config)
-    elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
+    elif not there and folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
     make(folder)
     folder.lock()
+    if initial is not None:  # before there is a config, without which it is no run
+        CheckpointFolder(folder.checkpoints).save(0, initial.files)
     folder.reopen(config.total_steps)
+    note_start(folder, _changes(before, config), options, initial.origin if initial is not None else None)
     folder.write_config(config)
     folder.write_sizes(config.sizes())
     folder.secret()
     return folder
+
+
+def _changes(before: RunConfig, config: RunConfig) -> dict[str, list[Any]]:
+    """By the option's path, what it was and is."""
+    was, now = flat(before), flat(config)
+    return {path: [was[path], now[path]] for path in now if was[path] != now[path]}
 
 
 def _new_name(config: RunConfig) -> str:
@@ -82,15 +143,25 @@ def make(folder: RunFolder) -> None:
         raise _cannot_be_made(folder.path, error) from None
 
 
-def _check_resumable(folder: RunFolder, config: RunConfig) -> None:
-    was, now = flat(folder.config()), flat(config)
-    for path in ["env.id", "preset", *was]:
-        if was[path] != now[path] and path not in MAY_CHANGE:
+def _check_resumable(folder: RunFolder, before: RunConfig, config: RunConfig) -> None:
+    changes = _changes(before, config)
+    for path in ["env.id", "preset", *changes]:
+        if path in changes and path not in MAY_CHANGE:
             name = "ENV" if path == "env.id" else option(path)
-            fix = f"the run in {folder.path} has {was[path]!r}; use that, or another --run-dir"
-            raise ConfigError(name, now[path], fix)
+            why = WHY_NOT.get(path) or WHY_NOT.get(path.partition(".")[0], "that is for good")
+            was, now = changes[path]
+            fix = f"the run in {folder.path} has {was!r}, and {why}; use that, or another --run-dir"
+            raise ConfigError(name, now, fix)
     folder.check_sizes(config.env.id, config.sizes())
     check_checkpoints(folder)
+
+
+def _check_begun(folder: RunFolder, options: LaunchOptions) -> None:
+    """Raises ConfigError where it is to begin with other weights than it did."""
+    began = next((start.init_from for start in starts(folder) if start.init_from is not None), {})
+    if options.init_from is not None and began.get("asked") != [options.init_from, options.init_parts]:
+        fix = f"the run in {folder.path} has begun, and not with that; leave it, or take another --run-dir"
+        raise ConfigError("--init-from", options.init_from, fix)
 
 
 def check_checkpoints(folder: RunFolder) -> None:

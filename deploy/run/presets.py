@@ -18,10 +18,10 @@ def robust(env: EnvConfig) -> RunConfig:
     return RunConfig(
         env=env,
         preset="robust",
-        agent=AgentConfig(normalize_observations=True, fill_blanks=True),
+        agent=AgentConfig(normalize_observations=True, impute_missing=True),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0),
-        update=UpdateConfig(scheme=3, policy_average=2_000),
+        update=UpdateConfig(scheme=3, policy_ema_updates=2_000),
         learner=LearnerConfig(batch_size=8, importance_exponent=0.0, publish_updates=80),
     )
 

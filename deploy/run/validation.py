@@ -43,7 +43,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "update.scheme": (1, 6),
     "update.n_step": (1, 10_000),
     "update.eta": (0, 1),
-    "update.policy_average": (0, 2**31),
+    "update.policy_ema_updates": (0, 2**31),
     "learner.batch_size": (1, 65_536),
     "learner.importance_exponent": (0, 1),
     "learner.publish_updates": (1, 2**31),
@@ -83,11 +83,11 @@ def validate(config: RunConfig) -> None:
         raise ConfigError("--stride", config.actor.stride, f"take 0 to --trained-steps={config.window.trained_steps}")
     if config.actor.stride and config.actor.state_strategy == "episode":
         raise ConfigError("--stride", config.actor.stride, "an episode is one window; leave it, or use burn-in")
-    if config.agent.blank_flag and config.env.frame_stack > 1:
-        raise ConfigError("--blank-flag", True, "a stack of frames has no flag; leave it, or use --frame-stack 1")
-    if config.agent.fill_blanks and not config.agent.normalize_observations:
-        fix = "it takes --normalize-observations; or leave missing frames as they are: --no-fill-blanks"
-        raise ConfigError("--fill-blanks", True, fix)
+    if config.agent.missing_flag and config.env.frame_stack > 1:
+        raise ConfigError("--missing-flag", True, "a stack of frames has no flag; leave it, or use --frame-stack 1")
+    if config.agent.impute_missing and not config.agent.normalize_observations:
+        fix = "it takes --normalize-observations; or leave missing frames as they are: --no-impute-missing"
+        raise ConfigError("--impute-missing", True, fix)
     if not config.update.policy_through_q and config.update.scheme < 4:
         raise ConfigError("--policy-through-q", False, "schemes 1 to 3 have no such way; take --scheme 4, 5 or 6")
     if config.total_steps <= config.replay.warmup_steps:
@@ -108,5 +108,7 @@ def validate_launch(config: RunConfig, options: LaunchOptions) -> None:
     if launcher == "lockstep" and config.replay.replay_shards > 1:
         fix = "a lockstep run has one; use --launcher local"
         raise ConfigError("--replay-shards", config.replay.replay_shards, fix)
+    if options.init_parts != "all" and options.init_from is None:
+        raise ConfigError("--init-parts", options.init_parts, "say whose: give --init-from RUN, or leave it")
     if launcher == "manual" and options.redis_url is None:
         raise ConfigError("--redis-url", None, "say which Redis the roles that you start by hand will use")

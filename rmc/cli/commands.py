@@ -2,21 +2,26 @@
 
 import logging
 
+from rmc.analysis.doctor import examine_run
 from rmc.cli import run_options, train_options, training
+from rmc.cli.dry_run import dry_run
 from rmc.cli.ending import say_end
 from rmc.cli.redis_password import warn_of_password
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor import attach as attachment
 from rmc.deploy.monitor.view import RunStatus, table, terminal
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.starts import format_starts
 
 log = logging.getLogger(__name__)
 
 
 def train(command: train_options.Train) -> int:
-    """Train a run."""
+    """Train a run, or go on with one."""
     warn_of_password(command.redis_url or "")
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    if command.dry_run:
+        return dry_run(command.config(), command.launch_options(), terminal())
     return training.train(command.config(), command.launch_options(), terminal())
 
 
@@ -31,8 +36,22 @@ def stats(command: run_options.Stats) -> int:
     if not board.roles:
         raise ConfigError("RUN", str(folder.path), "it has no metrics yet; train it first")
     console.print(table(board))
+    if history := format_starts(folder):
+        console.print(history, soft_wrap=True)
     if result is not None:
         console.print_json(data=result)
+    return 0
+
+
+def doctor(command: run_options.Doctor) -> int:
+    """Say what holds a run back."""
+    findings, seconds = examine_run(RunFolder(command.run))
+    console = terminal()
+    for finding in findings:
+        console.print(str(finding), soft_wrap=True)
+    if not findings:
+        console.print("nothing found: no share of time was recorded that could be judged")
+    console.print(f"judged by the newest {seconds:,.0f} s of training")
     return 0
 
 

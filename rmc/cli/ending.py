@@ -5,23 +5,24 @@ from typing import Any
 
 from rich.console import Console
 
+from rmc.analysis.doctor import examine
 from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.errors import RoleDied
-from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.starts import resume_command
 
 STOPPED = 130  # exit status after Ctrl-C, as shells have it
 
 
 def say_end(folder: RunFolder, console: Console) -> int:
     """Print how a run ended that another process trained; its exit status."""
-    status, config = folder.ended(), folder.config()
+    status = folder.ended()
     if status == 0:
         return say_result(folder, console)
     if status == STOPPED:
         newest = CheckpointFolder(folder.checkpoints).latest()
         steps = json.loads(newest[1][PROGRESS])["env_steps"] if newest else 0
-        return say_stopped(folder, config, steps, console)
+        return say_stopped(folder, steps, console)
     log_file = folder.logs / "launcher.log"
     last_lines = log_file.read_text(errors="replace").strip().splitlines()[-30:] if log_file.exists() else []
     console.print("\n".join(last_lines), soft_wrap=True)
@@ -40,10 +41,11 @@ def cut_note(evaluation: dict[str, Any]) -> str:
     return ", cut when its seconds were over" if evaluation.get("eval_cut") else ""
 
 
-def say_stopped(folder: RunFolder, config: RunConfig, env_steps: int, console: Console) -> int:
-    command = f"rmc train {config.env.id} --preset {config.preset} --seed {config.seed} --run-dir {folder.path}"
-    console.print(f"stopped at environment step {env_steps:,}; to go on, give the same options and")
-    console.print(f"  {command}", soft_wrap=True)
+def say_stopped(folder: RunFolder, env_steps: int, console: Console) -> int:
+    """Print how to go on; the exit status."""
+    console.print(f"stopped at environment step {env_steps:,}; to go on:")
+    console.print(f"  {resume_command(folder)}", soft_wrap=True)
+    say_findings(folder, console)
     return STOPPED
 
 
@@ -53,4 +55,11 @@ def say_result(folder: RunFolder, console: Console) -> int:
     console.print(f"after training:  {format_evaluation(result)}")
     facts = f"{result['env_steps']:,} environment steps, {result['updates']:,} updates, {result['wall_s']:,.0f} s"
     console.print(f"{facts}; {folder.result_file}", soft_wrap=True)
+    say_findings(folder, console)
     return 0
+
+
+def say_findings(folder: RunFolder, console: Console) -> None:
+    """What ``rmc doctor`` would say; nothing of a run that was too short to judge."""
+    for finding in examine(list(folder.records()), folder.config()):
+        console.print(str(finding), soft_wrap=True)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import typing
+from collections.abc import Set
 from typing import Annotated, Any
 
 import tyro
@@ -10,24 +11,24 @@ import tyro
 BASIC = frozenset(
     {
         "id", "flicker", "env_kwargs", "config_file", "preset", "seed", "total_steps", "actors", "run_dir", "if_exists",
-        "launcher", "device", "redis_url", "ray_address", "capacity", "replay_ratio", "learning_rate", "curiosity",
-        "batch_size", "checkpoint_steps", "episodes", "threads",
+        "init_from", "launcher", "device", "redis_url", "ray_address", "dry_run", "capacity", "replay_ratio",
+        "learning_rate", "curiosity", "batch_size", "checkpoint_steps", "episodes", "threads",
     }
 )  # fmt: skip
 ALL_OPTIONS = "--help-all"
 
 
-def only_basic(command: Any) -> Any:
-    """A command's dataclass of whose options the help names the ``BASIC`` ones; it is for showing help alone."""
+def only_basic(command: Any, names: Set[str] = BASIC) -> Any:
+    """A command's dataclass of whose options the help shows those of these ``names``; it is for showing help alone."""
     kind = type(command)
     hints = typing.get_type_hints(kind, include_extras=True)
     values = {item.name: getattr(command, item.name) for item in dataclasses.fields(command)}
-    values |= {name: only_basic(value) for name, value in values.items() if dataclasses.is_dataclass(value)}
+    values |= {name: only_basic(value, names) for name, value in values.items() if dataclasses.is_dataclass(value)}
     changed: list[tuple[str, Any, Any]] = []
     for name, value in values.items():
         if dataclasses.is_dataclass(value):
             changed.append((name, type(value), dataclasses.field(default=value)))
-        elif name not in BASIC:
+        elif name not in names:
             default = dataclasses.field(default_factory=functools.partial(_same, value))
             changed.append((name, Annotated[hints[name], tyro.conf.Suppress], default))
     shown = dataclasses.make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True)

@@ -12,7 +12,7 @@ from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
 from rmc.deploy.monitor import output
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
-PLAYS = {"train", "sweep", "baseline", "check-env", "evaluate", "inspect"}  # environments, in this process
+PLAYS = {"train", "resume", "sweep", "baseline", "check-env", "evaluate", "inspect"}  # environments, in this process
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 
@@ -90,6 +90,7 @@ def _parse_and_run(words: list[str]) -> int:
     from rmc.cli import parser
     from rmc.common.bus.redis_url import without_passwords
 
+    words = parser.renamed(words)
     try:
         with contextlib.redirect_stderr(io.StringIO()):
             command = parser.parse(words)

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import importlib
 import itertools
+import logging
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,13 +14,18 @@ import tyro
 
 from rmc.cli import role_options, run_options, sweep_options, train_options
 from rmc.cli.config_file import KWARGS, with_file
-from rmc.cli.help_text import ALL_OPTIONS, only_basic
+from rmc.cli.help_text import ALL_OPTIONS, BASIC, only_basic
 from rmc.cli.numerals import NUMERALS
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import Preset, RunConfig
+from rmc.deploy.run.config import Preset, RunConfig, flat
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.opening import MAY_CHANGE
 from rmc.deploy.run.presets import preset_config
+from rmc.deploy.run.starts import last_launch
 
+log = logging.getLogger(__name__)
 FLAT = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 
 
@@ -39,12 +45,15 @@ class Action:
 COMMANDS: dict[str, tuple[type, Action]] = {
     "train": (train_options.Train, Action("commands", "train")),
     "sweep": (sweep_options.Sweep, Action("sweep_command", "sweep")),
+    "resume": (train_options.Resume, Action("commands", "train")),
     "evaluate": (run_options.Evaluate, Action("analysis_commands", "evaluate")),
     "export": (run_options.Export, Action("analysis_commands", "export_policy")),
     "inspect": (run_options.Inspect, Action("analysis_commands", "inspect")),
     "check-env": (run_options.CheckEnv, Action("analysis_commands", "check_env")),
     "baseline": (run_options.Baseline, Action("analysis_commands", "baseline")),
     "plot": (run_options.Plot, Action("analysis_commands", "plot")),
+    "report": (run_options.Report, Action("report_command", "report")),
+    "doctor": (run_options.Doctor, Action("commands", "doctor")),
     "stats": (run_options.Stats, Action("commands", "stats")),
     "attach": (run_options.Attach, Action("commands", "attach")),
     "stop": (run_options.Stop, Action("commands", "stop")),
@@ -52,16 +61,56 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "completion": (run_options.Completion, Action("completion", "print_script")),
     "role": (role_options.Role, Action("role_commands", "run_role")),
 }
-ACTIONS = dict(COMMANDS.values())
+ACTIONS = dict(COMMANDS.values()) | {run_options.ResumeBaseline: COMMANDS["baseline"][1]}
+RENAMED = {"fill-blanks": "impute-missing", "blank-flag": "missing-flag", "policy-average": "policy-ema-updates"}
 
 
 def parse(words: list[str]) -> Any:
-    """The command line as a command's class. Raises ConfigError; SystemExit, its message on standard error."""
+    """The command line as a command's class. Raises ConfigError; SystemExit, its message on standard error.
+
+    A run that is there gives the defaults: it is known once the words are parsed with those of the preset.
+    """
     words, env = with_file(words, option_names(train_options.Train)) if words[:1] == ["train"] else (words, "")
     _check_once(KWARGS, words)
-    defaults: dict[str, Any] = {"train": _train_defaults(_named_preset(words), env)}
+    command = _parsed(words, _defaults(preset_config(_named_preset(words), EnvConfig(env)), LaunchOptions(None)))
+    folder = _known_run(command)
+    if folder is not None and isinstance(command, train_options.Resume) and folder.is_baseline():
+        return _parsed(words, {"resume": run_options.resuming_baseline(folder)})
+    if folder is not None:
+        config = folder.config()
+        named = dataclasses.replace(config.env, id=env or config.env.id)
+        return _parsed(words, _defaults(dataclasses.replace(config, env=named), last_launch(folder)))
+    if isinstance(command, train_options.Train) and not command.env.id:
+        raise ConfigError("ENV", "", "rmc train takes an environment, like HalfCheetah-v5, or --run-dir with a run")
+    return command
+
+
+def _defaults(config: RunConfig, launch: LaunchOptions) -> dict[str, Any]:
+    return {
+        "train": train_options.from_config(config, launch),
+        "resume": train_options.resuming(config, launch),
+    }
+
+
+def _known_run(command: Any) -> RunFolder | None:
+    """The run that the command goes on with. Raises ConfigError where it must, and there is none."""
+    if not isinstance(command, train_options.Train) or command.run_dir is None or command.if_exists != "resume":
+        return None
+    folder = RunFolder(command.run_dir)
+    if isinstance(command, train_options.Resume):
+        folder.settings()
+        return folder
+    return folder if (folder.path / "config.json").exists() else None
+
+
+def _parsed(words: list[str], defaults: dict[str, Any]) -> Any:
+    """The command, which is as by default where nothing is said."""
     if {"-h", "--help"}.intersection(words):
-        defaults["train"] = only_basic(defaults["train"])
+        fixed = {
+            path.rpartition(".")[2] for path in flat(preset_config("robust", EnvConfig(""))) if path not in MAY_CHANGE
+        }
+        shown = {"resume": BASIC - fixed}
+        defaults = {name: only_basic(command, shown.get(name, BASIC)) for name, command in defaults.items()}
     words = ["--help" if word == ALL_OPTIONS else word for word in words]
     subcommands = [
         Annotated[type(defaults[name]), tyro.conf.subcommand(name, default=defaults[name])]
@@ -77,18 +126,25 @@ def parse(words: list[str]) -> Any:
     return read()
 
 
+def renamed(words: list[str]) -> list[str]:
+    """The words with the new names of options, each of whose old ones is warned of."""
+    found = []
+    for word in words:
+        flag, equals, value = word.partition("=")
+        no = "no-" if flag.startswith("--no-") else ""
+        new = RENAMED.get(flag.replace("_", "-").removeprefix(f"--{no}")) if flag.startswith("--") else None
+        if new is not None:
+            log.warning("%s is called --%s%s now; the old name goes in the next version", flag, no, new)
+        found.append(f"--{no}{new}{equals}{value}" if new is not None else word)
+    return found
+
+
 def option_names(kind: type) -> list[str]:
     """The names of a command's options, also of those in its parts; what has no flag is left out."""
     names: list[str] = []
     for name, hint in get_type_hints(kind).items():
         names += option_names(cast(type, hint)) if dataclasses.is_dataclass(hint) else [name]
     return [name for name in names if name not in ("id", "config_file")]
-
-
-def _train_defaults(preset: Preset, env: str) -> train_options.Train:
-    start = preset_config(preset, EnvConfig(""))
-    shared = {item.name: getattr(start, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
-    return train_options.Train(env=train_options.EnvOptions(id=env or tyro.MISSING), **shared)
 
 
 def _check_once(option: str, words: list[str]) -> None:

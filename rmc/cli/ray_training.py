@@ -41,7 +41,7 @@ def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> int
     validate(config)  # again: the cluster may have changed the number of actors
     check_machine(config, options)
     place_for_sockets()
-    folder = open_run(config, options.run_dir, options.if_exists)
+    folder = open_run(config, options.run_dir, options.if_exists, options)
     folder.unlock()
     launcher.launch(config, folder, options.device, options.all_cpus, options.tls)
     console.print(f"run folder {folder.path}", soft_wrap=True)

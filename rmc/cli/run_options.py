@@ -3,13 +3,16 @@
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro import MISSING
+from tyro.conf import Positional, Suppress, arg
 
+from rmc.analysis import baseline_settings
 from rmc.analysis.baseline_settings import Algorithm, BaselineConfig
 from rmc.analysis.curves import Axis
-from rmc.cli.train_options import EnvOptions
+from rmc.cli.train_options import EnvOptions, KnownEnvOptions
+from rmc.deploy.run.folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -68,18 +71,36 @@ class CheckEnv:
 
 @dataclass(frozen=True)
 class Baseline(BaselineConfig):
-    """Train an agent of stable-baselines3 in the same environment, to compare with; or go on with such a run."""
+    """Train an agent of stable-baselines3 in the same environment, to compare with."""
 
     algorithm: Positional[Algorithm]
     """Which one."""
     env: EnvOptions
     run_dir: Path | None = None
-    """The run's folder; by default runs/<env>__<algorithm>-<settings>__<seed>__<time>. The same one goes on."""
+    """The run's folder; by default runs/<env>__<algorithm>-<settings>__<seed>__<time>. rmc resume goes on with it."""
 
     def config(self) -> BaselineConfig:
         """The run's config."""
         own = {item.name: getattr(self, item.name) for item in dataclasses.fields(BaselineConfig)}
         return BaselineConfig(**own | {"env": self.env.config()})
+
+
+@dataclass(frozen=True)
+class ResumeBaseline(Baseline):
+    """Go on with a baseline's run: all that is not said is as it was."""
+
+    algorithm: Suppress[Algorithm]
+    env: KnownEnvOptions
+    run_dir: Annotated[Path | None, Positional, arg(metavar="RUN")] = None
+    """The run's folder."""
+
+
+def resuming_baseline(folder: RunFolder) -> ResumeBaseline:
+    """The command that goes on with such a run, and changes nothing. Raises ConfigError."""
+    config = baseline_settings.read(folder)
+    return ResumeBaseline(
+        **vars(config) | {"env": KnownEnvOptions(**dataclasses.asdict(config.env)), "run_dir": MISSING}
+    )
 
 
 @dataclass(frozen=True)
@@ -106,6 +127,26 @@ class Stats:
 
 
 @dataclass(frozen=True)
+class Doctor:
+    """Say which stage holds a run back, by how much, and the option that changes it."""
+
+    run: Positional[Path]
+    """The run's folder."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write one file about runs, for a browser without a network: curves, tables, videos, waits, differences."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Folders of runs, also of baselines."""
+    out: Path = Path("report.html")
+    """The file to write."""
+    video: bool = True
+    """Film an episode of each agent's newest policy."""
+
+
+@dataclass(frozen=True)
 class Attach:
     """Watch a run that is being trained; Ctrl-C only stops watching."""
 
@@ -115,7 +156,7 @@ class Attach:
 
 @dataclass(frozen=True)
 class Stop:
-    """End a run in order; rmc train with its folder goes on with it."""
+    """End a run in order; rmc resume goes on with it."""
 
     run: Positional[Path]
     """The run's folder."""

@@ -9,21 +9,16 @@ from typing import Any
 
 from rmc.cli import complaint, parser
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig, flat, option_words
+from rmc.deploy.run.config import RunConfig, flat, option, option_words
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.validation import validate, validate_launch
 from rmc.sweep.job import Job
 from rmc.sweep.spec import Range, Spec
 
-RESERVED = (
-    "run_dir",
-    "if_exists",
-    "redis_url",
-    "ray_address",
-    "all_cpus",
-    "tls",
-)  # that a sweep sets, or has no use for
+RESERVED = ("run_dir", "if_exists", "redis_url", "ray_address", "all_cpus", "tls", "dry_run")
+LENGTH = "--total-steps"
+FILES = ("--config", "--init-from")  # that the nodes of a cluster do not have
 
 
 @dataclass(frozen=True)
@@ -35,8 +30,13 @@ class Checked:
     options: LaunchOptions
 
 
-def check_values(spec: Spec) -> None:
+def check_values(spec: Spec, on_this_machine: bool) -> None:
     """Raises ConfigError, which names the key, for the first value that rmc train would not read."""
+    words = [*spec.words, *(option(name) for name in spec.options)]
+    if not on_this_machine and (named := [word for word in words if word.partition("=")[0] in FILES]):
+        raise ConfigError(
+            named[0], " ".join(spec.words), "the nodes do not have that file; write options into [options]"
+        )
     for name in RESERVED:
         flag = f"--{name.replace('_', '-')}"
         if any(word.partition("=")[0] == flag for word in spec.words):
@@ -71,19 +71,26 @@ def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:
             alike = known[repr(job.values)] = _checked(job, on_this_machine)
         config = dataclasses.replace(alike.config, seed=job.seed)
         validate(config)
-        checked.append(Checked(job, config, alike.options))
+        checked.append(Checked(with_length(job, config), config, alike.options))
     return checked
 
 
 def config_of(job: Job) -> RunConfig:
-    """Of a run's words, which can be read."""
-    config: RunConfig = parser.parse(job.command(job.folder)).config()
+    """Of a run's words, which can be read. What they do not say is the preset's, whatever its folder has."""
+    config: RunConfig = parser.parse(list(job.words)).config()
     return config
 
 
+def with_length(job: Job, config: RunConfig) -> Job:
+    """A run that says how long it is: one that goes on would be as long as before."""
+    if any(word.partition("=")[0] == LENGTH for word in job.words):
+        return job
+    return dataclasses.replace(job, words=(*job.words, LENGTH, str(config.total_steps)))
+
+
 def _checked(job: Job, on_this_machine: bool) -> Checked:
-    command = parser.parse(job.command(job.folder))
-    config, options = command.config(), command.launch_options()
+    command = parser.parse(list(job.words))
+    config, options = command.config(), dataclasses.replace(command.launch_options(), run_dir=job.folder)
     validate(config)
     validate_launch(config, options)
     if on_this_machine:

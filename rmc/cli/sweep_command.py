@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rmc.cli import sweep_check
-from rmc.cli.config_file import OPTION as CONFIG
 from rmc.cli.ending import STOPPED
 from rmc.cli.signals import signals_caught
 from rmc.cli.sweep_check import Checked
@@ -38,10 +37,8 @@ def sweep(command: Sweep) -> int:
         raise ConfigError("--sweep-dir", str(folder), "is a run's folder; give another")
     if command.jobs < 0:
         raise ConfigError("--jobs", command.jobs, "take 1 or more, or 0 for as many as fit")
-    sweep_check.check_values(spec)
     on_this_machine = command.launcher == "local"
-    if not on_this_machine and any(word.partition("=")[0] == CONFIG for word in spec.words):
-        raise ConfigError(CONFIG, " ".join(spec.words), "the nodes do not have that file; write it into [options]")
+    sweep_check.check_values(spec, on_this_machine)
     jobs = grid_jobs(spec, folder) if spec.search is None else corner_jobs(spec, spec.search, folder)
     checked = sweep_check.check_jobs(jobs, on_this_machine)
     with closing(Index(folder)) as index:
@@ -122,7 +119,8 @@ def search_work(spec: Spec, search: Search, config: RunConfig, index: Index, fol
     }
 
     def make(name: str, values: dict[str, Any]) -> Job:
-        return make_job(spec, folder / name, values, spec.seeds[0])
+        job = make_job(spec, folder / name, values, spec.seeds[0])
+        return sweep_check.with_length(job, sweep_check.config_of(job))
 
     def finished(job: Job) -> bool:
         return is_finished(job, sweep_check.config_of(job))

@@ -12,7 +12,7 @@ from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig, read_kwargs, write_kwargs
 from rmc.deploy.run.config import Preset, RunConfig, WindowConfig
-from rmc.deploy.run.launch_options import IfExists, Launcher, LaunchOptions
+from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
 
@@ -40,6 +40,13 @@ class EnvOptions(EnvConfig):
 
 
 @dataclass(frozen=True)
+class KnownEnvOptions(EnvOptions):
+    """The environment of a run that is there."""
+
+    id: tyro.conf.Suppress[str]
+
+
+@dataclass(frozen=True)
 class Train:
     """Train an agent, or go on with a run. --help shows the basic options, --help-all all of them."""
 
@@ -62,9 +69,13 @@ class Train:
     actors: int = 1
     """Actor processes."""
     run_dir: Path | None = None
-    """The run's folder; by default runs/<env>__<preset>__<seed>__<time>."""
+    """The run's folder; by default runs/<env>__<preset>__<seed>__<time>. Of one that is there, ENV need not be said."""
     if_exists: IfExists = "resume"
     """What to do if the run's folder is there: go on, refuse, or take a new one beside it."""
+    init_from: str | None = None
+    """A run, or RUN:CHECKPOINT, whose networks and normaliser a new run begins with."""
+    init_parts: InitParts = "all"
+    """What is taken of them: all; the memory and what predicts; or what it takes to act."""
     launcher: Launcher = "local"
     """Processes on this machine; on a Ray cluster; every role in one thread, the same seed giving the same bits; or
     by hand."""
@@ -80,6 +91,9 @@ class Train:
     tls: bool = False
     """With --launcher ray: encrypt what the roles say across machines; needs a Redis server built with TLS on the
     head."""
+    dry_run: bool = False
+    """Train for some seconds in a temporary folder, and tell what the run needs beside what this machine has: memory,
+    disk, bandwidth, handles, threads, time. Exit status 1 where it does not fit."""
 
     def config(self) -> RunConfig:
         """The run's config."""
@@ -88,13 +102,31 @@ class Train:
 
     def launch_options(self) -> LaunchOptions:
         """Where and on what it runs."""
-        return LaunchOptions(
-            self.run_dir,
-            self.if_exists,
-            self.launcher,
-            self.device,
-            self.redis_url,
-            self.ray_address,
-            self.all_cpus,
-            self.tls,
-        )
+        return LaunchOptions(**{item.name: getattr(self, item.name) for item in dataclasses.fields(LaunchOptions)})
+
+
+def from_config(config: RunConfig, launch: LaunchOptions) -> Train:
+    """The command that would say all of this."""
+    own = {item.name: getattr(config, item.name) for item in dataclasses.fields(RunConfig)}
+    how = {item.name: getattr(launch, item.name) for item in dataclasses.fields(LaunchOptions)}
+    return Train(**own | how | {"env": EnvOptions(**dataclasses.asdict(config.env))})
+
+
+@dataclass(frozen=True)
+class Resume(Train):
+    """Go on with a run: what is not said is as it was, whatever is called a default here. --help shows the basic
+    options, --help-all all of them."""
+
+    env: KnownEnvOptions
+    run_dir: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
+    """The run's folder."""
+    config_file: tyro.conf.Suppress[Path | None] = None
+    if_exists: tyro.conf.Suppress[IfExists] = "resume"
+    init_from: tyro.conf.Suppress[str | None] = None
+    init_parts: tyro.conf.Suppress[InitParts] = "all"
+
+
+def resuming(config: RunConfig, launch: LaunchOptions) -> Resume:
+    """The command that goes on with such a run, and changes nothing."""
+    said = vars(from_config(config, launch))
+    return Resume(**said | {"env": KnownEnvOptions(**dataclasses.asdict(config.env)), "run_dir": tyro.MISSING})

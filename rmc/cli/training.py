@@ -8,6 +8,7 @@ from rich.console import Console
 from rmc.cli.ending import STOPPED, format_evaluation, say_result, say_stopped
 from rmc.cli.signals import signals_caught
 from rmc.common.bus.protocol import Bus
+from rmc.common.checkpoint import POLICY, CheckpointFolder
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local import launcher
@@ -42,7 +43,7 @@ def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
         place_for_sockets()
     if options.redis_url is not None:
         connect(options.redis_url, "check")
-    return open_run(config, options.run_dir, options.if_exists)
+    return open_run(config, options.run_dir, options.if_exists, options)
 
 
 def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
@@ -62,7 +63,7 @@ def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, consol
             monitor.close()
         if not finished:
             status = STOPPED
-            return say_stopped(folder, config, monitor.board.env_steps, console)
+            return say_stopped(folder, monitor.board.env_steps, console)
         result = _result(config, folder, monitor, before, console)
         folder.write_result(result)
         status = 0
@@ -106,13 +107,15 @@ def _launch(config: RunConfig, folder: RunFolder, options: LaunchOptions, monito
 
 
 def _before(config: RunConfig, folder: RunFolder, console: Console) -> dict[str, Any]:
-    """How the untrained policy plays: at a run's first start it does so, later ones read it."""
+    """How the policy plays that the run begins with: at its first start it does so, later ones read it."""
     kept = folder.initial()
     if kept is not None:
         return kept
     from rmc.analysis import evaluation  # imports torch
 
-    policy, seconds = evaluation.initial_policy(config), config.evaluator.evaluation_seconds
+    number, files = CheckpointFolder(folder.checkpoints).latest() or (0, {})
+    policy = files[POLICY] if files and number == 0 else evaluation.initial_policy(config)
+    seconds = config.evaluator.evaluation_seconds
     progress = evaluation.Progress(console, "before training")
     played = evaluation.evaluate_blob(config, policy, evaluation.FINAL_EPISODES, None, seconds, progress)
     folder.write_initial(played)

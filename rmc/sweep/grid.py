@@ -8,7 +8,7 @@ from typing import Any
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, flat, option, option_words
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.opening import MAY_CHANGE
+from rmc.deploy.run.opening import SAME_AGENT
 from rmc.sweep.job import Job, run_name
 from rmc.sweep.pool import Ending
 from rmc.sweep.spec import Spec
@@ -34,7 +34,7 @@ def is_finished(job: Job, config: RunConfig) -> bool:
         return False
     was, now = flat(folder.config()), flat(config)
     for path in now:
-        if path not in MAY_CHANGE and was.get(path) != now[path]:
+        if path not in SAME_AGENT and was.get(path) != now[path]:
             fix = f"the run in {job.folder} has {was.get(path)!r}; use that, or another --sweep-dir"
             raise ConfigError(option(path), now[path], fix)
     result = folder.result()

@@ -23,7 +23,12 @@ SEARCH_KEYS = ("trials", "sampler_seed", "prune", "ranges")
 RANGE_KEYS = ("low", "high", "log")
 SEEDS_FIX = 'write whole numbers, like [1, 2, 3] or "1-5"'
 OWN = {"id", "seed"}  # that a sweep gives each run itself
-NAMES = {path.rpartition(".")[2] for path in flat(robust(EnvConfig("")))} - OWN | {"launcher", "device"}
+NAMES = {path.rpartition(".")[2] for path in flat(robust(EnvConfig("")))} - OWN | {
+    "launcher",
+    "device",
+    "init_from",
+    "init_parts",
+}
 RUN_LAUNCHERS = ("local", "lockstep")
 MOST = 1_000_000  # runs and trials
 

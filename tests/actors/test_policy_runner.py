@@ -46,29 +46,29 @@ def reference(
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     normalized = agent.normalizer(observation, missing)
     hidden, last = state[:, : agent.config.hidden], state[:, agent.config.hidden :]
-    if agent.config.fill_blanks:
+    if agent.config.impute_missing:
         expected = agent.next_frame(hidden, last, prev_action).clamp(-10.0, 10.0)
         normalized = torch.where(missing.unsqueeze(1), expected, normalized)
     remembered = agent.memory(normalized.unsqueeze(1), missing.unsqueeze(1), prev_action.unsqueeze(1), hidden)
     mean, log_std = agent.policy(agent.features(remembered).squeeze(1))
     action = torch.tanh(mean) if noise is None else squashed_sample(mean, log_std, noise)[0]
     after = remembered.hidden.squeeze(1)
-    return action, torch.cat([after, normalized], 1) if agent.config.fill_blanks else after
+    return action, torch.cat([after, normalized], 1) if agent.config.impute_missing else after
 
 
 @pytest.mark.parametrize(
-    ("embedding", "layer_norm", "head_input", "normalize", "blank_flag", "fill_blanks"),
+    ("embedding", "layer_norm", "head_input", "normalize", "missing_flag", "impute_missing"),
     [
         *product((0, 16), (False, True), get_args(HeadInput), (False, True), (False, True), (False,)),
         *product((0, 16), (False, True), get_args(HeadInput), (True,), (False, True), (True,)),
     ],
 )
 def test_agrees_with_the_agent(
-    embedding: int, layer_norm: bool, head_input: HeadInput, normalize: bool, blank_flag: bool, fill_blanks: bool
+    embedding: int, layer_norm: bool, head_input: HeadInput, normalize: bool, missing_flag: bool, impute_missing: bool
 ) -> None:
     config = AgentConfig(
         hidden=12, embedding=embedding, heads=(9, 7), layer_norm=layer_norm, head_input=head_input,
-        normalize_observations=normalize, blank_flag=blank_flag, fill_blanks=fill_blanks,
+        normalize_observations=normalize, missing_flag=missing_flag, impute_missing=impute_missing,
     )  # fmt: skip
     agent = make_agent(config)
     runner = make_runner(agent)

@@ -25,13 +25,13 @@ AGENTS = {
             layer_norm=bool(embedding),
             head_input="hidden+embedding",
             normalize_observations=True,
-            blank_flag=bool(embedding),
+            missing_flag=bool(embedding),
         )
     )
     for shape, embedding in (("embedded", 12), ("raw", 0))
 }
 AGENTS["filled"] = make_agent(
-    dataclasses.replace(AGENTS["embedded"].config, head_input="hidden+observation", fill_blanks=True)
+    dataclasses.replace(AGENTS["embedded"].config, head_input="hidden+observation", impute_missing=True)
 )
 
 

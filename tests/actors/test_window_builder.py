@@ -109,7 +109,7 @@ def test_windows(play: Play, steps: int) -> None:
         np.testing.assert_array_equal(row["observation"][first : last + 1], expected)
         np.testing.assert_array_equal(row["action"][first:last], -expected[:-1])
         np.testing.assert_array_equal(row["reward"][first:last], expected[1:, 2])
-        assert row["blank"][first : last + 1].tolist() == [_is_missing(k0 + i) for i in range(last - first + 1)]
+        assert row["missing"][first : last + 1].tolist() == [_is_missing(k0 + i) for i in range(last - first + 1)]
         # the stored state is the one before the first real observation
         np.testing.assert_array_equal(row["state"], expected[0] if k0 else 0 * expected[0])
         np.testing.assert_array_equal(row["prev_action"], -(expected[0] - [0, 0, 1]) if k0 else 0 * expected[0])
@@ -118,7 +118,7 @@ def test_windows(play: Play, steps: int) -> None:
         assert block == last_start.get((env, episode), -play.stride) + play.stride
         last_start[env, episode] = block
         # masks: everything outside is zero
-        for field, end in (("observation", last + 1), ("action", last), ("reward", last), ("blank", last + 1)):
+        for field, end in (("observation", last + 1), ("action", last), ("reward", last), ("missing", last + 1)):
             assert not row[field][:first].any()
             assert not row[field][end:].any()
         # ends

@@ -32,7 +32,7 @@ AGENTS = {
     "observation beside": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="hidden+observation"),
     "without a memory": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="observation"),
     "filling blanks": AgentConfig(
-        hidden=16, embedding=12, heads=(10, 9), normalize_observations=True, fill_blanks=True
+        hidden=16, embedding=12, heads=(10, 9), normalize_observations=True, impute_missing=True
     ),
     "paper": AgentConfig(hidden=16, embedding=0, heads=(10, 9), grounding=False),
 }
@@ -79,7 +79,9 @@ def test_a_loop_of_ones_own_gives_what_an_evaluation_gives(run: RunFolder) -> No
 
 
 def test_an_evaluation_is_the_same_with_any_number_of_threads(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", AgentConfig(normalize_observations=True, fill_blanks=True), "HalfCheetah-v5", 0.5)
+    run = make_run(
+        tmp_path / "run", AgentConfig(normalize_observations=True, impute_missing=True), "HalfCheetah-v5", 0.5
+    )
     before, found = torch.get_num_threads(), []
     try:
         for threads in (1, 2):
@@ -97,7 +99,7 @@ def test_a_frame_that_is_not_finite_is_missing_or_refused(run: RunFolder, odd: f
     policy, other = load_policy(run.path), load_policy(run.path)
     first, bad, last = np.ones(3, np.float32), np.array([1.0, odd, 2.0]), np.full(3, 0.5, np.float32)
     assert (policy.act(first) == other.act(first)).all()
-    if run.config().agent.fill_blanks:
+    if run.config().agent.impute_missing:
         assert (policy.act(bad) == other.act(first, missing=True)).all()
     else:
         with pytest.raises(ConfigError, match=r"observation=\{1: -?(nan|inf)\}: give finite numbers"):
@@ -136,7 +138,7 @@ def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureF
         action, state = session.run(None, {"observation": observation, "missing": missing, **feed})
         np.testing.assert_allclose(action[0], policy.act(observation[0], bool(missing[0])), atol=1e-5)
         feed = {"previous_action": action, "state": state}
-    if run.config().agent.fill_blanks:
+    if run.config().agent.impute_missing:
         observation[1, 2] = np.nan
         found = [
             session.run(None, {"observation": seen, "missing": np.array([False, missing, False]), **feed})

@@ -53,7 +53,7 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
     frame = torch.zeros(1, 1, agent.obs_dim)
     for t in range(start + 1):
         last, frame, missing = frame, episode.observation[:, t : t + 1], episode.missing[:, t : t + 1]
-        if agent.config.fill_blanks and missing:
+        if agent.config.impute_missing and missing:
             frame = agent.next_frame(hidden.unsqueeze(1), last, previous)
         seen = agent.memory(frame, missing, previous, hidden)
         hidden, previous = seen.hidden[:, 0], episode.action[:, t : t + 1]

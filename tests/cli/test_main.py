@@ -27,27 +27,31 @@ DEBUG = ["train", PENDULUM, "--preset", "debug"]
 
 # Whoever changes this list changes what users have in their scripts.
 TRAIN_FLAGS = """
+    --init-from --init-parts
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
     --env-timeout --env-kwargs --config --run-dir --if-exists --launcher --device --redis-url
-    --ray-address --all-cpus --tls
+    --ray-address --all-cpus --tls --dry-run
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
-    --blank-flag --fill-blanks --initial-priority
+    --missing-flag --impute-missing --initial-priority
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
     --capacity --replay-shards --replay-ratio --warmup-steps --priority-exponent --importance-exponent
     --learning-rate --memory-learning-scale
-    --alpha-learning-rate --gamma --polyak --clip-norm --policy-average --latent-target --target-memory --policy-q
+    --alpha-learning-rate --gamma --polyak --clip-norm --policy-ema-updates --latent-target --target-memory --policy-q
     --scheme --policy-through-q --update-order --model-norm --n-step --state-strategy
     --curiosity --curiosity-scale --curiosity-steps --eta
     --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads
     --episodes --evaluation-seconds
 """.split()  # noqa: SIM905
 ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit --env-timeout --env-kwargs".split()  # noqa: SIM905
+NEW_RUN_FLAGS = {"--run-dir", "--config", "--if-exists", "--init-from", "--init-parts"}
+RESUME_FLAGS = [flag for flag in TRAIN_FLAGS if flag not in NEW_RUN_FLAGS]
 OTHER_FLAGS = {
     "sweep": [
         *"--seeds --grid --search --trials --sampler-seed --prune --sweep-dir --jobs --drop-replay --launcher".split(),  # noqa: SIM905
         "--ray-address",
     ],
+    "resume": RESUME_FLAGS,
     "evaluate": ["--episodes", "--seconds", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
     "inspect": ["--out", "--checkpoint"],
@@ -57,6 +61,8 @@ OTHER_FLAGS = {
         *"--settings --seed --total-steps --checkpoint-steps --episodes --threads --run-dir".split(),  # noqa: SIM905
     ],
     "plot": ["--out", "--by", "--reference"],
+    "report": ["--out", "--video"],
+    "doctor": [],
     "stats": [],
     "attach": [],
     "stop": [],
@@ -124,6 +130,11 @@ def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         ([], "train"),
         (["trian"], "trian"),
         (["train"], "train"),
+        (["train", "--run-dir", "nowhere"], "ENV='': rmc train takes an environment"),
+        (["resume"], "RUN"),
+        (["resume", "nowhere"], "nowhere': no config.json there"),
+        ([*DEBUG, "--init-from", "nowhere"], "--init-from='nowhere': no such run"),
+        ([*DEBUG, "--init-parts", "policy"], "--init-parts='policy': say whose"),
         (["stats", "/nowhere"], "/nowhere"),
         (["evaluate", "/nowhere"], "/nowhere"),
         (["role", "actor", "--run", "x", "--redis-url", "unix:///nowhere/redis.sock"], "--redis-url"),
@@ -205,7 +216,7 @@ def made_run(folder: Path) -> RunFolder:
         (["train", "InvertedDoublePendulum-v5", "--preset", "debug"], "ENV='InvertedDoublePendulum-v5'"),
         (["train", PENDULUM, "--preset", "paper"], "--preset='paper'"),
         ([*DEBUG, "--seed", "3"], "--seed=3"),
-        ([*DEBUG, "--gamma", "0.9"], "--gamma=0.9"),
+        ([*DEBUG, "--hidden", "9"], "--hidden=9"),
         ([*DEBUG, "--if-exists", "fail"], "--if-exists"),
     ],
 )

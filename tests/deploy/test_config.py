@@ -117,9 +117,9 @@ def test_values_that_do_not_go_together_are_refused() -> None:
         validate(with_value(config, "total_steps", config.replay.warmup_steps))
     with pytest.raises(ConfigError, match="--stride=5: an episode is one window"):
         validate(with_value(with_value(config, "actor.stride", 5), "actor.state_strategy", "episode"))
-    with pytest.raises(ConfigError, match="--blank-flag"):
-        validate(with_value(with_value(config, "agent.blank_flag", True), "env.frame_stack", 2))
-    with pytest.raises(ConfigError, match=r"--fill-blanks=True: .*--normalize-observations; .*--no-fill-blanks"):
+    with pytest.raises(ConfigError, match="--missing-flag"):
+        validate(with_value(with_value(config, "agent.missing_flag", True), "env.frame_stack", 2))
+    with pytest.raises(ConfigError, match=r"--impute-missing=True: .*--normalize-observations; .*--no-impute-missing"):
         validate(with_value(config, "agent.normalize_observations", False))
     with pytest.raises(ConfigError, match="--policy-through-q"):
         validate(with_value(config, "update.policy_through_q", False))

@@ -36,7 +36,7 @@ class PlainUpdate:
         self.generator = torch.Generator().manual_seed(seed)
         self.variance_sum = self.variance_weight = 0.0
         everything = ["world_model", "next_frame", "critic", "policy", None]
-        self.stages = [names for names, part in ALTERNATE if part != "next_frame" or agent.config.fill_blanks]
+        self.stages = [names for names, part in ALTERNATE if part != "next_frame" or agent.config.impute_missing]
         groups = (
             [everything]
             if config.update_order == "joint"
@@ -92,7 +92,7 @@ class PlainUpdate:
         return {t: known[t] for t in range(self.burn_in, int(row["last"]) + 1)}
 
     def embedded(self, memory: Memory, row: np.void, t: int, o: Tensor, previous: Tensor) -> Tensor:
-        flag = [torch.tensor([float(row["blank"][t])])] if self.agent.config.blank_flag else []
+        flag = [torch.tensor([float(row["missing"][t])])] if self.agent.config.missing_flag else []
         return memory.embed(torch.cat([o, previous, *flag]))
 
     @torch.no_grad()
@@ -103,7 +103,7 @@ class PlainUpdate:
         for t in range(int(row["first"]), int(row["last"]) + 1):
             previous = torch.tensor(row["prev_action"] if t == row["first"] else row["action"][t - 1])
             found[t] = self.seen(row, t)
-            if self.agent.config.fill_blanks and row["blank"][t]:
+            if self.agent.config.impute_missing and row["missing"][t]:
                 found[t] = self.agent.next_frame(h, last, previous).clamp(-10, 10)
             last = found[t]
             without = self.agent.config.head_input == "observation"
@@ -112,7 +112,7 @@ class PlainUpdate:
 
     def seen(self, row: np.void, t: int) -> Tensor:
         """The observation as the networks see it."""
-        if row["blank"][t]:
+        if row["missing"][t]:
             return torch.zeros(self.agent.obs_dim)
         o = torch.tensor(row["observation"][t])
         normalizer = self.agent.normalizer
@@ -154,10 +154,10 @@ class PlainUpdate:
                 window[t] = 0.0 if self.ends(row, t) else error.item()
                 if agent.config.grounding:
                     wanted = self.seen(row, t + 1) - online[t].o
-                    if not row["blank"][t + 1] and (agent.config.fill_blanks or not row["blank"][t]):
+                    if not row["missing"][t + 1] and (agent.config.impute_missing or not row["missing"][t]):
                         sums["observation"].append((predicted.observation_change - wanted).abs().mean())
                     sums["reward"].append((predicted.reward - float(row["reward"][t])).abs())
-                if agent.config.fill_blanks and not row["blank"][t + 1]:
+                if agent.config.impute_missing and not row["missing"][t + 1]:
                     expected = agent.next_frame(online[t].h.detach(), online[t].o, a)
                     sums["F"].append((expected - self.seen(row, t + 1)).abs().mean())
                 pi, log_pi = self.sample(self.reaching("P", z), noise[b, t - self.burn_in])

@@ -30,12 +30,12 @@ def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC) -> Rows:
     rows["episode_step"] = spec.burn_in
     rows["last"] = rng.integers(spec.burn_in + 1, spec.steps + 1, count)
     rows["terminated"] = rng.integers(0, 2, count)
-    rows["blank"] = rng.uniform(size=rows["blank"].shape) < 0.3
+    rows["missing"] = rng.uniform(size=rows["missing"].shape) < 0.3
     for name in ("observation", "action", "prev_action", "reward", "state"):
         rows[name] = rng.uniform(-1.0, 1.0, rows[name].shape)
     observed, stepped = observation_valid(rows, spec), step_valid(rows, spec)
     rows["observation"] *= observed[..., None]
-    rows["blank"] *= observed
+    rows["missing"] *= observed
     rows["action"] *= stepped[..., None]
     rows["reward"] *= stepped
     return rows

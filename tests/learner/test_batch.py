@@ -15,7 +15,7 @@ def test_fields_match_the_rows():
             assert bool(batch.observation_valid[b, t]) == real
             wanted = row["observation"][t] if real else np.zeros(3)
             np.testing.assert_array_equal(batch.observation[b, t], wanted)
-            assert bool(batch.missing[b, t]) == bool(real and row["blank"][t])
+            assert bool(batch.missing[b, t]) == bool(real and row["missing"][t])
         for t in range(SPEC.steps):
             real = row["first"] <= t < row["last"]
             assert bool(batch.step_valid[b, t]) == real
@@ -60,7 +60,7 @@ def test_padding_is_cleared_and_nothing_else_touched():
     clean = rows.copy()
     observed, stepped = observation_valid(rows), step_valid(rows)
     rows["observation"][~observed] = np.nan
-    rows["blank"][~observed] = 1
+    rows["missing"][~observed] = 1
     rows["action"][~stepped] = rows["reward"][~stepped] = np.inf
     clear_padding(rows, SPEC)
     assert (rows == clean).all()

@@ -14,7 +14,7 @@ from rmc.learner.diagnostics import measurable, staleness
 SPEC = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=5)
 UNBURNED = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=0, train=5)
 AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), head_input="hidden+embedding", normalize_observations=True)
-FILLING = dataclasses.replace(AGENT, fill_blanks=True)
+FILLING = dataclasses.replace(AGENT, impute_missing=True)
 STEPS = 32  # of the episode
 
 
@@ -33,13 +33,13 @@ def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray,
         before = episode["action"][k - 1] if k else np.zeros(SPEC.action_dim, np.float32)
         o, missing, a, previous = (
             torch.from_numpy(np.asarray(x))[None, None]
-            for x in (episode["observation"][k], episode["blank"][k], episode["action"][k], before)
+            for x in (episode["observation"][k], episode["missing"][k], episode["action"][k], before)
         )
         seen = agent.normalizer(o, missing)
-        if agent.config.fill_blanks and missing:
+        if agent.config.impute_missing and missing:
             seen = agent.next_frame(state, last, previous[0]).unsqueeze(1)
         step = agent.memory(seen, missing, previous, state)
-        state, last = step.hidden[:, 0], seen[:, 0] if agent.config.fill_blanks else last
+        state, last = step.hidden[:, 0], seen[:, 0] if agent.config.impute_missing else last
         carried = torch.cat([state, last], 1)[0].numpy()
         found.append((carried, float(agent.critic(agent.features(step), a).mean())))
     return found
@@ -55,7 +55,7 @@ def play(agent: Agent, spec: WindowSpec, blanks: float = 0.2) -> tuple[dict[str,
     episode = {
         "observation": rng.normal(size=(STEPS + 1, spec.obs_dim)).astype(np.float32),
         "action": rng.uniform(-1, 1, (STEPS, spec.action_dim)).astype(np.float32),
-        "blank": rng.random(STEPS + 1) < blanks,
+        "missing": rng.random(STEPS + 1) < blanks,
     }
     states = [np.zeros(spec.state, np.float32)]
     states += [h for h, _ in remembered(agent, episode, states[0], 0, STEPS)]
@@ -66,7 +66,7 @@ def play(agent: Agent, spec: WindowSpec, blanks: float = 0.2) -> tuple[dict[str,
         start, end = block - spec.burn_in + first, block - spec.burn_in + last
         row["episode_step"], row["first"], row["last"] = block, first, last
         row["observation"][first : last + 1] = episode["observation"][start : end + 1]
-        row["blank"][first : last + 1] = episode["blank"][start : end + 1]
+        row["missing"][first : last + 1] = episode["missing"][start : end + 1]
         row["action"][first:last] = episode["action"][start:end]
         row["state"] = states[start]
     return episode, rows

@@ -17,7 +17,7 @@ from rmc.learner.update import make_update
 from tests.learner.rows import SPEC, random_rows, to_batch
 
 B, T = 6, 5
-CONFIG = AgentConfig(hidden=24, embedding=20, heads=(40, 28), head_input="hidden+embedding", fill_blanks=True)
+CONFIG = AgentConfig(hidden=24, embedding=20, heads=(40, 28), head_input="hidden+embedding", impute_missing=True)
 
 
 def floats(bits):
@@ -122,7 +122,7 @@ def test_parameters_keep_their_names_and_values(pair):
     assert all(torch.equal(ours[name], value) for name, value in theirs.items())
 
 
-FILLING = AgentConfig(hidden=24, embedding=20, heads=(40, 28), fill_blanks=True)
+FILLING = AgentConfig(hidden=24, embedding=20, heads=(40, 28), impute_missing=True)
 
 
 def impute(config, low, scale=1.0):
@@ -144,7 +144,7 @@ def impute(config, low, scale=1.0):
 
 @pytest.mark.parametrize("flag", [False, True])
 def test_blanks_are_filled_to_the_precision_of_bfloat16_and_nothing_else_is_touched(flag):
-    (plain, plain_after), (fused, after), o, missing = impute(dataclasses.replace(FILLING, blank_flag=flag), low=True)
+    (plain, plain_after), (fused, after), o, missing = impute(dataclasses.replace(FILLING, missing_flag=flag), low=True)
     assert torch.equal(fused[~missing], o[~missing])
     gap = (fused - plain)[missing].norm() / plain[missing].norm()
     assert 1e-5 < gap < 0.01

@@ -24,7 +24,7 @@ from tests.learner.rows import SPEC, random_rows, to_batch
 def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput, fill: bool) -> None:
     config = AgentConfig(
         hidden=SPEC.state, embedding=7, heads=(10, 9), head_input=head_input, normalize_observations=True,
-        initial_priority="actor", fill_blanks=fill,
+        initial_priority="actor", impute_missing=fill,
     )  # fmt: skip
     torch.manual_seed(0)
     agent = Agent(SPEC.obs_dim, SPEC.action_dim, config)

@@ -39,8 +39,11 @@ class Setting:
         self.bus.append(0, EntryId(1, 0), encode_hello(SPEC))
         self.learner = self.start()
 
-    def start(self, policy_average: int = 0) -> Learner:
-        checkpoints, update = CheckpointFolder(self.folder / "checkpoints"), UpdateConfig(policy_average=policy_average)
+    def start(self, policy_ema_updates: int = 0) -> Learner:
+        checkpoints, update = (
+            CheckpointFolder(self.folder / "checkpoints"),
+            UpdateConfig(policy_ema_updates=policy_ema_updates),
+        )
         return Learner(SPEC, AGENT, update, CONFIG, self.server, self.bus, checkpoints, seed=1)
 
     def feed(self, windows: int, reward: float = 1.0) -> None:

@@ -118,7 +118,7 @@ def test_grounding_reaches_memory_and_world_model(monkeypatch):
 
 
 def test_what_fills_blanks_trains_itself_alone():
-    config = dataclasses.replace(ROBUST, fill_blanks=True)
+    config = dataclasses.replace(ROBUST, impute_missing=True)
     spec, update = dataclasses.replace(SPEC, state=config.state_size(SPEC.obs_dim)), make(config, scheme=4)
     parts, _ = update.forward(to_batch(random_rows(8, spec=spec), spec), BETA)
     named = dict(update.agent.named_parameters())
@@ -135,7 +135,7 @@ def test_garbage_in_padding_changes_nothing():
     dirty = rows.copy()
     observed, stepped = observation_valid(rows), step_valid(rows)
     dirty["observation"][~observed] = np.nan
-    dirty["blank"][~observed] = 1
+    dirty["missing"][~observed] = 1
     dirty["action"][~stepped] = np.inf
     dirty["reward"][~stepped] = np.nan
     clean_update, dirty_update = make(ROBUST, latent_target="ema"), make(ROBUST, latent_target="ema")
@@ -211,7 +211,7 @@ def test_targets_follow_by_polyak_alone():
 
 def test_the_policys_average_is_over_the_last_tenth_and_then_over_so_many():
     """As a plain loop has it. What does not act has none."""
-    update = make(dataclasses.replace(ROBUST, fill_blanks=True), policy_average=40)
+    update = make(dataclasses.replace(ROBUST, impute_missing=True), policy_ema_updates=40)
     names = {name for name, _ in update.agent.named_parameters() if name.startswith(("memory", "policy", "next_frame"))}
     assert set(update.average) == names
     expected = {name: value.double() for name, value in update.average.items()}
@@ -301,3 +301,21 @@ def test_bf16_stays_near_fp32():
         assert p.grad is not None
         assert q.grad is not None
         assert (p.grad - q.grad).norm() <= 0.1 * p.grad.norm() + 1e-4, name
+
+
+@pytest.mark.parametrize("order", ["joint", "alternate"])
+def test_a_checkpoint_does_not_bring_its_step_sizes_along(order: str) -> None:
+    before, rates = make(ROBUST, update_order=order), {"learning_rate": 1e-5, "alpha_learning_rate": 2e-5}
+    before(to_batch(random_rows(8)), BETA)
+    after = make(ROBUST, update_order=order, memory_learning_scale=0.5, **rates)
+    after.load_state_dict(before.state_dict())
+    for optimizer in after.optimizers:
+        for group in optimizer.param_groups:
+            owner = group["params"][0]
+            in_memory = any(owner is value for value in after.agent.memory.parameters())
+            assert group["lr"] == (2e-5 if owner is after.agent.log_alpha else 5e-6 if in_memory else 1e-5)
+    assert all(optimizer.state for optimizer in after.optimizers)  # their moments go on
+    moved = [value.detach().clone() for value in after.agent.critic.parameters()]
+    after(to_batch(random_rows(8)), BETA)
+    steps = [(new - old).abs().max() for new, old in zip(after.agent.critic.parameters(), moved, strict=True)]
+    assert 0 < max(steps) < 2e-5

@@ -21,7 +21,7 @@ ROBUST = AgentConfig(
     heads=(10, 9),
     head_input="hidden+embedding",
     normalize_observations=True,
-    blank_flag=True,
+    missing_flag=True,
 )
 NAMES = {
     "M": "model_loss", "G": "grounding_loss", "F": "fill_loss",
@@ -55,9 +55,9 @@ AGENTS = [
     dataclasses.replace(ROBUST, layer_norm=True, head_input="hidden"),
     dataclasses.replace(ROBUST, critic_norm=True, head_input="hidden+observation"),
     dataclasses.replace(ROBUST, head_input="observation"),
-    dataclasses.replace(ROBUST, head_input="hidden", fill_blanks=True),
-    dataclasses.replace(ROBUST, fill_blanks=True),
-    dataclasses.replace(ROBUST, head_input="observation", fill_blanks=True),
+    dataclasses.replace(ROBUST, head_input="hidden", impute_missing=True),
+    dataclasses.replace(ROBUST, impute_missing=True),
+    dataclasses.replace(ROBUST, head_input="observation", impute_missing=True),
 ]
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rmc.common.bus.protocol import EntryId
 from rmc.common.errors import ConfigError
 from rmc.common.window import WindowSpec
-from rmc.replay_server.commit_record import Progress, StreamPosition, decode_progress, record_bytes
+from rmc.replay_server.commit_record import Progress, RecordPair, StreamPosition, decode_progress, record_bytes
 from rmc.replay_server.ring import Ring
 from tests.replay_server.support import SPEC, make_rows
 
@@ -88,11 +88,25 @@ def test_progress_survives_the_round_trip(numbers: list[int], streams: dict[int,
     *counters, observations = numbers
     progress = Progress(SPEC.obs_dim, *counters, max_priority=3.5, observations=observations)
     progress.total += [1.0, 2.0, 3.0]
+    progress.replay_ratio = 0.1
     progress.streams = {actor: StreamPosition(EntryId(e, s), n) for actor, (e, s, n) in streams.items()}
     again = decode_progress(progress.encode(), SPEC.obs_dim)
     assert again.encode() == progress.encode()
     assert again.streams == progress.streams
     assert again.total.tolist() == [1.0, 2.0, 3.0]
+    assert again.replay_ratio == 0.1
+    assert decode_progress(progress.encode()[:-8], SPEC.obs_dim).replay_ratio == 0.0  # as of config format 1
+
+
+@pytest.mark.parametrize("obs_dim", [1, 3, 248, 249, 376])
+def test_most_streams_and_the_ratio_fit_into_a_record(obs_dim: int) -> None:
+    progress = Progress(obs_dim, replay_ratio=4.0)
+    progress.streams = {actor: StreamPosition(EntryId(1, 0), 0) for actor in range(4096)}
+    records = RecordPair(np.zeros(2 * record_bytes(obs_dim), np.uint8), obs_dim)
+    records.write(progress)
+    found = records.read()
+    assert found is not None
+    assert (len(found.streams), found.replay_ratio) == (4096, 4.0)
 
 
 def test_too_many_streams() -> None:

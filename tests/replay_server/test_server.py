@@ -109,19 +109,19 @@ def test_statistics_against_a_loop_and_padding_changes_nothing() -> None:
     rows["last"] = rng.integers(SPEC.burn_in + 1, SPEC.steps + 1, 200)
     rows["new_steps"] = rng.integers(0, rows["last"] - SPEC.burn_in + 1)
     rows["new_observations"] = rows["new_steps"] + rng.integers(0, 2, 200)
-    rows["blank"] = rng.random(rows["blank"].shape) < 0.4
+    rows["missing"] = rng.random(rows["missing"].shape) < 0.4
     expected = [
         row["observation"][t].astype(float)
         for row in rows
         for t in range(row["last"] - row["new_observations"] + 1, row["last"] + 1)
-        if not row["blank"][t]
+        if not row["missing"][t]
     ]
     sums = observation_sums(rows, SPEC)
     assert sums.count == len(expected)
     np.testing.assert_allclose(sums.total, np.sum(expected, axis=0), rtol=1e-9)
     np.testing.assert_allclose(sums.total_square, np.sum(np.square(expected), axis=0), rtol=1e-9)
     rows["observation"][~observation_valid(rows, SPEC)] = np.nan
-    rows["observation"][rows["blank"] == 1] = 1e30
+    rows["observation"][rows["missing"] == 1] = 1e30
     again = observation_sums(rows, SPEC)
     assert again.count == sums.count
     assert np.array_equal(again.total, sums.total)
@@ -512,3 +512,60 @@ def test_policy_lag_is_measured(make: Make, bus: MemoryBus) -> None:
     assert metrics["policy_lag_mean"] == 20
     assert metrics["policy_lag_max"] == 30
     assert metrics["windows"] == 2
+
+
+@pytest.mark.parametrize("ratio", [1.0, 64.0])
+def test_a_changed_ratio_counts_from_there(ratio: float, make: Make, bus: MemoryBus) -> None:
+    """Neither does the learner owe updates for what was, nor does anybody wait for it; and so after a restart."""
+    slack, batch = 16, 4 * SPEC.train
+    before = ReplayConfig(capacity=100, replay_ratio=8.0, warmup_steps=40)
+    server, sender = make(before), Sender(bus)
+    for _ in range(30):
+        sender.send(4)
+        drain(server)
+        while server.sample(4).draw is SampleStatus.BATCH:
+            pass
+    close(server)
+    changed, count = ReplayConfig(capacity=100, replay_ratio=ratio, warmup_steps=40), 0
+    for _ in range(3):  # the first start with it, and two more
+        server = make(changed)
+        assert server.stats()["credit_steps"] > 0  # actors may step at once
+        for _ in range(10):
+            sender.send(4)
+            drain(server)
+            while server.sample(4).draw is SampleStatus.BATCH:
+                count += 1
+            assert server.waiting_for() == "windows"
+        stats = server.stats()
+        told = (stats["env_steps"] - 480) * ratio  # from where it changed
+        assert told - batch <= count * batch <= told + slack * ratio + batch
+        assert not stats["replay_ratio_off"]
+        close(server)
+
+
+def test_a_ratio_that_changes_in_the_warm_up_changes_nothing_else(make: Make, bus: MemoryBus) -> None:
+    server, sender = make(ReplayConfig(capacity=100, replay_ratio=8.0, warmup_steps=40)), Sender(bus)
+    sender.send(4)
+    drain(server)
+    close(server)
+    server = make(ReplayConfig(capacity=100, replay_ratio=2.0, warmup_steps=40))
+    assert server.sample(4).draw is SampleStatus.WAIT
+    sender.send(6)
+    drain(server)
+    assert server.sample(4).draw is SampleStatus.BATCH
+
+
+def test_a_ring_that_does_not_say_its_ratio_counts_from_where_it_is_opened(make: Make, bus: MemoryBus) -> None:
+    """As those of config format 1."""
+    config = ReplayConfig(capacity=100, replay_ratio=8.0, warmup_steps=0)
+    server, sender = make(config), Sender(bus)
+    for _ in range(10):
+        sender.send(4)
+        drain(server)  # 160 steps, for which nothing is drawn
+    server._store.ring.progress.replay_ratio = 0.0
+    close(server)
+    drawn = 0
+    server = make(config)
+    while server.sample(4).draw is SampleStatus.BATCH:
+        drawn += 4 * SPEC.train
+    assert drawn <= 16 * 8.0 + 4 * SPEC.train

@@ -149,7 +149,7 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(
         ([PENDULUM, "--grid", "scheme=1,2", "--scheme", "3"], "scheme=[1, 2]: is an option of every run"),
         ([PENDULUM, "--grid", "grounding=true,false", "--no-grounding"], "grounding=[True, False]: is an option"),
         ([PENDULUM, "--jobs", "-1"], "--jobs=-1: take 1 or more"),
-        ([PENDULUM, "--config", "f.toml", "--launcher", "ray"], "--config='--config f.toml': the nodes do not have"),
+        ([PENDULUM, "--config", "f.toml", "--launcher", "ray"], "--config='--config f.toml': the nodes do not"),
         ([PENDULUM, "--config", "f.toml"], "--config='f.toml': cannot be read"),
         ([PENDULUM, "--trials", "3"], "--trials=3: is for a search"),
         (["spec.toml", "--seeds", "1"], "--seeds='1': belongs into spec.toml"),

@@ -1,0 +1,52 @@
+"""What ``config.json`` of an older version says, in the words of this one.
+
+``format`` in the file counts its changes: the version of the distribution does not, as it may stay while options come.
+Files without it are of format 1. An option that came later takes the value that keeps what older runs did.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from rmc.common.errors import ConfigError
+
+Raw = dict[str, Any]
+
+
+def _to_2(raw: Raw) -> None:
+    _add(raw, "env", env_kwargs={})
+    _add(raw, "evaluator", evaluation_seconds=0.0)  # no evaluation was cut
+    _rename(raw, "agent", fill_blanks="impute_missing", blank_flag="missing_flag")
+    _rename(raw, "update", policy_average="policy_ema_updates")
+
+
+MIGRATIONS: list[Callable[[Raw], None]] = [_to_2]  # the first is from format 1 to 2
+FORMAT = 1 + len(MIGRATIONS)
+
+
+def migrated(raw: Any) -> Any:
+    """The same in this version's words, without its ``format``; what is no object is left for others to judge.
+
+    Raises ConfigError for a newer format.
+    """
+    if not isinstance(raw, dict):
+        return raw
+    found = {name: dict(part) if isinstance(part, dict) else part for name, part in raw.items()}
+    was = found.pop("format", 1)
+    if type(was) is not int or was < 1:
+        raise ConfigError("config.json format", was, "must be a number from 1; restore the file or start a new run")
+    if was > FORMAT:
+        fix = f"written by a newer version of RMC, this one reads up to {FORMAT}; update RMC to use this run"
+        raise ConfigError("config.json format", was, fix)
+    for migrate in MIGRATIONS[was - 1 :]:
+        migrate(found)
+    return found
+
+
+def _add(raw: Raw, part: str, **options: Any) -> None:
+    if isinstance(raw.get(part), dict):
+        raw[part] = options | raw[part]
+
+
+def _rename(raw: Raw, part: str, **names: str) -> None:
+    if isinstance(raw.get(part), dict):
+        raw[part] = {names.get(name, name): value for name, value in raw[part].items()}

@@ -1,0 +1,128 @@
+"""What a new run begins with, where that is another run's networks: its checkpoint 0, which every launcher carries.
+
+The learner takes a checkpoint up as ever; so does the one that is started again after a crash. Optimisers begin anew.
+"""
+
+import io
+import json
+import time
+from dataclasses import dataclass, fields
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from rmc.common.agent import Agent
+from rmc.common.agent_config import FILL_PARTS, POLICY_PARTS
+from rmc.common.checkpoint import POLICY, PROGRESS, STATE
+from rmc.common.errors import ConfigError
+from rmc.common.replay import ObservationStatistics
+from rmc.deploy.run.checkpoint_choice import choose_checkpoint
+from rmc.deploy.run.config import RunConfig, option
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import InitParts
+from rmc.learner.update import JointUpdate, make_update
+
+OPTION = "--init-from"
+PREDICTS = ("normalizer.", "memory.", "world_model.", *FILL_PARTS)
+PARTS: dict[InitParts, tuple[str, ...]] = {  # the beginnings of what is taken
+    "all": ("",),
+    "memory+world-model": PREDICTS,
+    "policy": (*POLICY_PARTS, *FILL_PARTS),
+}
+NOT_IN: dict[InitParts, set[str]] = {  # options of the networks that say nothing of these parts
+    "all": {"initial_priority"},
+    "memory+world-model": {"initial_priority", "critic_norm"},
+    "policy": {"initial_priority", "critic_norm", "grounding"},
+}
+
+
+@dataclass(frozen=True)
+class InitialCheckpoint:
+    """A checkpoint's files, and where they are from, for the run's history."""
+
+    files: dict[str, bytes]
+    origin: dict[str, Any]
+
+
+def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheckpoint:
+    """Checkpoint 0 of a run that begins with ``RUN`` or ``RUN:CHECKPOINT``.
+
+    Raises ConfigError where there is no such checkpoint, or its networks have other sizes.
+    """
+    folder, which = _split(init_from)
+    source = folder.config()
+    try:
+        number, files = choose_checkpoint(folder, which)
+    except ConfigError as error:
+        raise ConfigError(OPTION, init_from, error.fix) from None
+    try:
+        state = torch.load(io.BytesIO(files[STATE]), map_location="cpu", weights_only=True)
+        _check_sizes(init_from, parts, source, config, state["agent"])
+        update = _begun(config, state, parts, bool(source.update.policy_ema_updates))
+        progress = _progress(state["agent"], json.loads(files[PROGRESS])["env_steps"])
+    except (KeyError, RuntimeError, ValueError, EOFError, UnpicklingError) as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        fix = f"its checkpoint {number} cannot be used ({reason}); use another"
+        raise ConfigError(OPTION, init_from, fix) from None
+    learnt = io.BytesIO()
+    torch.save(update.state_dict(), learnt)
+    policy = safetensors.torch.save({name: value.contiguous() for name, value in update.policy_weights().items()})
+    made = {STATE: learnt.getvalue(), POLICY: policy, PROGRESS: json.dumps(progress).encode()}
+    return InitialCheckpoint(
+        made, {"asked": [init_from, parts], "run": str(folder.path), "checkpoint": number, "parts": parts}
+    )
+
+
+def _split(init_from: str) -> tuple[RunFolder, str]:
+    if Path(init_from).exists():
+        return RunFolder(Path(init_from)), "latest"
+    run, colon, which = init_from.rpartition(":")
+    if not (colon and Path(run).exists()):
+        raise ConfigError(OPTION, init_from, "no such run; give the folder of a run, or RUN:CHECKPOINT")
+    return RunFolder(Path(run)), which
+
+
+def _check_sizes(
+    init_from: str, parts: InitParts, source: RunConfig, config: RunConfig, agent: dict[str, Tensor]
+) -> None:
+    theirs = {"observations": len(agent["normalizer.mean"]), "actions": len(agent["policy.net.4.bias"]) // 2}
+    for name, ours in config.sizes().items():
+        if theirs.get(name, ours) != ours:
+            raise ConfigError(
+                OPTION, init_from, f"that run has {theirs[name]} {name}, this one has {ours}; use another"
+            )
+    for item in fields(source.agent):
+        was, now = getattr(source.agent, item.name), getattr(config.agent, item.name)
+        if was != now and item.name not in NOT_IN[parts]:
+            fix = f"that run has {option(item.name)} {was}, this one has {now}; use the same"
+            raise ConfigError(OPTION, init_from, fix)
+
+
+def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages: bool) -> JointUpdate:
+    """The run's own learner before its first update, with what is taken in its place."""
+    spec, taken = config.window_spec(), PARTS[parts]
+    torch.manual_seed(config.seed)  # the rest is as the learner would make it
+    update = make_update(Agent(spec.obs_dim, spec.action_dim, config.agent), spec.burn_in, config.update, config.seed)
+    theirs = {name: value for name, value in state["agent"].items() if name.startswith(taken)}
+    update.agent.load_state_dict(update.agent.state_dict() | theirs)
+    update.target_memory.load_state_dict(update.agent.memory.state_dict())
+    update.target_critic.load_state_dict(update.agent.critic.state_dict())
+    if parts == "all":
+        update.target_memory.load_state_dict(state["target_memory"])
+        update.target_critic.load_state_dict(state["target_critic"])
+    acting = dict(update.agent.acting())
+    for name, value in update.average.items():
+        value.copy_(state["average"][name] if averages and name in theirs else acting[name].detach())
+    return update
+
+
+def _progress(agent: dict[str, Tensor], env_steps: int) -> dict[str, Any]:
+    """Of a learner that has done nothing. What normalises its observations weighs as much as the steps it is from."""
+    mean, std = (agent[f"normalizer.{name}"].double() for name in ("mean", "std"))
+    total, total_square = mean * env_steps, (std.square() + mean.square()) * env_steps
+    before = ObservationStatistics(env_steps, total.numpy(), total_square.numpy())
+    return {"updates": 0, "env_steps": 0, "epoch": 0, "time": time.time(), "observed_before": before.to_json()}

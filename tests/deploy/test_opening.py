@@ -1,0 +1,89 @@
+"""What may be other when a run goes on: every option is one or the other, and each change is in the run's history."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import pytest
+
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import RunConfig, flat
+from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.opening import MAY_CHANGE, open_run
+from rmc.deploy.run.presets import debug
+from rmc.deploy.run.starts import format_starts, last_launch, starts
+from tests.deploy.test_config import with_value
+
+CONFIG = debug(EnvConfig("InvertedPendulum-v5"))
+
+
+def another(path: str, value: Any) -> Any:
+    """Of the same kind."""
+    kind: Any = RunConfig
+    for name in path.split("."):
+        kind = get_type_hints(kind)[name]
+    if choices := [choice for choice in get_args(kind) if choice != value and not isinstance(choice, type)]:
+        return choices[0]
+    match value:
+        case bool():
+            return not value
+        case str():
+            return "Pendulum-v1"
+        case dict():
+            return {"goal": 1}
+        case tuple():
+            return (7, *value[1:])
+    return value + 1
+
+
+@pytest.mark.parametrize("path", flat(CONFIG))
+def test_every_option_may_change_or_is_refused_with_the_reason(path: str, tmp_path: Path) -> None:
+    folder = open_run(CONFIG, tmp_path / "run", "fail")
+    folder.unlock()
+    was = flat(CONFIG)[path]
+    changed = with_value(CONFIG, path, another(path, was))
+    if path in MAY_CHANGE:
+        open_run(changed, folder.path, "resume").unlock()
+        assert folder.config() == changed
+        assert starts(folder)[-1].changes == {path: [was, flat(changed)[path]]}
+    else:
+        said = r": the run in .*run has .*, and .+; use that, or another --run-dir"
+        with pytest.raises(ConfigError, match=said) as no:
+            open_run(changed, folder.path, "resume")
+        assert repr(flat(changed)[path]) in str(no.value)
+        assert folder.config() == CONFIG
+        assert len(starts(folder)) == 1
+
+
+def test_the_history_is_a_line_a_start(tmp_path: Path) -> None:
+    folder = open_run(CONFIG, tmp_path / "run", "fail")
+    assert format_starts(folder) == "1 start"
+    folder.unlock()
+    folder.metrics.write_text('{"role": "learner", "env_steps": 1200}\n{"role": "replay", "env_steps": 1230}\n{"ro')
+    folder.history_file.write_bytes(folder.history_file.read_bytes() + b'{"time": 1.0, "vers')  # torn by a crash
+    replay = dataclasses.replace(CONFIG.replay, replay_ratio=8.0)
+    longer = dataclasses.replace(CONFIG, total_steps=9_000, replay=replay)
+    open_run(longer, folder.path, "resume").unlock()
+    open_run(longer, folder.path, "resume").unlock()
+    assert [start.env_steps for start in starts(folder)] == [0, 1_230, 1_230]
+    assert starts(folder)[-1].changes == {}
+    assert format_starts(folder) == "3 starts; from step 1,230 --total-steps 4000 to 9000, --replay-ratio 32 to 8"
+
+
+def test_an_older_run_has_no_history(tmp_path: Path) -> None:
+    folder = open_run(CONFIG, tmp_path / "run", "fail")
+    folder.unlock()
+    folder.history_file.unlink()
+    assert (starts(folder), format_starts(folder), last_launch(folder)) == ([], "", LaunchOptions(folder.path))
+
+
+@pytest.mark.parametrize(
+    ("url", "kept"), [("file:redis-url", "file:redis-url"), ("redis://:hush@localhost:1", None), (None, None)]
+)
+def test_how_it_was_started_is_kept_but_no_password(url: str | None, kept: str | None, tmp_path: Path) -> None:
+    options = LaunchOptions(tmp_path / "run", "fail", "manual", "cuda:1", url, all_cpus=True)
+    folder = open_run(CONFIG, tmp_path / "run", "fail", options)
+    folder.unlock()
+    assert last_launch(folder) == LaunchOptions(folder.path, "resume", "manual", "cuda:1", kept, all_cpus=True)
+    assert "hush" not in folder.history_file.read_text()

@@ -1,0 +1,186 @@
+"""A run that begins with another's networks: what its learner publishes first, and what is refused."""
+
+import dataclasses
+import io
+import json
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+
+from rmc.cli import main
+from rmc.common.agent_config import POLICY_PARTS
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.local.lockstep import Lockstep
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import InitParts, LaunchOptions
+from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.presets import debug
+from rmc.deploy.run.starts import format_starts
+from tests.deploy.test_config import with_value
+
+ENV = EnvConfig("InvertedPendulum-v5")
+CONFIG = dataclasses.replace(
+    debug(ENV),
+    total_steps=1_200,
+    agent=dataclasses.replace(debug(ENV).agent, hidden=8, embedding=8, heads=(8, 8), normalize_observations=True),
+    update=dataclasses.replace(debug(ENV).update, policy_ema_updates=100),
+)
+OTHER = dataclasses.replace(CONFIG, seed=7)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run that has learnt something, in lockstep."""
+    folder = open_run(CONFIG, tmp_path_factory.mktemp("source") / "run", "fail")
+    run = Lockstep(CONFIG, folder.path)
+    while not run.learner.finished:
+        run.step()
+    run.close()
+    folder.unlock()
+    return folder
+
+
+def state(folder: RunFolder) -> dict[str, dict[str, torch.Tensor]]:
+    newest = CheckpointFolder(folder.checkpoints).latest()
+    assert newest is not None
+    loaded: dict[str, dict[str, torch.Tensor]] = torch.load(io.BytesIO(newest[1]["learner.pt"]), weights_only=True)
+    return loaded
+
+
+def begin(config: RunConfig, path: Path, source: RunFolder, parts: InitParts = "all", which: str = "") -> RunFolder:
+    options = LaunchOptions(path, init_from=f"{source.path}{which}", init_parts=parts)
+    folder = open_run(config, path, "resume", options)
+    folder.unlock()
+    return folder
+
+
+def published(run: Lockstep) -> dict[str, torch.Tensor]:
+    newest = run.bus.weights()
+    assert newest is not None
+    weights: dict[str, torch.Tensor] = safetensors.torch.load(newest[1])
+    return weights
+
+
+@pytest.mark.parametrize("parts", ["all", "policy", "memory+world-model"])
+def test_the_first_published_weights_are_the_sources(parts: InitParts, source: RunFolder, tmp_path: Path) -> None:
+    theirs, plain = state(source)["agent"], Lockstep(OTHER, tmp_path / "plain")
+    ours = published(plain)
+    folder = begin(OTHER, tmp_path / "run", source, parts)
+    for _ in range(2):  # the second is a learner that was killed before its first checkpoint
+        run = Lockstep(OTHER, folder.path)
+        first = published(run)
+        run.close()
+        assert first.keys() == ours.keys()
+        for name, value in first.items():
+            from_source = name.startswith(("normalizer.", "memory.")) or parts != "memory+world-model"
+            assert torch.equal(value, theirs[name] if from_source else ours[name]), name
+    assert any(not torch.equal(theirs[name], ours[name]) for name in ours if name.startswith("policy."))
+    plain.close()
+
+
+@pytest.mark.parametrize("parts", ["all", "policy", "memory+world-model"])
+def test_what_is_not_taken_is_the_runs_own(parts: InitParts, source: RunFolder, tmp_path: Path) -> None:
+    plain = Lockstep(OTHER, tmp_path / "plain")
+    ours, theirs = plain.learner.update.state_dict(), state(source)
+    made = state(begin(OTHER, tmp_path / "run", source, parts))
+    predicts = ("normalizer.", "memory.", "world_model.")
+    taken = {"all": ("",), "policy": POLICY_PARTS, "memory+world-model": predicts}[parts]
+    for name, value in made["agent"].items():
+        expected = theirs if name.startswith(taken) else ours
+        assert torch.equal(value, expected["agent"][name]), name
+    for part, module in (("target_critic", "critic"), ("target_memory", "memory")):
+        for name, value in made[part].items():
+            told = theirs[part][name] if parts == "all" else made["agent"][f"{module}.{name}"]
+            assert torch.equal(value, told), name
+    for name, value in made["average"].items():
+        expected = theirs["average"] if name.startswith(taken) else made["agent"]
+        assert torch.equal(value, expected[name]), name
+    assert all(not optimizer["state"] for optimizer in made["optimizers"])  # they begin anew
+    plain.close()
+
+
+def test_the_normaliser_goes_on_from_the_sources(source: RunFolder, tmp_path: Path) -> None:
+    """At the first update it is that of both runs' observations, and so it is after a restart."""
+    theirs = state(source)["agent"]["normalizer.mean"].double()
+    folder = begin(OTHER, tmp_path / "run", source)
+    run = Lockstep(OTHER, folder.path)
+    while not run.learner.last_checkpoint:
+        run.step()
+    run.close()
+    for _ in range(2):
+        run = Lockstep(OTHER, folder.path)
+        run.learner.publish()
+        own = run.server.statistics()
+        mean = (theirs * 1_200 + torch.from_numpy(own.total)) / (1_200 + own.count)
+        run.close()
+        torch.testing.assert_close(published(run)["normalizer.mean"], mean.float(), atol=1e-3, rtol=1e-3)
+
+
+def test_a_numbered_checkpoint_and_the_history(source: RunFolder, tmp_path: Path) -> None:
+    numbers = CheckpointFolder(source.checkpoints).numbers()
+    folder = begin(OTHER, tmp_path / "run", source, "policy", f":{numbers[0]}")
+    assert format_starts(folder) == f"1 start; began with policy of {source.path}, update {numbers[0]}"
+    begin(OTHER, folder.path, source, "policy", f":{numbers[0]}")  # the same words again go on
+    with pytest.raises(ConfigError, match=r"--init-from='.*': the run in .* has begun, and not with that"):
+        begin(OTHER, folder.path, source, "all")
+    assert format_starts(folder).startswith("2 starts; began with policy of ")
+
+
+@pytest.mark.parametrize(
+    ("config", "which", "said"),
+    [
+        (with_value(OTHER, "agent.hidden", 16), "", "that run has --hidden 8, this one has 16; use the same"),
+        (with_value(OTHER, "agent.heads", (8, 9)), "", r"that run has --heads \(8, 8\), this one has \(8, 9\)"),
+        (with_value(OTHER, "agent.grounding", False), "", "that run has --grounding True, this one has False"),
+        (with_value(OTHER, "env.id", "Pendulum-v1"), "", "that run has 4 observations, this one has 3; use another"),
+        (OTHER, ":7", r"use latest, best or one of \[\d+, "),
+        (OTHER, "-none", "no such run; give the folder of a run, or RUN:CHECKPOINT"),
+    ],
+)
+def test_what_does_not_fit_is_one_line_and_leaves_no_folder(
+    config: RunConfig, which: str, said: str, source: RunFolder, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=rf"^--init-from='{source.path}{which}': .*{said}") as no:
+        begin(config, tmp_path / "run", source, which=which)
+    assert "\n" not in str(no.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_grounding_says_nothing_of_a_policy(source: RunFolder, tmp_path: Path) -> None:
+    begin(with_value(OTHER, "agent.grounding", False), tmp_path / "run", source, "policy")
+
+
+def test_a_state_that_is_cut_is_one_line(source: RunFolder, tmp_path: Path) -> None:
+    copied = open_run(CONFIG, tmp_path / "copied", "fail")
+    copied.unlock()
+    progress = json.dumps({"updates": 5, "env_steps": 50}).encode()
+    CheckpointFolder(copied.checkpoints).save(5, {"learner.pt": b"PK", "progress.json": progress})
+    said = r"--init-from='.*copied': its checkpoint 5 cannot be used \(.+\); use another"
+    with pytest.raises(ConfigError, match=said):
+        begin(OTHER, tmp_path / "run", copied)
+    assert not (tmp_path / "run").exists()
+
+
+def test_by_the_command_line_the_first_evaluation_is_of_what_it_begins_with(
+    source: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = "train InvertedPendulum-v5 --preset debug --hidden 8 --embedding 8 --heads 8 8 --normalize-observations"
+    words += f" --policy-ema-updates 100 --total-steps 600 --launcher lockstep --init-from {source.path}"
+    threads = torch.get_num_threads()
+    try:
+        assert main.run([*words.split(), "--run-dir", str(tmp_path / "run")]) == 0
+    finally:
+        torch.set_num_threads(threads)
+    capsys.readouterr()
+    assert main.run(["evaluate", str(source.path), "--json"]) == 0
+    played = json.loads(capsys.readouterr().out)
+    initial = RunFolder(tmp_path / "run").initial()
+    assert initial is not None
+    assert initial["eval_return_mean"] == played["eval_return_mean"]
+    assert main.run(["resume", str(tmp_path / "run"), "--init-parts", "policy"]) == 2
+    assert "--init-parts" in capsys.readouterr().err

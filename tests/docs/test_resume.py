@@ -1,0 +1,72 @@
+"""The commands of docs/resume.md and docs/warm-start.md run as they are printed, and their tables are the code's."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from rmc.analysis.baselines import MAY_CHANGE as BASELINES_MAY_CHANGE
+from rmc.deploy.run.config import option
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import InitParts
+from rmc.deploy.run.opening import MAY_CHANGE
+from rmc.deploy.run.starts import format_starts, starts
+
+DOCS = Path(__file__).parents[2] / "docs"
+RESUME, WARM = ((DOCS / name).read_text() for name in ("resume.md", "warm-start.md"))
+
+
+def execute(page: str, folder: Path) -> list[str]:
+    """Its commands, in order; what each printed."""
+    said = []
+    for command in re.findall(r"```sh\n(rmc .*?)\n```", page, re.DOTALL):
+        words = shlex.split(command.replace("\\\n", ""))[1:]
+        done = subprocess.run(
+            [sys.executable, "-m", "rmc.cli.main", *words], cwd=folder, capture_output=True, text=True, timeout=150
+        )
+        assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
+        said.append(done.stdout)
+    return said
+
+
+@pytest.mark.timeout(500)
+def test_a_run_is_resumed(tmp_path: Path) -> None:
+    assert len(execute(RESUME, tmp_path)) == 3
+    run = RunFolder(tmp_path / "runs" / "first")
+    result = run.result()
+    assert result is not None
+    assert result["env_steps"] >= 2_000
+    assert [list(start.changes) for start in starts(run)] == [[], [], ["total_steps", "replay.replay_ratio"]]
+    told = re.search(r"```\n(3 starts; .*)\n```", RESUME)
+    assert told is not None
+    assert re.sub(r"1,5\d\d", "1,500", format_starts(run)) == told[1]
+
+
+def test_the_options_that_may_change_are_in_the_table() -> None:
+    table = RESUME.split("## What may change")[1].split("\n\n")[1]
+    assert set(re.findall(r"`(--[a-z-]+)`", table)) == {option(path) for path in MAY_CHANGE}
+    line = next(line for line in RESUME.splitlines() if line.startswith("Of a baseline's run"))
+    assert set(re.findall(r"`(--[a-z-]+)`", line)) == {option(path) for path in BASELINES_MAY_CHANGE}
+
+
+@pytest.mark.timeout(600)
+def test_runs_begin_with_anothers_networks(tmp_path: Path) -> None:
+    assert len(execute(WARM, tmp_path)) == 3
+    (code,) = re.findall(r"```python\n(.*?)```", WARM, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=200)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    parts = {}
+    for name in ("warm", "model", "policy"):
+        began = starts(RunFolder(tmp_path / "runs" / name))[0].init_from
+        assert began is not None
+        assert began["run"] == str(tmp_path / "runs" / "source")
+        parts[name] = began["parts"]
+    assert parts == {"warm": "all", "model": "memory+world-model", "policy": "policy"}
+    assert set(re.findall(r"^\| `([a-z+-]+)` \|", WARM, re.MULTILINE)) == set(get_args(InitParts))
+    best = json.loads((tmp_path / "runs" / "source" / "checkpoints" / "best.json").read_bytes())["update"]
+    assert f"update {best}" in format_starts(RunFolder(tmp_path / "runs" / "model"))

@@ -1,0 +1,87 @@
+"""The command that a stopped run prints goes on with it, typed as it is printed; what it changes counts from there."""
+
+import itertools
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.starts import starts
+from rmc.replay_server.recovery import open_store
+from tests.integration.running import ENVIRONMENT, Training
+
+SIZES = "--hidden 16 --embedding 16 --heads 16 16 --total-steps 2400 --actors 2 --replay-ratio 8".split()  # noqa: SIM905
+
+
+def rmc(words: str, cwd) -> subprocess.CompletedProcess[str]:
+    assert words.startswith("rmc ")
+    command = [sys.executable, "-m", "rmc.cli.main", *shlex.split(words)[1:]]
+    path = os.pathsep.join([os.getcwd(), os.environ.get("PYTHONPATH", "")])
+    return subprocess.run(
+        command, cwd=cwd, env={**ENVIRONMENT, "PYTHONPATH": path}, capture_output=True, text=True, timeout=240
+    )
+
+
+def drawn_steps(folder: RunFolder) -> int:
+    """Trained steps that were drawn from the run's ring."""
+    config = folder.config()
+    store = open_store(folder.replay, config.window_spec(), config.replay.capacity, 0.0)
+    store.close()
+    return store.ring.progress.drawn_steps
+
+
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize("launcher", ["local", "lockstep"])
+def test_the_printed_command_goes_on(launcher, tmp_path):
+    folder = tmp_path / "a run"
+    with Training(folder, *SIZES, "--launcher", launcher) as training:
+        training.wait_for_updates()
+        training.interrupt()
+        (printed,) = re.findall(r"to go on:\n\s+(rmc .*)\n", training.text())
+    config = RunFolder(folder).config()
+    assert printed == f"rmc resume '{folder}'"
+    done = rmc(printed, tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    result = RunFolder(folder).result()
+    assert 2_400 <= result["env_steps"] < 2_400 + 2 * config.slack_steps()
+    assert RunFolder(folder).config() == config
+    assert [start.changes for start in starts(RunFolder(folder))] == [{}, {}]
+    assert {start.launch["launcher"] for start in starts(RunFolder(folder))} == {launcher}
+
+
+@pytest.mark.timeout(400)
+def test_a_changed_ratio_and_rate_count_from_there(tmp_path):
+    """In a run: neither more updates for what was, nor none until the old ones are used up."""
+    folder = tmp_path / "run"
+    start = f"rmc train InvertedPendulum-v5 --preset debug --launcher lockstep --run-dir {folder} --total-steps 1500"
+    drawn = []
+    for words in (
+        f"{start} --replay-ratio 32 --hidden 16 --embedding 16 --heads 16 16",
+        f"rmc resume {folder} --total-steps 2500 --replay-ratio 4 --learning-rate 1e-5",
+        f"rmc resume {folder} --total-steps 3500",
+        f"rmc train --run-dir {folder} --total-steps 4500 --replay-ratio 16",
+    ):
+        done = rmc(words, tmp_path)
+        assert done.returncode == 0, done.stdout + done.stderr
+        drawn.append(drawn_steps(RunFolder(folder)))
+    config = RunFolder(folder).config()
+    assert (config.total_steps, config.replay.replay_ratio, config.update.learning_rate) == (4_500, 16.0, 1e-5)
+    batch, slack = 16 * 15, config.slack_steps()
+    more = [after - before for before, after in itertools.pairwise(drawn)]
+    for steps, ratio in zip(more, (4, 4, 16), strict=True):
+        assert 1_000 * ratio - batch - 2 * slack * ratio <= steps <= (1_000 + 2 * slack) * ratio + batch, more
+    _, files = CheckpointFolder(folder / "checkpoints").latest()
+    (folder / "state").write_bytes(files["learner.pt"])
+    state = torch.load(folder / "state", weights_only=True)
+    assert [group["lr"] for group in state["optimizers"][0]["param_groups"]] == [1e-5, 1e-5, 3e-4]
+    told = rmc(f"rmc stats {folder}", tmp_path).stdout
+    assert "4 starts; from step 1,5" in told
+    assert "--replay-ratio 32 to 4, --learning-rate 0.0003 to 1e-05" in told
+    assert json.loads((folder / "config.json").read_text())["format"] == 2
