@@ -25,7 +25,12 @@ class RayRuns:
     def __init__(self, cores: int, memory: int, gpus: int, at_once: int) -> None:
         """Raises ConfigError where no node can hold a run."""
         self._cores, self._at_once, self._running = cores, at_once, 0
-        self._needs: dict[str, Any] = {"num_cpus": cores, "num_gpus": gpus, "memory": memory}
+        self._needs: dict[str, Any] = {
+            "num_cpus": cores,
+            "num_gpus": gpus,
+            "memory": memory,
+            "scheduling_strategy": "SPREAD",
+        }
         if not self.capacity():
             fix = f"no node of the cluster has {cores} CPUs, which a run takes; start one that has"
             raise ConfigError("--launcher", "ray", fix)
