@@ -108,7 +108,8 @@ class Plot:
     """Draw the returns of runs as curves, and print them as a table, by environment and agent."""
 
     runs: Positional[tuple[Path, ...]]
-    """Folders of runs, or files of JSON lines as a study writes them."""
+    """Runs, folders that hold some at any depth, quoted patterns like 'runs/*', or files of JSON lines as a study
+    writes them."""
     out: Path = Path("curves.png")
     """The picture to write."""
     by: Axis = "env_steps"

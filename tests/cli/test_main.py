@@ -49,6 +49,10 @@ ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit
 NEW_RUN_FLAGS = {"--run-dir", "--config", "--if-exists", "--init-from", "--init-parts"}
 RESUME_FLAGS = [flag for flag in TRAIN_FLAGS if flag not in NEW_RUN_FLAGS]
 OTHER_FLAGS = {
+    "sweep": [
+        *"--seeds --grid --search --trials --sampler-seed --prune --sweep-dir --jobs --drop-replay --launcher".split(),  # noqa: SIM905
+        "--ray-address",
+    ],
     "resume": RESUME_FLAGS,
     "evaluate": ["--episodes", "--seconds", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
