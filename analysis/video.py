@@ -60,10 +60,10 @@ def _mode_fault(env: EnvConfig) -> str | None:
     return None
 
 
-def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path) -> float:
-    """Play one deterministic episode and write it to ``out``; its return. ``prepare`` must have been called.
+def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest: int = LONGEST_EPISODE) -> float:
+    """Play one deterministic episode, ``longest`` steps of it at most, and write it to ``out``; its return.
 
-    Raises EnvFault.
+    ``prepare`` must have been called. Raises EnvFault.
     """
     from imageio_ffmpeg import write_frames  # an extra
 
@@ -74,7 +74,7 @@ def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path) -> float
     video = write_frames(str(out), (frame.shape[1], frame.shape[0]), fps=rate, macro_block_size=1)
     video.send(None)  # the generator's start
     total = 0.0
-    for _ in range(LONGEST_EPISODE):
+    for _ in range(longest):
         video.send(_frame(env, frame.shape).tobytes())
         action = policy.act(observation, bool(info.get("missing", False)))
         observation, reward, terminated, truncated, info = env.step(action)

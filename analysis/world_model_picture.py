@@ -8,7 +8,7 @@ import io
 import pickle
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 import torch
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rmc.actors.evaluator import LONGEST_EPISODE
-from rmc.analysis.evaluation import load_state
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import load_policy
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
+from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.learner.diagnostics import relative_l1_error
@@ -68,7 +68,7 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     spec = config.window_spec()
     folder.check_sizes(config.env.id, config.sizes())
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
-    raw = load_state(folder, checkpoint)
+    raw = choose_checkpoint(folder, checkpoint)[1][STATE]
     try:
         agent.load_state_dict(torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)["agent"])
     except (pickle.UnpicklingError, EOFError, RuntimeError, KeyError, TypeError) as error:
@@ -163,17 +163,22 @@ def inspect(run: Path, checkpoint: str, out: Path) -> Insight:
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError("--out", str(out), f"matplotlib is missing; {how_to_install('plot')}")
     check_writable("--out", out, PICTURES)
-    folder = RunFolder(run)
+    return inspect_to(RunFolder(run), checkpoint, out)
+
+
+def inspect_to(folder: RunFolder, checkpoint: str, out: Path | BinaryIO) -> Insight:
+    """Play, look, and write the picture to a file, or as PNG to what is like one. Raises ConfigError."""
     config = folder.config()
     if not config.agent.grounding:
-        raise ConfigError("RUN", str(run), "its world model predicts no observations; train with --grounding")
+        fix = "its world model predicts no observations; train with --grounding"
+        raise ConfigError("RUN", str(folder.path), fix)
     agent = load_agent(folder, config, checkpoint)
     insight = look(agent, play(folder, agent, config, checkpoint), config.update.model_norm)
     draw(insight, f"{config.env.id}, {config.preset}, seed {config.seed}", out)
     return insight
 
 
-def draw(insight: Insight, title: str, out: Path) -> None:
+def draw(insight: Insight, title: str, out: Path | BinaryIO) -> None:
     """Predicted against real amid the episode, then curiosity and reward over all of it."""
     from matplotlib.figure import Figure  # an extra
 
@@ -187,7 +192,7 @@ def draw(insight: Insight, title: str, out: Path) -> None:
         for horizon, predicted in insight.ahead.items():
             label = f"{horizon} step{'s' * (horizon > 1)} ahead"
             axis.plot(time[horizon - 1 :], predicted[:, dimension], linewidth=1.0, label=label)
-        axis.set_xlim(start, start + SHOWN_STEPS)
+        axis.set_xlim(start, min(start + SHOWN_STEPS, len(time)))
         axis.set_ylabel(f"observation {dimension}")
     axes[-2].plot(time, insight.curiosity, color="tab:purple", linewidth=0.8)
     axes[-2].set_ylabel("curiosity")

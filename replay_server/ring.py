@@ -112,6 +112,11 @@ def _rows_start(spec: WindowSpec) -> int:
     return _IDENTITY_BYTES + 2 * record_bytes(spec.obs_dim)
 
 
+def file_bytes(spec: WindowSpec, capacity: int) -> int:
+    """What the file of a ring takes."""
+    return _rows_start(spec) + capacity * spec.dtype.itemsize
+
+
 def _identity(spec: WindowSpec, capacity: int) -> bytes:
     packed = _IDENTITY.pack(_MAGIC, spec.fingerprint.encode(), capacity, spec.dtype.itemsize)
     return packed + struct.pack("<I", zlib.crc32(packed))
@@ -121,7 +126,7 @@ def _create(path: Path, spec: WindowSpec, capacity: int) -> None:
     """Under another name first, so that a ring is there whole or not at all."""
     temporary = path.with_suffix(".tmp")
     start = _rows_start(spec)
-    reserve(temporary, start + capacity * spec.dtype.itemsize, capacity)
+    reserve(temporary, file_bytes(spec, capacity), capacity)
     head = np.memmap(temporary, np.uint8, "r+", shape=(start,))
     identity = _identity(spec, capacity)
     head[: len(identity)] = np.frombuffer(identity, np.uint8)
@@ -161,7 +166,7 @@ def _check_identity(path: Path, spec: WindowSpec, capacity: int) -> None:
     if found != capacity:
         fix = f"the ring in {path.parent} has {found}; keep that or use a new --run-dir"
         raise ConfigError("--capacity", capacity, fix)
-    if path.stat().st_size != _rows_start(spec) + capacity * spec.dtype.itemsize:
+    if path.stat().st_size != file_bytes(spec, capacity):
         raise _unusable(path, "cut short")
 
 

@@ -37,7 +37,7 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
     checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
     learner = Learner(
         spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device,
-        (threads - model_threads, model_threads),
+        config.policy_header(), (threads - model_threads, model_threads),
     )  # fmt: skip
     run_role(learner, bus, process.stop, lambda: learner.finished)
     for client in clients:

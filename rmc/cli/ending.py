@@ -5,12 +5,12 @@ from typing import Any
 
 from rich.console import Console
 
+from rmc.analysis.doctor import examine
 from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.errors import RoleDied
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.starts import resume_command
-
-STOPPED = 130  # exit status after Ctrl-C, as shells have it
+from rmc.deploy.run.state import STOPPED
 
 
 def say_end(folder: RunFolder, console: Console) -> int:
@@ -44,6 +44,7 @@ def say_stopped(folder: RunFolder, env_steps: int, console: Console) -> int:
     """Print how to go on; the exit status."""
     console.print(f"stopped at environment step {env_steps:,}; to go on:")
     console.print(f"  {resume_command(folder)}", soft_wrap=True)
+    say_findings(folder, console)
     return STOPPED
 
 
@@ -53,4 +54,11 @@ def say_result(folder: RunFolder, console: Console) -> int:
     console.print(f"after training:  {format_evaluation(result)}")
     facts = f"{result['env_steps']:,} environment steps, {result['updates']:,} updates, {result['wall_s']:,.0f} s"
     console.print(f"{facts}; {folder.result_file}", soft_wrap=True)
+    say_findings(folder, console)
     return 0
+
+
+def say_findings(folder: RunFolder, console: Console) -> None:
+    """What ``rmc doctor`` would say; nothing of a run that was too short to judge."""
+    for finding in examine(list(folder.records()), folder.config()):
+        console.print(str(finding), soft_wrap=True)

@@ -66,7 +66,12 @@ def binaries(request: pytest.FixtureRequest, sources: Path, tmp_path_factory: py
         (wheel,) = folder.glob("rmc_rl-*.whl")
         names = zipfile.ZipFile(wheel).namelist()
         assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"rmc"}
-        assert {"rmc/deploy/cluster/aws.yaml", "rmc/py.typed", "rmc/common/bus/redis_bus.py"} <= set(names)
+        assert {
+            "rmc/deploy/cluster/aws.yaml",
+            "rmc/py.typed",
+            "rmc/analysis/report.html",
+            "rmc/common/bus/redis_bus.py",
+        } <= set(names)
         _run([*install, "--prefix", str(folder), str(wheel)], ROOT)
     else:
         _run([*install, "--prefix", str(folder), "-e", str(sources)], ROOT)

@@ -1,0 +1,156 @@
+"""What a run will need beside what the machine has, from a trial of some seconds: pure functions of both."""
+
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import Any
+
+from rmc.analysis.bottleneck import busy_threads, learner_threads
+from rmc.analysis.host_faults import CROWDED
+from rmc.analysis.vitals import Vitals
+from rmc.common.errors import ConfigError
+from rmc.deploy.local.trial import RoleUse, Trial
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.host import Machine
+from rmc.deploy.run.preflight import DISK_RESERVE
+from rmc.replay_server import ring
+
+KEPT_BESIDE = 2  # checkpoints beside the newest: the best, and the one that is being written
+WIRE_SHARE = 0.2  # of the speed at which memory is copied: on its way a window is copied and checked some times
+
+
+@dataclass(frozen=True)
+class Need:
+    """A row of ``rmc train --dry-run``."""
+
+    what: str
+    needs: str
+    has: str = ""
+    fits: bool | None = None  # None where it is only told
+    is_needed: bool = True  # else what does not fit is only slower
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How fast a run goes once it is warm."""
+
+    steps_per_s: float
+    updates_per_s: float
+    windows_per_s: float
+
+
+def speed(config: RunConfig, records: list[dict[str, Any]]) -> Speed:
+    """By what the learner draws: over a whole run the replay ratio holds, in its first seconds it need not.
+
+    Raises ConfigError where the trial was too short to say.
+    """
+    vitals = Vitals(records).training()
+    drawn = sum(_slope(vitals, role, "drawn_steps") for role in vitals.of("replay"))
+    if drawn <= 0.0:
+        fix = "a trial of it is over too soon to be measured; train it"
+        raise ConfigError("--total-steps", config.total_steps, fix)
+    steps_per_s = drawn / config.replay.replay_ratio
+    windows, steps = (sum(vitals.last(role, name) for role in vitals.of("replay")) for name in ("windows", "env_steps"))
+    return Speed(steps_per_s, _slope(vitals, "learner", "updates"), steps_per_s * windows / steps)
+
+
+def _slope(vitals: Vitals, role: str, name: str) -> float:
+    found = vitals.series(role, name)
+    if len(found) < 2:
+        return 0.0
+    (began, before), (ended, after) = found[0], found[-1]
+    return (after - before) / max(ended - began, 1e-9)
+
+
+def needs(config: RunConfig, trial: Trial, machine: Machine) -> list[Need]:
+    """All rows, in the order in which they are shown."""
+    fast = speed(config, trial.records)
+    seconds = config.total_steps / fast.steps_per_s
+    at = f"{fast.steps_per_s:,.0f} steps/s, {fast.updates_per_s:,.1f} updates/s"
+    return [
+        *memory(config, trial.roles, machine),
+        *disk(config, trial, seconds, machine),
+        *bandwidth(config, fast, machine),
+        *handles(trial.roles, machine),
+        threads(config, trial.records, machine),
+        Need("time to the end", f"{duration(seconds)} at {at}"),
+    ]
+
+
+def ring_bytes(config: RunConfig) -> int:
+    """Of the rings of all replay servers."""
+    shards = config.replay.replay_shards
+    return shards * ring.file_bytes(config.window_spec(), -(-config.replay.capacity // shards))
+
+
+def memory(config: RunConfig, roles: dict[str, RoleUse], machine: Machine) -> list[Need]:
+    """Of each role, of the ring's pages, and of all."""
+    uses: dict[str, list[int]] = defaultdict(list)
+    for role, use in sorted(roles.items()):
+        uses[role.partition("-")[0]].append(use.memory_bytes)
+    pages, total = ring_bytes(config), sum(map(sum, uses.values()))
+    rows = [_role_memory(kind, each) for kind, each in uses.items()]
+    rows.append(Need("memory, pages of the ring", megabytes(pages)))
+    fits = total + pages <= machine.free_memory_bytes
+    return [*rows, Need("memory, all", megabytes(total + pages), f"{megabytes(machine.free_memory_bytes)} free", fits)]
+
+
+def _role_memory(kind: str, each: list[int]) -> Need:
+    count = f" ({len(each)})" if len(each) > 1 else ""
+    return Need(f"memory, {kind}{count}", megabytes(sum(each)))
+
+
+def disk(config: RunConfig, trial: Trial, seconds: float, machine: Machine) -> list[Need]:
+    """The ring, the checkpoints, what is recorded until the end, and all."""
+    rows, kept = ring_bytes(config), config.learner.keep_checkpoints + KEPT_BESIDE
+    made = config.total_steps // config.learner.checkpoint_steps + 1
+    saved, said = min(kept, made) * trial.checkpoint_bytes, trial.record_bytes_per_s * seconds
+    free = max(0, machine.free_disk_bytes - DISK_RESERVE)
+    return [
+        Need("disk, ring", megabytes(rows)),
+        Need(f"disk, {min(kept, made)} checkpoints", megabytes(saved)),
+        Need("disk, metrics", megabytes(said)),
+        Need("disk, all", megabytes(rows + saved + said), f"{megabytes(free)} free", rows + saved + said <= free),
+    ]
+
+
+def bandwidth(config: RunConfig, fast: Speed, machine: Machine) -> list[Need]:
+    """To and from the replay servers, beside a share of what this machine copies in memory."""
+    row, has = config.window_spec().dtype.itemsize, WIRE_SHARE * machine.copied_bytes_per_s
+    flows = {"to": fast.windows_per_s * row, "from": fast.updates_per_s * config.learner.batch_size * row}
+    return [
+        Need(f"bandwidth {way} replay", f"{megabytes(flow)}/s", f"{megabytes(has)}/s", flow <= has, False)
+        for way, flow in flows.items()
+    ]
+
+
+def handles(roles: dict[str, RoleUse], machine: Machine) -> list[Need]:
+    """Of the process that has the most: the limit is a process's."""
+    rows = []
+    for what in ("handles", "sockets"):
+        role, most = max(((role, getattr(use, what)) for role, use in roles.items()), key=lambda one: one[1])
+        title = "file handles" if what == "handles" else what
+        rows.append(Need(f"{title} of a role", f"{most} ({role})", f"{machine.handles}", most <= machine.handles))
+    return rows
+
+
+def threads(config: RunConfig, records: list[dict[str, Any]], machine: Machine) -> Need:
+    """The learner's and one of every other role, and how many of them work at a time."""
+    learner, others = learner_threads(config, machine.cores), len(config.roles()) - 1
+    busy = busy_threads(Vitals(records).training(), config, machine.cores)
+    text = f"{learner} learner + {others} others, {busy:.1f} busy"
+    return Need("threads", text, f"{machine.cores} cores", max(learner, busy) <= CROWDED * machine.cores, False)
+
+
+def megabytes(size: float) -> str:
+    """Bytes in the unit that suits them."""
+    return next(
+        (f"{size / unit:,.1f} {name}" for unit, name in ((1e9, "GB"), (1e6, "MB")) if size >= unit),
+        f"{size / 1e3:.1f} kB",
+    )
+
+
+def duration(seconds: float) -> str:
+    """Seconds as a user says them."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours:,} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"

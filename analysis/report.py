@@ -1,0 +1,153 @@
+"""``rmc report``: one HTML file about runs, which a browser shows without a network."""
+
+import importlib.util
+import time
+from collections.abc import Sequence
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+from statistics import mean, pstdev
+from typing import Any
+
+from rmc.analysis.curves import LAST, grouped
+from rmc.analysis.history import History
+from rmc.analysis.out_file import check_writable
+from rmc.analysis.report_run import ReportRun
+from rmc.common.errors import ConfigError
+from rmc.common.extra import how_to_install
+from rmc.common.whole_file import write_whole
+from rmc.deploy.run.config import option
+
+PAGES = (".html", ".htm")
+COLUMNS = ("agent", "runs", "return", "each run", f"worst of last {LAST}", "steps", "updates", "wall s")
+CHARTS = (  # what is drawn over wall time: its name, its unit, and its lines by role and metric
+    ("throughput of environment steps", "steps / s", {"collected": ("replay", "env_steps_per_s")}),
+    ("throughput of updates", "updates / s", {"learner": ("learner", "updates_per_s")}),
+    (
+        "staleness of policies", "updates behind",
+        {"when inserted": ("replay", "policy_lag_mean"), "when trained on": ("learner", "sample_age_mean")},
+    ),
+    (
+        "staleness of replayed memories", "distance / norm",
+        {"as stored": ("learner", "stale_state_stored"), "after burn-in": ("learner", "stale_state_burned")},
+    ),
+)  # fmt: skip
+
+
+def check_report(out: Path) -> None:
+    """Raises ConfigError where a report cannot be made, or not there."""
+    for package in ("matplotlib", "jinja2"):
+        if importlib.util.find_spec(package) is None:
+            raise ConfigError("--out", str(out), f"{package} is missing; {how_to_install('report')}")
+    check_writable("--out", out, PAGES)
+
+
+def write_report(runs: Sequence[ReportRun], out: Path, with_video: bool) -> None:
+    """The whole page. ``check_report`` must have been called."""
+    from jinja2 import Environment  # an extra
+
+    from rmc.analysis import report_media  # imports torch
+
+    shown = newest(runs)
+    page = {
+        "title": f"Report of {runs[0].name}" if len(runs) == 1 else f"Report of {len(runs)} runs",
+        "date": time.strftime("%Y-%m-%d %H:%M"),
+        "version": version("rmc-rl"),
+        "runs": runs,
+        "returns": _returns([run.history for run in runs if run.history is not None]),
+        "final_columns": COLUMNS,
+        "unevaluated": [run.name for run in runs if run.history is None],
+        "films": [report_media.film(run) for run in shown] if with_video else [],
+        "rollouts": [report_media.rollouts(run) for run in shown],
+        "courses": [_course(run) for run in runs],
+        "differences": differences(runs),
+    }
+    template = files("rmc.analysis").joinpath("report.html").read_text(encoding="utf-8")
+    made = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(template)
+    write_whole(out, made.render(page).encode())
+
+
+def newest(runs: Sequence[ReportRun]) -> list[ReportRun]:
+    """Of every agent in every environment the run that was trained last: its policy is played."""
+    found: dict[tuple[str, str], ReportRun] = {}
+    for run in sorted(runs, key=lambda run: run.records[-1]["time"] if run.records else 0.0):
+        found[run.about.env, run.about.agent] = run
+    return [run for run in runs if run in found.values()]
+
+
+def _returns(histories: list[History]) -> list[dict[str, Any]]:
+    from rmc.analysis.report_figures import COLOURS, returns
+
+    found = []
+    for env, agents in grouped(histories).items():
+        colours = {agent: COLOURS[i % len(COLOURS)] for i, agent in enumerate(agents)}
+        found.append(
+            {
+                "name": env,
+                "colours": colours,
+                "over_steps": returns(agents, colours, "env_steps"),
+                "over_wall": returns(agents, colours, "wall_s"),
+                "final": [final_row(agent, past) for agent, past in agents.items()],
+            }
+        )
+    return found
+
+
+def final_row(agent: str, past: list[History]) -> list[str]:
+    """An agent's last evaluations, as ``COLUMNS`` names them."""
+    last = [run.evaluations[-1].return_mean for run in past]
+    worst = min(one.return_mean for run in past for one in run.evaluations[-LAST:])
+    numbers = [mean(getattr(run, name) for run in past) for name in ("env_steps", "updates", "wall_s")]
+    deviation = f" ± {pstdev(last):,.1f}" if len(last) > 1 else ""
+    each = ", ".join(f"{value:,.0f}" for value in last)
+    return [
+        agent,
+        f"{len(past)}",
+        f"{mean(last):,.1f}{deviation}",
+        each,
+        f"{worst:,.1f}",
+        *(f"{n:,.0f}" for n in numbers),
+    ]
+
+
+def _course(run: ReportRun) -> dict[str, Any]:
+    """How a run went, in figures over wall time."""
+    from rmc.analysis.report_figures import over_time, waits
+
+    drawn = {
+        title: over_time({name: run.series(*metric) for name, metric in lines.items()}, unit)
+        for title, unit, lines in CHARTS
+    }
+    figures = [{"alt": title, "uri": uri} for title, uri in drawn.items() if uri]
+    baseline = run.folder.is_baseline()
+    return {
+        "name": run.name,
+        "is_baseline": baseline,
+        "findings": run.findings,
+        "waits": waits(run),
+        "figures": figures,
+    }
+
+
+def differences(runs: Sequence[ReportRun]) -> dict[str, Any]:
+    """Options that are not alike in the runs that have them; of one run, those that are not its preset's."""
+    if len(runs) == 1:
+        changed = runs[0].changed()
+        rows = [[option(path), *map(_text, values)] for path, values in changed.items()]
+        note = "Options that are not the preset's." if rows else "All options are the preset's."
+        return {"columns": ["preset", runs[0].name], "rows": rows, "note": note}
+    paths = list(dict.fromkeys(path for run in runs for path in run.options))
+    values = {path: [run.options[path] for run in runs if path in run.options] for path in paths}
+    differing = [path for path, found in values.items() if any(one != found[0] for one in found)]
+    rows = [[path, *(_text(run.options[path]) if path in run.options else "-" for run in runs)] for path in differing]
+    note = "Options that are not alike in all runs that have them." if rows else "All options are alike."
+    return {"columns": [run.name for run in runs], "rows": rows, "note": note}
+
+
+def _text(value: Any) -> str:
+    """As it is typed, without the decimals of a whole number."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, list | tuple):
+        return " ".join(map(_text, value))
+    return f"{value:,}".replace(",", " ") if isinstance(value, int) else str(value)

@@ -1,0 +1,57 @@
+"""What a report plays and looks at: an episode of a policy as a video, and its world model's rollouts as a picture."""
+
+import io
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from rmc.analysis import video, world_model_picture
+from rmc.analysis.policy import load_policy
+from rmc.analysis.report_figures import data_uri
+from rmc.analysis.report_run import ReportRun
+from rmc.common.errors import ConfigError, RmcError
+
+LONGEST_FILM = 1_000  # steps: the page holds it
+
+
+@dataclass(frozen=True)
+class Medium:
+    """An embedded file, or why there is none."""
+
+    run: str
+    uri: str = ""
+    note: str = ""
+
+
+def film(run: ReportRun) -> Medium:
+    """One deterministic episode of the newest policy, its first 1 000 steps."""
+    if run.folder.is_baseline():
+        return Medium(run.name, note="Of a baseline there is no video.")
+    try:
+        config = run.folder.config()
+        with tempfile.TemporaryDirectory() as place:
+            out = Path(place) / "episode.mp4"
+            video.prepare(config.env, out)
+            policy = load_policy(run.folder.path)
+            total = video.record(policy, config.env, config.seed, out, LONGEST_FILM)
+            return Medium(run.name, data_uri(out.read_bytes(), "video/mp4"), f"return {total:,.1f}")
+    except RmcError as error:
+        return Medium(run.name, note=f"No video: {_why(error)}.")
+
+
+def rollouts(run: ReportRun) -> Medium:
+    """The world model's predictions along an episode of the newest policy."""
+    if run.folder.is_baseline():
+        return Medium(run.name, note="A baseline has no world model.")
+    picture = io.BytesIO()
+    try:
+        seen = world_model_picture.inspect_to(run.folder, "latest", picture)
+    except RmcError as error:
+        return Medium(run.name, note=f"No world-model rollouts: {_why(error)}.")
+    ahead = ", ".join(f"{share:.0%} at {horizon}" for horizon, share in seen.open_loop.items())
+    note = f"unexplained of the observation's change, by steps ahead: {ahead} (100% is a guess of no change)"
+    return Medium(run.name, data_uri(picture.getvalue(), "image/png"), note)
+
+
+def _why(error: RmcError) -> str:
+    return error.fix if isinstance(error, ConfigError) else str(error)

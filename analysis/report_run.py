@@ -1,0 +1,115 @@
+"""A run as a report shows it: what it is, how far it is, its evaluations and records."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rmc.analysis import history
+from rmc.analysis.doctor import examine
+from rmc.analysis.history import About, History
+from rmc.analysis.vitals import Record
+from rmc.common.bus.metrics_record import is_finite
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import flat
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.presets import preset_config
+
+ENDED_BY_SIGNAL = 130
+Series = tuple[list[float], list[float]]
+
+
+@dataclass(frozen=True)
+class ReportRun:
+    """One run, read once."""
+
+    folder: RunFolder
+    about: About
+    history: History | None  # None before the first evaluation
+    records: list[Record]
+    options: dict[str, Any]
+
+    @staticmethod
+    def read(path: Path) -> "ReportRun":
+        """From its folder. Raises ConfigError where it is none."""
+        folder = RunFolder(path)
+        about = history.describe(path)
+        records = [record for record in folder.records() if is_finite(record.get("time"))]
+        try:
+            past = history.of_run(folder)
+        except ConfigError:
+            folder.result()  # damaged, it is an error; a missing evaluation is none
+            past = None
+        return ReportRun(folder, about, past, records, _flat(folder.settings()))
+
+    @property
+    def name(self) -> str:
+        """The folder's."""
+        return self.folder.path.name
+
+    @property
+    def state(self) -> str:
+        """Whether it trains, has finished or was stopped."""
+        if self.folder.trainer() is not None:
+            return "training"
+        if self.folder.result() is not None:
+            return "finished"
+        ended = self.folder.ended()
+        return "stopped" if ended in (None, ENDED_BY_SIGNAL) else f"ended with status {ended}"
+
+    @property
+    def env_steps(self) -> int:
+        """So far."""
+        return int(max((value for _, value in self._metric("learner", "env_steps")), default=0.0))
+
+    @property
+    def findings(self) -> list[str]:
+        """What ``rmc doctor`` says; nothing of a baseline, or where there is too little to judge."""
+        if self.folder.is_baseline():
+            return []
+        return [str(finding) for finding in examine(self.records, self.folder.config())]
+
+    def changed(self) -> dict[str, tuple[Any, Any]]:
+        """Options that are not the preset's, with both values; of a baseline there are none."""
+        if self.folder.is_baseline():
+            return {}
+        config = self.folder.config()
+        was, now = flat(preset_config(config.preset, config.env)), flat(config)
+        return {path: (was[path], now[path]) for path in now if now[path] != was[path]}
+
+    def series(self, kind: str, name: str) -> Series:
+        """A metric over wall time (s), the mean over the roles of a kind as each speaks; empty where nobody does."""
+        found = self._metric(kind, name)
+        return self.wall_seconds([time for time, _ in found]), [value for _, value in found]
+
+    def _metric(self, kind: str, name: str) -> list[tuple[float, float]]:
+        return [
+            (record["time"], float(record[name]))
+            for record in self.records
+            if record["role"].partition("-")[0] == kind and is_finite(record.get(name))
+        ]
+
+    def wall_seconds(self, times: list[float]) -> list[float]:
+        """Seconds trained at these times, over all starts of the run."""
+        told = [
+            (record["time"], record["wall_s"])
+            for record in self.records
+            if record["role"] == "launcher" and is_finite(record.get("wall_s"))
+        ]
+        if not told:
+            return [0.0] * len(times)
+        began, wall = told[0]
+        found = np.interp(times, [at for at, _ in told], [seconds for _, seconds in told])
+        return [
+            max(0.0, wall - (began - at)) if at < began else float(one) for at, one in zip(times, found, strict=True)
+        ]
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """``config.json`` by dotted path."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        nested = isinstance(value, dict) and name != "env_kwargs"
+        found |= _flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+    return found

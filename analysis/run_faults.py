@@ -1,0 +1,110 @@
+"""What is wrong with a run beside its speed: pure functions of its records, one a fault."""
+
+from itertools import pairwise
+
+from rmc.analysis.finding import Finding, typed_number
+from rmc.analysis.vitals import Vitals
+from rmc.deploy.run.config import RunConfig
+
+STALLED_SECONDS = 60.0  # without a step and an update
+SILENT_SECONDS = 30.0  # without a word; roles speak every second
+PLAYED = 0.75  # of the checkpoints: fewer evaluations leave holes in the curve
+STALE_UPDATES = 1_000  # of lag; docs/metrics.md calls tens to hundreds healthy
+HALF_FULL, WORTH_WINDOWS = 0.5, 10_000  # of a ring, when a smaller one is worth a word
+WARM_UP_SECONDS = 300.0  # that are left of it
+
+
+def stalled(vitals: Vitals, _: RunConfig) -> Finding | None:
+    """Deadlock: every role speaks, none gets on. A run that has finished is none."""
+    if vitals.last("learner", "finished"):
+        return None
+    still = _still_seconds(vitals)
+    if still < STALLED_SECONDS:
+        return None
+    waits = [f"{role} for {reason}" for role in vitals.roles if (reason := vitals.waiting_for(role))]
+    measured = f"no step and no update for {still:.0f} s ({', '.join(waits) or 'nobody says what it waits for'})"
+    return Finding("deadlock", measured, "rmc stop saves the run and rmc resume goes on with it; logs/ may say why")
+
+
+def _still_seconds(vitals: Vitals) -> float:
+    """Since when no counter has moved."""
+    moved = []
+    for role, name in [("learner", "updates"), *((role, "env_steps") for role in vitals.of("replay"))]:
+        found = vitals.series(role, name)
+        changes = [now[0] for before, now in pairwise(found) if now[1] != before[1]]
+        moved += changes[-1:] or [time for time, _ in found[:1]]
+    return vitals.end - max(moved, default=vitals.end)
+
+
+def silent(vitals: Vitals, _: RunConfig) -> Finding | None:
+    """Roles that have stopped speaking while others go on."""
+    ended = {role: vitals.end - vitals.series(role, "time")[-1][0] for role in vitals.roles if role != "launcher"}
+    found = [f"{role} for {seconds:.0f} s" for role, seconds in ended.items() if seconds > SILENT_SECONDS]
+    if not found or vitals.last("learner", "finished"):
+        return None
+    log = f"logs/{found[0].split()[0]}.log"
+    return Finding("silent", f"{', '.join(found)} said nothing", f"it hangs, or its machine is away; see {log}")
+
+
+def long_warm_up(vitals: Vitals, config: RunConfig) -> Finding | None:
+    """No update yet, and none for long."""
+    steps = sum(vitals.last(role, "env_steps") for role in vitals.of("replay"))
+    rates = [vitals.last(role, "env_steps_per_s") for role in vitals.of("replay")]
+    missing = config.replay.warmup_steps - steps
+    if vitals.last("learner", "updates") > 0 or missing <= 0 or sum(rates) <= 0.0:
+        return None
+    left = missing / sum(rates)
+    if left < WARM_UP_SECONDS:
+        return None
+    measured = (
+        f"{steps:,.0f} of {config.replay.warmup_steps:,} steps at {sum(rates):,.0f} a second, {left:,.0f} s to go"
+    )
+    return Finding(
+        "long warm-up", measured, f"--warmup-steps {config.replay.warmup_steps // 4}, or more --actors, would help"
+    )
+
+
+def evaluator_starved(vitals: Vitals, config: RunConfig) -> Finding | None:
+    """Checkpoints come faster than the evaluator plays them; those in between are passed over."""
+    if not config.evaluator.episodes:
+        return None
+    made = {value for _, value in vitals.series("learner", "checkpoint_update") if value > 0}
+    played = {value for _, value in vitals.series("evaluator", "eval_update")}
+    missed = len(made - played)
+    if len(made) - 1 <= 0 or len(made & played) >= PLAYED * (len(made) - 1):  # the newest may be on its way
+        return None
+    every = typed_number(config.learner.checkpoint_steps * len(made) / max(1, len(made) - missed))
+    fewer = max(1, config.evaluator.episodes * (len(made) - missed) // len(made))
+    advice = f"--checkpoint-steps {every} gives it the time"
+    if fewer < config.evaluator.episodes:
+        advice += f", --episodes {fewer} or a smaller --evaluation-seconds makes it faster"
+    return Finding("evaluator starved", f"{missed} of {len(made)} checkpoints were not evaluated", advice)
+
+
+def stale_weights(vitals: Vitals, config: RunConfig) -> Finding | None:
+    """Actors act with a policy that the learner has long left behind."""
+    lag = vitals.mean("replay", "policy_lag_mean")
+    if lag is None or lag < STALE_UPDATES:
+        return None
+    trained = config.learner.batch_size * config.window.trained_steps
+    refreshing = config.actor.refresh_steps * config.actors * config.replay.replay_ratio / trained / 2
+    name, now = "--refresh-steps", config.actor.refresh_steps
+    if config.learner.publish_updates > refreshing:
+        name, now = "--publish-updates", config.learner.publish_updates
+    smaller = max(1, int(now * STALE_UPDATES / lag / 2))
+    measured = f"windows came from a policy {lag:,.0f} updates old on average"
+    return Finding("stale weights", measured, f"{name} {smaller} in place of {now} brings newer ones")
+
+
+def oversized_ring(vitals: Vitals, config: RunConfig) -> Finding | None:
+    """A ring that the whole run cannot fill."""
+    steps = sum(vitals.last(role, "env_steps") for role in vitals.of("replay"))
+    fills = vitals.values("replay", "ring_fill")
+    if not steps or not fills or max(fills) >= HALF_FULL:
+        return None
+    capacity, end = config.replay.capacity, max(fills) * config.total_steps / steps
+    if end >= HALF_FULL or capacity * (1.0 - end) < WORTH_WINDOWS:
+        return None
+    needed = typed_number(1.1 * end * capacity)
+    measured = f"of {capacity:,} windows {end:.0%} will be used at the end of the run"
+    return Finding("ring never fills", measured, f"--capacity {needed} holds the whole run")

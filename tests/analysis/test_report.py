@@ -1,0 +1,245 @@
+"""rmc report: one page that a real browser shows without a network, of every kind of run."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rmc.analysis import report
+from rmc.analysis.history import Evaluation, History
+from rmc.analysis.report_run import ReportRun
+from rmc.cli.main import run
+from rmc.deploy.run.folder import RunFolder
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+BROWSER_SECONDS = 60
+PROBE = """<script>
+const say = (name, value) => document.documentElement.setAttribute("data-" + name, value);
+const videos = [...document.querySelectorAll("video")];
+addEventListener("load", () => {
+  say("broken", [...document.images].filter(image => !image.naturalWidth).length);
+  say("overflow", document.documentElement.scrollWidth - document.documentElement.clientWidth);
+  say("videos", videos.filter(video => video.readyState >= 1 && video.duration > 0).length);
+});
+</script>"""
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short real run of processes, seed 0."""
+    path = tmp_path_factory.mktemp("runs") / "seed-0"
+    words = ["train", "InvertedPendulum-v5", "--preset", "debug", "--replay-ratio", "64", "--run-dir", str(path)]
+    done = subprocess.run(
+        [sys.executable, "-m", "rmc.cli.main", *words], capture_output=True, text=True, timeout=170, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return path
+
+
+@pytest.fixture
+def other(trained: Path, tmp_path: Path) -> Path:
+    """The same as of another seed and length."""
+    path = tmp_path / "seed-1"
+    shutil.copytree(trained, path)
+    config = json.loads((path / "config.json").read_text())
+    config["seed"], config["total_steps"] = 1, 1600
+    (path / "config.json").write_text(json.dumps(config))
+    return path
+
+
+class Links(HTMLParser):
+    """Everything of a page that a browser would fetch."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.feed(text)
+        self.found += re.findall(r"url\(([^)]*)\)|@import", text)
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.found += [value or "" for name, value in attributes if name in ("src", "href", "srcset", "data", "poster")]
+
+
+def written(out: Path, *words: str) -> str:
+    assert run(["report", *words, "--out", str(out)]) == 0
+    return out.read_text()
+
+
+def opened(page: Path, width: int, tmp_path: Path) -> dict[str, int]:
+    """What a browser without a network says of the page: broken images, pixels too wide, videos that play."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here: apt-get install chromium")
+    probed = tmp_path / f"probed-{width}.html"
+    probed.write_text(page.read_text().replace("</body>", f"{PROBE}</body>"))
+    command = [
+        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--enable-logging=stderr",
+        "--proxy-server=127.0.0.1:9", f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},900",
+        "--virtual-time-budget=5000", "--dump-dom", probed.as_uri(),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=BROWSER_SECONDS, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "CONSOLE" not in done.stderr, done.stderr
+    head = done.stdout[: done.stdout.index("<head>")]
+    return {name: int(value) for name, value in re.findall(r'data-(\w+)="(-?\d+)"', head)}
+
+
+def test_a_browser_shows_it_without_a_network(trained: Path, other: Path, tmp_path: Path) -> None:
+    page = tmp_path / "report.html"
+    text = written(page, str(trained), str(other))
+    links = Links(text).found
+    assert all(link.startswith("data:") for link in links)
+    assert sum(link.startswith("data:image/svg+xml") for link in links) >= 2 + 2 * 4  # curves; each run's figures
+    assert "Report of 2 runs" in text
+    for heading in ("Returns", "The newest policy", "World-model rollouts", "How each run went", "Config differences"):
+        assert f"<h2>{heading}</h2>" in text
+    assert re.search(r"<code>total_steps</code></td><td>4 000</td><td>1 600</td>", text)
+    assert '<p class="finding">learner-bound: actors waited' in text
+    films = text.count("<video")
+    assert films == 1 or "No video: nothing here can render" in text
+    for width in (1280, 500):
+        assert opened(page, width, tmp_path) == {"broken": 0, "overflow": 0, "videos": films}
+
+
+def test_the_table_is_of_all_runs_of_an_agent(trained: Path, other: Path) -> None:
+    evaluations = [[Evaluation(100, 10, 1.0, 5.0, 0.0), Evaluation(200, 20, 2.0, mean, 0.0)] for mean in (10.0, 20.0)]
+    past = [History("RMC", "E", seed, 200, 20, 1, 2.0, 0.0, found, True) for seed, found in enumerate(evaluations)]
+    row = report.final_row("RMC", past)
+    assert dict(zip(report.COLUMNS, row, strict=True)) == {
+        "agent": "RMC", "runs": "2", "return": "15.0 ± 5.0", "each run": "10, 20", "worst of last 5": "5.0",
+        "steps": "200", "updates": "20", "wall s": "2",
+    }  # fmt: skip
+    runs = [ReportRun.read(path) for path in (trained, other)]
+    assert {run.about.agent for run in runs} == {"RMC debug --replay-ratio 64.0"}
+    assert len(report.newest(runs)) == 1  # of an agent one policy is played
+
+
+def test_wall_time_goes_over_all_starts(trained: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    path.mkdir()
+    shutil.copy(trained / "config.json", path)
+    said = [(100.0, 1.0), (110.0, 11.0), (500.0, 11.0), (510.0, 21.0)]
+    lines = [{"role": "launcher", "time": time, "wall_s": wall} for time, wall in said]
+    lines += [{"role": "learner", "time": time, "updates_per_s": 2.0} for time in (99.5, 105.0, 300.0, 505.0)]
+    (path / "metrics.jsonl").write_text("".join(f"{json.dumps(one)}\n" for one in lines))
+    places, values = ReportRun.read(path).series("learner", "updates_per_s")
+    np.testing.assert_allclose(places, [0.5, 6.0, 11.0, 16.0])
+    assert values == [2.0] * 4
+
+
+def test_a_run_that_trains_and_was_never_evaluated(trained: Path, tmp_path: Path) -> None:
+    path = tmp_path / "begun"
+    shutil.copytree(trained, path, ignore=shutil.ignore_patterns("result.json", "checkpoints", "replay"))
+    lines = (path / "metrics.jsonl").read_text().splitlines()
+    kept = [line for line in lines if json.loads(line)["role"] != "evaluator"]
+    (path / "metrics.jsonl").write_text("\n".join(kept[: len(kept) // 2]) + '\n{"role": "lear')
+    (path / "checkpoints").mkdir()
+    folder = RunFolder(path)
+    folder.lock()
+    try:
+        text = written(tmp_path / "report.html", str(path))
+    finally:
+        folder.unlock()
+    assert "<td>training</td>" in text
+    assert "Without an evaluation yet: begun." in text
+    assert "No video: " in text
+    assert "No world-model rollouts: " in text
+    assert 'alt="shares of time that the roles of begun worked and waited"' in text
+    assert "<td>stopped</td>" in written(tmp_path / "report.html", str(path), "--no-video")
+
+
+def test_of_a_run_without_a_record_there_is_still_a_page(trained: Path, tmp_path: Path) -> None:
+    path = tmp_path / "<b>new & empty"
+    path.mkdir()
+    shutil.copy(trained / "config.json", path)
+    text = written(tmp_path / "report.html", str(path), "--no-video")
+    assert "Nothing is recorded yet." in text
+    assert "<b>new" not in text
+    assert "The newest policy" not in text
+
+
+def test_where_nothing_renders_the_video_is_a_note(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    text = written(tmp_path / "report.html", str(trained))
+    assert "No video: nothing here can render" in text
+    assert "<video" not in text
+    assert "data:image/png" in text  # the world model's picture needs no renderer
+
+
+def test_a_baseline_stands_beside_a_run(trained: Path, tmp_path: Path) -> None:
+    path = tmp_path / "sac"
+    words = ["baseline", "sac", "InvertedPendulum-v5", "--total-steps", "200", "--checkpoint-steps", "100"]
+    done = subprocess.run(
+        [sys.executable, "-m", "rmc.cli.main", *words, "--episodes", "1", "--run-dir", str(path)],
+        capture_output=True, text=True, timeout=170, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    text = written(tmp_path / "report.html", str(trained), str(path))
+    assert "SAC 400-300</span>" in text
+    assert "Of a baseline there is no video." in text
+    assert "A baseline has no world model." in text
+    assert "A baseline records neither waits nor rates." in text
+    alone = written(tmp_path / "report.html", str(path))
+    assert "<td>finished</td>" in alone
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "RUNS='': give folders of runs"),
+        (["nowhere"], "no config.json there; give the folder of a run"),
+        (["nowhere", "elsewhere"], "none of them is a run's folder"),
+        (["nowhere", "--out", "no/report.html"], "--out='no/report.html': its folder is not there"),
+        (["nowhere", "--out", "report.pdf"], "give a name that ends in .html or .htm"),
+    ],
+)
+def test_what_it_cannot_do_is_one_line(
+    words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["report", *words]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert said in err.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_no_run_is_left_out(trained: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    text = written(tmp_path / "report.html", str(trained), str(tmp_path / "nowhere"), "--no-video")
+    assert "Report of seed-0" in text
+    assert "(left out)" in caplog.text
+
+
+@pytest.mark.parametrize("package", ["matplotlib", "jinja2"])
+def test_what_is_not_installed_is_named(
+    package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = report.importlib.util.find_spec
+    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None if name == package else there(name))
+    assert run(["report", "nowhere", "--out", str(tmp_path / "report.html")]) == 2
+    err = capsys.readouterr().err
+    assert f"{package} is missing; pip install" in err
+    assert "[report]" in err
+
+
+def test_differences_are_those_that_matter() -> None:
+    class Run:
+        def __init__(self, name: str, **options: Any) -> None:
+            self.name, self.options = name, options
+
+    found = report.differences(
+        [Run("a", seed=0, gamma=0.9, heads=[4, 2]), Run("b", seed=1, gamma=0.9), Run("c", seed=1)]
+    )  # type: ignore[list-item]
+    assert found["columns"] == ["a", "b", "c"]
+    assert found["rows"] == [["seed", "0", "1", "1"]]
+    alike = report.differences([Run("a", seed=0), Run("b", seed=0)])  # type: ignore[list-item]
+    assert (alike["rows"], alike["note"]) == ([], "All options are alike.")
