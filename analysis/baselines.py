@@ -41,10 +41,10 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.opening import make, new_folder
 from rmc.deploy.run.starts import note_start, resume_command
+from rmc.deploy.run.state import STOPPED
 
 CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
 MAY_CHANGE = {"total_steps", "threads", "checkpoint_steps", "episodes", "env.env_timeout"}
-STOPPED = 130  # exit status after Ctrl-C, as shells have it
 SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
 RECORD_SECONDS = 5.0
 MODEL, BUFFER, SCALES, PROGRESS = "model.zip", "replay_buffer.pkl", "scales.pkl", "progress.json"
@@ -55,12 +55,14 @@ def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: 
     validate(config)
     sizes = _sizes(config)
     folder = _open_folder(config, run_dir, sizes)
+    status = 1
     try:
         _set_torch(config)
         console.print(f"run folder {folder.path}", soft_wrap=True)
-        return _conduct(config, folder, console, stop)
+        status = _conduct(config, folder, console, stop)
     finally:
-        folder.unlock()
+        folder.unlock(status)
+    return status
 
 
 def _set_torch(config: BaselineConfig) -> None:

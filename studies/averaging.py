@@ -16,7 +16,8 @@ from rmc.analysis.policy_file import read_policy
 from rmc.analysis.world_model_picture import load_agent
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.run.folder import RunFolder
-from studies.study import Job, Play, Scale, Study
+from rmc.sweep.job import Job
+from studies.study import Play, Scale, Study
 
 EPISODES = 10
 STUDY = Study(
@@ -40,7 +41,7 @@ def play(job: Job, episodes: int = EPISODES) -> dict[str, Any]:
         averaged.append(found["eval_return_mean"])
         blob = safetensors.torch.save(load_agent(folder, config, str(number)).policy_weights())
         newest.append(evaluate_blob(config.policy_header(), blob, episodes)["eval_return_mean"])
-    about = {"agent": job.agent, "env": job.env, "seed": job.seed}
+    about = {**job.values, "seed": job.seed}
     return about | {"env_steps": steps, "averaged": averaged, "newest": newest}
 
 

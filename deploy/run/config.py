@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.common.agent_config import AgentConfig
-from rmc.common.env.config import EnvConfig
+from rmc.common.env.config import EnvConfig, write_kwargs
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.make import env_layout
 from rmc.common.env.wrappers import Env
@@ -225,3 +225,12 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
 def option(path: str) -> str:
     """The command line's name of a config path: ``replay.replay_ratio`` is ``--replay-ratio``."""
     return "--" + path.rpartition(".")[2].replace("_", "-")
+
+
+def option_words(name: str, value: Any) -> list[str]:
+    """An option as it is given on the command line."""
+    if isinstance(value, bool):
+        return [option(name) if value else option(f"no_{name}")]
+    if isinstance(value, dict):
+        return [option(name), *write_kwargs(value)]
+    return [option(name), *map(str, value)] if isinstance(value, list) else [f"{option(name)}={value}"]

@@ -16,6 +16,7 @@ from rmc.analysis.evaluation import Progress, evaluate_policy
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.analysis.policy_file import read_policy
+from rmc.analysis.run_paths import expanded
 from rmc.cli import run_options
 from rmc.cli.ending import cut_note
 from rmc.cli.signals import signals_caught
@@ -143,12 +144,13 @@ def plot(command: run_options.Plot) -> int:
 
 def _histories(paths: Sequence[Path]) -> list[history.History]:
     """Of all that can be read; the others are told. Raises ConfigError where that is none."""
+    runs = list(dict.fromkeys(run for path in paths for run in expanded(path)))
     found = []
-    for path in paths:
+    for run in runs:
         try:
-            found += history.read(path)
+            found += history.read(run)
         except ConfigError as error:
-            if len(paths) == 1:
+            if len(runs) == 1:
                 raise
             log.warning("%s (left out)", error)
     if not found:

@@ -12,7 +12,7 @@ from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
 from rmc.deploy.monitor import output
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
-PLAYS = {"train", "resume", "baseline", "check-env", "evaluate", "inspect"}  # environments, in this process
+PLAYS = {"train", "resume", "sweep", "baseline", "check-env", "evaluate", "inspect"}  # environments, in this process
 SHARED_MEMORY = "/dev/shm"
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
@@ -112,20 +112,11 @@ def _parse_and_run(words: list[str]) -> int:
 
 def _complaint(words: list[str]) -> str:
     """What is wrong with words that cannot be parsed; it quotes them."""
-    from rmc.cli import parser
+    from rmc.cli import complaint, parser
 
     with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.suppress(SystemExit):
         parser.parse(words)
-    return _as_line(said.getvalue())
-
-
-def _as_line(boxed: str) -> str:
-    """tyro's boxed message as one line, without its frame, headings and help text."""
-    rows = [row.strip("│╭╮╰╯─ \t") for row in boxed.splitlines()]
-    body = [row for row in rows if row]
-    ends = [i for i, row in enumerate(body) if row.startswith(("For full helptext", "Argument helptext"))]
-    heading = 1 if len(body) > 1 else 0
-    return " ".join(body[heading : ends[0] if ends else None]) + " (see rmc --help)"
+    return f"{complaint.as_line(said.getvalue())} (see rmc --help)"
 
 
 def _complain(message: str, status: int) -> int:
