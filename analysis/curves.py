@@ -1,9 +1,11 @@
 """``rmc plot``: returns of many runs as curves and as a table, by agent and environment.
 
 From five seeds on, the interquartile mean and its bootstrap interval; with fewer, every seed is a line of its own.
+Runs of other length, unfinished ones, and further runs of the same seed are an agent of their own.
 """
 
 import importlib.util
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -28,21 +30,41 @@ from rmc.common.extra import how_to_install
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 Axis = Literal["env_steps", "updates", "wall_s"]
 LABELS = {"env_steps": "environment steps", "updates": "updates", "wall_s": "wall time (s)"}
+LEGEND_WIDTH, LEGEND_LINE = 55, 0.22  # characters under a panel, inches
+SAME_LENGTH = 1.05  # runs overshoot their end a little
 POINTS, CURVE_RESAMPLES, COLUMNS, LAST, WIDTH = 100, 300, 3, 5, 120
 Groups = dict[str, dict[str, list[History]]]  # environment -> agent -> its runs
 
 
 def grouped(histories: Sequence[History]) -> Groups:
     """By environment, then agent, each in the order in which it came; seeds in order. A run given twice counts once."""
-    groups: Groups = {}
+    alike: Groups = {}
     for one in histories:
-        runs = groups.setdefault(one.env, {}).setdefault(one.agent, [])
+        runs = alike.setdefault(one.env, {}).setdefault(one.agent, [])
         if one not in runs:
             runs.append(one)
-    for agents in groups.values():
-        for runs in agents.values():
-            runs.sort(key=lambda run: run.seed)
-    return groups
+    return {
+        env: {name: runs for agent, all_runs in agents.items() for name, runs in _told_apart(agent, all_runs).items()}
+        for env, agents in alike.items()
+    }
+
+
+def _told_apart(agent: str, runs: list[History]) -> dict[str, list[History]]:
+    """What may be averaged, by its name: finished or not, as long as each other, each seed once."""
+    alike: dict[tuple[bool, int], list[History]] = {}
+    for run in sorted(runs, key=lambda run: (not run.finished, run.env_steps)):
+        key = next((key for key in alike if key[0] == run.finished and run.env_steps <= SAME_LENGTH * key[1]), None)
+        alike.setdefault(key or (run.finished, run.env_steps), []).append(run)
+    found: dict[str, list[History]] = {}
+    for (finished, steps), same in alike.items():
+        state = "" if finished else ", unfinished"
+        name = agent if len(alike) == 1 else f"{agent}{state}, {steps:,} steps"
+        seeds: list[int] = []
+        for run in sorted(same, key=lambda run: run.seed):
+            seeds.append(run.seed)
+            again = f", run {seeds.count(run.seed)} of its seed" if seeds.count(run.seed) > 1 else ""
+            found.setdefault(name + again, []).append(run)
+    return found
 
 
 def curve(run: History, by: Axis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -63,9 +85,11 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
 
     columns = min(COLUMNS, len(groups))
     rows = -(-len(groups) // columns)
-    figure = Figure(figsize=(1.0 + 5.0 * columns, 0.6 + 3.6 * rows), layout="constrained")
-    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
     agents = list(dict.fromkeys(agent for found in groups.values() for agent in found))
+    names = [textwrap.fill(_named(agent, groups), LEGEND_WIDTH) for agent in agents]
+    legend = LEGEND_LINE * sum(name.count("\n") + 1 for name in names) / columns
+    figure = Figure(figsize=(1.0 + 5.0 * columns, 0.6 + 3.3 * rows + legend), layout="constrained")
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
     handles: dict[str, Any] = {}
     for panel, (env, found) in zip(panels, groups.items(), strict=False):
         for agent, runs in found.items():
@@ -77,15 +101,13 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
         panel.grid(alpha=0.3)
     for panel in panels[len(groups) :]:
         panel.set_axis_off()
-    figure.legend(
-        handles.values(), [_named(agent, groups) for agent in handles], loc="outside lower center", ncols=columns
-    )
+    figure.legend(handles.values(), names, loc="outside lower center", ncols=columns)
     figure.savefig(out, dpi=110)
 
 
 def _draw_agent(panel: Any, runs: list[History], by: Axis, color: str) -> Any:
     curves = [curve(run, by) for run in runs]
-    if _seeds(runs) < ENOUGH_SEEDS:
+    if len(runs) < ENOUGH_SEEDS:
         lines = [panel.plot(*one, color=color, linewidth=1.2, alpha=0.8)[0] for one in curves]
         return lines[0]
     places = np.linspace(max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves), POINTS)
@@ -96,13 +118,8 @@ def _draw_agent(panel: Any, runs: list[History], by: Axis, color: str) -> Any:
     return line
 
 
-def _seeds(runs: list[History]) -> int:
-    """Of one seed there may be several runs, which say no more of others than one."""
-    return len({run.seed for run in runs})
-
-
 def _named(agent: str, groups: Groups) -> str:
-    counts = [_seeds(found[agent]) for found in groups.values() if agent in found]
+    counts = [len(found[agent]) for found in groups.values() if agent in found]
     fewest, most = min(counts), max(counts)
     how = "interquartile mean, 95 %" if fewest >= ENOUGH_SEEDS else "each a line"
     seeds = f"{fewest}" if fewest == most else f"{fewest} to {most}"
@@ -126,14 +143,14 @@ def _table(env: str, found: dict[str, list[History]], reference: str | None) -> 
     made = Table(title=env, title_justify="left", box=None, pad_edge=False)
     columns = ["agent", "seeds", "return", f"worst of last {LAST}", "steps", "updates", "wall s"]
     for name in [*columns, *(["scaled", "P(better)"] if reference else [])]:
-        made.add_column(name, justify="left" if name == "agent" else "right", no_wrap=True)
+        made.add_column(name, justify="left" if name == "agent" else "right", no_wrap=name != "agent")
     for agent, runs in found.items():
         made.add_row(agent, *_cells(runs), *(_beside(runs, found.get(reference, [])) if reference else []))
     return made
 
 
 def _cells(runs: list[History]) -> list[str]:
-    seeds, unfinished = f"{_seeds(runs)}", sum(not run.finished for run in runs)
+    seeds, unfinished = str(len(runs)), sum(not run.finished for run in runs)
     seeds += f", {unfinished} unfinished" if unfinished else ""
     ends = [run.env_steps for run in runs]
     steps = f"{min(ends):,}" + (f" to {max(ends):,}" if min(ends) < max(ends) else "")
@@ -144,7 +161,7 @@ def _cells(runs: list[History]) -> list[str]:
 
 def _returns(runs: list[History]) -> str:
     scores = last_returns(runs)
-    if _seeds(runs) >= ENOUGH_SEEDS:
+    if len(runs) >= ENOUGH_SEEDS:
         low, high = interval(interquartile_mean, scores)
         return f"{interquartile_mean(scores):,.0f} [{low:,.0f}, {high:,.0f}]"
     return f"{scores.mean():,.0f} ({', '.join(f'{score:,.0f}' for score in scores[:, 0])})"

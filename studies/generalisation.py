@@ -12,13 +12,15 @@ import numpy as np
 
 from rmc.analysis.baselines import evaluate
 from rmc.analysis.curves import PICTURES
-from rmc.analysis.evaluation import evaluate_checkpoint
+from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.history import objects
 from rmc.analysis.out_file import check_writable
+from rmc.analysis.policy_file import read_policy
 from rmc.analysis.statistics import ENOUGH_SEEDS, interquartile_mean, interval
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
-from studies.study import Job, Play, Scale, Study
+from rmc.sweep.job import Job
+from studies.study import Play, Scale, Study
 
 ENVS = ("HalfCheetah-v5", "Walker2d-v5", "Ant-v5")
 PROBABILITIES = tuple(round(0.1 * tenths, 1) for tenths in range(11))
@@ -46,9 +48,9 @@ def play(job: Job, episodes: int = EPISODES) -> dict[str, object]:
         if folder.is_baseline():
             played = evaluate(folder, episodes, probability)
         else:
-            played = evaluate_checkpoint(folder, folder.config(), "latest", episodes, probability)
+            played = evaluate_policy(read_policy(folder.path), episodes, probability)
         returns.append(played["eval_return_mean"])
-    about = {"agent": job.agent, "env": job.env, "seed": job.seed, "env_steps": played["env_steps"]}
+    about = {**job.values, "seed": job.seed, "env_steps": played["env_steps"]}
     return about | {"flicker": PROBABILITIES, "returns": returns}
 
 

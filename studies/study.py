@@ -14,21 +14,22 @@ play, with ``--play``, what the same command has trained.
 import argparse
 import dataclasses
 import json
-import os
 import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import product
 from pathlib import Path
-from queue import SimpleQueue
-from threading import Lock
 from typing import Any
 
 from rmc.analysis import history
+from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
+from rmc.sweep.grid import Grid
+from rmc.sweep.job import Job
+from rmc.sweep.local_runs import LocalRuns
+from rmc.sweep.pool import Ending, conduct
 
 RESULTS, RUNS = Path(__file__).parent / "results", Path("runs") / "studies"
 TINY = "--checkpoint-steps 300 --episodes 1"  # at the scale smoke
@@ -45,17 +46,6 @@ class Scale:
 
 
 SMOKE, SMALL, FULL = Scale(1_200, (1,)), Scale(100_000, (1, 2)), Scale(1_000_000, (1, 2, 3, 4, 5))
-
-
-@dataclasses.dataclass(frozen=True)
-class Job:
-    """One run: ``rmc`` with these words."""
-
-    agent: str
-    env: str
-    seed: int
-    words: list[str]
-    folder: Path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,8 +83,9 @@ class Study:
         tiny = {"train": TINY_OURS, "baseline": TINY}[words[0]].split() if scale == "smoke" else []
         plain = "".join(letter if letter.isalnum() else "-" for letter in f"{env} {agent} {seed}")
         folder = RUNS / f"{self.name}-{scale}" / plain
-        size = ["--total-steps", str(self.scales[scale].steps), "--seed", str(seed), "--run-dir", str(folder)]
-        return Job(agent, env, seed, [*words[:2], *tiny, *words[2:], *size], folder)  # what the study says of it wins
+        size = ["--total-steps", str(self.scales[scale].steps), "--seed", str(seed)]
+        words = [*words[:2], *tiny, *words[2:], *size]  # what the study says of it wins
+        return Job(folder, tuple(words), seed, {"agent": agent, "env": env})
 
     def of_steps(self, steps: int) -> str:
         """The name of a scale that is small, but of so many environment steps."""
@@ -138,7 +129,7 @@ class Study:
         lines = history.objects(target, "agent", "env", "seed").values() if target.exists() else []
         done = {(line["agent"], line["env"], line["seed"]) for line in lines}
         for job in jobs:
-            if (job.agent, job.env, job.seed) not in done and RunFolder(job.folder).result():
+            if _key(job) not in done and RunFolder(job.folder).result():
                 line = json.dumps(after.play(job))
                 with target.open("a") as file:
                     file.write(line + "\n")
@@ -148,57 +139,40 @@ class Study:
 
     def run(self, scale: str, jobs: Sequence[Job], at_once: int = 1) -> None:
         """Those that have no line yet, so many at once. Raises ConfigError for the first that fails, after the rest."""
-        target, lock = self.results(scale), Lock()
+        target = self.results(scale)
         target.parent.mkdir(parents=True, exist_ok=True)
         found = history.read(target) if target.exists() else []
         done = {(one.agent, one.env.partition(",")[0], one.seed) for one in found}
-        parts: SimpleQueue[set[int]] = SimpleQueue()
-        for part in _parts(at_once):
-            parts.put(part)
+        failures: list[ConfigError] = []
 
-        def conduct(job: Job) -> None:
-            cores = parts.get()
-            try:
-                found = _trained(job, cores)
-            finally:
-                parts.put(cores)
-            with lock, target.open("a") as file:
-                file.write(found.to_line() + "\n")
+        def ended(job: Job, ending: Ending) -> None:
+            if ending.state == "finished":
+                with target.open("a") as file:
+                    file.write(_line(job) + "\n")
+            else:
+                said = f"{ending.state}: {ending.reason}"
+                failures.append(ConfigError(job.values["agent"], shlex.join(job.words), said))
 
-        missing = [job for job in jobs if (job.agent, job.env, job.seed) not in done]
-        with ThreadPoolExecutor(at_once) as pool:
-            runs = [pool.submit(conduct, job) for job in missing]
-            try:
-                wait(runs)
-            except KeyboardInterrupt:  # those at work have heard it, too; no other one starts
-                pool.shutdown(cancel_futures=True)
-                raise
-            for run in runs:
-                run.result()
+        with signals_caught() as stop:
+            conduct(Grid(job for job in jobs if _key(job) not in done), LocalRuns(at_once), stop, _begun, ended)
+        if stop.requested:
+            raise KeyboardInterrupt
+        if failures:
+            raise failures[0]
 
 
-def _parts(count: int) -> list[set[int]]:
-    """The cores in as many parts; more parts than cores share them."""
-    cores = sorted(os.sched_getaffinity(0))
-    return [set(cores[index::count]) or {cores[index % len(cores)]} for index in range(count)]
+def _key(job: Job) -> tuple[str, str, int]:
+    return job.values["agent"], job.values["env"], job.seed
 
 
-def _trained(job: Job, cores: set[int]) -> history.History:
-    """Train it on these cores, and read what came. Raises ConfigError with the end of what it said where it failed."""
+def _begun(job: Job) -> None:
     print(f"{job.folder}: rmc {shlex.join(job.words)}", flush=True)
-    job.folder.parent.mkdir(parents=True, exist_ok=True)
-    log = job.folder.with_suffix(".log")
-    with log.open("a") as said:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "rmc.cli.main", *job.words], stdin=subprocess.DEVNULL, stdout=said, stderr=said
-        )
-        os.sched_setaffinity(process.pid, cores)
-        status = process.wait()
-    if status:
-        last = log.read_text().strip().splitlines()[-1:]
-        raise ConfigError(job.agent, shlex.join(job.words), f"ended with {status}: {' '.join(last)}; see {log}")
+
+
+def _line(job: Job) -> str:
+    """A finished run's, under the name that the study has for it."""
     (found,) = history.read(job.folder)
-    return dataclasses.replace(found, agent=job.agent, commit=commit())
+    return dataclasses.replace(found, agent=job.values["agent"], commit=commit()).to_line()
 
 
 def commit(studies: Path = RESULTS.parent) -> str:

@@ -70,7 +70,8 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
         raise ConfigError(OPTION, init_from, fix) from None
     learnt = io.BytesIO()
     torch.save(update.state_dict(), learnt)
-    policy = safetensors.torch.save({name: value.contiguous() for name, value in update.policy_weights().items()})
+    weights = {name: value.contiguous() for name, value in update.policy_weights().items()}
+    policy = safetensors.torch.save(weights, config.policy_header().metadata())
     made = {STATE: learnt.getvalue(), POLICY: policy, PROGRESS: json.dumps(progress).encode()}
     return InitialCheckpoint(
         made, {"asked": [init_from, parts], "run": str(folder.path), "checkpoint": number, "parts": parts}

@@ -9,6 +9,7 @@ from typing import Any
 
 from rmc.common.env.config import check_kwargs, write_kwargs
 from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import option_words
 
 OPTION, KWARGS = "--config", "--env-kwargs"
 
@@ -29,7 +30,7 @@ def with_file(words: list[str], known: Sequence[str]) -> tuple[list[str], str]:
         raise ConfigError(f"{OPTION} {path}: env_kwargs", kwargs, "write a table, like env_kwargs = { goal = 1.5 }")
     for name, value in options.items():
         _check(path, name, value, known)
-    given = [word for name, value in options.items() for word in _words(name, value)]
+    given = [word for name, value in options.items() for word in option_words(name, value)]
     check_kwargs(kwargs)
     if any(word.partition("=")[0].replace("_", "-") == KWARGS for word in words):
         kwargs = {}
@@ -61,11 +62,3 @@ def _check(path: Path, name: str, value: Any, known: Sequence[str]) -> None:
         raise ConfigError(f"{OPTION} {path}: {name}", value, f"is no option; {fix}")
     if not all(isinstance(one, str | bool | int | float) for one in (value if isinstance(value, list) else [value])):
         raise ConfigError(f"{OPTION} {path}: {name}", value, "give a number, text, true, false or a list of such")
-
-
-def _words(name: str, value: Any) -> list[str]:
-    """An option as it is given on the command line."""
-    flag = "--" + name.replace("_", "-")
-    if isinstance(value, bool):
-        return [flag if value else f"--no-{flag[2:]}"]
-    return [flag, *map(str, value)] if isinstance(value, list) else [f"{flag}={value}"]

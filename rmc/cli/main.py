@@ -12,7 +12,8 @@ from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
 from rmc.deploy.monitor import output
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
-PLAYS = {"train", "resume", "baseline", "check-env", "evaluate", "inspect"}  # environments, in this process
+PLAYS = {"train", "resume", "sweep", "baseline", "check-env", "evaluate", "inspect"}  # environments, in this process
+SHARED_MEMORY = "/dev/shm"
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 
@@ -52,6 +53,7 @@ def run(words: list[str]) -> int:
         # before numpy and torch are imported, which read these once
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")
+    _choose_temporary_folder()
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
     try:
         here = os.getcwd()
@@ -76,6 +78,13 @@ def run(words: list[str]) -> int:
         if error.errno not in NO_ROOM:
             raise
         return _complain(f"{error.filename or 'disk'}: {error.strerror}; make room and try again", FAILED_STATUS)
+
+
+def _choose_temporary_folder() -> None:
+    """Shared memory where no usual place can be written, as in a container: Python would take the working folder."""
+    usual = [*filter(None, map(os.environ.get, ("TMPDIR", "TEMP", "TMP"))), "/tmp", "/var/tmp", "/usr/tmp"]
+    if not any(os.access(place, os.W_OK | os.X_OK) for place in usual) and os.access(SHARED_MEMORY, os.W_OK | os.X_OK):
+        os.environ["TMPDIR"] = SHARED_MEMORY
 
 
 def _say_version() -> int:
@@ -103,20 +112,11 @@ def _parse_and_run(words: list[str]) -> int:
 
 def _complaint(words: list[str]) -> str:
     """What is wrong with words that cannot be parsed; it quotes them."""
-    from rmc.cli import parser
+    from rmc.cli import complaint, parser
 
     with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.suppress(SystemExit):
         parser.parse(words)
-    return _as_line(said.getvalue())
-
-
-def _as_line(boxed: str) -> str:
-    """tyro's boxed message as one line, without its frame, headings and help text."""
-    rows = [row.strip("│╭╮╰╯─ \t") for row in boxed.splitlines()]
-    body = [row for row in rows if row]
-    ends = [i for i, row in enumerate(body) if row.startswith(("For full helptext", "Argument helptext"))]
-    heading = 1 if len(body) > 1 else 0
-    return " ".join(body[heading : ends[0] if ends else None]) + " (see rmc --help)"
+    return f"{complaint.as_line(said.getvalue())} (see rmc --help)"
 
 
 def _complain(message: str, status: int) -> int:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, cast, get_type_hints
 
 import tyro
 
-from rmc.cli import role_options, run_options, train_options
+from rmc.cli import hub_options, role_options, run_options, sweep_options, train_options
 from rmc.cli.config_file import KWARGS, with_file
 from rmc.cli.help_text import ALL_OPTIONS, BASIC, only_basic
 from rmc.cli.numerals import NUMERALS
@@ -44,6 +44,7 @@ class Action:
 
 COMMANDS: dict[str, tuple[type, Action]] = {
     "train": (train_options.Train, Action("commands", "train")),
+    "sweep": (sweep_options.Sweep, Action("sweep_command", "sweep")),
     "resume": (train_options.Resume, Action("commands", "train")),
     "evaluate": (run_options.Evaluate, Action("analysis_commands", "evaluate")),
     "export": (run_options.Export, Action("analysis_commands", "export_policy")),
@@ -51,9 +52,11 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "check-env": (run_options.CheckEnv, Action("analysis_commands", "check_env")),
     "baseline": (run_options.Baseline, Action("analysis_commands", "baseline")),
     "plot": (run_options.Plot, Action("analysis_commands", "plot")),
+    "hub": (hub_options.Hub, Action("hub_commands", "run_hub")),
     "report": (run_options.Report, Action("report_command", "report")),
     "doctor": (run_options.Doctor, Action("commands", "doctor")),
     "stats": (run_options.Stats, Action("commands", "stats")),
+    "list": (run_options.List, Action("commands", "list_runs")),
     "attach": (run_options.Attach, Action("commands", "attach")),
     "stop": (run_options.Stop, Action("commands", "stop")),
     "cluster": (run_options.Cluster, Action("commands", "cluster")),
@@ -120,7 +123,11 @@ def _parsed(words: list[str], defaults: dict[str, Any]) -> Any:
         for name, (kind, _) in COMMANDS.items()
     ]
     kinds: Any = functools.reduce(operator.or_, subcommands)
-    return tyro.cli(kinds, prog="rmc", args=words, config=FLAT, registry=NUMERALS)
+    read = functools.partial(tyro.cli, kinds, prog="rmc", args=words, config=FLAT, registry=NUMERALS)
+    if words[:1] == ["sweep"]:  # what it does not know, rmc train may
+        command, others = read(return_unknown_args=True)
+        return dataclasses.replace(command, train_words=tuple(others))
+    return read()
 
 
 def renamed(words: list[str]) -> list[str]:

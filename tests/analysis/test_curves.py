@@ -124,23 +124,55 @@ def test_a_run_that_cannot_be_read_is_told_and_left_out(tmp_path, capsys):
     assert "--out='/proc/out.png': cannot be written" in said.err
 
 
-def test_a_run_counts_once_and_a_seed_once(tmp_path):
-    """Unfinished ones are said to be so."""
+def test_a_run_counts_once_and_what_differs_is_told_apart(tmp_path):
+    """Length, an end that is missing, and a seed's second run each make a line of their own."""
     runs = [made(seed=seed) for seed in (1, 2, 3, 4)]
-    others = [dataclasses.replace(made(seed=1, last=400.0), finished=False, env_steps=1000)] * 2
     twice = [dataclasses.replace(run, commit="def") for run in runs]
-    groups = curves.grouped([*runs, *twice, *others])
-    assert len(groups["HalfCheetah-v5"]["RMC"]) == 5
-    line = shown(curves.tables(groups, None)).splitlines()[-1]
-    assert "4, 1 unfinished" in line
-    assert "(100, 400, 100, 100, 100)" in line
-    assert "1,000 to 3,000" in line
-    assert curves._named("RMC", groups) == "RMC (4 seeds, each a line)"
-    from matplotlib.figure import Figure
+    again = made(seed=1, last=300.0)
+    late = [dataclasses.replace(made(seed=seed, last=500.0), env_steps=9000 + seed) for seed in (1, 2)]
+    cut = dataclasses.replace(made(seed=1, last=400.0), finished=False, env_steps=1000)
+    groups = curves.grouped([*runs, *twice, *late, again, cut, cut])
+    assert {name: [one.seed for one in found] for name, found in groups["HalfCheetah-v5"].items()} == {
+        "RMC, 3,000 steps": [1, 2, 3, 4],
+        "RMC, 3,000 steps, run 2 of its seed": [1],
+        "RMC, 9,001 steps": [1, 2],
+        "RMC, unfinished, 1,000 steps": [1],
+    }
+    text = shown(curves.tables(groups, None))
+    for cells in ("4  100 (100, 100, 100, 100)", "1                 300 (300)", "9,001 to 9,002", "1, 1 unfinished"):
+        assert cells in text
+    assert curves._named("RMC, 3,000 steps", groups) == "RMC, 3,000 steps (4 seeds, each a line)"
 
-    panel = Figure().subplots()
-    curves._draw_agent(panel, groups["HalfCheetah-v5"]["RMC"], "env_steps", "C0")
-    assert (len(panel.lines), len(panel.collections)) == (5, 0)
+
+def test_runs_that_are_all_alike_keep_their_name():
+    found = curves.grouped([made(seed=seed) for seed in (1, 2)])
+    assert list(found["HalfCheetah-v5"]) == ["RMC"]
+    late = [dataclasses.replace(made(seed=1), finished=False), dataclasses.replace(made(seed=2), finished=False)]
+    assert list(curves.grouped(late)["HalfCheetah-v5"]) == ["RMC"]
+
+
+def test_a_folder_of_runs_at_any_depth_and_a_pattern_can_be_plotted(tmp_path, capsys):
+    config = robust(EnvConfig("Hopper-v5"))
+    for seed, place in enumerate(("one", "deep/er/two", "deep/three")):
+        folder = tmp_path / "runs" / place
+        (folder / "checkpoints" / "1").mkdir(parents=True)
+        (folder / "config.json").write_text(to_json(dataclasses.replace(config, seed=seed)))
+        (folder / "checkpoints" / "1" / "config.json").write_text("{}")  # not looked at
+        record = {"role": "evaluator", "time": 1.0, "eval_update": 5, "eval_return_mean": 7.0, "eval_return_std": 1.0}
+        (folder / "metrics.jsonl").write_text(json.dumps(record) + "\n")
+    (tmp_path / "runs" / "sweep.jsonl").write_text("{}\n")
+    (tmp_path / "empty").mkdir()
+    out = ["--out", str(tmp_path / "out.png")]
+    for words in ([str(tmp_path / "runs")], [str(tmp_path / "runs" / "*")], [str(tmp_path / "runs" / "*")] * 2):
+        assert run(["plot", *words, *out]) == 0
+        assert "7 (7, 7, 7)" in capsys.readouterr().out
+    assert run(["plot", str(tmp_path / "runs" / "d*"), *out]) == 0
+    assert "7 (7, 7)" in capsys.readouterr().out
+    for words, fault in {"empty": "no run in there", "no*": "matches nothing"}.items():
+        assert run(["plot", str(tmp_path / words), *out]) == 2
+        said = capsys.readouterr().err
+        assert fault in said
+        assert said.count("\n") == 1
 
 
 def test_a_run_without_an_evaluation_is_refused(tmp_path):

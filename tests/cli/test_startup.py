@@ -33,8 +33,9 @@ def test_help_imports_no_torch(tmp_path: Path) -> None:
     assert "torch" not in imported
 
 
-def test_a_refused_option_imports_no_torch(tmp_path: Path) -> None:
-    done, imported = rmc(tmp_path, "train", "HalfCheetah-v5", "--batch-size", "0")
+@pytest.mark.parametrize("words", [["train", "--batch-size", "0"], ["sweep", "--grid", "batch_size=1,0"]])
+def test_a_refused_option_imports_no_torch(words: list[str], tmp_path: Path) -> None:
+    done, imported = rmc(tmp_path, words[0], "HalfCheetah-v5", *words[1:])
     assert done.returncode == 2
     assert "--batch-size=0" in done.stderr
     assert len(done.stderr.splitlines()) == 1

@@ -9,6 +9,7 @@ import pytest
 import safetensors.torch
 import torch
 
+from rmc.analysis.policy_file import read_policy
 from rmc.cli import main
 from rmc.common.agent_config import POLICY_PARTS
 from rmc.common.checkpoint import CheckpointFolder
@@ -109,6 +110,7 @@ def test_the_normaliser_goes_on_from_the_sources(source: RunFolder, tmp_path: Pa
     """At the first update it is that of both runs' observations, and so it is after a restart."""
     theirs = state(source)["agent"]["normalizer.mean"].double()
     folder = begin(OTHER, tmp_path / "run", source)
+    assert read_policy(folder.path, "0").header == OTHER.policy_header()
     run = Lockstep(OTHER, folder.path)
     while not run.learner.last_checkpoint:
         run.step()

@@ -1,12 +1,13 @@
 """Studies: every run of every scale is one that rmc would take, and one study is run as a user would."""
 
+import contextlib
 import dataclasses
 import importlib
 import json
 import os
 import signal
 import subprocess
-import time
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from rmc.cli import parser, run_options, train_options
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RESULT, RunFolder
 from rmc.deploy.run.validation import validate
+from rmc.sweep.pool import Ending
 from studies import averaging, generalisation, study
 from studies.study import Play, Scale, Study
 
@@ -36,9 +38,9 @@ def test_every_run_is_one_that_rmc_takes(name, scale):
         assert job.words[job.words.index("--seed") + 1] == str(job.seed)
         if job.seed != jobs[0].seed:  # the same words but for that
             continue
-        command = parser.parse(job.words)
+        command = parser.parse(job.command(job.folder))
         assert isinstance(command, train_options.Train | run_options.Baseline)
-        assert (command.seed, command.run_dir, command.env.id) == (job.seed, job.folder, job.env)
+        assert (command.seed, command.run_dir, command.env.id) == (job.seed, job.folder, job.values["env"])
         config = command.config()
         if isinstance(command, train_options.Train):
             validate(config)
@@ -51,7 +53,7 @@ def test_a_study_runs_once_and_its_lines_can_be_plotted(tmp_path, monkeypatch):
     agents = {"ours": "train ENV --flicker 0.1", "theirs": "baseline sac ENV --flicker 0.1"}
     tiny = Study("tiny", agents, small=Scale(1000, (1, 2), ("InvertedPendulum-v5",)))
     jobs = tiny.jobs("smoke")
-    assert [job.agent for job in jobs] == ["ours", "theirs"]
+    assert [job.values["agent"] for job in jobs] == ["ours", "theirs"]
     tiny.run("smoke", jobs, at_once=2)
     lines = tmp_path / "tiny-smoke.jsonl"
     found = history.read(lines)
@@ -62,7 +64,7 @@ def test_a_study_runs_once_and_its_lines_can_be_plotted(tmp_path, monkeypatch):
     tiny.run("smoke", jobs)
     assert lines.read_bytes() == before
     played = averaging.play(jobs[0], episodes=1)
-    plays = iter([{"agent": one.agent, "env": one.env, "seed": one.seed} for one in jobs])
+    plays = iter([{**one.values, "seed": one.seed} for one in jobs])
     for _ in range(2):  # the second time nothing is left to play
         told = tiny.played("smoke", jobs, Play("played", lambda _: next(plays), print)).read_text().splitlines()
         assert [json.loads(line)["agent"] for line in told] == ["ours", "theirs"]
@@ -74,18 +76,18 @@ def test_a_study_runs_once_and_its_lines_can_be_plotted(tmp_path, monkeypatch):
 def test_of_so_many_steps_it_has_runs_and_a_file_of_its_own(tmp_path, monkeypatch):
     begun = []
 
-    def trained(job, cores):
-        begun.append(job)
-        raise ConfigError(job.agent, "", "ended with 1")
+    def conduct(plan, place, stop, began, ended):
+        begun.append(plan.next())
+        ended(begun[0], Ending("failed", 1.0, "ended with 1"))
 
     monkeypatch.setattr(study, "RESULTS", tmp_path)
-    monkeypatch.setattr(study, "_trained", trained)
+    monkeypatch.setattr(study, "conduct", conduct)
     tiny = Study("tiny", {"ours": "train ENV"}, small=Scale(1000, (1, 2), ("InvertedPendulum-v5",)))
     monkeypatch.setattr("sys.argv", ["tiny", "--steps", "3000", "--seeds", "4"])
     with pytest.raises(SystemExit, match="ended with 1"):
         tiny.main()
     (job,) = begun
-    command = parser.parse(job.words)
+    command = parser.parse(job.command(job.folder))
     assert (command.total_steps, command.seed, command.env.id) == (3000, 4, "InvertedPendulum-v5")
     assert job.folder.parent.name == "tiny-3000"
     assert tiny.results("3000") == tmp_path / "tiny-3000.jsonl"
@@ -97,7 +99,7 @@ def test_what_is_played_is_of_the_length_that_was_trained(tmp_path, monkeypatch,
     monkeypatch.setattr(study, "RESULTS", tmp_path)
     monkeypatch.setattr(study, "RUNS", tmp_path)
     tiny = Study("tiny", {"ours": "train ENV"}, small=Scale(1000, (1, 2), ("InvertedPendulum-v5",)))
-    after = Play("seen", lambda job: {"agent": job.agent, "env": job.env, "seed": job.seed}, lambda path: print(path))
+    after = Play("seen", lambda job: {**job.values, "seed": job.seed}, lambda path: print(path))
     monkeypatch.setattr("sys.argv", ["tiny", "--steps", "3000", "--seeds", "2", "3", "--play"])
     with pytest.raises(SystemExit, match="no such run has ended"):
         tiny.main(after)
@@ -145,25 +147,17 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, monkeypatch):
     assert found["agent"] == "sound"
 
 
-def test_ctrl_c_starts_no_other_run(tmp_path, monkeypatch):
-    begun = []
-
-    def interrupted(job, cores):
-        begun.append(job.agent)
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.3)
-        raise ConfigError(job.agent, "", "ended with 130")
-
+def test_ctrl_c_starts_no_other_run(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "RUNS", tmp_path)
-    monkeypatch.setattr(study, "_trained", interrupted)
-    tiny = Study("tiny", {name: f"train ENV --seed {name}" for name in "123"})
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-    try:
+    tiny = Study("tiny", {name: f"train ENV --gamma 0.{name}" for name in "123"})
+    with contextlib.ExitStack() as ending:
+        timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+        ending.callback(timer.cancel)
+        timer.start()
         with pytest.raises(KeyboardInterrupt):
             tiny.run("smoke", tiny.jobs("smoke"))
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert begun == ["1"]
+    assert capsys.readouterr().out.count("rmc train") == 1
+    assert not (tmp_path / "tiny-smoke.jsonl").exists()
 
 
 def test_results_do_not_change_the_commit_but_code_does(tmp_path):

@@ -1,0 +1,108 @@
+"""A sweep's options, judged by the parser of ``rmc train`` before anything starts."""
+
+import contextlib
+import dataclasses
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rmc.cli import complaint, parser
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import RunConfig, flat, option, option_words
+from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.preflight import check_machine
+from rmc.deploy.run.validation import validate, validate_launch
+from rmc.sweep.job import Job
+from rmc.sweep.spec import Range, Spec
+
+RESERVED = ("run_dir", "if_exists", "redis_url", "ray_address", "all_cpus", "tls", "dry_run")
+LENGTH = "--total-steps"
+FILES = ("--config", "--init-from")  # that the nodes of a cluster do not have
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A run that can be started."""
+
+    job: Job
+    config: RunConfig
+    options: LaunchOptions
+
+
+def check_values(spec: Spec, on_this_machine: bool) -> None:
+    """Raises ConfigError, which names the key, for the first value that rmc train would not read."""
+    words = [*spec.words, *(option(name) for name in spec.options)]
+    if not on_this_machine and (named := [word for word in words if word.partition("=")[0] in FILES]):
+        raise ConfigError(
+            named[0], " ".join(spec.words), "the nodes do not have that file; write options into [options]"
+        )
+    for name in RESERVED:
+        flag = f"--{name.replace('_', '-')}"
+        if any(word.partition("=")[0] == flag for word in spec.words):
+            raise ConfigError(flag, " ".join(spec.words), "a sweep's runs are given none; leave it")
+    _check("options of rmc train", " ".join(spec.words), spec, list(spec.words))
+    ranges = spec.search.ranges if spec.search is not None else {}
+    ends = {name: [value.low, value.high] if isinstance(value, Range) else value for name, value in ranges.items()}
+    for part, values in (("options", {name: [value] for name, value in spec.options.items()}), ("grid", spec.grid)):
+        for name, tried in values.items():
+            for value in tried:
+                _check(f"{part}.{name}", value, spec, option_words(name, value))
+    for name, tried in ends.items():
+        for value in tried:
+            _check(f"search.{name}", value, spec, option_words(name, value))
+
+
+def _check(place: str, value: Any, spec: Spec, words: list[str]) -> None:
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        try:
+            parser.parse(["train", spec.env, *words])
+        except SystemExit:
+            raise ConfigError(place, value, complaint.as_line(said.getvalue())) from None
+
+
+def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:
+    """All of them, if each can be started. Raises ConfigError. What differs in its seed alone is read once."""
+    known: dict[str, Checked] = {}
+    checked = []
+    for job in jobs:
+        alike = known.get(repr(job.values))
+        if alike is None:
+            alike = known[repr(job.values)] = _checked(job, on_this_machine)
+        config = dataclasses.replace(alike.config, seed=job.seed)
+        validate(config)
+        checked.append(Checked(with_length(job, config), config, alike.options))
+    return checked
+
+
+def config_of(job: Job) -> RunConfig:
+    """Of a run's words, which can be read. What they do not say is the preset's, whatever its folder has."""
+    config: RunConfig = parser.parse(list(job.words)).config()
+    return config
+
+
+def with_length(job: Job, config: RunConfig) -> Job:
+    """A run that says how long it is: one that goes on would be as long as before."""
+    if any(word.partition("=")[0] == LENGTH for word in job.words):
+        return job
+    return dataclasses.replace(job, words=(*job.words, LENGTH, str(config.total_steps)))
+
+
+def _checked(job: Job, on_this_machine: bool) -> Checked:
+    command = parser.parse(list(job.words))
+    config, options = command.config(), dataclasses.replace(command.launch_options(), run_dir=job.folder)
+    validate(config)
+    validate_launch(config, options)
+    if on_this_machine:
+        check_machine(config, options)
+    else:
+        config.sizes()  # the environment's, which the nodes make, too
+    return Checked(job, config, options)
+
+
+def is_whole(name: str, config: RunConfig) -> bool:
+    """Whether an option's values are whole numbers. Raises ConfigError where they are no numbers."""
+    (value,) = [value for path, value in flat(config).items() if path.rpartition(".")[2] == name] or [None]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ConfigError(f"search.{name}", value, "only numbers have a range; give a list of choices")
+    return isinstance(value, int)

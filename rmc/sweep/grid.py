@@ -1,0 +1,59 @@
+"""All runs of a grid, and which of them are over."""
+
+from collections.abc import Iterable
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import RunConfig, flat, option, option_words
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import SAME_AGENT
+from rmc.sweep.job import Job, run_name
+from rmc.sweep.pool import Ending
+from rmc.sweep.spec import Spec
+
+
+def grid_jobs(spec: Spec, folder: Path) -> list[Job]:
+    """Each value with each other, seed by seed, so that what is compared goes on side by side."""
+    points = [dict(zip(spec.grid, values, strict=True)) for values in product(*spec.grid.values())]
+    return [make_job(spec, folder / run_name(values, seed), values, seed) for seed in spec.seeds for values in points]
+
+
+def make_job(spec: Spec, folder: Path, values: dict[str, Any], seed: int) -> Job:
+    """The run of some values and a seed."""
+    options = [word for name, value in spec.options.items() for word in option_words(name, value)]
+    own = [word for name, value in values.items() for word in option_words(name, value)]
+    return Job(folder, ("train", spec.env, *options, *spec.words, *own, "--seed", str(seed)), seed, values)
+
+
+def is_finished(job: Job, config: RunConfig) -> bool:
+    """Whether its run has a result after as many steps. Raises ConfigError where the folder has another run."""
+    folder = RunFolder(job.folder)
+    if not (folder.path / "config.json").exists():
+        return False
+    was, now = flat(folder.config()), flat(config)
+    for path in now:
+        if path not in SAME_AGENT and was.get(path) != now[path]:
+            fix = f"the run in {job.folder} has {was.get(path)!r}; use that, or another --sweep-dir"
+            raise ConfigError(option(path), now[path], fix)
+    result = folder.result()
+    return result is not None and result["env_steps"] >= config.total_steps
+
+
+class Grid:
+    """A plan of runs that are known beforehand."""
+
+    def __init__(self, jobs: Iterable[Job]) -> None:
+        self._jobs = iter(jobs)
+
+    def next(self) -> Job | None:
+        """The next one; None where all have begun."""
+        return next(self._jobs, None)
+
+    def is_hopeless(self, job: Job) -> bool:  # noqa: ARG002 - none is
+        """Each goes to its end."""
+        return False
+
+    def end(self, job: Job, ending: Ending) -> None:
+        """Nothing depends on it."""

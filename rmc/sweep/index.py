@@ -1,0 +1,91 @@
+"""``sweep.jsonl``: what ran in a sweep's folder, a line a run; and the folder's lock."""
+
+import json
+import os
+import shlex
+from pathlib import Path
+from typing import Any
+
+from rmc.analysis.history import objects, of_run
+from rmc.common.errors import ConfigError
+from rmc.common.process.file_lock import take_lock
+from rmc.common.whole_file import write_whole
+from rmc.deploy.run.folder import RunFolder
+from rmc.sweep.job import Job
+from rmc.sweep.pool import Ending, State
+
+NAME = "sweep.jsonl"
+COLUMNS = ("run", "state", "words", "seed", "values", "return", "env_steps", "seconds", "reason")
+BY_HAND = "mend or remove its line"
+
+
+class Index:
+    """Of one sweep's folder, which this process alone writes to until it is closed."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises ConfigError where another sweep runs in it, or it cannot be made or read."""
+        self._path = folder / NAME
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = take_lock(folder / ".lock", patience=0.0)
+        except OSError as error:
+            raise ConfigError("--sweep-dir", str(folder), f"cannot be used ({error.strerror}); give another") from None
+        if self._lock is None:
+            fix = "another rmc sweep runs in it; wait until it ends, or give another --sweep-dir"
+            raise ConfigError("--sweep-dir", str(folder), fix)
+        lines = objects(self._path, *COLUMNS) if self._path.exists() else {}
+        self.lines = {str(line["run"]): line for line in lines.values()}
+
+    def close(self) -> None:
+        """Let another sweep in."""
+        if self._lock is not None:
+            os.close(self._lock)
+
+    def state(self, job: Job) -> str:
+        """What became of it so far."""
+        return str(self.lines.get(job.name, {}).get("state", "waiting"))
+
+    def begin(self, job: Job) -> None:
+        """Note that it runs."""
+        self.put(job, "running")
+        self.write()
+
+    def end(self, job: Job, ending: Ending) -> None:
+        """Note how it ended."""
+        self.put(job, ending.state, ending.seconds, ending.reason)
+        self.write()
+
+    def put(self, job: Job, state: State, seconds: float = 0.0, reason: str = "") -> None:
+        """Make its line anew. Seconds are added up over its starts."""
+        before = self.lines.get(job.name, {}).get("seconds", 0.0)
+        returned, env_steps = newest_return(job)
+        words = f"rmc {shlex.join(job.command(job.folder))}"
+        cells = (job.name, state, words, job.seed, job.values, returned, env_steps, round(before + seconds, 1), reason)
+        self.lines[job.name] = dict(zip(COLUMNS, cells, strict=True))
+
+    def write(self) -> None:
+        """All lines, whole or not at all."""
+        write_whole(self._path, "".join(f"{json.dumps(line)}\n" for line in self.lines.values()).encode())
+
+
+def newest_return(job: Job) -> tuple[float | None, int]:
+    """Of its result, or else of its newest evaluation, and the environment steps there."""
+    folder = RunFolder(job.folder)
+    result = folder.result()
+    if result is not None:
+        return result["eval_return_mean"], result["env_steps"]
+    if not (folder.path / "config.json").exists():
+        return None, 0
+    try:
+        last = of_run(folder).evaluations[-1]
+    except ConfigError:  # not evaluated yet
+        return None, 0
+    return last.return_mean, last.env_steps
+
+
+def values_of(line: dict[str, Any]) -> dict[str, Any]:
+    """A line's values. Raises ConfigError where it has none."""
+    values = line["values"]
+    if not isinstance(values, dict):
+        raise ConfigError(f"{NAME} {line['run']}", values, f"its values must be an object; {BY_HAND}")
+    return values

@@ -1,0 +1,79 @@
+"""Whole runs as processes of this machine, each on its own part of the cores."""
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+from rmc.common.process.parent_death import PARENT_VARIABLE
+from rmc.deploy.local.role_environment import command_line
+from rmc.deploy.run.preflight import cores
+from rmc.sweep.job import Job
+
+
+class LocalRuns:
+    """So many at once; more than cores share them."""
+
+    def __init__(self, at_once: int) -> None:
+        self._free = core_parts(at_once)
+
+    def has_room(self) -> bool:
+        """Whether a part of the cores is free."""
+        return bool(self._free)
+
+    def start(self, job: Job) -> "LocalRun":
+        """Start one on a part of the cores."""
+        return LocalRun(job, self._free.pop(0), self._free)
+
+
+class LocalRun:
+    """A process that ends with this one."""
+
+    def __init__(self, job: Job, part: set[int], free: list[set[int]]) -> None:
+        self._log, self._part, self._free = job.log, part, free
+        self._process = spawn(job.command(job.folder), job.log)
+        if hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(self._process.pid, part)
+
+    def status(self) -> int | None:
+        """Its exit status, once it has one."""
+        status = self._process.poll()
+        if status is not None:
+            self._free.append(self._part)
+        return status
+
+    def stop(self) -> None:
+        """As rmc stop does."""
+        self._process.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it now; its roles end with it."""
+        self._process.kill()
+        self._process.wait()
+
+    def last_words(self) -> str:
+        """The last line of its log."""
+        return last_line(self._log)
+
+
+def core_parts(count: int) -> list[set[int]]:
+    """The cores in as many parts; more parts than cores share them."""
+    numbers = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(cores()))
+    return [set(numbers[index::count]) or {numbers[index % len(numbers)]} for index in range(count)]
+
+
+def spawn(words: list[str], log: Path) -> "subprocess.Popen[bytes]":
+    """``rmc`` as a process that ends with this one, and that a terminal's Ctrl-C does not reach."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    environment = os.environ | {PARENT_VARIABLE: str(os.getpid())}
+    with log.open("ab") as said:
+        return subprocess.Popen(
+            command_line(words),
+            stdin=subprocess.DEVNULL, stdout=said, stderr=said, env=environment, start_new_session=True,
+        )  # fmt: skip
+
+
+def last_line(log: Path) -> str:
+    """Of what a run said."""
+    lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
+    return lines[-1] if lines else "no word"

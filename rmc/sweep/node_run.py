@@ -1,0 +1,70 @@
+"""A Ray actor that holds one whole run on its node."""
+
+import os
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from rmc.common.process.file_lock import take_lock
+from rmc.sweep.local_runs import spawn
+from rmc.sweep.parcel import Known, Parcel, pack, unpack
+
+BEGIN_SECONDS = 60.0
+
+
+class NodeRun:
+    """``rmc train`` in a folder of the node that goes with it. Ends with the sweep."""
+
+    def __init__(self, words: tuple[str, ...], name: str, brought: Parcel, working_folder: str) -> None:
+        for variable in ("RAY_JOB_ID", "RAY_RAYLET_PID", "OMP_NUM_THREADS"):  # for Ray's own workers
+            os.environ.pop(variable, None)
+        if os.path.isdir(working_folder):  # where the user's own environments may lie
+            os.chdir(working_folder)
+        base = _private(Path(tempfile.gettempdir()) / f"rmc-sweep-{os.getuid()}")
+        for left in _left(base):
+            shutil.rmtree(left, ignore_errors=True)
+        self._place = Path(tempfile.mkdtemp(dir=base))
+        self._lock = take_lock(self._place / "lock")
+        self._folder, self._log = self._place / name, self._place / "log"
+        if brought.known:
+            unpack(brought, self._folder)
+        self._process = spawn([*words, "--run-dir", str(self._folder)], self._log)
+
+    def look(self, known: Known, copy: bool) -> tuple[int | None, Parcel | None, bytes]:
+        """The run's exit status, if it has one; where that is so, or a ``copy`` is due, what has changed, and its log.
+
+        After its end, nothing is kept here.
+        """
+        status = self._process.poll()
+        if status is None and not copy:
+            return None, None, b""
+        parcel, log = pack(self._folder, known), self._log.read_bytes()
+        if status is not None:
+            shutil.rmtree(self._place, ignore_errors=True)
+        return status, parcel, log
+
+    def stop(self) -> None:
+        """As rmc stop does."""
+        self._process.send_signal(signal.SIGTERM)
+
+
+def _private(folder: Path) -> Path:
+    """Raises RuntimeError where others may write there."""
+    folder.mkdir(mode=0o700, exist_ok=True)
+    about = folder.lstat()
+    if about.st_uid != os.getuid() or about.st_mode & 0o077:
+        raise RuntimeError(f"{folder} is not private; remove it")
+    return folder
+
+
+def _left(base: Path) -> Iterator[Path]:
+    """What killed sweeps have left there."""
+    for folder in base.iterdir():
+        begins = time.time() - folder.stat().st_mtime < BEGIN_SECONDS  # another one's may not be locked yet
+        lock = None if begins else take_lock(folder / "lock", patience=0.0)
+        if lock is not None:
+            os.close(lock)
+            yield folder

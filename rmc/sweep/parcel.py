@@ -1,0 +1,56 @@
+"""What a run's folder has that another copy of it lacks, to be sent there. The replay ring is never in it."""
+
+import io
+import shutil
+import tarfile
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+Known = dict[str, tuple[int, int]]  # a file's size and time of change in ns, by its path in the folder
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """Changed files, and the names of all."""
+
+    folders: list[str]
+    known: Known
+    tar: bytes = field(repr=False)
+
+
+def pack(folder: Path, known: Known) -> Parcel:
+    """All that is not as it is ``known``. Files that vanish meanwhile are left out."""
+    content, now, folders = io.BytesIO(), Known(), list[str]()
+    with tarfile.open(fileobj=content, mode="w") as tar:
+        for path in sorted(folder.rglob("*")):
+            name = path.relative_to(folder)
+            if name.parts[0] == "replay" or path.is_symlink():
+                continue
+            with suppress(FileNotFoundError):
+                if path.is_dir():
+                    folders.append(str(name))
+                elif path.is_file():
+                    about = path.stat()
+                    seen = about.st_size, about.st_mtime_ns
+                    if known.get(str(name)) != seen:
+                        tar.add(path, str(name))
+                    now[str(name)] = seen
+    return Parcel(folders, now, content.getvalue())
+
+
+def unpack(parcel: Parcel, folder: Path) -> None:
+    """Make a folder like the one that was packed; its own ring stays."""
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with tarfile.open(fileobj=io.BytesIO(parcel.tar)) as tar:
+        tar.extractall(folder, filter="data")
+    for name in parcel.folders:
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    for path in sorted(folder.rglob("*"), reverse=True):
+        name = str(path.relative_to(folder))
+        if name.split("/")[0] == "replay" or name in parcel.known or name in parcel.folders:
+            continue
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)

@@ -1,0 +1,127 @@
+"""Runs side by side: starts what there is room for, ends in order, and tells how each ended."""
+
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.process.role import StopSignal
+from rmc.deploy.monitor.attach import STOP_SECONDS
+from rmc.deploy.run.folder import RunFolder
+from rmc.sweep.job import Job
+
+LOOK_SECONDS = 0.2
+STOPPED = 130  # how a run ends that was asked to
+State = Literal["waiting", "running", "finished", "pruned", "stopped", "failed"]
+OVER = ("finished", "pruned")  # which are not run again
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended."""
+
+    state: State
+    seconds: float
+    reason: str = ""
+
+
+class Run(Protocol):
+    """A run that was started."""
+
+    def status(self) -> int | None:
+        """Its exit status, once it has one and all that it left is in the job's folder; negative after a signal."""
+
+    def stop(self) -> None:
+        """Ask it to end in order; does not wait."""
+
+    def kill(self) -> None:
+        """End it now."""
+
+    def last_words(self) -> str:
+        """What it said last."""
+
+
+class Place(Protocol):
+    """Where runs run."""
+
+    def has_room(self) -> bool:
+        """Whether another one fits now."""
+
+    def start(self, job: Job) -> Run:
+        """Start one; it goes on with what its folder has."""
+
+
+class Plan(Protocol):
+    """Which runs there are."""
+
+    def next(self) -> Job | None:
+        """The next one to start; None where there is none, now or any more."""
+
+    def is_hopeless(self, job: Job) -> bool:
+        """Whether a run at work may as well be stopped."""
+
+    def end(self, job: Job, ending: Ending) -> None:
+        """Hears how one ended."""
+
+
+@dataclass
+class _AtWork:
+    job: Job
+    run: Run
+    began: float
+    deadline: float | None = None  # once it was asked to end
+    hopeless: bool = False
+
+    def stop(self) -> None:
+        if self.deadline is None:
+            seconds = STOP_SECONDS + CheckpointFolder(RunFolder(self.job.folder).checkpoints).patience(0.0)
+            self.deadline = time.monotonic() + seconds
+            self.run.stop()
+        elif time.monotonic() > self.deadline:
+            self.run.kill()
+
+    def ending(self, status: int) -> Ending:
+        seconds = time.monotonic() - self.began
+        if status == 0:
+            return Ending("finished", seconds)
+        if self.hopeless and status == STOPPED:
+            return Ending("pruned", seconds)
+        if status == STOPPED or self.deadline is not None:
+            return Ending("stopped", seconds)
+        how = f"killed by signal {-status}" if status < 0 else f"ended with {status}: {self.run.last_words()}"
+        return Ending("failed", seconds, f"{how}; see {self.job.log}")
+
+
+def conduct(
+    plan: Plan, place: Place, stop: StopSignal, begun: Callable[[Job], None], ended: Callable[[Job, Ending], None]
+) -> None:
+    """Run all of a plan; with a stop signal no other one starts, and those at work end in order."""
+    at_work: list[_AtWork] = []
+    try:
+        while True:
+            while not stop.requested and place.has_room() and (job := plan.next()) is not None:
+                begun(job)
+                at_work.append(_AtWork(job, place.start(job), time.monotonic()))
+            if not at_work:
+                return
+            for one in list(at_work):
+                one.hopeless = one.hopeless or plan.is_hopeless(one.job)
+                if stop.requested or one.hopeless:
+                    one.stop()
+                status = one.run.status()
+                if status is not None:
+                    at_work.remove(one)
+                    ending = one.ending(status)
+                    plan.end(one.job, ending)
+                    ended(one.job, ending)
+            time.sleep(LOOK_SECONDS)
+    finally:
+        for one in at_work:  # only where an error ends the sweep itself
+            one.run.kill()
+
+
+def drop_replay(job: Job) -> None:
+    """Remove a finished run's ring. Its checkpoints, metrics and result stay; trained longer, it fills another."""
+    shutil.rmtree(RunFolder(job.folder).replay, ignore_errors=True)

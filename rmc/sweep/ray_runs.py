@@ -1,0 +1,113 @@
+"""Whole runs spread over a Ray cluster, each on the cores of one node; what they leave comes to this machine."""
+
+import os
+import time
+from contextlib import suppress
+from typing import Any
+
+import ray
+
+from rmc.common.errors import ConfigError
+from rmc.deploy.ray.role_actor import last_line
+from rmc.sweep.job import Job
+from rmc.sweep.local_runs import last_line as last_log_line
+from rmc.sweep.node_run import NodeRun
+from rmc.sweep.parcel import Known, Parcel, pack, unpack
+
+LOOK_SECONDS = 2.0
+BYTES_PER_SECOND = 1e6  # that copies of a run's files take at most, but for the last
+LOST = 1
+
+
+class RayRuns:
+    """As many at once as the nodes that are there hold, and at most ``at_once`` where that is above 0."""
+
+    def __init__(self, cores: int, memory: int, gpus: int, at_once: int) -> None:
+        """Raises ConfigError where no node can hold a run."""
+        self._cores, self._at_once, self._running = cores, at_once, 0
+        self._needs: dict[str, Any] = {
+            "num_cpus": cores,
+            "num_gpus": gpus,
+            "memory": memory,
+            "scheduling_strategy": "SPREAD",
+        }
+        if not self.capacity():
+            fix = f"no node of the cluster has {cores} CPUs, which a run takes; start one that has"
+            raise ConfigError("--launcher", "ray", fix)
+
+    def capacity(self) -> int:
+        """How many runs the nodes hold, of those that are there now."""
+        nodes = (int(node["Resources"].get("CPU", 0.0)) for node in ray.nodes() if node["Alive"])
+        fit = sum(cpus // self._cores for cpus in nodes)
+        return min(fit, self._at_once) if self._at_once else fit
+
+    def has_room(self) -> bool:
+        """Whether the nodes hold another one. With no run at all one may wait for a node to come."""
+        return self._running == 0 or self._running < self.capacity()
+
+    def start(self, job: Job) -> "RayRun":
+        """Ask for a node, and send it what the job's folder has."""
+        self._running += 1
+        return RayRun(self, job, self._needs)
+
+    def release(self) -> None:
+        """One has ended."""
+        self._running -= 1
+
+
+class RayRun:
+    """A run on some node, whose files are copied here again and again; nothing here waits for the node."""
+
+    def __init__(self, runs: RayRuns, job: Job, needs: dict[str, Any]) -> None:
+        self._runs, self._job, self._lost = runs, job, ""
+        self._log = job.log.read_bytes() if job.log.exists() else b""
+        brought = pack(job.folder, {}) if job.folder.exists() else Parcel([], {}, b"")
+        self._actor = ray.remote(NodeRun).options(**needs).remote(job.words, job.name, brought, os.getcwd())
+        self._known: Known = {}  # of its files, those that are here
+        self._asked: Any = self._actor.look.remote(self._known, True)
+        self._begun, self._look_at, self._copy_at = False, 0.0, 0.0
+
+    def status(self) -> int | None:
+        """Its exit status, once that and all that it left are here."""
+        now = time.monotonic()
+        if self._asked is None and now >= self._look_at:
+            self._asked = self._actor.look.remote(self._known, now >= self._copy_at)
+        if self._asked is None or not ray.wait([self._asked], timeout=0.0)[0]:
+            return None
+        try:
+            status, parcel, log = ray.get(self._asked)
+        except ray.exceptions.RayError as error:
+            self._lost = f"its node was lost, or could not start it ({last_line(error)})"
+            return self._end(LOST)
+        self._asked, self._begun, self._look_at = None, True, now + LOOK_SECONDS
+        if parcel is not None:
+            self._take(parcel, log)
+            self._copy_at = now + len(parcel.tar) / BYTES_PER_SECOND
+        return None if status is None else self._end(status)
+
+    def _take(self, parcel: Parcel, log: bytes) -> None:
+        unpack(parcel, self._job.folder)
+        self._known = parcel.known
+        self._job.log.parent.mkdir(parents=True, exist_ok=True)
+        self._job.log.write_bytes(self._log + log)
+
+    def _end(self, status: int) -> int:
+        ray.kill(self._actor)
+        self._runs.release()
+        return status
+
+    def stop(self) -> None:
+        """In order, where it has begun; where it waits for a node, it waits no longer."""
+        if not self._begun:
+            self.kill()
+        else:
+            self._actor.stop.remote()
+
+    def kill(self) -> None:
+        """End it now, with what was copied last."""
+        with suppress(ray.exceptions.RayError):
+            ray.kill(self._actor)
+
+    def last_words(self) -> str:
+        """Why it failed."""
+        return self._lost or last_log_line(self._job.log)

@@ -1,0 +1,180 @@
+"""A plan whose values Optuna chooses from what earlier runs returned; hopeless ones are pruned by their evaluations.
+
+The sweep's index is all that it remembers: a search that goes on is told again what became of its trials. Each trial
+draws with a seed of its own, so that one that goes on draws what it would have drawn.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+try:
+    import optuna
+except ImportError as missing:
+    from rmc.common.errors import ConfigError
+    from rmc.common.extra import how_to_install
+
+    raise ConfigError("search", "", f"Optuna is not installed; {how_to_install('optuna')}") from missing
+
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
+from optuna.trial import TrialState
+
+from rmc.analysis.history import Evaluation, of_run
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import MetricsTail
+from rmc.sweep.index import Index, values_of
+from rmc.sweep.job import TRIAL, Job
+from rmc.sweep.pool import Ending
+from rmc.sweep.spec import Range, Search
+
+STARTUP_TRIALS = 4  # that are finished before any is pruned
+FIRST_JUDGED = 2  # evaluation of a trial
+TRIAL_STATES = {"finished": TrialState.COMPLETE, "pruned": TrialState.PRUNED}
+
+
+class SearchPlan:
+    """One run a trial; maximises the return."""
+
+    def __init__(
+        self,
+        search: Search,
+        distributions: Mapping[str, BaseDistribution],
+        index: Index,
+        make: Callable[[str, dict[str, Any]], Job],
+        is_finished: Callable[[Job], bool],
+        checkpoint_steps: int,
+    ) -> None:
+        """``make`` gives a trial's run by its name and values. Raises ConfigError where the index has other ranges."""
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self._search, self._distributions, self._make = search, dict(distributions), make
+        self._is_finished = is_finished
+        self._checkpoint_steps = checkpoint_steps
+        pruner = optuna.pruners.MedianPruner(STARTUP_TRIALS, FIRST_JUDGED)
+        self._study = optuna.create_study(
+            direction="maximize", pruner=pruner if search.prune else optuna.pruners.NopPruner()
+        )
+        self._at_work: dict[str, _Trial] = {}
+        self.todo: list[Job] = []
+        self._index = index
+        self.jobs = [self._known(line) for name, line in index.lines.items() if name.startswith(TRIAL)]
+        self._names = self._all_names()
+
+    def _known(self, line: dict[str, Any]) -> Job:
+        """Tell Optuna of a trial of before, or take it up again."""
+        name, values = str(line["run"]), values_of(line)
+        job = self._make(name, values)
+        over = line["state"] == "pruned" or (line["state"] == "finished" and self._is_finished(job))
+        try:
+            trial = self._frozen(job, line, TRIAL_STATES[line["state"]] if over else TrialState.FAIL)
+        except (KeyError, ValueError):
+            fix = f"{name} has {values}, which these ranges do not hold; use those of before, or another --sweep-dir"
+            raise ConfigError("search.ranges", sorted(self._distributions), fix) from None
+        if over:
+            self._study.add_trial(trial)
+        else:
+            self.todo.append(job)
+        return job
+
+    def _frozen(self, job: Job, line: dict[str, Any], state: TrialState) -> optuna.trial.FrozenTrial:
+        """Raises KeyError, ValueError where its values are not of these ranges."""
+        if values_of(line).keys() != self._distributions.keys():
+            raise KeyError
+        return optuna.trial.create_trial(
+            state=state,
+            value=_final_return(job) if state == TrialState.COMPLETE else None,
+            params=self._params(values_of(line)),
+            distributions=self._distributions,
+            intermediate_values={step: one.return_mean for step, one in self._evaluations(job)},
+        )
+
+    def _params(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Values as Optuna has them."""
+        choices = [name for name, kind in self._distributions.items() if isinstance(kind, CategoricalDistribution)]
+        return values | {name: json.dumps(values[name]) for name in choices}
+
+    def _values(self, params: dict[str, Any]) -> dict[str, Any]:
+        """The reverse."""
+        return {name: json.loads(value) if isinstance(value, str) else value for name, value in params.items()}
+
+    def _all_names(self) -> Iterator[str]:
+        """Of those that go on, then of new ones up to as many trials as there shall be."""
+        yield from [job.name for job in self.todo]
+        for number in range(self._search.trials):
+            if f"{TRIAL}{number}" not in self._index.lines:
+                yield f"{TRIAL}{number}"
+
+    def next(self) -> Job | None:
+        """The next trial's run."""
+        name = next(self._names, None)
+        if name is None:
+            return None
+        line = self._index.lines.get(name)
+        if line is not None:
+            self._study.enqueue_trial(self._params(values_of(line)))
+        seed = self._search.sampler_seed + int(name.removeprefix(TRIAL))
+        self._study.sampler = optuna.samplers.TPESampler(seed=seed, constant_liar=True)
+        trial = self._study.ask(self._distributions)
+        job = self._make(name, self._values(trial.params))
+        self._at_work[name] = _Trial(trial, MetricsTail(RunFolder(job.folder).metrics))
+        if line is None:
+            self.jobs.append(job)
+        return job
+
+    def is_hopeless(self, job: Job) -> bool:
+        """Whether its evaluations are below the median of the others' at as many steps."""
+        if not self._search.prune:
+            return False
+        at_work = self._at_work[job.name]
+        if not any("eval_return_mean" in record for record in at_work.tail.take()):
+            return False
+        self._report(at_work, job)
+        return bool(at_work.trial.should_prune())
+
+    def _report(self, at_work: "_Trial", job: Job) -> None:
+        for step, one in self._evaluations(job):
+            if step not in at_work.reported:
+                at_work.reported.add(step)
+                at_work.trial.report(one.return_mean, step)
+
+    def _evaluations(self, job: Job) -> list[tuple[int, Evaluation]]:
+        """By which evaluation of a run it is: the steps themselves differ a little from run to run."""
+        try:
+            found = of_run(RunFolder(job.folder)).evaluations
+        except ConfigError:  # none yet
+            return []
+        by_step = {round(one.env_steps / self._checkpoint_steps): one for one in found}
+        return sorted(by_step.items(), key=lambda pair: pair[0])
+
+    def end(self, job: Job, ending: Ending) -> None:
+        """Tell Optuna."""
+        at_work = self._at_work.pop(job.name)
+        self._report(at_work, job)
+        if ending.state == "finished":
+            self._study.tell(at_work.trial, _final_return(job))
+        else:
+            self._study.tell(at_work.trial, state=TRIAL_STATES.get(ending.state, TrialState.FAIL))
+
+
+def _final_return(job: Job) -> float:
+    return of_run(RunFolder(job.folder)).evaluations[-1].return_mean
+
+
+class _Trial:
+    def __init__(self, trial: optuna.Trial, tail: MetricsTail) -> None:
+        self.trial, self.tail = trial, tail
+        self.reported: set[int] = set()
+
+
+def distribution(values: Range | list[Any], whole: bool) -> BaseDistribution:
+    """Optuna's for an option whose values are ``whole`` numbers or not; choices are text of JSON, as lists may be."""
+    if isinstance(values, list):
+        return CategoricalDistribution([json.dumps(value) for value in values])
+    if whole:
+        return IntDistribution(int(values.low), int(values.high), log=values.log)
+    return FloatDistribution(float(values.low), float(values.high), log=values.log)

@@ -1,0 +1,237 @@
+"""What a sweep is asked to run, from a file or from the command line, before any of it is checked as an option.
+
+SPEC.toml: ``env``, ``seeds``, ``[options]`` that every run has, and ``[grid]`` or ``[search]``.
+"""
+
+import difflib
+import json
+import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rmc.common.bus.metrics_record import is_finite
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import flat
+from rmc.deploy.run.presets import robust
+
+KEYS = ("env", "seeds", "options", "grid", "search")
+SEARCH_KEYS = ("trials", "sampler_seed", "prune", "ranges")
+RANGE_KEYS = ("low", "high", "log")
+SEEDS_FIX = 'write whole numbers, like [1, 2, 3] or "1-5"'
+OWN = {"id", "seed"}  # that a sweep gives each run itself
+NAMES = {path.rpartition(".")[2] for path in flat(robust(EnvConfig("")))} - OWN | {
+    "launcher",
+    "device",
+    "init_from",
+    "init_parts",
+}
+RUN_LAUNCHERS = ("local", "lockstep")
+MOST = 1_000_000  # runs and trials
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers from ``low`` to ``high``, both included; whole ones where the option's are."""
+
+    low: float
+    high: float
+    log: bool = False
+
+
+@dataclass(frozen=True)
+class Search:
+    """Options and where their values are looked for: a range, or a list of choices."""
+
+    ranges: dict[str, Range | list[Any]]
+    trials: int = 20
+    sampler_seed: int = 0
+    prune: bool = True
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A sweep."""
+
+    env: str
+    seeds: tuple[int, ...] = (0,)
+    options: dict[str, Any] = field(default_factory=dict)
+    grid: dict[str, list[Any]] = field(default_factory=dict)
+    search: Search | None = None
+    words: tuple[str, ...] = ()  # options of rmc train, as they were typed
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for names and lists that make no sense; values are judged by the parser of rmc train."""
+        for part, given in (("options", self.options), ("grid", self.grid)):
+            for name, value in given.items():
+                check_name(f"{part}.{name}", name, value)
+        for name, values in self.grid.items():
+            if not isinstance(values, list) or not values:
+                raise ConfigError(f"grid.{name}", values, "write a list of values, like [3e-4, 1e-3]")
+            if len({repr(value) for value in values}) < len(values):
+                raise ConfigError(f"grid.{name}", values, "has a value twice; give each once")
+        if self.search is not None:
+            self._check_search(self.search)
+        varied = {**self.grid, **(self.search.ranges if self.search else {})}
+        typed = [word.lstrip("-").partition("=")[0].replace("-", "_") for word in self.words if word.startswith("--")]
+        for name in [*self.options, *typed]:
+            if (plain := name.removeprefix("no_")) in varied:
+                raise ConfigError(name, varied[plain], "is an option of every run and varied, too; leave one of them")
+
+    def _check_search(self, search: Search) -> None:
+        if self.grid:
+            raise ConfigError("grid", sorted(self.grid), "a sweep has a grid or a search; leave one of them")
+        if len(self.seeds) != 1:
+            raise ConfigError("seeds", list(self.seeds), "a search has one; repeat its best with more as a grid")
+        if not search.ranges:
+            raise ConfigError("search.ranges", {}, "name options, like learning_rate = {low = 1e-5, high = 1e-2}")
+        if not 1 <= search.trials <= MOST:
+            raise ConfigError("search.trials", search.trials, f"take 1 to {MOST:_}")
+        if not 0 <= search.sampler_seed < 2**31:
+            raise ConfigError("search.sampler_seed", search.sampler_seed, "take 0 to 2147483647")
+        for name, values in search.ranges.items():
+            check_name(f"search.{name}", name, values)
+            if isinstance(values, list) and not values:
+                raise ConfigError(f"search.{name}", values, "write a list of choices, or a range")
+
+
+def check_name(place: str, name: str, value: Any) -> None:
+    """Raises ConfigError where that is no option that a sweep's runs may have."""
+    if name in OWN:
+        raise ConfigError(place, value, "every run has its own; give env and seeds")
+    if name not in NAMES:
+        near = difflib.get_close_matches(name, NAMES, 1)
+        hint = f"did you mean {near[0]}?" if near else "rmc train --help lists them"
+        raise ConfigError(place, value, f"no option that a sweep's runs take; {hint}")
+    if name == "launcher" and (value if isinstance(value, str) else "") not in RUN_LAUNCHERS:
+        raise ConfigError(place, value, f"a run's is {' or '.join(RUN_LAUNCHERS)}; --launcher ray spreads whole runs")
+
+
+def read_spec(path: Path, words: Sequence[str]) -> Spec:
+    """A sweep from its file. Raises ConfigError, which names the key."""
+    try:
+        raw = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError("SPEC", str(path), f"{error.strerror}; give a .toml file or an environment") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError("SPEC", str(path), f"not TOML ({error}); mend it") from None
+    _check_keys("", raw, KEYS)
+    if not isinstance(raw.get("env"), str):
+        raise ConfigError("env", raw.get("env"), f'write an environment into {path}, like env = "HalfCheetah-v5"')
+    for part in ("options", "grid", "search"):
+        if not isinstance(raw.get(part, {}), dict):
+            raise ConfigError(part, raw[part], f"write it as a table, [{part}]")
+    search = _search(raw["search"]) if "search" in raw else None
+    seeds = read_seeds(raw.get("seeds", 0))
+    options, grid = (_plain_names(raw.get(part, {})) for part in ("options", "grid"))
+    return Spec(raw["env"], seeds, options, grid, search, tuple(words))
+
+
+def _check_keys(place: str, raw: dict[str, Any], known: Sequence[str]) -> None:
+    for name, value in raw.items():
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean {near[0]}?" if near else f"use {', '.join(known)}"
+            raise ConfigError(f"{place}{name}", value, f"no such key; {hint}")
+
+
+def _plain_names(raw: dict[str, Any]) -> dict[str, Any]:
+    return {name.replace("-", "_"): value for name, value in raw.items()}
+
+
+def _search(raw: dict[str, Any]) -> Search:
+    _check_keys("search.", raw, SEARCH_KEYS)
+    kinds = {"trials": int, "sampler_seed": int, "prune": bool, "ranges": dict}
+    for name, value in raw.items():
+        if type(value) is not kinds[name]:
+            wanted = {int: "a whole number", bool: "true or false", dict: "a table, [search.ranges]"}[kinds[name]]
+            raise ConfigError(f"search.{name}", value, f"write {wanted}")
+    ranges = {name: _range(f"search.{name}", value) for name, value in raw.get("ranges", {}).items()}
+    return Search(**{**raw, "ranges": _plain_names(ranges)})
+
+
+def _range(place: str, raw: Any) -> Range | list[Any]:
+    if isinstance(raw, list):
+        return raw
+    if not isinstance(raw, dict) or not raw.keys() >= {"low", "high"}:
+        raise ConfigError(place, raw, "write {low = 1e-5, high = 1e-2, log = true}, or a list of choices")
+    _check_keys(f"{place}.", raw, RANGE_KEYS)
+    return _checked_range(place, raw["low"], raw["high"], raw.get("log", False))
+
+
+def _checked_range(place: str, low: Any, high: Any, log: Any) -> Range:
+    numbers = is_finite(low) and is_finite(high)
+    if not numbers or type(log) is not bool or not low < high:
+        fix = "low and high are numbers, low below high, log is true or false"
+        raise ConfigError(place, {"low": low, "high": high, "log": log}, fix)
+    if log and low <= 0:
+        raise ConfigError(place, low, "a logarithmic range begins above 0")
+    return Range(low, high, log)
+
+
+def read_seeds(raw: Any) -> tuple[int, ...]:
+    """Of a list of whole numbers, of one, or of words like ``1-3,7``. Raises ConfigError."""
+    if isinstance(raw, str):
+        ends = [re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip()) for part in raw.split(",")]
+        pairs = [(int(found[1]), int(found[2] or found[1])) for found in ends if found]
+        if len(pairs) < len(ends) or any(not 0 <= high - low < MOST for low, high in pairs):
+            raise ConfigError("seeds", raw, SEEDS_FIX)
+        seeds = [seed for low, high in pairs for seed in range(low, high + 1)]
+    else:
+        seeds = raw if isinstance(raw, list) else [raw]
+    if not seeds or any(type(seed) is not int for seed in seeds) or len(set(seeds)) < len(seeds):
+        raise ConfigError("seeds", raw, f"{SEEDS_FIX}, each once")
+    return tuple(seeds)
+
+
+def read_grid(words: Sequence[str]) -> dict[str, list[Any]]:
+    """Of ``NAME=VALUE,VALUE…`` words. Raises ConfigError."""
+    found: dict[str, list[Any]] = {}
+    for name, text in _pairs("--grid", words):
+        found[name] = read_values(text)
+    return found
+
+
+def read_ranges(words: Sequence[str]) -> dict[str, Range | list[Any]]:
+    """Of ``NAME=LOW..HIGH``, ``NAME=LOW..HIGH:log`` or ``NAME=CHOICE,CHOICE…`` words. Raises ConfigError."""
+    found: dict[str, Range | list[Any]] = {}
+    for name, text in _pairs("--search", words):
+        ends = re.fullmatch(r"(.+?)\.\.(.+?)(:log)?", text)
+        if ends is None:
+            found[name] = read_values(text)
+        else:
+            low, high = read_values(ends[1])[0], read_values(ends[2])[0]
+            found[name] = _checked_range(f"search.{name}", low, high, bool(ends[3]))
+    return found
+
+
+def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:
+    pairs = []
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not (name and equals and text):
+            raise ConfigError(option, word, "write NAME=VALUE,VALUE…, like learning_rate=3e-4,1e-3")
+        pairs.append((name.replace("-", "_"), text))
+    names = [name for name, _ in pairs]
+    if len(set(names)) < len(names):
+        raise ConfigError(option, " ".join(words), "has an option twice; give all of its values after one name")
+    return pairs
+
+
+def read_values(text: str) -> list[Any]:
+    """Values between commas: numbers, true, false, words; lists in brackets."""
+    try:
+        values: list[Any] = json.loads(f"[{text}]")
+    except ValueError:
+        values = [_value(part) for part in text.split(",")]
+    return values
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text

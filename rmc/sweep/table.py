@@ -1,0 +1,47 @@
+"""How a sweep's runs did, by their values, best first."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from rich.table import Table
+
+from rmc.sweep.index import Index
+from rmc.sweep.job import TRIAL, Job, shown
+
+
+def result_table(jobs: Sequence[Job], index: Index) -> Table:
+    """A row for each point of the grid, or each trial; the return is over finished runs alone."""
+    points: dict[str, list[Job]] = {}
+    for job in jobs:
+        points.setdefault(job.name if job.name.startswith(TRIAL) else repr(job.values), []).append(job)
+    rows = sorted((_row(runs, index) for runs in points.values()), key=lambda row: -row[0])
+    table = Table(box=None, pad_edge=False)
+    whole = all(not cells[-1] for _, cells in rows)
+    columns = ["trial" if jobs[0].name.startswith(TRIAL) else "", *jobs[0].values, "seeds", "return", "not finished"]
+    shown_at = [at for at, name in enumerate(columns) if name and not (whole and name == "not finished")]
+    for at in shown_at:
+        table.add_column(columns[at], justify="right", no_wrap=True)
+    for _, cells in rows:
+        table.add_row(*(cells[at] for at in shown_at))
+    return table
+
+
+def _row(runs: list[Job], index: Index) -> tuple[float, list[str]]:
+    """Its mean return, by which it is sorted, and its cells."""
+    returns = [line["return"] for job in runs if (line := index.lines.get(job.name)) and line["state"] == "finished"]
+    mean = float(np.mean(returns)) if returns else -np.inf
+    deviation = f" ± {np.std(returns):,.1f}" if len(returns) > 1 else ""
+    others = [index.state(job) for job in runs if index.state(job) != "finished"]
+    counts = ", ".join(f"{others.count(state)} {state}" for state in dict.fromkeys(others))
+    values = (f"{one:.4g}" if isinstance(one, float) else shown(one) for one in runs[0].values.values())
+    text = f"{mean:,.1f}{deviation}" if returns else "-"
+    return mean, [runs[0].name.removeprefix(TRIAL), *values, str(len(returns)), text, counts]
+
+
+def run_line(job: Job, index: Index) -> str:
+    """How one run ended, for a line."""
+    line = index.lines[job.name]
+    returned = "" if line["return"] is None else f"return {line['return']:,.1f} after {line['env_steps']:,} steps, "
+    said = "" if line["state"] == "finished" else f"{line['state']}: "
+    reason = f"; {line['reason']}" if line["reason"] else ""
+    return f"{job.title}: {said}{returned}{line['seconds']:,.0f} s{reason}"

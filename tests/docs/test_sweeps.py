@@ -1,0 +1,26 @@
+"""The commands of docs/sweeps.md run as they are printed; the file's with one seed in place of two."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PAGE = (Path(__file__).parents[2] / "docs" / "sweeps.md").read_text()
+
+
+@pytest.mark.timeout(500)
+def test_its_commands_run(tmp_path: Path) -> None:
+    spec = PAGE.split("```toml\n")[1].split("```")[0]
+    (tmp_path / "rates.toml").write_text(spec.replace('seeds = "1-2"', "seeds = 1"))
+    commands = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()]
+    assert len(commands) == 5
+    for command in commands:
+        words = [sys.executable, "-m", "rmc.cli.main", *command.split()[1:]]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+        assert (done.returncode, done.stderr) == (0, ""), f"{command}\n{done.stdout}{done.stderr}"
+    runs = {path.parent.name: len(path.read_text().splitlines()) for path in tmp_path.glob("runs/*/sweep.jsonl")}
+    assert runs == {"InvertedPendulum-v5__sweep": 4, "rates": 2, "search": 2, "on-ray": 2}
+    assert not list((tmp_path / "runs" / "rates").glob("*/replay"))
+    assert (tmp_path / "rates.png").stat().st_size > 10_000

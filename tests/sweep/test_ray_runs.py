@@ -1,0 +1,121 @@
+"""Whole runs on a Ray of this machine: their folders come here without the ring, and go on from there."""
+
+import io
+import os
+import tarfile
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from rmc.deploy.run.folder import RunFolder
+from rmc.sweep.parcel import pack, unpack
+from tests.cluster.test_ray import leaves_nothing_behind
+from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
+
+assert leaves_nothing_behind  # Ray keeps a few files of its own
+RAY = ("--launcher", "ray", "--ray-address", "local")
+BASE = Path(tempfile.gettempdir()) / f"rmc-sweep-{os.getuid()}"
+
+
+def kept() -> list[Path]:
+    """What the runs have left on their node."""
+    return list(BASE.iterdir()) if BASE.exists() else []
+
+
+def test_runs_are_spread_and_their_folders_come_without_the_ring(tmp_path: Path) -> None:
+    folder, spec = tmp_path / "sweep", str(write_spec(tmp_path, seeds=(1, 2)))
+    with Sweeping(folder, spec, *RAY) as sweep:
+        assert sweep.finish() == 0, sweep.text()
+    assert sweep.states() == {"seed=1": "finished", "seed=2": "finished"}
+    for name in sweep.states():
+        run = RunFolder(folder / name)
+        assert run.result() is not None
+        assert run.ended() == 0
+        assert {"config.json", "metrics.jsonl", "checkpoints"} <= {path.name for path in run.path.iterdir()}
+        assert not run.replay.exists()
+        assert "after training" in (folder / "logs" / f"{name}.log").read_text()
+    assert not kept()
+
+
+@pytest.mark.timeout(300)
+def test_a_stopped_and_a_lost_run_go_on_with_the_same_command(tmp_path: Path) -> None:
+    folder, spec = tmp_path / "sweep", str(write_spec(tmp_path, **ENDLESS))
+    with Sweeping(folder, spec, *RAY) as sweep:
+        sweep.wait_for_updates("seed=0")
+        assert sweep.interrupt() == 130
+    assert sweep.states() == {"seed=0": "stopped"}
+    run = RunFolder(folder / "seed=0")
+    assert run.ended() == 130
+    saved = sorted(path.name for path in run.checkpoints.glob("[0-9]*"))
+    assert saved
+    with Sweeping(folder, spec, *RAY) as sweep:
+        sweep.wait_for(lambda: sorted(path.name for path in run.checkpoints.glob("[0-9]*"))[-1] > saved[-1])
+        train = next(one for one in _processes() if "train" in one.info["cmdline"])
+        host = train.parent()
+        assert host is not None
+        host.kill()  # as a node that is gone
+        assert sweep.finish() == 1
+        assert not train.is_running()
+    assert "without their replay ring, these go on" in sweep.text()
+    assert sweep.lines()["seed=0"]["state"] == "failed"
+    assert "its node was lost" in sweep.lines()["seed=0"]["reason"]
+    assert sweep.text().count("its node was lost") == 1
+
+
+def _processes() -> Iterator[psutil.Process]:
+    for one in psutil.process_iter(["cmdline"]):
+        if any(word.startswith(str(BASE)) for word in one.info["cmdline"] or []):
+            yield one
+
+
+def test_a_node_that_is_too_small_and_a_cluster_that_is_not_there_are_one_line(tmp_path: Path) -> None:
+    spec = str(write_spec(tmp_path))
+    with Sweeping(tmp_path / "sweep", spec, "--launcher", "ray") as sweep:
+        assert sweep.finish() == 2
+    assert sweep.text().startswith("rmc: --ray-address='auto': no Ray cluster answers")
+    assert sweep.text().count("\n") == 1
+
+
+def test_a_copy_is_like_the_folder_and_only_what_changed_is_sent(tmp_path: Path) -> None:
+    source, copy = tmp_path / "source", tmp_path / "copy"
+    (source / "checkpoints" / "1").mkdir(parents=True)
+    (source / "replay").mkdir()
+    (source / "replay" / "ring").write_bytes(b"0" * 9999)
+    (source / "checkpoints" / "1" / "policy").write_text("one")
+    (source / "metrics.jsonl").write_text("first\n")
+    (source / "secret").write_text("s")
+    (source / "secret").chmod(0o600)
+    parcel = pack(source, {})
+    (copy / "replay").mkdir(parents=True)
+    (copy / "checkpoints" / "0").mkdir(parents=True)
+    (copy / "checkpoints" / "0" / "policy").write_text("old")
+    unpack(parcel, copy)
+    assert (
+        _content(copy) == _content(source) == {"checkpoints/1/policy": "one", "metrics.jsonl": "first\n", "secret": "s"}
+    )
+    assert (copy / "secret").stat().st_mode & 0o777 == 0o600
+    assert not (copy / "checkpoints" / "0").exists()
+    assert (copy / "replay").is_dir()  # its own
+
+    time.sleep(0.01)
+    with (source / "metrics.jsonl").open("a") as file:
+        file.write("second\n")
+    (source / "checkpoints" / "1").rename(source / "checkpoints" / "2")
+    (source / "events").mkdir()
+    later = pack(source, parcel.known)
+    unpack(later, copy)
+    assert _content(copy) == {"checkpoints/2/policy": "one", "metrics.jsonl": "first\nsecond\n", "secret": "s"}
+    assert (copy / "events").is_dir()
+    with tarfile.open(fileobj=io.BytesIO(later.tar)) as tar:
+        assert sorted(tar.getnames()) == ["checkpoints/2/policy", "metrics.jsonl"]
+    with tarfile.open(fileobj=io.BytesIO(pack(source, later.known).tar)) as tar:
+        assert tar.getnames() == []
+
+
+def _content(folder: Path) -> dict[str, str]:
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != "ring")
+    return {str(path.relative_to(folder)): path.read_text() for path in files}

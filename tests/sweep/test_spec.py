@@ -1,0 +1,173 @@
+"""A sweep's words and file: what they mean, and that bad ones are one line that names key, value and fix."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from rmc.cli import main, parser, sweep_check
+from rmc.cli.sweep_command import default_folder, read
+from rmc.common.errors import ConfigError
+from rmc.sweep.grid import grid_jobs
+from rmc.sweep.job import run_name
+from rmc.sweep.spec import Range, Spec, read_seeds, read_spec, read_values
+
+PENDULUM = "InvertedPendulum-v5"
+
+
+def spec_of(*words: str) -> Spec:
+    return read(parser.parse(["sweep", *words]))
+
+
+def test_words_and_file_say_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "spec.toml"
+    path.write_text(
+        f'env = "{PENDULUM}"\nseeds = "1-3"\n[options]\npreset = "debug"\n'
+        "[grid]\nlearning-rate = [3e-4, 1e-3]\nheads = [[64, 64], [32, 32]]\ngrounding = [true, false]\n"
+    )
+    grid = ["learning_rate=3e-4,1e-3", "heads=[64,64],[32,32]", "grounding=true,false"]
+    words = spec_of(PENDULUM, "--seeds", "1-3", "--grid", *grid, "--preset", "debug")
+    ours, theirs = grid_jobs(read_spec(path, []), tmp_path), grid_jobs(words, tmp_path)
+    assert len(ours) == 24
+    assert [(job.name, job.seed, job.values) for job in ours] == [(job.name, job.seed, job.values) for job in theirs]
+    assert [job.seed for job in ours] == [1] * 8 + [2] * 8 + [3] * 8  # what is compared goes on side by side
+    configs = [sweep_check.config_of(job) for job in ours]
+    assert configs == [sweep_check.config_of(job) for job in theirs]
+    last = configs[-1]
+    assert (last.update.learning_rate, last.agent.heads, last.agent.grounding) == (1e-3, (32, 32), False)
+    assert (last.seed, last.preset) == (3, "debug")
+
+
+def test_options_of_train_come_after_the_environment_or_the_file(tmp_path: Path) -> None:
+    (tmp_path / "spec.toml").write_text(f'env = "{PENDULUM}"\n')
+    for what in (PENDULUM, str(tmp_path / "spec.toml")):
+        spec = spec_of(what, "--preset", "debug", "--heads", "8", "8", "--env-kwargs", "a=1", "b=2", "--jobs", "1")
+        (job,) = grid_jobs(spec, tmp_path)
+        config = sweep_check.config_of(job)
+        assert (config.agent.heads, config.env.env_kwargs, config.preset) == ((8, 8), {"a": 1, "b": 2}, "debug")
+
+
+@pytest.mark.parametrize(
+    ("raw", "seeds"),
+    [("1-3,7", (1, 2, 3, 7)), ("4", (4,)), ([5, 2], (5, 2)), (6, (6,)), (" 1 , 2", (1, 2))],
+)
+def test_seeds(raw: object, seeds: tuple[int, ...]) -> None:
+    assert read_seeds(raw) == seeds
+
+
+@pytest.mark.parametrize("raw", ["", "a", "3-1", "1,1", "-1", [], [1, 1], ["1"], [True], 1.5, "1-99999999"])
+def test_what_are_no_seeds(raw: object) -> None:
+    with pytest.raises(ConfigError, match=r"^seeds=.*whole numbers"):
+        read_seeds(raw)
+
+
+def test_values() -> None:
+    assert read_values("1,2.5,1e-3") == [1, 2.5, 1e-3]
+    assert read_values("l1,l2") == ["l1", "l2"]
+    assert read_values("true,l2,3") == [True, "l2", 3]
+    assert read_values("[64,64],[8]") == [[64, 64], [8]]
+
+
+def test_a_search_has_ranges_and_choices() -> None:
+    words = ["learning_rate=1e-5..1e-2:log", "n_step=1..5", "scheme=1,3"]
+    search = spec_of(PENDULUM, "--search", *words, "--trials", "7", "--no-prune").search
+    assert search is not None
+    ranges = {"learning_rate": Range(1e-5, 1e-2, log=True), "n_step": Range(1, 5), "scheme": [1, 3]}
+    assert (search.ranges, search.trials, search.prune) == (ranges, 7, False)
+
+
+def test_names_of_folders_are_plain_and_tell_values_apart() -> None:
+    assert run_name({"learning_rate": 3e-4, "grounding": True}, 1) == "learning_rate=0.0003,grounding=true,seed=1"
+    odd = [run_name({"env_kwargs": {"map": text}}, 1) for text in ("a/b", "a:b", "x" * 300)]
+    assert len(set(odd)) == 3
+    assert all("/" not in name and len(name) < 200 for name in odd)
+    assert default_folder("dm_control/walker-walk-v0") == Path("runs/dm_control_walker-walk-v0__sweep")
+    assert default_folder("some/where/rates.toml") == Path("runs/rates")
+
+
+FILES = {
+    'sedes = "1-2"': "sedes='1-2': no such key; did you mean seeds?",
+    'seeds = "a"': "seeds='a': write whole numbers",
+    "options = 1": "options=1: write it as a table",
+    "[options]\ntotal_step = 5": "options.total_step=5: no option that a sweep's runs take; did you mean total_steps?",
+    "[options]\nseed = 5": "options.seed=5: every run has its own",
+    '[options]\nrun_dir = "x"': "options.run_dir='x': no option that a sweep's runs take",
+    '[options]\nlauncher = "ray"': "options.launcher='ray': a run's is local or lockstep",
+    "[options]\nactors = 1.5": "options.actors=1.5: Error parsing --actors: '1.5' is no whole number",
+    "[options]\nactors = 0": "--actors=0: take a number from 1",
+    "[grid]\nlearning_rate = []": "grid.learning_rate=[]: write a list of values",
+    "[grid]\nlearning_rate = 3e-4": "grid.learning_rate=0.0003: write a list of values",
+    "[grid]\nlearning_rate = [1e-3, 1e-3]": "grid.learning_rate=[0.001, 0.001]: has a value twice",
+    '[grid]\nlearning_rate = ["high"]': "grid.learning_rate='high': Error parsing --learning-rate",
+    "[grid]\nlearning_rate = [3e-4, 7.0]": "--learning-rate=7.0: take a number from",
+    "[grid]\nlearning_rate = [1979-05-27]": "grid.learning_rate=datetime.date(1979, 5, 27)",
+    "[grid]\nlayer_norm = [true]\nembedding = [16, 0]": "--layer-norm=True: it normalises the embedding",
+    "[options]\nactors = 1\n[grid]\nactors = [1, 2]": "actors=[1, 2]: is an option of every run and varied, too",
+    "[search]": "search.ranges={}: name options",
+    "[search]\ntrials = 0\n[search.ranges]\nscheme = [1]": "search.trials=0: take 1 to",
+    "[search]\ntrails = 2": "search.trails=2: no such key; did you mean trials?",
+    '[search]\ntrials = "2"': "search.trials='2': write a whole number",
+    "[search.ranges]\nscheme = 1": "search.scheme=1: write {low",
+    "[search.ranges]\nscheme = []": "search.scheme=[]: write a list of choices",
+    "[search.ranges]\nlearning_rat = [1]": "search.learning_rat=[1]: no option that a sweep's runs take; did you mean",
+    "[search.ranges]\nlearning_rate = {low = 2, high = 1}": "search.learning_rate={'low': 2, 'high': 1",
+    "[search.ranges]\nlearning_rate = {low = 0, high = 1, log = true}": "search.learning_rate=0: a logarithmic range",
+    "[search.ranges]\nlearning_rate = {low = 0, high = 1, lag = 1}": "search.learning_rate.lag=1: no such key",
+    "[search.ranges]\nlearning_rate = {low = 1e-4, high = 2.0}": "--learning-rate=2.0: take a number from",
+    "[search.ranges]\nhide = {low = 1, high = 2}": "search.hide=1: invalid choice",
+    "[search.ranges]\nscheme = [1, 9]": "search.scheme=9: invalid choice",
+    "[search.ranges]\ngrounding = {low = 0, high = 1}": "search.grounding=",
+    "[grid]\nscheme = [1]\n[search.ranges]\nn_step = [1]": "grid=['scheme']: a sweep has a grid or a search",
+    'seeds = "1-2"\n[search.ranges]\nn_step = [1]': "seeds=[1, 2]: a search has one",
+    "seeds = [": "not TOML",
+}
+
+
+@pytest.mark.parametrize(("text", "said"), FILES.items())
+def test_a_bad_file_is_one_line_and_nothing_is_written(
+    text: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("spec.toml").write_text(f'env = "{PENDULUM}"\n{text}\n')
+    assert main.run(["sweep", "spec.toml"]) == 2
+    _one_line(capsys, said)
+    assert os.listdir() == ["spec.toml"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "ENV|SPEC.toml"),
+        (["nowhere.toml"], "SPEC='nowhere.toml': No such file"),
+        (["Nope-v5"], "no such environment"),
+        ([PENDULUM, "--sede", "1"], "options of rmc train='--sede 1': Unrecognized options: --sede"),
+        ([PENDULUM, "other"], "options of rmc train='other': Unrecognized options: other"),
+        ([PENDULUM, "--run-dir", "x"], "--run-dir='--run-dir x': a sweep's runs are given none"),
+        ([PENDULUM, "--grid", "learning_rate"], "--grid='learning_rate': write NAME=VALUE"),
+        ([PENDULUM, "--grid", "scheme=1", "scheme=2"], "has an option twice"),
+        ([PENDULUM, "--grid", "lr=1"], "grid.lr=[1]: no option"),
+        ([PENDULUM, "--grid", "scheme=1,2", "--scheme", "3"], "scheme=[1, 2]: is an option of every run"),
+        ([PENDULUM, "--grid", "grounding=true,false", "--no-grounding"], "grounding=[True, False]: is an option"),
+        ([PENDULUM, "--jobs", "-1"], "--jobs=-1: take 1 or more"),
+        ([PENDULUM, "--config", "f.toml", "--launcher", "ray"], "--config='--config f.toml': the nodes do not"),
+        ([PENDULUM, "--config", "f.toml"], "--config='f.toml': cannot be read"),
+        ([PENDULUM, "--trials", "3"], "--trials=3: is for a search"),
+        (["spec.toml", "--seeds", "1"], "--seeds='1': belongs into spec.toml"),
+        ([PENDULUM, "--search", "scheme=9..1"], "search.scheme={'low': 9"),
+        ([PENDULUM, "--preset", "debug", "--total-steps", "9"], "--total-steps=9: take more than --warmup-steps"),
+    ],
+)
+def test_bad_words_are_one_line(
+    words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main.run(["sweep", *words]) == 2
+    _one_line(capsys, said)
+    assert os.listdir() == []
+
+
+def _one_line(capsys: pytest.CaptureFixture[str], said: str) -> None:
+    found = capsys.readouterr()
+    assert found.out == ""
+    assert found.err.count("\n") == 1
+    assert said in found.err

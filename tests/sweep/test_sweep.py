@@ -1,0 +1,181 @@
+"""Sweeps as a user starts, interrupts and repeats them."""
+
+import os
+import re
+import signal
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from rmc.cli.main import run
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.folder import RunFolder
+from rmc.sweep import local_runs, room
+from rmc.sweep.job import Job
+from tests.integration.running import alive
+from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
+
+SEEDS = (1, 2)
+OTHERS = ("seed=1", "seed=2")
+
+
+def test_a_grid_is_run_once_and_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spec, folder = write_spec(tmp_path, "[grid]\nlearning_rate = [3e-4, 1e-3]\n"), tmp_path / "sweep"
+    runs = {"learning_rate=0.0003,seed=0": 3e-4, "learning_rate=0.001,seed=0": 1e-3}
+    with Sweeping(folder, str(spec), "--drop-replay") as sweep:
+        assert sweep.finish() == 0, sweep.text()
+        lines, text = sweep.lines(), sweep.text()
+    assert text.startswith(f"2 runs in {folder}, 0 of them over; {min(2, room.cores())} at a time")
+    told = re.findall(
+        r"^([12] of 2): learning_rate \S+, seed 0: return \S+ after 70[01] steps, \d+ s$", text, re.MULTILINE
+    )
+    assert told == ["1 of 2", "2 of 2"]
+    assert {name: line["values"] for name, line in lines.items()} == {
+        name: {"learning_rate": rate} for name, rate in runs.items()
+    }
+    for name, line in lines.items():
+        result = RunFolder(folder / name).result()
+        assert result is not None
+        assert line["return"] == result["eval_return_mean"]
+        assert (line["state"], line["env_steps"], line["seed"]) == ("finished", result["env_steps"], 0)
+        assert line["words"].startswith("rmc train InvertedPendulum-v5 --preset=debug --launcher=lockstep")
+        assert line["seconds"] > 0.0
+        assert not (folder / name / "replay").exists()
+    best = max(lines.values(), key=lambda line: line["return"])
+    first_row = text.splitlines()[-2].split()
+    assert first_row == [f"{best['values']['learning_rate']:.4g}", "1", f"{best['return']:,.1f}"]
+
+    before = {name: (folder / name / "metrics.jsonl").stat().st_mtime_ns for name in runs}
+    assert run(["sweep", str(spec), "--sweep-dir", str(folder)]) == 0  # nothing is left to do
+    assert capsys.readouterr().out.splitlines() == text.splitlines()[-3:]
+    assert before == {name: (folder / name / "metrics.jsonl").stat().st_mtime_ns for name in runs}
+    assert run(["sweep", str(spec), "--sweep-dir", str(folder), "--batch-size", "4"]) == 2
+    assert "--batch-size=4: the run in " in capsys.readouterr().err
+
+    one = str(folder / next(iter(runs)))
+    assert run(["evaluate", one, "--episodes", "1"]) == 0
+    assert run(["plot", str(folder), "--out", str(tmp_path / "out.png")]) == 0
+    said = capsys.readouterr().out
+    assert "RMC debug" in said
+    assert "--learning-rate 0.001" in said
+
+
+def test_a_killed_run_is_told_the_other_goes_on_and_the_same_command_resumes(tmp_path: Path) -> None:
+    """A longer one resumes finished runs, too; without their ring, which it says."""
+    spec, folder = write_spec(tmp_path, seeds=SEEDS, total_steps=2500), tmp_path / "sweep"
+    words = [str(spec), "--jobs", "2"]
+    with Sweeping(folder, *words) as sweep:
+        sweep.wait_for_updates(*OTHERS)
+        victim = sweep.run_process("seed=1")
+        assert victim is not None
+        victim.kill()
+        with Sweeping(folder, *words) as second:  # only one at a time
+            assert second.finish(60.0) == 2
+            assert "another rmc sweep runs in it" in second.text()
+            assert second.text().count("\n") == 1
+        assert sweep.finish() == 1
+    assert sweep.states() == {"seed=1": "failed", "seed=2": "finished"}
+    assert sweep.lines()["seed=1"]["reason"] == f"killed by signal 9; see {folder / 'logs' / 'seed=1.log'}"
+    steps = sweep.lines()["seed=1"]["env_steps"]
+    with Sweeping(folder, *words, "--total-steps", "2600", "--drop-replay") as sweep:
+        assert sweep.finish() == 0, sweep.text()
+    assert steps < 2500
+    assert all(line["env_steps"] >= 2600 for line in sweep.lines().values())
+    log = (folder / "logs" / "seed=1.log").read_text()
+    assert log.count("run folder") == 2
+    with Sweeping(folder, *words, "--total-steps", "2700") as sweep:
+        assert sweep.finish() == 0, sweep.text()
+    assert "without their replay ring, these go on with --warmup-steps that are not trained on: seed=1, seed=2" in (
+        sweep.text()
+    )
+
+
+def test_a_run_that_fails_is_told_with_its_last_words(tmp_path: Path) -> None:
+    """As where its folder has something else in it."""
+    spec, folder = write_spec(tmp_path, seeds=SEEDS), tmp_path / "sweep"
+    (folder / "seed=1").mkdir(parents=True)
+    (folder / "seed=1" / "thesis.tex").touch()
+    with Sweeping(folder, str(spec)) as sweep:
+        assert sweep.finish() == 1
+    assert sweep.states() == {"seed=1": "failed", "seed=2": "finished"}
+    assert re.search(
+        r"^\d of 2: seed 1: failed: .*is no run's folder; give another one; see ", sweep.text(), re.MULTILINE
+    )
+    assert "1 failed" in sweep.text()
+    assert "1 not over; the same command goes on; " in sweep.text()
+    assert (folder / "seed=1" / "thesis.tex").exists()
+
+
+def test_ctrl_c_ends_all_in_order_and_a_kill_leaves_nothing(tmp_path: Path) -> None:
+    spec, folder = write_spec(tmp_path, seeds=(1, 2, 3), **ENDLESS, launcher="local"), tmp_path / "sweep"
+    words = [str(spec), "--jobs", "2"]
+    with Sweeping(folder, *words) as sweep:
+        sweep.wait_for_updates(*OTHERS)
+        processes = psutil.Process(sweep.process.pid).children(recursive=True)
+        assert sweep.interrupt() == 130
+        assert not alive(processes)
+        assert sweep.states() == {"seed=1": "stopped", "seed=2": "stopped", "seed=3": "waiting"}
+    for name in OTHERS:
+        assert RunFolder(folder / name).ended() == 130  # it has saved
+        assert max((folder / name / "checkpoints").glob("[0-9]*")).is_dir()
+    with Sweeping(folder, *words) as sweep:
+        sweep.wait_for(lambda: all(sweep.run_process(name) for name in OTHERS))
+        processes = psutil.Process(sweep.process.pid).children(recursive=True)
+        assert len(processes) >= 2
+        sweep.process.kill()
+        sweep.process.wait()
+        deadline = time.monotonic() + 20.0
+        while alive(processes):
+            assert time.monotonic() < deadline, alive(processes)
+            time.sleep(0.1)
+
+
+def test_cores_are_shared_out() -> None:
+    mine = os.sched_getaffinity(0)
+    for count in (1, len(mine), len(mine) + 1):
+        parts = local_runs.core_parts(count)
+        assert len(parts) == count
+        assert set().union(*parts) == mine
+        assert count > len(mine) or sum(map(len, parts)) == len(mine)
+    assert room.runs_that_fit(1, 1 << 60) == 1
+    assert room.runs_that_fit(1, 1) == len(mine)
+    assert room.runs_that_fit(2 * len(mine), 1) == 1
+
+
+def test_rings_that_the_disk_cannot_hold_are_refused(tmp_path: Path) -> None:
+    jobs = [Job(tmp_path / f"seed={seed}", (), seed) for seed in range(3)]
+    free = 1 << 45
+    with pytest.raises(ConfigError, match=r"3 rings take .* are free; take --drop-replay"):
+        room.check_disk(tmp_path, jobs, free, 1, dropped=False)
+    with pytest.raises(ConfigError, match=r"1 rings take .* take fewer --jobs"):
+        room.check_disk(tmp_path, jobs, free, 1, dropped=True)
+    for job in jobs:
+        (job.folder / "replay").mkdir(parents=True)
+    room.check_disk(tmp_path, jobs, free, 1, dropped=False)
+
+
+def test_a_sweep_in_a_runs_folder_or_with_a_damaged_index_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = str(write_spec(tmp_path))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text("{}")
+    (tmp_path / "torn").mkdir()
+    (tmp_path / "torn" / "sweep.jsonl").write_text('{"run": "seed=0"')
+    (tmp_path / "file").touch()
+    for name, fault in {"run": "is a run's folder", "torn": "sweep.jsonl:1", "file": "cannot be used"}.items():
+        assert run(["sweep", spec, "--sweep-dir", str(tmp_path / name)]) == 2
+        said = capsys.readouterr().err
+        assert fault in said
+        assert said.count("\n") == 1
+
+
+def test_a_stop_signal_before_a_run_trains_ends_it_too(tmp_path: Path) -> None:
+    spec = write_spec(tmp_path, launcher="local")
+    with Sweeping(tmp_path / "sweep", str(spec)) as sweep:
+        sweep.wait_for(lambda: sweep.run_process("seed=0"))
+        sweep.process.send_signal(signal.SIGTERM)
+        assert sweep.finish(60.0) == 130
+    assert sweep.states() == {"seed=0": "stopped"}
