@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo wheel site test test-faults test-cluster test-dm-control test-newest lint docs bench peers clean
+.PHONY: env demo wheel site test test-faults test-cluster test-container test-dm-control test-newest lint docs bench peers clean
 
 env: $(STAMP)
 
@@ -59,6 +59,10 @@ ONLY ?= test
 
 test-cluster: $(STAMP)
 	for round in $$(seq $(ROUNDS)); do RMC_CUTS="$(CUTS)" $(BIN)/python -m pytest -x tests/cluster/on_machines.py -k "$(ONLY)" || exit; done
+
+# The Dockerfile's steps in a chroot, some minutes and 2 GB: Linux, root, debootstrap. A network, or RMC_TORCH_INDEX and pip's settings.
+test-container: $(STAMP)
+	$(BIN)/python -m pytest -x tests/packaging/in_container.py
 
 # In an environment of its own, .venv-dm-control: dm_control wants an older MuJoCo than the others' 4.
 test-dm-control:

@@ -30,7 +30,7 @@ from rmc.actors.config import EvaluatorConfig
 from rmc.actors.evaluator import first_start, play_episodes, told
 from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, read, validate
 from rmc.analysis.evaluation import FINAL_EPISODES, Progress, Watch
-from rmc.common.env.make import env_spaces, make_env
+from rmc.common.env.make import env_layout, make_env
 from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
@@ -41,10 +41,10 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.opening import make, new_folder
 from rmc.deploy.run.starts import note_start, resume_command
+from rmc.deploy.run.state import STOPPED
 
 CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
 MAY_CHANGE = {"total_steps", "threads", "checkpoint_steps", "episodes", "env.env_timeout"}
-STOPPED = 130  # exit status after Ctrl-C, as shells have it
 SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
 RECORD_SECONDS = 5.0
 MODEL, BUFFER, SCALES, PROGRESS = "model.zip", "replay_buffer.pkl", "scales.pkl", "progress.json"
@@ -55,12 +55,14 @@ def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: 
     validate(config)
     sizes = _sizes(config)
     folder = _open_folder(config, run_dir, sizes)
+    status = 1
     try:
         _set_torch(config)
         console.print(f"run folder {folder.path}", soft_wrap=True)
-        return _conduct(config, folder, console, stop)
+        status = _conduct(config, folder, console, stop)
     finally:
-        folder.unlock()
+        folder.unlock(status)
+    return status
 
 
 def _set_torch(config: BaselineConfig) -> None:
@@ -85,8 +87,8 @@ def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: 
 
 def _sizes(config: BaselineConfig) -> dict[str, int]:
     """What its networks are made for. Raises ConfigError."""
-    observations, actions, _ = env_spaces(config.env)
-    return {"observations": observations, "actions": actions}
+    layout = env_layout(config.env)
+    return {"observations": layout.obs_dim, "actions": layout.action_dim}
 
 
 def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, int]) -> RunFolder:
@@ -331,7 +333,7 @@ def evaluate(
     seconds: float = 0.0,
     watch: Watch = lambda _: None,
 ) -> dict[str, Any]:
-    """Deterministic episodes of what a baseline's run saved last, as ``evaluate_checkpoint``. Raises ConfigError."""
+    """Deterministic episodes of what a baseline's run saved last, as ``evaluate_policy``. Raises ConfigError."""
     config, states = read(folder), _states(folder)
     if not states:
         raise ConfigError("RUN", str(folder.path), "it has no checkpoint yet; train it for longer")

@@ -70,12 +70,13 @@ def _faster_actors(vitals: Vitals, config: RunConfig, learner: float) -> str:
     """As many actors as would keep the learner busy, where there are cores for them."""
     wanted = ceil(config.actors / max(learner, 0.01))
     ratio = f"--replay-ratio {config.replay.replay_ratio / max(learner, 0.01):.3g} would use the learner's idle time"
-    free = floor(free_cores(vitals))
-    if free < 1:
+    shards, free = config.replay.replay_shards, free_cores(vitals)
+    if free is None:
+        return f"more --actors would help where cores are free; with what there is, {ratio}"
+    if free < 1.0:
         return f"all cores are taken: more machines (--launcher ray) would help, and {ratio}"
-    affordable = min(wanted, config.actors + free)
-    affordable -= affordable % config.replay.replay_shards
-    return f"--actors {max(affordable, config.actors + 1)} would help; with what there is, {ratio}"
+    affordable = min(wanted, config.actors + floor(free)) // shards * shards
+    return f"--actors {max(affordable, config.actors + shards)} would help; with what there is, {ratio}"
 
 
 def delivery_bound(vitals: Vitals, config: RunConfig) -> Finding | None:
@@ -114,10 +115,10 @@ def learner_threads(config: RunConfig, cores: int) -> int:
 
 def host_cores(vitals: Vitals) -> int:
     """Cores that the run may use; 0 where it was recorded without."""
-    return int(vitals.last("launcher", "host_cores") or 0)
+    return int(vitals.last("launcher", "host_cores"))
 
 
-def free_cores(vitals: Vitals) -> float:
+def free_cores(vitals: Vitals) -> float | None:
     """Cores that nobody computes on, on average; a role that is busy need not compute: its environment may wait."""
     idle = vitals.mean("launcher", "host_idle_share")
-    return idle * host_cores(vitals) if idle is not None else 0.0
+    return idle * host_cores(vitals) if idle is not None else None

@@ -1,7 +1,6 @@
 """Playing a checkpoint: the one way in which ``rmc evaluate`` and the end of a run judge a policy."""
 
 import dataclasses
-import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,13 +12,14 @@ from rich.console import Console
 
 from rmc.actors.evaluator import Rollout, first_start, play_episodes, told
 from rmc.actors.policy_runner import PolicyRunner
+from rmc.analysis.policy_file import PolicyFile
 from rmc.common.agent import Agent
-from rmc.common.checkpoint import POLICY, PROGRESS, STATE
-from rmc.common.env.make import make_env
-from rmc.common.errors import ConfigError, MessageError
-from rmc.deploy.run.checkpoint_choice import choose_checkpoint
-from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import RunFolder
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import first_env
+from rmc.common.env.wrappers import Env
+from rmc.common.errors import ConfigError
+from rmc.common.policy_header import PolicyHeader
+from rmc.deploy.run.config import RunConfig, check_sizes, env_sizes
 
 FINAL_EPISODES = 10  # of a run's first and last evaluation
 SAY_SECONDS = 10.0  # between lines that an evaluation goes on
@@ -41,22 +41,35 @@ class Progress:
 
 
 def evaluate_blob(
-    config: RunConfig,
+    header: PolicyHeader,
     blob: bytes,
     episodes: int,
     flicker: float | None = None,
     seconds: float = 0.0,
     watch: Watch = lambda _: None,
 ) -> dict[str, Any]:
-    """Deterministic episodes of a policy, cut after ``seconds`` (0: never): mean, deviation and number of returns."""
-    env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
-    spec = config.window_spec()
-    runner = PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, envs=1)
+    """Deterministic episodes of a policy, cut after ``seconds`` (0: never): mean, deviation and number of returns.
+
+    Raises ConfigError where its environment cannot be made, or has other sizes than the policy.
+    """
+    env = header.env if flicker is None else dataclasses.replace(header.env, flicker=flicker)
+    runner = PolicyRunner(header.obs_dim, header.action_dim, header.agent, envs=1)
     runner.load(blob)
     with _one_thread():
-        seed = first_start(config.seed, final=True)
-        match = play_episodes(runner, lambda: make_env(env), episodes, seed, seconds, watch)
+        seed = first_start(header.seed, final=True)
+        match = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
     return told(match) | {"eval_flicker": env.flicker}
+
+
+def policy_env(header: PolicyHeader, config: EnvConfig) -> Env:
+    """An environment for a policy to act in. Raises ConfigError, also where its sizes are not the policy's."""
+    env = first_env(config)
+    try:
+        check_sizes(config.id, {"observations": header.obs_dim, "actions": header.action_dim}, env_sizes(env))
+    except ConfigError:
+        env.close()
+        raise
+    return env
 
 
 @contextmanager
@@ -70,45 +83,23 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def evaluate_checkpoint(
-    folder: RunFolder,
-    config: RunConfig,
-    checkpoint: str,
+def evaluate_policy(
+    policy: PolicyFile,
     episodes: int,
     flicker: float | None = None,
     seconds: float = 0.0,
     watch: Watch = lambda _: None,
 ) -> dict[str, Any]:
-    """Deterministic episodes of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
-    progress, blob = load_checkpoint(folder, config, checkpoint)
+    """Deterministic episodes of a policy, as ``evaluate_blob``, and where it comes from. Raises ConfigError."""
+    header = policy.header
     return {
-        "env": config.env.id,
-        "preset": config.preset,
-        "seed": config.seed,
-        "env_steps": progress["env_steps"],
-        "updates": progress["updates"],
-        **evaluate_blob(config, blob, episodes, flicker, seconds, watch),
+        "env": header.env.id,
+        "preset": header.preset,
+        "seed": header.seed,
+        "env_steps": header.env_steps,
+        "updates": header.updates,
+        **evaluate_blob(header, policy.blob, episodes, flicker, seconds, watch),
     }
-
-
-def load_checkpoint(folder: RunFolder, config: RunConfig, checkpoint: str) -> tuple[dict[str, Any], bytes]:
-    """Progress and policy of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError, also where the
-    policy is not this config's.
-
-    The best is of those that were evaluated while it trained, which the last one need not be.
-    """
-    (_, files), spec = choose_checkpoint(folder, checkpoint), config.window_spec()
-    folder.check_sizes(config.env.id, config.sizes())
-    try:
-        PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, envs=1).load(files[POLICY])
-    except MessageError as error:
-        raise ConfigError("--checkpoint", checkpoint, f"{error}; use another") from None
-    return json.loads(files[PROGRESS]), files[POLICY]
-
-
-def load_state(folder: RunFolder, checkpoint: str) -> bytes:
-    """The learner's whole state of a checkpoint, for ``torch.load``. Raises ConfigError."""
-    return choose_checkpoint(folder, checkpoint)[1][STATE]
 
 
 def initial_policy(config: RunConfig) -> bytes:

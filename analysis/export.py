@@ -2,6 +2,7 @@
 
 Inputs: observation (N, O) raw, previous_action (N, A), missing (N,) bool, state (N, S), zeros at an episode's start.
 Outputs: action (N, A) in [-1, 1], the policy's mean, and next_state (N, S).
+The model's metadata hold the policy's header, as its safetensors do.
 """
 
 import contextlib
@@ -16,12 +17,10 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from rmc.analysis.evaluation import load_checkpoint
-from rmc.analysis.out_file import check_writable
+from rmc.analysis.policy_file import PolicyFile
 from rmc.common.agent import Agent
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
-from rmc.deploy.run.folder import RunFolder
 
 INPUTS, OUTPUTS = ("observation", "previous_action", "missing", "state"), ("action", "next_state")
 NEEDED = ("onnx", "onnxscript")
@@ -47,24 +46,25 @@ class _Step(nn.Module):
         return torch.tanh(mean), state
 
 
-def export(folder: RunFolder, checkpoint: str, out: Path) -> None:
-    """Write the policy of a checkpoint to ``out``. Raises ConfigError."""
+def export(policy: PolicyFile, out: Path) -> None:
+    """Write a policy to ``out``, its header in the model's metadata. Raises ConfigError."""
     for name in NEEDED:
         if importlib.util.find_spec(name) is None:
             raise ConfigError("--out", str(out), f"{name} is missing; {how_to_install('onnx')}")
-    check_writable("--out", out, (".onnx",))
-    config = folder.config()
-    (_, blob), spec = load_checkpoint(folder, config, checkpoint), config.window_spec()
-    agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
-    agent.load_state_dict(safetensors.torch.load(blob), strict=False)
-    two = [torch.zeros(2, size) for size in (spec.obs_dim, spec.action_dim, spec.state)]
+    header = policy.header
+    agent = Agent(header.obs_dim, header.action_dim, header.agent)
+    agent.load_state_dict(safetensors.torch.load(policy.blob), strict=False)
+    two = [torch.zeros(2, size) for size in header.sizes().values()]
     example = (two[0], two[1], torch.zeros(2, dtype=torch.bool), two[2])
     rows = torch.export.Dim("rows", min=1)
     with _quiet():
-        torch.onnx.export(
-            _Step(agent).eval(), example, str(out), input_names=INPUTS, output_names=OUTPUTS,
-            dynamic_shapes=({0: rows},) * 4, dynamo=True, external_data=False,
+        made = torch.onnx.export(
+            _Step(agent).eval(), example, input_names=INPUTS, output_names=OUTPUTS,
+            dynamic_shapes=({0: rows},) * 4, dynamo=True,
         )  # fmt: skip
+        assert made is not None
+        made.model.metadata_props.update(header.metadata())
+        made.save(str(out), external_data=False)
 
 
 @contextlib.contextmanager

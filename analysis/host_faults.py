@@ -25,7 +25,7 @@ def threads_fight(vitals: Vitals, config: RunConfig) -> Finding | None:
     if threads > cores:
         measured = f"the learner has {threads} threads on {cores} cores"
         return Finding("threads fight", measured, f"--threads {max(1, cores - 1)} leaves one to the other roles")
-    if busy <= CROWDED * cores or free_cores(vitals) > IDLE_CORES * cores:
+    if busy <= CROWDED * cores or (free_cores(vitals) or 0.0) > IDLE_CORES * cores:
         return None
     measured = f"{busy:.1f} threads of the run are busy at a time, on {cores} cores"
     fewer = max(1, int(cores - busy + threads))
@@ -47,7 +47,7 @@ def oversubscribed(vitals: Vitals, config: RunConfig) -> Finding | None:
     busy = busy_threads(vitals, config, cores)
     if load <= busy + LOADED:  # it is this run's own, which threads_fight judges
         return None
-    measured = f"load {load:.1f} on {cpus} CPUs, of which this run is {busy:.1f}"
+    measured = f"load {load:.1f} on {cpus:.0f} CPUs, of which this run is {busy:.1f}"
     return Finding("oversubscribed", measured, "other programs take the rest: end them, or use another machine")
 
 

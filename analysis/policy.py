@@ -7,72 +7,151 @@
     action = policy.act(observation, info.get("missing", False))
     observation, reward, terminated, truncated, info = env.step(action)
 
-Shapes: O observation, A action, S state.
+Shapes: N episodes side by side, O observation, A action, S state.
 """
 
 from pathlib import Path
+from typing import Any, Literal, overload
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from rmc.actors.policy_runner import PolicyRunner
-from rmc.analysis.evaluation import load_checkpoint
-from rmc.common.env.make import make_env
+from rmc.analysis.evaluation import policy_env
+from rmc.analysis.policy_file import PolicyFile, read_policy
+from rmc.common.env.layout import ActionScale
 from rmc.common.env.wrappers import Env, Floats
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import RunFolder
+from rmc.common.policy_header import PolicyHeader
+from rmc.common.window import BoolArray
+
+Units = Literal["agent", "environment"]
+UNITS = ("agent", "environment")
 
 
-def load_policy(run: str | Path, checkpoint: str = "latest") -> "Policy":
-    """The policy of a run's ``latest``, ``best`` or numbered checkpoint. Raises ConfigError."""
-    folder = RunFolder(Path(run))
-    config = folder.config()
-    _, blob = load_checkpoint(folder, config, checkpoint)
-    return Policy(config, blob)
+def load_policy(source: str | Path, checkpoint: str = "latest") -> "Policy":
+    """The policy of a file, of ``hf://owner/name``, or of a run's ``latest``, ``best`` or numbered checkpoint.
+
+    A file is all that it takes: neither its run nor the module of its environment need be there. Raises ConfigError.
+    """
+    return Policy(read_policy(source, checkpoint))
 
 
 class Policy:
-    """Acts in one environment, and remembers: ``reset`` at the start of every episode, then ``act`` at every step."""
+    """Acts, and remembers: ``reset`` at the start of every episode, then ``act`` at every step.
 
-    def __init__(self, config: RunConfig, blob: bytes, seed: int = 0) -> None:
-        """``blob`` is the safetensors of a policy; ``seed`` is for actions that explore. Raises MessageError."""
-        spec = config.window_spec()
-        self.config, self._obs_dim = config, spec.obs_dim
-        self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, config.agent, envs=1)
-        self._runner.load(blob)
-        self._rng = np.random.default_rng(seed)
-        self.reset()
+    It acts in one episode, or in N side by side: as many as the first observation after ``reset`` has rows.
+    """
+
+    def __init__(self, file: PolicyFile, seed: int = 0) -> None:
+        """``seed`` is for actions that explore."""
+        self._file, self._rng = file, np.random.default_rng(seed)
+        layout = file.header.layout
+        self._scale = ActionScale(np.array(layout.action_low), np.array(layout.action_high))
+        self._runner: PolicyRunner | None = None
+        self._prev_action = self._state = np.zeros((0, 0), np.float32)  # (N, A), (N, S), once it acts
+
+    @property
+    def header(self) -> PolicyHeader:
+        """Its sizes, options, environment, steps and return."""
+        return self._file.header
 
     def make_env(self) -> Env:
-        """An environment as the policy saw it in training: actions in [-1, 1], and all that the run's options hide."""
-        return make_env(self.config.env)
+        """An environment as the policy saw it in training: actions in [-1, 1], and all that the run's options hide.
 
-    def reset(self) -> None:
-        """Forget: a new episode begins."""
-        self._prev_action, self._state = self._runner.start()
-
-    def act(self, observation: Floats, missing: bool = False, explore: bool = False) -> Floats:
-        """(O,) -> (A,) in [-1, 1]: the policy's mean, or a sample of it.
-
-        ``missing`` says that the frame is missing (``info["missing"]`` under flicker). A policy that fills missing
-        frames also takes one that is not finite for missing. Raises ConfigError for any other that it cannot read.
+        Raises ConfigError where its module cannot be imported, or its sizes are others now.
         """
-        noise = self._rng.standard_normal(self._prev_action.shape, np.float32) if explore else None
-        seen, missing = self._read(observation, missing)
-        action, state = self._runner.act(seen, self._prev_action, np.array([missing]), self._state, noise)
-        self._prev_action, self._state[:] = action, state
-        found: Floats = action[0].copy()
-        return found
+        return policy_env(self.header, self.header.env)
 
-    def _read(self, observation: Floats, missing: bool) -> tuple[Floats, bool]:
-        """(O,) -> (1, O), and whether it counts as missing. Raises ConfigError; nothing is remembered of it then."""
-        with np.errstate(over="ignore"):  # infinity, which is judged below
+    def reset(self, index: int | None = None) -> None:
+        """Forget: a new episode begins, in all of them or in that of one row. Raises ConfigError."""
+        if index is None:
+            self._runner = None
+        elif self._runner is not None:
+            rows = len(self._state)
+            if not -rows <= index < rows:
+                raise ConfigError("index", index, f"the policy acts in {rows} episodes, from 0 on")
+            self._prev_action[index], self._state[index] = 0.0, 0.0
+
+    @overload
+    def act(
+        self,
+        observation: ArrayLike,
+        missing: bool | BoolArray = ...,
+        explore: bool = ...,
+        units: Literal["agent"] = ...,
+    ) -> Floats: ...
+    @overload
+    def act(
+        self, observation: ArrayLike, missing: bool | BoolArray = ..., explore: bool = ..., *, units: Units
+    ) -> NDArray[Any]: ...
+    def act(
+        self,
+        observation: ArrayLike,
+        missing: bool | BoolArray = False,
+        explore: bool = False,
+        units: Units = "agent",
+    ) -> NDArray[Any]:
+        """(O,) -> (A,) or (N, O) -> (N, A): the policy's mean, or a sample of it.
+
+        ``missing``, one or (N,), says that the frame is missing (``info["missing"]`` under flicker). A policy that
+        fills missing frames also takes one that is not finite for missing. ``units`` "agent" gives float32 in [-1, 1],
+        as ``make_env`` takes; "environment" what the environment itself takes: its units, dtype and shape, where its
+        action is a Dict or a Tuple all numbers in a row. Raises ConfigError for what it cannot read.
+        """
+        if units not in UNITS:
+            raise ConfigError("units", units, f"use one of {UNITS}")
+        seen, absent = self._read(observation, missing)
+        runner = self._begin(len(seen))
+        shape = self._prev_action.shape
+        noise = self._rng.standard_normal(shape, np.float32) if explore else None
+        action, state = runner.act(seen, self._prev_action, absent, self._state, noise)
+        self._prev_action, self._state[:] = action, state
+        found = action.copy() if units == "agent" else self._in_environment(action)
+        return found if np.ndim(observation) == 2 else found[0]
+
+    def _begin(self, rows: int) -> PolicyRunner:
+        """What acts in so many episodes; new ones begin after ``reset``."""
+        if self._runner is None:
+            header = self.header
+            runner = PolicyRunner(header.obs_dim, header.action_dim, header.agent, rows)
+            runner.load(self._file.blob)
+            self._runner, (self._prev_action, self._state) = runner, runner.start()
+        return self._runner
+
+    def _in_environment(self, action: Floats) -> NDArray[Any]:
+        """(N, A) in [-1, 1] -> (N, ...) as the environment takes it."""
+        parts, scaled = self.header.layout.actions, self._scale(action)
+        if len(parts) > 1:
+            return scaled.astype(np.result_type(*(part.dtype for part in parts)))
+        return scaled.astype(parts[0].dtype).reshape(len(action), *parts[0].shape)
+
+    def _read(self, observation: ArrayLike, missing: bool | BoolArray) -> tuple[Floats, BoolArray]:
+        """(N, O), and (N,) whether each counts as missing. Raises ConfigError; nothing is remembered of it then."""
+        seen = self._rows(observation)
+        absent = np.array(missing, bool)
+        if absent.shape not in ((), (len(seen),)):
+            raise ConfigError("missing", f"of shape {absent.shape}", f"give one, or one for each of {len(seen)} rows")
+        absent = np.broadcast_to(absent, len(seen)).copy()
+        odd = ~np.isfinite(seen) & ~absent[:, None]
+        if odd.any():
+            if not self.header.agent.impute_missing:
+                places = [place if len(seen) == 1 else (row, place) for row, place in np.argwhere(odd).tolist()]
+                values = dict(zip(places, seen[odd].tolist(), strict=True))
+                raise ConfigError("observation", values, "give finite numbers, or missing=True where there is none")
+            absent |= odd.any(1)
+        return seen, absent
+
+    def _rows(self, observation: ArrayLike) -> Floats:
+        """(O,) or (N, O) -> (N, O). Raises ConfigError."""
+        with np.errstate(over="ignore"):  # infinity, which is judged later
             seen = np.asarray(observation, np.float32)
-        if seen.shape != (self._obs_dim,):
-            raise ConfigError("observation", f"of shape {seen.shape}", f"the policy reads shape {(self._obs_dim,)}")
-        if not (missing or np.isfinite(seen).all()):
-            missing = True
-            if not self.config.agent.impute_missing:
-                odd = {i: float(seen[i]) for i in np.flatnonzero(~np.isfinite(seen)).tolist()}
-                raise ConfigError("observation", odd, "give finite numbers, or missing=True where there is none")
-        return seen[None], missing
+        size = self.header.obs_dim
+        if seen.ndim not in (1, 2) or seen.shape[-1] != size or not len(seen):
+            fix = f"the policy reads shape {(size,)}, or (N, {size}) of N episodes"
+            raise ConfigError("observation", f"of shape {seen.shape}", fix)
+        rows = seen.reshape(-1, size)
+        if self._runner is not None and len(rows) != len(self._state):
+            fix = f"the policy acts in {len(self._state)} episodes; reset() it before there are others"
+            raise ConfigError("observation", f"of shape {seen.shape}", fix)
+        return rows

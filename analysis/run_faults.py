@@ -21,7 +21,7 @@ def stalled(vitals: Vitals, _: RunConfig) -> Finding | None:
     still = _still_seconds(vitals)
     if still < STALLED_SECONDS:
         return None
-    waits = [f"{role} for {reason}" for role in vitals.roles if (reason := vitals.last(role, "waiting_for"))]
+    waits = [f"{role} for {reason}" for role in vitals.roles if (reason := vitals.waiting_for(role))]
     measured = f"no step and no update for {still:.0f} s ({', '.join(waits) or 'nobody says what it waits for'})"
     return Finding("deadlock", measured, "rmc stop saves the run and rmc resume goes on with it; logs/ may say why")
 
@@ -48,10 +48,10 @@ def silent(vitals: Vitals, _: RunConfig) -> Finding | None:
 
 def long_warm_up(vitals: Vitals, config: RunConfig) -> Finding | None:
     """No update yet, and none for long."""
-    steps = sum(vitals.last(role, "env_steps") or 0 for role in vitals.of("replay"))
-    rates = [vitals.last(role, "env_steps_per_s") or 0.0 for role in vitals.of("replay")]
+    steps = sum(vitals.last(role, "env_steps") for role in vitals.of("replay"))
+    rates = [vitals.last(role, "env_steps_per_s") for role in vitals.of("replay")]
     missing = config.replay.warmup_steps - steps
-    if vitals.last("learner", "updates") != 0 or missing <= 0 or sum(rates) <= 0.0:
+    if vitals.last("learner", "updates") > 0 or missing <= 0 or sum(rates) <= 0.0:
         return None
     left = missing / sum(rates)
     if left < WARM_UP_SECONDS:
@@ -98,7 +98,7 @@ def stale_weights(vitals: Vitals, config: RunConfig) -> Finding | None:
 
 def oversized_ring(vitals: Vitals, config: RunConfig) -> Finding | None:
     """A ring that the whole run cannot fill."""
-    steps = sum(vitals.last(role, "env_steps") or 0 for role in vitals.of("replay"))
+    steps = sum(vitals.last(role, "env_steps") for role in vitals.of("replay"))
     fills = vitals.values("replay", "ring_fill")
     if not steps or not fills or max(fills) >= HALF_FULL:
         return None

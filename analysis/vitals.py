@@ -6,7 +6,7 @@ Kinds are roles without their number: ``actor`` stands for ``actor-0``, ``actor-
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from statistics import mean
-from typing import Any
+from typing import Any, TypeGuard
 
 from rmc.common.bus.metrics_record import is_finite
 
@@ -51,9 +51,15 @@ class Vitals:
         found = self._roles.get(role, [])
         return [(record["time"], float(record[name])) for record in found if is_finite(record.get(name))]
 
-    def last(self, role: str, name: str) -> Any:
-        """A role's newest value."""
-        return next((record[name] for record in reversed(self._roles.get(role, [])) if name in record), None)
+    def last(self, role: str, name: str) -> float:
+        """A role's newest number; 0 where it has said none."""
+        found = self.series(role, name)
+        return found[-1][1] if found else 0.0
+
+    def waiting_for(self, role: str) -> str:
+        """What a role has waited for last; empty where it did not."""
+        said = (record["waiting_for"] for record in reversed(self._roles.get(role, [])) if "waiting_for" in record)
+        return str(next(said, ""))
 
     def values(self, kind: str, name: str) -> list[float]:
         """All that the roles of a kind have said."""
@@ -88,7 +94,7 @@ class Vitals:
         for role in self.of(kind):
             for record in self._roles[role]:
                 busy, waiting = record.get("busy_share"), record.get("waiting_share")
-                if is_finite(busy) and is_finite(waiting) and busy + waiting > 0.0:
+                if _is_share(busy) and _is_share(waiting) and busy + waiting > 0.0:
                     yield record
 
     def training(self) -> "Vitals":
@@ -96,6 +102,10 @@ class Vitals:
         updates = self.series("learner", "updates")
         began = next((time for time, value in updates if value > updates[0][1]), float("inf"))
         return Vitals(one for found in self._roles.values() for one in found if one["time"] > began)
+
+
+def _is_share(value: Any) -> TypeGuard[float]:
+    return is_finite(value) and 0.0 <= value <= 1.0
 
 
 def _newest(records: Iterable[Record], span: float) -> list[Record]:

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rmc.actors.evaluator import LONGEST_EPISODE
-from rmc.analysis.evaluation import load_state
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import load_policy
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
+from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.learner.diagnostics import relative_l1_error
@@ -68,7 +68,7 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     spec = config.window_spec()
     folder.check_sizes(config.env.id, config.sizes())
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
-    raw = load_state(folder, checkpoint)
+    raw = choose_checkpoint(folder, checkpoint)[1][STATE]
     try:
         agent.load_state_dict(torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)["agent"])
     except (pickle.UnpicklingError, EOFError, RuntimeError, KeyError, TypeError) as error:

@@ -29,7 +29,7 @@ from benchmarks.harness import (
 )
 from benchmarks.sender import CHUNK, Sender
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.make import env_spaces
+from rmc.common.env.make import env_layout
 from rmc.common.window import WindowSpec
 from rmc.replay_server.config import ReplayConfig
 
@@ -81,7 +81,8 @@ def copy(spec: WindowSpec, seconds: float) -> Measure:
 
 def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
     """Windows of one environment."""
-    obs_dim, action_dim, _ = env_spaces(EnvConfig(env_id))
+    layout = env_layout(EnvConfig(env_id))
+    obs_dim, action_dim = layout.obs_dim, layout.action_dim
     spec, cores = WindowSpec(obs_dim, action_dim, HIDDEN), sorted(os.sched_getaffinity(0))
     words = [str(word) for word in (cores[0], cores[-1], obs_dim, action_dim, HIDDEN, WINDOWS[env_id], CHUNK)]
     python, peers = peer_python("reverb"), dict[str, Measure | None]()

@@ -35,7 +35,7 @@ from benchmarks.peers.turns import send_at
 from benchmarks.sender import CHUNK, Sender
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.make import env_spaces
+from rmc.common.env.make import env_layout
 from rmc.common.replay import SampleStatus
 from rmc.common.window import WindowSpec
 from rmc.learner.batch import Batch, clear_padding, importance_weights, view_batch
@@ -143,7 +143,8 @@ def gather(spec: WindowSpec, windows: int, seconds: float) -> Measure:
 
 def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
     """Windows of one environment."""
-    obs_dim, action_dim, _ = env_spaces(EnvConfig(env_id))
+    layout = env_layout(EnvConfig(env_id))
+    obs_dim, action_dim = layout.obs_dim, layout.action_dim
     spec, windows = WindowSpec(obs_dim, action_dim, HIDDEN), WINDOWS[env_id]
     core = max(os.sched_getaffinity(0))
     sizes = [str(size) for size in (core, obs_dim, action_dim, HIDDEN, windows, BATCH, RATE, CHUNK)]

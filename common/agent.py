@@ -300,6 +300,11 @@ class Agent(nn.Module):
         """What it takes to act, detached, on the CPU: what fills missing frames, too, where they are filled."""
         return self._weights(self._acting())
 
+    def policy_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of ``policy_weights``; also of an agent on the device ``meta``, which takes no memory."""
+        found = self.state_dict().items()
+        return {name: tuple(value.shape) for name, value in found if name.startswith(self._acting())}
+
     def broadcast_weights(self) -> dict[str, Tensor]:
         """What actors are sent: the critics, too, where they rate their windows."""
         return self._weights(self._acting() + (CRITIC_PARTS if self.config.initial_priority == "actor" else ()))

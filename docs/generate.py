@@ -27,6 +27,7 @@ TITLES = {
 }
 HEAD, RULE = "| option | default | what it is | when to touch it |", "|---|---|---|---|"
 PLACEMENT = ["run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls", "dry_run"]
+TRACKING = ["track", "track_project", "track_tags"]
 BEGINNING = ["init_from", "init_parts"]
 # When a user should touch an option; what it does is said where it is defined.
 WHEN = {
@@ -44,6 +45,9 @@ WHEN = {
     "ray_address": "`local` to try Ray on one machine",
     "all_cpus": "on a cluster that is there for this run",
     "tls": "where others are on the cluster's network",
+    "track": "to compare runs in a web service, or to keep their videos",
+    "track_project": "to keep kinds of runs apart",
+    "track_tags": "to find runs again",
     "dry_run": "before a long run, or on a machine that is new to it",
     "flicker": "for trials of partial observation",
     "hide": "for trials of partial observation",
@@ -133,6 +137,7 @@ def page() -> str:
         if part == "run":
             lines += ["", "Which of them may change when a run goes on: [Resume a run](resume.md#what-may-change)."]
             lines += ["", "## Where it runs", "", HEAD, RULE, *_launch_rows(PLACEMENT)]
+            lines += ["", "## Trackers", "", HEAD, RULE, *_launch_rows(TRACKING)]
             lines += ["", "## What a new run begins with", "", HEAD, RULE, *_launch_rows(BEGINNING)]
     return "\n".join(lines) + "\n"
 
@@ -170,7 +175,7 @@ def _docstrings(kind: type[Any]) -> dict[str, str]:
 
 
 def _text(value: Any) -> str:
-    if value is None or value == {}:
+    if value in (None, {}, ()):
         return "none"
     if isinstance(value, bool):
         return "on" if value else "off"

@@ -7,6 +7,7 @@ import pickle
 import time
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from rmc.common.bus.protocol import Bus, Version
 from rmc.common.checkpoint import POLICY, PROGRESS, STATE, CheckpointFolder
 from rmc.common.errors import CheckpointError, FencedError, RmcError
 from rmc.common.metrics import Means, Rate
+from rmc.common.policy_header import PolicyHeader
 from rmc.common.replay import ObservationStatistics, Replay, Sample, SampleStatus
 from rmc.common.window import Rows, WindowSpec
 from rmc.learner.batch import clear_padding, importance_weights
@@ -65,9 +67,11 @@ class Learner:
         checkpoints: CheckpointFolder,
         seed: int,
         device: str = "cpu",
+        header: PolicyHeader | None = None,
     ) -> None:
+        """``header`` goes into the policy's file of every checkpoint, with the steps so far; None: bare weights."""
         self.spec, self.config, self.replay, self.bus, self.checkpoints = spec, config, replay, bus, checkpoints
-        self.device = torch.device(device)
+        self.device, self._header = torch.device(device), header
         self.updates = self.env_steps = self.last_checkpoint = self._checkpoint_steps = 0
         self.finished = self._fenced = self._diverged = self._evaluation_due = False
         self._observed_before = ObservationStatistics.none(spec.obs_dim)  # by the run that this one began with
@@ -189,10 +193,15 @@ class Learner:
         self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate=True)
         self._evaluation_due = False
 
-    def _sound(self, weights: dict[str, Tensor]) -> bytes:
+    def _sound(self, weights: dict[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
         """Weights as they are sent and saved. Raises RmcError where they are not finite: neither must then happen."""
         self._check_finite(weights)
-        return safetensors.torch.save(weights)
+        return safetensors.torch.save(weights, metadata)
+
+    def _metadata(self) -> dict[str, str] | None:
+        if self._header is None:
+            return None
+        return replace(self._header, env_steps=self.env_steps, updates=self.updates).metadata()
 
     def _check_finite(self, state: Any) -> None:
         self._diverged = not all(map(is_finite, tensors_in(state)))
@@ -253,7 +262,7 @@ class Learner:
             progress["observed_before"] = self._observed_before.to_json()
         files = {
             STATE: state.getvalue(),
-            POLICY: self._sound(self.update.policy_weights()),
+            POLICY: self._sound(self.update.policy_weights(), self._metadata()),
             PROGRESS: json.dumps(progress).encode(),
         }
         self.checkpoints.save(self.updates, files)

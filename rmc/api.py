@@ -1,18 +1,20 @@
 """What the commands ``rmc train``, ``rmc resume`` and ``rmc evaluate`` do, as functions for scripts and notebooks."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_checkpoint
+from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_policy
+from rmc.analysis.policy_file import read_policy
 from rmc.cli import training
-from rmc.cli.ending import STOPPED
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions
+from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions, Tracker
 from rmc.deploy.run.starts import last_launch
+from rmc.deploy.run.state import STOPPED
 
 
 def train(
@@ -25,6 +27,9 @@ def train(
     redis_url: str | None = None,
     init_from: str | Path | None = None,
     init_parts: InitParts = "all",
+    track: Tracker | Literal["off"] | None = None,
+    track_project: str | None = None,
+    track_tags: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Train a run to its ``total_steps``, or go on with the one in ``run_dir``; its ``result.json``.
 
@@ -35,9 +40,17 @@ def train(
     Raises ConfigError for options that cannot work, before anything starts; RoleDied where a role keeps dying;
     KeyboardInterrupt where the run was stopped, which ``resume`` goes on with.
     """
-    start = None if init_from is None else str(init_from)
     options = LaunchOptions(
-        Path(run_dir), if_exists, launcher, device, redis_url, init_from=start, init_parts=init_parts
+        Path(run_dir),
+        if_exists,
+        launcher,
+        device,
+        redis_url,
+        init_from=None if init_from is None else str(init_from),
+        init_parts=init_parts,
+        track=track,
+        track_project=track_project,
+        track_tags=tuple(track_tags),
     )
     return _train(config, options)
 
@@ -58,9 +71,9 @@ def resume(
     Other options that may change are given to ``train``, with the run's whole config. Raises as ``train`` does.
     """
     folder = RunFolder(Path(run_dir))
-    config, options = folder.config(), last_launch(folder)
+    config, options = folder.config(), last_launch(folder, launcher)
     said: dict[str, Any] = {"total_steps": total_steps, "actors": actors}
-    how: dict[str, Any] = {"launcher": launcher, "device": device, "redis_url": redis_url}
+    how: dict[str, Any] = {"device": device, "redis_url": redis_url}
     if replay_ratio is not None:
         said["replay"] = replace(config.replay, replay_ratio=replay_ratio)
     if learning_rate is not None:
@@ -90,7 +103,7 @@ def _train(config: RunConfig, options: LaunchOptions) -> dict[str, Any]:
 def evaluate(
     run: str | Path, episodes: int = FINAL_EPISODES, *, checkpoint: str = "latest", flicker: float | None = None
 ) -> dict[str, Any]:
-    """Play deterministic episodes with a run's ``latest``, ``best`` or numbered checkpoint.
+    """Play deterministic episodes with a policy's file, or a run's ``latest``, ``best`` or numbered checkpoint.
 
     ``flicker`` is the probability of a missing observation, by default the run's own. The keys are those of
     ``rmc evaluate --json``: ``eval_return_mean``, ``eval_return_std``, ``eval_episodes``, ``env_steps`` and more.
@@ -101,5 +114,4 @@ def evaluate(
         raise ConfigError("episodes", episodes, "take 1 to 10_000")
     if flicker is not None and not 0.0 <= flicker <= 1.0:
         raise ConfigError("flicker", flicker, "take a probability from 0 to 1")
-    folder = RunFolder(Path(run))
-    return evaluate_checkpoint(folder, folder.config(), checkpoint, episodes, flicker)
+    return evaluate_policy(read_policy(run, checkpoint), episodes, flicker)

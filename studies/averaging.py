@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import safetensors.torch
 
-from rmc.analysis.evaluation import evaluate_blob, evaluate_checkpoint
+from rmc.analysis.evaluation import evaluate_blob, evaluate_policy
 from rmc.analysis.history import objects
+from rmc.analysis.policy_file import read_policy
 from rmc.analysis.world_model_picture import load_agent
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.run.folder import RunFolder
@@ -35,11 +36,11 @@ def play(job: Job, episodes: int = EPISODES) -> dict[str, Any]:
     folder = RunFolder(job.folder)
     config, steps, averaged, newest = folder.config(), [], [], []
     for number in CheckpointFolder(folder.checkpoints).numbers():
-        found = evaluate_checkpoint(folder, config, str(number), episodes)
+        found = evaluate_policy(read_policy(folder.path, str(number)), episodes)
         steps.append(found["env_steps"])
         averaged.append(found["eval_return_mean"])
         blob = safetensors.torch.save(load_agent(folder, config, str(number)).policy_weights())
-        newest.append(evaluate_blob(config, blob, episodes)["eval_return_mean"])
+        newest.append(evaluate_blob(config.policy_header(), blob, episodes)["eval_return_mean"])
     about = {**job.values, "seed": job.seed}
     return about | {"env_steps": steps, "averaged": averaged, "newest": newest}
 

@@ -12,9 +12,10 @@ import numpy as np
 
 from rmc.analysis.baselines import evaluate
 from rmc.analysis.curves import PICTURES
-from rmc.analysis.evaluation import evaluate_checkpoint
+from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.history import objects
 from rmc.analysis.out_file import check_writable
+from rmc.analysis.policy_file import read_policy
 from rmc.analysis.statistics import ENOUGH_SEEDS, interquartile_mean, interval
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
@@ -47,7 +48,7 @@ def play(job: Job, episodes: int = EPISODES) -> dict[str, object]:
         if folder.is_baseline():
             played = evaluate(folder, episodes, probability)
         else:
-            played = evaluate_checkpoint(folder, folder.config(), "latest", episodes, probability)
+            played = evaluate_policy(read_policy(folder.path), episodes, probability)
         returns.append(played["eval_return_mean"])
     about = {**job.values, "seed": job.seed, "env_steps": played["env_steps"]}
     return about | {"flicker": PROBABILITIES, "returns": returns}

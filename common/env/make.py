@@ -23,7 +23,9 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from rmc.common.env.config import EnvConfig, check_kwargs
+from rmc.common.env.describe import layout_of, shown, structure
 from rmc.common.env.faults import RAISED, asked, one_line, told
+from rmc.common.env.layout import EnvLayout
 from rmc.common.env.process_state import ApartCall
 from rmc.common.env.spaces import space_fault
 from rmc.common.env.watched_env import WatchedEnv
@@ -48,7 +50,7 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
         spec = find_spec(config.id)
         made: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
     fault = asked("spaces", lambda: space_fault(made.observation_space, made.action_space))
-    if fault is None and config.hide != "nothing" and not _structure(made):
+    if fault is None and config.hide != "nothing" and not structure(made):
         fault = f"it does not say which observations are {config.hide}; --hide is for MuJoCo's bodies, like Ant-v5"
     if fault is not None:
         with suppress(*RAISED):
@@ -98,14 +100,14 @@ def entry_point(spec: EnvSpec) -> Callable[..., Any]:
 
 def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> Env:
     """The environment as the agent sees it: each wrapper only where it does something."""
-    shown = _shown(env, config.hide)
+    seen_part = shown(env, config.hide)
     seen: Env = RescaledEnv(env)  # the innermost: it judges what the user's own code gives
     if limit:
         seen = gym.wrappers.TimeLimit(seen, limit)
     if config.action_repeat > 1:
         seen = gym.wrappers.RepeatAction(seen, config.action_repeat)
-    if shown is not None:
-        seen = ObservationSlice(seen, shown)
+    if seen_part is not None:
+        seen = ObservationSlice(seen, seen_part)
     if config.noise:
         seen = Noise(seen, config.noise)
     if config.flicker:
@@ -145,28 +147,12 @@ def first_env(config: EnvConfig) -> Env:
         raise ConfigError("ENV", config.id, str(fault)) from None
 
 
-def env_spaces(config: EnvConfig) -> tuple[int, int, int | None]:
-    """O, A and the time limit in the agent's steps (None where there is none). Raises ConfigError."""
+def env_layout(config: EnvConfig) -> EnvLayout:
+    """What the agent reads and gives there. Makes an environment; raises ConfigError."""
     env = first_env(config)
-    limit = env.spec.max_episode_steps if env.spec else None
+    layout = layout_of(env, config)
     env.close()
-    assert env.observation_space.shape
-    assert env.action_space.shape
-    if limit is not None:
-        limit = -(-limit // config.action_repeat)
-    return env.observation_space.shape[0], env.action_space.shape[0], limit
-
-
-def _structure(env: gym.Env[Any, Any]) -> dict[str, int]:
-    """Names and sizes of the observation's parts in order, where the environment tells them (MuJoCo's bodies)."""
-    parts = getattr(env.unwrapped, "observation_structure", None) or {}
-    return {name: size for name, size in parts.items() if not name.startswith("skipped")}
-
-
-def _shown(env: gym.Env[Any, Any], hide: str) -> slice | None:
-    """Positions come first, and what follows is velocities and what depends on them; None shows all."""
-    positions = _structure(env).get("qpos", 0)
-    return {"nothing": None, "velocities": slice(0, positions), "positions": slice(positions, None)}[hide]
+    return layout
 
 
 def _check_options(config: EnvConfig) -> None:

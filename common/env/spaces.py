@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.env.faults import RAISED
+from rmc.common.env.layout import Part
 from rmc.common.errors import EnvFault
 
 LARGEST_ACTION = 1e9  # of an action space that means its bounds
@@ -34,6 +35,15 @@ def bounds(action: gym.Space[Any]) -> tuple[NDArray[np.float64], NDArray[np.floa
     boxes = [box for _, box in _leaves(action)]
     low, high = (np.concatenate([np.ravel(getattr(box, side)) for box in boxes]) for side in ("low", "high"))
     return low.astype(np.float64), high.astype(np.float64)
+
+
+def parts(space: gym.Space[Any]) -> tuple[Part, ...]:
+    """The boxes that a space is made of, in order."""
+    found: list[Part] = []
+    for name, box in _leaves(space):
+        start, shape = found[-1].stop if found else 0, box.shape or ()
+        found.append(Part(name, start, start + math.prod(shape), shape, str(box.dtype)))
+    return tuple(found)
 
 
 def vector(space: gym.Space[Any], value: Any) -> NDArray[np.float32]:

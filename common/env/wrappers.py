@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.env.faults import asked
+from rmc.common.env.layout import ActionScale
 from rmc.common.env.spaces import array, bounds, vector
 from rmc.common.errors import EnvFault
 
@@ -34,24 +35,23 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
-        self._given, self._taken = env.observation_space, env.action_space
-        self._low, self._high = bounds(env.action_space)
-        self._half_range = (self._high - self._low) / 2
+        self.given, self.taken = env.observation_space, env.action_space
+        low, high = bounds(env.action_space)
+        self._scale = ActionScale(low, high)
         self._vectors = isinstance(env.action_space, gym.spaces.Box) and len(env.action_space.shape) == 1
-        self._plain = bool((self._low == -1.0).all() and (self._high == 1.0).all())
-        self.action_space = gym.spaces.Box(-1.0, 1.0, self._low.shape, np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, low.shape, np.float32)
         self.observation_space = _box(gym.spaces.flatdim(env.observation_space))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         found = asked("reset", partial(self.env.reset, seed=seed, options=options))
         observation, info = _values("reset", found, RESET)
-        return vector(self._given, observation), _own(info)
+        return vector(self.given, observation), _own(info)
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         found = asked("step", self.env.step, self._stretched(action))
         observation, reward, terminated, truncated, info = _values("step", found, STEP)
         ends = _bool("terminated", terminated), _bool("truncated", truncated)
-        return vector(self._given, observation), _number("reward", reward), *ends, _own(info)
+        return vector(self.given, observation), _number("reward", reward), *ends, _own(info)
 
     def render(self) -> Any:
         return asked("render", self.env.render)
@@ -65,11 +65,10 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
 
     def _stretched(self, action: Floats) -> Any:
         """(A,) in [-1, 1] -> an action of the environment's own space, which it may change as it likes."""
-        if not self._plain:
-            action = (self._low + (action + 1.0) * self._half_range).clip(self._low, self._high)
+        scaled = self._scale(action)
         if self._vectors:
-            return np.array(action, self._taken.dtype)
-        return gym.spaces.unflatten(self._taken, action.astype(np.float64))
+            return np.array(scaled, self.taken.dtype)
+        return gym.spaces.unflatten(self.taken, scaled.astype(np.float64))
 
 
 def _values(method: str, found: Any, wanted: tuple[str, ...]) -> Sequence[Any]:

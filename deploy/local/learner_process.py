@@ -32,7 +32,18 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
     clients = replay_clients(config, bus, secret, pinned, context)
     replay = clients[0] if len(clients) == 1 else ShardedReplay(clients, spec, batch, config.seed, pinned)
     checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
-    learner = Learner(spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device)
+    learner = Learner(
+        spec,
+        config.agent,
+        config.update,
+        config.learner,
+        replay,
+        bus,
+        checkpoints,
+        config.seed,
+        device,
+        config.policy_header(),
+    )
     run_role(learner, bus, process.stop, lambda: learner.finished)
     for client in clients:
         client.close()

@@ -42,7 +42,16 @@ class Lockstep:
         self.server.step()  # publishes what a resumed ring has seen, from which actors take their epochs
         checkpoints = CheckpointFolder(folder / "checkpoints", config.learner.keep_checkpoints)
         self.learner = Learner(
-            spec, config.agent, config.update, config.learner, self.server, self.bus, checkpoints, config.seed, device
+            spec,
+            config.agent,
+            config.update,
+            config.learner,
+            self.server,
+            self.bus,
+            checkpoints,
+            config.seed,
+            device,
+            config.policy_header(),
         )
         ticks = itertools.count()  # timers count calls, so that no clock decides anything
         self.actors = [

@@ -67,7 +67,9 @@ def run_trial(config: RunConfig, device: str, stop: StopSignal) -> Trial:
             watcher.close()
         records = list(folder.records())
         seconds = records[-1]["time"] - records[0]["time"] if records else 0.0
-        return Trial(uses, records, _checkpoint_bytes(folder), _size(folder.metrics, folder.events) / max(seconds, 1.0))
+        return Trial(
+            uses, records, _checkpoint_bytes(folder), _size(folder.metrics, *folder.event_files()) / max(seconds, 1.0)
+        )
 
 
 @contextmanager

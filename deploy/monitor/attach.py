@@ -6,54 +6,36 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError
-from rmc.deploy.monitor.view import RunStatus, View
-from rmc.deploy.run.folder import RunFolder, parse_record
+from rmc.deploy.monitor.recorded import catch_up, empty_status
+from rmc.deploy.monitor.view import View
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import MetricsTail
+from rmc.deploy.run.starts import resume_command
+from rmc.deploy.run.state import run_state
 
 LOOK_SECONDS = 0.2
 AWAY_SECONDS = 30.0  # a launcher on Ray that was killed begins again within that
 STOP_SECONDS = 60.0
 
 
-class Tail:
-    """The records of a ``metrics.jsonl`` that others write to."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._position = path, 0
-
-    def take(self) -> list[dict[str, Any]]:
-        """Those that are new since the last call."""
-        with suppress(FileNotFoundError), self._path.open("rb") as file:
-            self._position = min(self._position, os.fstat(file.fileno()).st_size)  # it may have been cut
-            file.seek(self._position)
-            text = file.read()
-            whole = text[: text.rfind(b"\n") + 1]
-            self._position += len(whole)
-            return list(filter(None, map(parse_record, whole.splitlines())))
-        return []
-
-
 def watch(folder: RunFolder, console: Console, gone: Callable[[], bool]) -> int | None:
     """Show a run until its launcher ends, and give its exit status; None where it is ``gone`` without one."""
-    config = folder.config()
-    ratio, roles = config.replay.replay_ratio, (*config.roles(), "launcher")
-    board = RunStatus(config.env.id, config.preset, config.seed, config.total_steps, ratio, roles)
-    tail, view = Tail(folder.metrics), View(board, console)
+    config, tail = folder.config(), MetricsTail(folder.metrics)
+    board = empty_status(folder, (*config.roles(), "launcher"))
+    catch_up(board, tail)
+    view = View(board, console)
     try:
         while folder.ended() is None and not gone():
-            for found in tail.take():
-                board.take(found)
+            catch_up(board, tail)
             time.sleep(LOOK_SECONDS)
     finally:
-        for found in tail.take():
-            board.take(found)
-        view.close()
+        catch_up(board, tail)
+        view.close(run_state(folder))
     return folder.ended()
 
 
@@ -76,8 +58,9 @@ def launcher_pid(folder: RunFolder) -> int:
     while (trainer := folder.trainer()) is None:
         if time.monotonic() >= deadline:
             folder.settings()
-            fix = "nobody trains it now; the command that began it goes on with it, given its --run-dir"
-            raise ConfigError("RUN", str(folder.path), fix)
+            raise ConfigError(
+                "RUN", str(folder.path), f"nobody trains it now; {resume_command(folder)} goes on with it"
+            )
         time.sleep(LOOK_SECONDS)
     return trainer
 

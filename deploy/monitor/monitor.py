@@ -13,11 +13,15 @@ from rmc.common.bus.protocol import Bus
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.process.outage import OutageLog
+from rmc.deploy.monitor.main_metrics import evaluation_metrics, main_metrics
 from rmc.deploy.monitor.metrics_log import MetricsLog
-from rmc.deploy.monitor.view import RunStatus, View
-from rmc.deploy.run.config import RunConfig
+from rmc.deploy.monitor.recorded import empty_status
+from rmc.deploy.monitor.tracker import Tracker
+from rmc.deploy.monitor.view import View
+from rmc.deploy.run.config import RunConfig, flat
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.host import HostFigures
+from rmc.deploy.run.metrics_tail import MetricsTail
 
 RECORD_SECONDS = 5.0  # between the launcher's own records, and looks at the run's folder
 log = logging.getLogger(__name__)
@@ -26,15 +30,10 @@ log = logging.getLogger(__name__)
 class Monitor:
     """Reads every role's records and shows them. ``watch`` as often as you like; ``close`` at the end."""
 
-    def __init__(self, folder: RunFolder, config: RunConfig, console: Console) -> None:
-        self.board = RunStatus(
-            config.env.id,
-            config.preset,
-            config.seed,
-            config.total_steps,
-            config.replay.replay_ratio,
-            config.roles(),
-        )
+    def __init__(self, folder: RunFolder, config: RunConfig, console: Console, tracker: Tracker | None = None) -> None:
+        self.board = empty_status(folder, config.roles())
+        for record in MetricsTail(folder.metrics).take():  # of earlier starts
+            self.board.take_evaluation(record)
         self.restarts: Callable[[], dict[str, int]] = dict  # how often each role was started again
         self.unplaced: Callable[[], list[str]] = list  # roles that run nowhere now
         self._checkpoints = CheckpointFolder(folder.checkpoints, config.learner.keep_checkpoints)
@@ -43,8 +42,8 @@ class Monitor:
         self._refused = 0  # records and values that could not be read
         self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
         self._next_record, self._is_away = 0.0, False
-        self._metrics_log, self._host = MetricsLog(folder), HostFigures()
-        self._folder, self._writable = folder, True
+        self._metrics_log, self._host = MetricsLog(folder, flat(config)), HostFigures()
+        self._folder, self._writable, self._tracker = folder, True, tracker
         self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
         self.view, self.outage = View(self.board, console), OutageLog("launcher")
 
@@ -78,6 +77,8 @@ class Monitor:
             self._next_record = time.monotonic() + RECORD_SECONDS
             self._look_at_folder()
             self._record_launcher()
+            if self._tracker is not None:
+                self._tracker.look()
 
     def _look_at_folder(self) -> None:
         self._folder.check_there()
@@ -98,12 +99,12 @@ class Monitor:
 
     def take(self, record: dict[str, Any]) -> None:
         """Write one record (with its ``role``) and take it into the view."""
-        self.board.take(record)
         at = self.board.checkpoint_steps(record.get("eval_update"))  # an evaluation belongs where its checkpoint was
-        if at is None:
-            self._metrics_log.write(record, self.board.env_steps)
-        else:
-            self._metrics_log.write(record | {"eval_env_steps": at}, at)
+        if at is not None:
+            record = record | {"eval_env_steps": at}
+        self.board.take(record)
+        main = main_metrics(self.board) if record["role"] == "launcher" else evaluation_metrics(record)
+        self._metrics_log.write(record, self.board.env_steps if at is None else at, main)
         update, score = record.get("eval_update"), record.get("eval_return_mean")
         if (
             record["role"] == "evaluator" and isinstance(update, int) and is_finite(score)
@@ -122,6 +123,7 @@ class Monitor:
                 "role": "launcher",
                 "time": time.time(),
                 "wall_s": self.wall_seconds,
+                "start_s": time.monotonic() - self._started,
                 "restarts": total,
                 **restarts,
                 "refused_values": self._refused,

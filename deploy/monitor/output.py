@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
-PLAIN = str.maketrans({"±": "+-", "·": "-", "→": "->", "…": "..."})  # for a terminal that has ASCII alone
+PLAIN = str.maketrans({"±": "+-", "·": "-", "→": "->", "…": "...", "–": "-"})  # for a terminal that has ASCII alone
 PASSING = (errno.ENOSPC, errno.EDQUOT, errno.EAGAIN)  # there may be room again
 
 

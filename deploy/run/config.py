@@ -9,14 +9,17 @@ import types
 import typing
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib.metadata import version
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig, write_kwargs
-from rmc.common.env.make import env_spaces
+from rmc.common.env.layout import EnvLayout
+from rmc.common.env.make import env_layout
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
+from rmc.common.policy_header import PolicyHeader
 from rmc.common.shard import Shard
 from rmc.common.window import WindowSpec
 from rmc.deploy.run.migrations import FORMAT, migrated
@@ -61,12 +64,13 @@ class RunConfig:
     evaluator: EvaluatorConfig = field(default_factory=EvaluatorConfig)
 
     @cached_property
-    def _spaces(self) -> tuple[int, int, int | None]:
-        return env_spaces(self.env)
+    def layout(self) -> EnvLayout:
+        """What the agent reads and gives. Makes an environment once; raises ConfigError."""
+        return env_layout(self.env)
 
     def window_spec(self) -> WindowSpec:
         """The window that every role of the run speaks. Makes an environment once; raises ConfigError."""
-        obs_dim, action_dim, time_limit = self._spaces
+        obs_dim, action_dim, time_limit = self.layout.obs_dim, self.layout.action_dim, self.layout.time_limit
         burn_in, train, strategy = self.window.burn_in, self.window.trained_steps, self.actor.state_strategy
         if strategy == "episode":
             if time_limit is None:
@@ -82,6 +86,10 @@ class RunConfig:
                 name, train, f"a window would have more than {LARGEST_WINDOW >> 20} MiB; take fewer steps"
             )
         return spec
+
+    def policy_header(self) -> PolicyHeader:
+        """What the files of this run's policies say about themselves, before any step. Raises ConfigError."""
+        return PolicyHeader(FORMAT, version("rmc-rl"), self.env, self.layout, self.agent, self.preset, self.seed)
 
     def sizes(self) -> dict[str, int]:
         """What a run's networks and windows were made for, in words. Raises ConfigError."""
@@ -118,22 +126,20 @@ def to_json(config: RunConfig) -> str:
 
 def from_json(text: str | bytes) -> RunConfig:
     """The config again, also an older version's. Raises ConfigError on anything unknown, missing or of a wrong type."""
-    return _build(RunConfig, migrated(_read(text)), "")
+    return from_dict(RunConfig, migrated(_read(text)), "config.json ")
 
 
 def to_registration(config: RunConfig) -> bytes:
     """The config as JSON for the roles: with it a role knows the environment's sizes without making one."""
-    return json.dumps(dataclasses.asdict(config) | {"spaces": config._spaces}).encode()
+    return json.dumps(dataclasses.asdict(config) | {"layout": dataclasses.asdict(config.layout)}).encode()
 
 
 def from_registration(text: bytes) -> RunConfig:
     """The config again. Raises ConfigError."""
     raw = _read(text)
-    spaces: Any = raw.pop("spaces", None) if isinstance(raw, dict) else None
-    config = _build(RunConfig, raw, "")
-    if type(spaces) is not list or len(spaces) != 3 or not all(_matches(int | None, size) for size in spaces):
-        raise ConfigError("config.json spaces", spaces, "must be three numbers")
-    config.__dict__["_spaces"] = tuple(spaces)  # where the cached property keeps it
+    layout: Any = raw.pop("layout", None) if isinstance(raw, dict) else None
+    config = from_dict(RunConfig, raw, "config.json ")
+    config.__dict__["layout"] = from_dict(EnvLayout, layout, "layout ")  # where the cached property keeps it
     return config
 
 
@@ -159,27 +165,30 @@ def _read(text: str | bytes) -> Any:
         raise ConfigError("config.json", str(error), "not JSON; restore the file or start a new run") from None
 
 
-def _build(kind: type[ConfigT], raw: Any, path: str) -> ConfigT:
+def from_dict(kind: type[ConfigT], raw: Any, path: str) -> ConfigT:
+    """A dataclass from what JSON holds of it; ``path`` is what leads there, in words. Raises ConfigError."""
     if not isinstance(raw, dict):
-        raise ConfigError(f"config.json {path or 'as a whole'}", raw, "must be an object")
+        raise ConfigError(path.rstrip(". "), raw, "must be an object")
     hints = get_type_hints(kind)
     known = {item.name for item in dataclasses.fields(kind)}  # type: ignore[arg-type]
     for name in sorted(set(raw) ^ known):
         fix = "is missing; the run was made by another version" if name in known else "no such option in this version"
-        raise ConfigError(f"config.json {path}{name}", raw.get(name), fix)
+        raise ConfigError(f"{path}{name}", raw.get(name), fix)
     return kind(**{name: _value(hints[name], value, f"{path}{name}") for name, value in raw.items()})
 
 
 def _value(kind: Any, value: Any, path: str) -> Any:
     if dataclasses.is_dataclass(kind):
-        return _build(typing.cast(type[Any], kind), value, f"{path}.")
+        return from_dict(typing.cast(type[Any], kind), value, f"{path}.")
     if get_origin(kind) is tuple:
         parts = get_args(kind)
+        if isinstance(value, list) and parts[-1] is ...:
+            return tuple(_value(parts[0], item, f"{path}[{index}]") for index, item in enumerate(value))
         if isinstance(value, list) and len(value) == len(parts):
             return tuple(_value(part, item, path) for part, item in zip(parts, value, strict=True))
     elif _matches(kind, value):
         return float(value) if kind is float else value
-    raise ConfigError(f"config.json {path}", value, f"must be {_told(kind)}")
+    raise ConfigError(path, value, f"must be {_told(kind)}")
 
 
 def _told(kind: Any) -> str:

@@ -42,7 +42,7 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path.resolve()
         self.checkpoints, self.replay, self.logs = self.path / "checkpoints", self.path / "replay", self.path / "logs"
-        self.metrics, self.events = self.path / "metrics.jsonl", self.path / "events"
+        self.metrics = self.path / "metrics.jsonl"
         self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
         self.initial_file, self.sizes_file = self.path / "initial.json", self.path / "sizes.json"
         self.history_file = self.path / "history.jsonl"
@@ -76,7 +76,7 @@ class RunFolder:
     def config(self) -> RunConfig:
         """The run's config. Raises ConfigError, which names the folder, where it cannot be read or is a baseline's."""
         if self.is_baseline():
-            fix = "is a baseline's run; rmc resume goes on with it, and rmc evaluate, plot and stop take it"
+            fix = "is a baseline's run; rmc resume goes on with it, and rmc evaluate, plot, report and stop take it"
             raise ConfigError("RUN", str(self.path), fix)
         try:
             return from_json((self.path / "config.json").read_bytes())
@@ -130,6 +130,10 @@ class RunFolder:
         if result is not None and result["env_steps"] < total_steps:
             self.result_file.unlink()
 
+    def event_files(self) -> list[Path]:
+        """TensorBoard's, one a start."""
+        return list(self.path.glob("events.out.tfevents.*"))
+
     def records(self) -> Iterator[dict[str, Any]]:
         """Those of ``metrics.jsonl`` that are whole, each with its role."""
         with suppress(FileNotFoundError), self.metrics.open("rb") as lines:
@@ -168,15 +172,6 @@ class RunFolder:
         """How long the run was trained before, over all its starts."""
         said = (found.get("wall_s") for found in self.records() if found["role"] == "launcher")
         return max(filter(is_finite, said), default=0.0)
-
-    def env_steps(self) -> int:
-        """Environment steps that the run has, as its learner or all its replay servers said last."""
-        newest: dict[str, int] = {}
-        for found in self.records():
-            if found["role"].startswith(("learner", "replay")) and is_finite(found.get("env_steps")):
-                newest[found["role"]] = int(found["env_steps"])
-        learner = newest.pop("learner", 0)
-        return max(learner, sum(newest.values()))
 
     def lock(self) -> None:
         """Be the one launcher of this run. Raises ConfigError where another one is."""

@@ -6,6 +6,7 @@ from typing import Literal
 
 IfExists = Literal["resume", "fail", "new"]
 Launcher = Literal["local", "ray", "lockstep", "manual"]
+Tracker = Literal["wandb", "trackio"]
 InitParts = Literal["all", "memory+world-model", "policy"]
 
 
@@ -23,3 +24,6 @@ class LaunchOptions:
     tls: bool = False
     init_from: str | None = None
     init_parts: InitParts = "all"
+    track: Tracker | Literal["off"] | None = None
+    track_project: str | None = None
+    track_tags: tuple[str, ...] = ()

@@ -71,17 +71,14 @@ def open_run(
 
     ``options`` say how it is started, for its history, and what a new one begins with.
     """
-    options, initial = options or LaunchOptions(run_dir), None
+    options = options or LaunchOptions(run_dir)
     folder = RunFolder(run_dir or Path("runs") / _new_name(config))
     if os.fsencode(folder.path).decode(errors="replace") != str(folder.path):
         raise ConfigError("--run-dir", str(folder.path), "is no UTF-8; give another")
     there = run_dir is not None and if_exists != "new" and (folder.path / "config.json").exists()
-    if there and if_exists == "fail":
-        raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")
-    before = folder.config() if there else config
+    before, initial = config, None
     if there:
-        _check_resumable(folder, before, config)
-        _check_begun(folder, options)
+        before = _taken_up(folder, config, if_exists, options)
     elif options.init_from is not None:
         from rmc.deploy.run import warm_start  # imports torch
 
@@ -143,7 +140,20 @@ def make(folder: RunFolder) -> None:
         raise _cannot_be_made(folder.path, error) from None
 
 
-def _check_resumable(folder: RunFolder, before: RunConfig, config: RunConfig) -> None:
+def _taken_up(folder: RunFolder, config: RunConfig, if_exists: IfExists, options: LaunchOptions) -> RunConfig:
+    """The config that a run had which goes on with this one. Raises ConfigError where it may not."""
+    if if_exists == "fail":
+        raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")
+    before = folder.config()
+    _check_changes(folder, before, config)
+    folder.check_sizes(config.env.id, config.sizes())
+    check_checkpoints(folder)
+    _check_begun(folder, options)
+    return before
+
+
+def _check_changes(folder: RunFolder, before: RunConfig, config: RunConfig) -> None:
+    """Raises ConfigError for the first that may not be."""
     changes = _changes(before, config)
     for path in ["env.id", "preset", *changes]:
         if path in changes and path not in MAY_CHANGE:
@@ -152,8 +162,6 @@ def _check_resumable(folder: RunFolder, before: RunConfig, config: RunConfig) ->
             was, now = changes[path]
             fix = f"the run in {folder.path} has {was!r}, and {why}; use that, or another --run-dir"
             raise ConfigError(name, now, fix)
-    folder.check_sizes(config.env.id, config.sizes())
-    check_checkpoints(folder)
 
 
 def _check_begun(folder: RunFolder, options: LaunchOptions) -> None:

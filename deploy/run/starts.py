@@ -10,10 +10,13 @@ from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Any
 
+from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.redis_url import has_password
+from rmc.common.checkpoint import PROGRESS
+from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import option
-from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.folder import RunFolder, read_object
+from rmc.deploy.run.launch_options import Launcher, LaunchOptions
 
 KEPT = ("launcher", "device", "redis_url", "ray_address", "all_cpus", "tls")  # of how a run was started last
 
@@ -37,13 +40,26 @@ def note_start(
     launch = {name: getattr(options, name) for name in KEPT}
     if options.redis_url is not None and has_password(options.redis_url):
         launch["redis_url"] = None  # it must be said again
-    start = Start(time.time(), version("rmc-rl"), folder.env_steps(), changes, launch, init_from)
+    start = Start(time.time(), version("rmc-rl"), _env_steps(folder), changes, launch, init_from)
     path = folder.history_file
     torn = path.exists() and not path.read_bytes().endswith(b"\n")  # by a crash
     with path.open("a") as file:
         file.write("\n" * torn + json.dumps(asdict(start)) + "\n")
         file.flush()
         os.fsync(file.fileno())
+
+
+def _env_steps(folder: RunFolder) -> int:
+    """That the run has, by its newest checkpoint and what its roles said last."""
+    newest: dict[str, int] = {}
+    for found in folder.records():
+        if found["role"].startswith(("learner", "replay")) and is_finite(found.get("env_steps")):
+            newest[found["role"]] = int(found["env_steps"])
+    learner, saved = newest.pop("learner", 0), 0
+    for progress in sorted(folder.checkpoints.glob(f"[0-9]*/{PROGRESS}"))[-1:]:
+        with suppress(OSError, ConfigError):  # damaged, it is as none
+            saved = int(read_object(progress, "env_steps")["env_steps"])
+    return max(learner, saved, sum(newest.values()))
 
 
 def starts(folder: RunFolder) -> list[Start]:
@@ -61,11 +77,14 @@ def resume_command(folder: RunFolder) -> str:
     return f"rmc resume {shlex.quote(str(folder.path))}"
 
 
-def last_launch(folder: RunFolder) -> LaunchOptions:
-    """How the run was started last; as by default where that is not known."""
+def last_launch(folder: RunFolder, launcher: Launcher | None = None) -> LaunchOptions:
+    """How the run was started last; with another ``launcher`` only its device is taken. As by default if not known."""
     known = starts(folder)
     kept = {name: value for name, value in known[-1].launch.items() if name in KEPT} if known else {}
-    return dataclasses.replace(LaunchOptions(folder.path), **kept)
+    last = dataclasses.replace(LaunchOptions(folder.path), **kept)
+    if launcher in (None, last.launcher):
+        return last
+    return LaunchOptions(folder.path, launcher=launcher, device=last.device)
 
 
 def format_starts(folder: RunFolder) -> str:

@@ -70,7 +70,8 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
         raise ConfigError(OPTION, init_from, fix) from None
     learnt = io.BytesIO()
     torch.save(update.state_dict(), learnt)
-    policy = safetensors.torch.save({name: value.contiguous() for name, value in update.policy_weights().items()})
+    weights = {name: value.contiguous() for name, value in update.policy_weights().items()}
+    policy = safetensors.torch.save(weights, config.policy_header().metadata())
     made = {STATE: learnt.getvalue(), POLICY: policy, PROGRESS: json.dumps(progress).encode()}
     return InitialCheckpoint(
         made, {"asked": [init_from, parts], "run": str(folder.path), "checkpoint": number, "parts": parts}
@@ -110,10 +111,8 @@ def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages:
     theirs = {name: value for name, value in state["agent"].items() if name.startswith(taken)}
     update.agent.load_state_dict(update.agent.state_dict() | theirs)
     update.target_memory.load_state_dict(update.agent.memory.state_dict())
-    update.target_critic.load_state_dict(update.agent.critic.state_dict())
-    if parts == "all":
-        update.target_memory.load_state_dict(state["target_memory"])
-        update.target_critic.load_state_dict(state["target_critic"])
+    critic = state["target_critic"] if parts == "all" else update.agent.critic.state_dict()
+    update.target_critic.load_state_dict(critic)
     acting = dict(update.agent.acting())
     for name, value in update.average.items():
         value.copy_(state["average"][name] if averages and name in theirs else acting[name].detach())

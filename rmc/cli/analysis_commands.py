@@ -12,14 +12,17 @@ import numpy as np
 from rich.console import Console
 
 from rmc.analysis import curves, env_check, export, history, video, world_model_picture
-from rmc.analysis.evaluation import Progress, evaluate_checkpoint
-from rmc.analysis.policy import load_policy
+from rmc.analysis.evaluation import Progress, evaluate_policy
+from rmc.analysis.out_file import check_writable
+from rmc.analysis.policy import Policy
+from rmc.analysis.policy_file import read_policy
 from rmc.analysis.run_paths import expanded
 from rmc.cli import run_options
 from rmc.cli.ending import cut_note
 from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
+from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.folder import RunFolder
 
@@ -35,36 +38,40 @@ def evaluate(command: run_options.Evaluate) -> int:
     for flicker in command.flicker:
         if not 0.0 <= flicker <= 1.0:
             raise ConfigError("--flicker", flicker, "take probabilities from 0 to 1")
-    folder, console = RunFolder(command.run), terminal()
-    if command.video is not None and folder.is_baseline():
-        raise ConfigError("--video", str(command.video), "only runs of rmc train are filmed; leave it")
+    if command.run.is_dir() and RunFolder(command.run).is_baseline():
+        return _evaluate_baseline(command)
+    policy = read_policy(command.run, command.checkpoint)
+    env = policy.header.env
     if command.video is not None:
-        video.prepare(folder.config().env, command.video)
+        video.prepare(env, command.video)
+    watch = Progress(Console(stderr=True), str(command.run))
     for probability in command.flicker or (None,):
-        played = _played(folder, command, probability)
-        text = json.dumps(played) if command.json else _said(played)
-        console.print(text, soft_wrap=True)
+        _say_played(command, evaluate_policy(policy, command.episodes, probability, command.seconds, watch))
     if command.video is not None:
-        policy, config = load_policy(command.run, command.checkpoint), folder.config()
-        env = dataclasses.replace(config.env, flicker=command.flicker[0]) if command.flicker else config.env
-        total = video.record(policy, env, config.seed, command.video)
+        env = dataclasses.replace(env, flicker=command.flicker[0]) if command.flicker else env
+        total = video.record(Policy(policy), env, policy.header.seed, command.video)
         if not command.json:
-            console.print(f"{command.video}: an episode with return {total:,.1f}", soft_wrap=True)
+            terminal().print(f"{command.video}: an episode with return {total:,.1f}", soft_wrap=True)
     return 0
 
 
-def _played(folder: RunFolder, command: run_options.Evaluate, flicker: float | None) -> dict[str, Any]:
-    watch = Progress(Console(stderr=True), str(command.run))
-    if not folder.is_baseline():
-        return evaluate_checkpoint(
-            folder, folder.config(), command.checkpoint, command.episodes, flicker, command.seconds, watch
-        )
+def _evaluate_baseline(command: run_options.Evaluate) -> int:
+    if command.video is not None:
+        raise ConfigError("--video", str(command.video), "only runs of rmc train are filmed; leave it")
     if command.checkpoint != "latest":
         raise ConfigError("--checkpoint", command.checkpoint, "a baseline keeps its last state only; use latest")
+    folder = RunFolder(command.run)
     _check_baselines(str(folder.path))
     from rmc.analysis import baselines
 
-    return baselines.evaluate(folder, command.episodes, flicker, command.seconds, watch)
+    watch = Progress(Console(stderr=True), str(command.run))
+    for flicker in command.flicker or (None,):
+        _say_played(command, baselines.evaluate(folder, command.episodes, flicker, command.seconds, watch))
+    return 0
+
+
+def _say_played(command: run_options.Evaluate, played: dict[str, Any]) -> None:
+    terminal().print(json.dumps(played) if command.json else _said(played), soft_wrap=True)
 
 
 def _check_baselines(what: str) -> None:
@@ -81,9 +88,15 @@ def _said(played: dict[str, Any]) -> str:
 
 
 def export_policy(command: run_options.Export) -> int:
-    """Write a policy as ONNX."""
-    export.export(RunFolder(command.run), command.checkpoint, command.out)
-    terminal().print(f"{command.out}: inputs {', '.join(export.INPUTS)}; outputs {', '.join(export.OUTPUTS)}")
+    """Write a policy as ONNX, or as a policy file."""
+    check_writable("--out", command.out, (".onnx", ".safetensors"))
+    policy, console = read_policy(command.run, command.checkpoint), terminal()
+    if command.out.suffix.lower() == ".safetensors":
+        write_whole(command.out, policy.encode())
+        console.print(f"{command.out}: {policy.header.summary()}", soft_wrap=True)
+        return 0
+    export.export(policy, command.out)
+    console.print(f"{command.out}: inputs {', '.join(export.INPUTS)}; outputs {', '.join(export.OUTPUTS)}")
     return 0
 
 

@@ -1,7 +1,10 @@
 """What each command of the command line does."""
 
+import dataclasses
+import json
 import logging
 
+from rmc.analysis import run_list
 from rmc.analysis.doctor import examine_run
 from rmc.cli import run_options, train_options, training
 from rmc.cli.dry_run import dry_run
@@ -9,7 +12,9 @@ from rmc.cli.ending import say_end
 from rmc.cli.redis_password import warn_of_password
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor import attach as attachment
-from rmc.deploy.monitor.view import RunStatus, table, terminal
+from rmc.deploy.monitor.recorded import recorded_status, status_json
+from rmc.deploy.monitor.table import table
+from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.starts import format_starts
 
@@ -27,19 +32,31 @@ def train(command: train_options.Train) -> int:
 
 def stats(command: run_options.Stats) -> int:
     """Print the newest metrics of a run, and its result if it has one."""
-    folder = RunFolder(command.run)
-    config, result, console = folder.config(), folder.result(), terminal()
-    board = RunStatus(config.env.id, config.preset, config.seed, config.total_steps, config.replay.replay_ratio)
-    board.is_over = folder.trainer() is None
-    for record in folder.records():
-        board.take(record)
+    folder, console = RunFolder(command.run), terminal()
+    board = recorded_status(folder)
     if not board.roles:
         raise ConfigError("RUN", str(folder.path), "it has no metrics yet; train it first")
-    console.print(table(board))
+    if command.json:
+        console.print(json.dumps(status_json(folder, board)), soft_wrap=True)
+        return 0
+    console.print(table(board, console.width))
     if history := format_starts(folder):
         console.print(history, soft_wrap=True)
-    if result is not None:
+    if (result := folder.result()) is not None:
         console.print_json(data=result)
+    return 0
+
+
+def list_runs(command: run_options.List) -> int:
+    """Print a table of the runs in a folder."""
+    console, found = terminal(), run_list.runs(command.folder)
+    if command.json:
+        console.print(json.dumps([dataclasses.asdict(one) for one in found]), soft_wrap=True)
+        return 0
+    console.print(run_list.table(found, command.folder, console.width))
+    for one in found:
+        if one.fault is not None:
+            console.print(one.fault, soft_wrap=True)
     return 0
 
 

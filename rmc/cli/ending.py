@@ -10,8 +10,7 @@ from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.errors import RoleDied
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.starts import resume_command
-
-STOPPED = 130  # exit status after Ctrl-C, as shells have it
+from rmc.deploy.run.state import STOPPED
 
 
 def say_end(folder: RunFolder, console: Console) -> int:

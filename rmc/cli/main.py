@@ -13,6 +13,7 @@ from rmc.deploy.monitor import output
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
 PLAYS = {"train", "resume", "sweep", "baseline", "check-env", "evaluate", "inspect"}  # environments, in this process
+SHARED_MEMORY = "/dev/shm"
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 
@@ -52,6 +53,7 @@ def run(words: list[str]) -> int:
         # before numpy and torch are imported, which read these once
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")
+    _choose_temporary_folder()
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
     try:
         here = os.getcwd()
@@ -76,6 +78,13 @@ def run(words: list[str]) -> int:
         if error.errno not in NO_ROOM:
             raise
         return _complain(f"{error.filename or 'disk'}: {error.strerror}; make room and try again", FAILED_STATUS)
+
+
+def _choose_temporary_folder() -> None:
+    """Shared memory where no usual place can be written, as in a container: Python would take the working folder."""
+    usual = [*filter(None, map(os.environ.get, ("TMPDIR", "TEMP", "TMP"))), "/tmp", "/var/tmp", "/usr/tmp"]
+    if not any(os.access(place, os.W_OK | os.X_OK) for place in usual) and os.access(SHARED_MEMORY, os.W_OK | os.X_OK):
+        os.environ["TMPDIR"] = SHARED_MEMORY
 
 
 def _say_version() -> int:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, cast, get_type_hints
 
 import tyro
 
-from rmc.cli import role_options, run_options, sweep_options, train_options
+from rmc.cli import hub_options, role_options, run_options, sweep_options, train_options
 from rmc.cli.config_file import KWARGS, with_file
 from rmc.cli.help_text import ALL_OPTIONS, BASIC, only_basic
 from rmc.cli.numerals import NUMERALS
@@ -52,9 +52,11 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "check-env": (run_options.CheckEnv, Action("analysis_commands", "check_env")),
     "baseline": (run_options.Baseline, Action("analysis_commands", "baseline")),
     "plot": (run_options.Plot, Action("analysis_commands", "plot")),
+    "hub": (hub_options.Hub, Action("hub_commands", "run_hub")),
     "report": (run_options.Report, Action("report_command", "report")),
     "doctor": (run_options.Doctor, Action("commands", "doctor")),
     "stats": (run_options.Stats, Action("commands", "stats")),
+    "list": (run_options.List, Action("commands", "list_runs")),
     "attach": (run_options.Attach, Action("commands", "attach")),
     "stop": (run_options.Stop, Action("commands", "stop")),
     "cluster": (run_options.Cluster, Action("commands", "cluster")),
@@ -79,7 +81,9 @@ def parse(words: list[str]) -> Any:
     if folder is not None:
         config = folder.config()
         named = dataclasses.replace(config.env, id=env or config.env.id)
-        return _parsed(words, _defaults(dataclasses.replace(config, env=named), last_launch(folder)))
+        config = dataclasses.replace(config, env=named)
+        as_before = _parsed(words, _defaults(config, last_launch(folder)))
+        return _parsed(words, _defaults(config, last_launch(folder, as_before.launcher)))
     if isinstance(command, train_options.Train) and not command.env.id:
         raise ConfigError("ENV", "", "rmc train takes an environment, like HalfCheetah-v5, or --run-dir with a run")
     return command

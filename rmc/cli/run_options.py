@@ -17,10 +17,10 @@ from rmc.deploy.run.folder import RunFolder
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Play deterministic episodes with a run's checkpoint."""
+    """Play deterministic episodes with a run's checkpoint, or with a policy file."""
 
     run: Positional[Path]
-    """The run's folder."""
+    """The run's folder, or a policy file."""
     episodes: int = 10
     """Episodes to play."""
     seconds: float = 0.0
@@ -38,12 +38,12 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Export:
-    """Write a run's policy as an ONNX file, for programs without torch."""
+    """Write a policy as one file: policy.safetensors for load_policy, or ONNX for programs without torch."""
 
     run: Positional[Path]
-    """The run's folder."""
+    """The run's folder, or a policy file."""
     out: Path = Path("policy.onnx")
-    """The file to write."""
+    """The file to write, which ends in .safetensors or .onnx."""
     checkpoint: str = "latest"
     """latest, best of those evaluated while it trained, or the number of a checkpoint."""
 
@@ -120,10 +120,22 @@ class Plot:
 
 @dataclass(frozen=True)
 class Stats:
-    """Show the newest metrics of a run."""
+    """Show how far a run is, how good, and its newest metrics."""
 
     run: Positional[Path]
     """The run's folder."""
+    json: bool = False
+    """Print one line of JSON, with every metric of every role."""
+
+
+@dataclass(frozen=True)
+class List:
+    """List the runs in a folder and below: state, steps, return."""
+
+    folder: Positional[Path] = Path("runs")
+    """Where to look."""
+    json: bool = False
+    """Print one line of JSON."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rmc.cli import sweep_check
-from rmc.cli.ending import STOPPED
 from rmc.cli.signals import signals_caught
 from rmc.cli.sweep_check import Checked
 from rmc.cli.sweep_options import Sweep
@@ -17,6 +16,7 @@ from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.preflight import cores as cores_here
+from rmc.deploy.run.state import STOPPED
 from rmc.sweep import room
 from rmc.sweep.grid import Grid, grid_jobs, is_finished, make_job
 from rmc.sweep.index import NAME, Index

@@ -3,7 +3,7 @@
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
@@ -12,7 +12,7 @@ from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig, read_kwargs, write_kwargs
 from rmc.deploy.run.config import Preset, RunConfig, WindowConfig
-from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions
+from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions, Tracker
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
 
@@ -91,6 +91,12 @@ class Train:
     tls: bool = False
     """With --launcher ray: encrypt what the roles say across machines; needs a Redis server built with TLS on the
     head."""
+    track: Tracker | Literal["off"] | None = None
+    """Follow the run in a tracker, also where it goes on later; by default as before: a new run in none."""
+    track_project: str | None = None
+    """The tracker's project, by default rmc."""
+    track_tags: tuple[str, ...] = ()
+    """The run's tags in the tracker."""
     dry_run: bool = False
     """Train for some seconds in a temporary folder, and tell what the run needs beside what this machine has: memory,
     disk, bandwidth, handles, threads, time. Exit status 1 where it does not fit."""

@@ -5,23 +5,26 @@ from typing import Any
 
 from rich.console import Console
 
-from rmc.cli.ending import STOPPED, format_evaluation, say_result, say_stopped
+from rmc.cli.ending import format_evaluation, say_result, say_stopped
 from rmc.cli.signals import signals_caught
 from rmc.common.bus.protocol import Bus
 from rmc.common.checkpoint import POLICY, CheckpointFolder
-from rmc.common.errors import ConfigError
+from rmc.common.errors import ConfigError, EnvFault
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local import launcher
 from rmc.deploy.local.socket_folder import place_for_sockets
 from rmc.deploy.local.supervisor import EXIT_CONFIG
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.monitor.output import Output
+from rmc.deploy.monitor.tracker import start_tracker
 from rmc.deploy.redis.connect import connect
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine
+from rmc.deploy.run.state import STOPPED
+from rmc.deploy.run.tracking import choose_tracking, keep_tracking
 from rmc.deploy.run.validation import validate, validate_launch
 
 
@@ -39,21 +42,26 @@ def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
     validate(config)
     validate_launch(config, options)
     check_machine(config, options)
+    tracking = choose_tracking(options)
     if options.launcher == "local":
         place_for_sockets()
     if options.redis_url is not None:
         connect(options.redis_url, "check")
-    return open_run(config, options.run_dir, options.if_exists, options)
+    folder = open_run(config, options.run_dir, options.if_exists, options)
+    keep_tracking(folder, tracking)
+    return folder
 
 
 def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
     """Be the launcher of a run whose folder is locked, from its first evaluation to its last."""
-    status, Output.log = 1, folder.logs / "launcher.log"
+    status, Output.log, tracker = 1, folder.logs / "launcher.log", None
+    end: dict[str, Any] = {"state": "failed"}
     try:
         console.print(f"run folder {folder.path}", soft_wrap=True)
         before = _before(config, folder, console)
         console.print(f"before training: {format_evaluation(before)}")
-        monitor = Monitor(folder, config, console)
+        tracker = start_tracker(folder)
+        monitor = Monitor(folder, config, console, tracker)
         if options.launcher == "manual":
             console.print(f"start the roles with --run {folder.name}", soft_wrap=True)
         try:
@@ -62,11 +70,13 @@ def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, consol
         finally:
             monitor.close()
         if not finished:
-            status = STOPPED
+            status, end = STOPPED, {"state": "stopped"}
             return say_stopped(folder, monitor.board.env_steps, console)
         result = _result(config, folder, monitor, before, console)
         folder.write_result(result)
-        status = 0
+        status, end = 0, {"state": "finished", **result}
+        if tracker is not None:
+            end["video"] = _video(config, folder, console)
     except ConfigError:
         status = EXIT_CONFIG
         raise
@@ -74,9 +84,29 @@ def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, consol
         status = STOPPED
         raise
     finally:
+        if tracker is not None:
+            tracker.close(end)
         folder.unlock(status)
     console.print(f"before training: {format_evaluation(before)}")
     return say_result(folder, console)
+
+
+def _video(config: RunConfig, folder: RunFolder, console: Console) -> str | None:
+    """The final policy filmed for the run's tracker, where that can be done here; else why not is said."""
+    from rmc.analysis import video  # imports torch
+    from rmc.analysis.policy import load_policy
+
+    out = folder.path / "video.mp4"
+    try:
+        video.prepare(config.env, out)
+        console.print("filming an episode for the tracker; Ctrl-C leaves it out")
+        video.record(load_policy(folder.path), config.env, config.seed, out)
+    except KeyboardInterrupt:
+        return None
+    except (ConfigError, EnvFault, OSError) as error:
+        console.print(f"no video for the tracker: {error}", soft_wrap=True)
+        return None
+    return str(out)
 
 
 def _launch(config: RunConfig, folder: RunFolder, options: LaunchOptions, monitor: Monitor, stop: StopSignal) -> bool:
@@ -115,9 +145,9 @@ def _before(config: RunConfig, folder: RunFolder, console: Console) -> dict[str,
 
     number, files = CheckpointFolder(folder.checkpoints).latest() or (0, {})
     policy = files[POLICY] if files and number == 0 else evaluation.initial_policy(config)
-    seconds = config.evaluator.evaluation_seconds
+    header, seconds = config.policy_header(), config.evaluator.evaluation_seconds
     progress = evaluation.Progress(console, "before training")
-    played = evaluation.evaluate_blob(config, policy, evaluation.FINAL_EPISODES, None, seconds, progress)
+    played = evaluation.evaluate_blob(header, policy, evaluation.FINAL_EPISODES, None, seconds, progress)
     folder.write_initial(played)
     return played
 
@@ -125,10 +155,11 @@ def _before(config: RunConfig, folder: RunFolder, console: Console) -> dict[str,
 def _result(
     config: RunConfig, folder: RunFolder, monitor: Monitor, before: dict[str, Any], console: Console
 ) -> dict[str, Any]:
-    from rmc.analysis.evaluation import FINAL_EPISODES, Progress, evaluate_checkpoint
+    from rmc.analysis.evaluation import FINAL_EPISODES, Progress, evaluate_policy
+    from rmc.analysis.policy_file import read_policy
 
     progress, seconds = Progress(console, "after training"), config.evaluator.evaluation_seconds
-    after = evaluate_checkpoint(folder, config, "latest", FINAL_EPISODES, None, seconds, progress)
+    after = evaluate_policy(read_policy(folder.path), FINAL_EPISODES, None, seconds, progress)
     return {
         **after,
         "initial_return_mean": before["eval_return_mean"],

@@ -26,8 +26,8 @@ from optuna.trial import TrialState
 
 from rmc.analysis.history import Evaluation, of_run
 from rmc.common.errors import ConfigError
-from rmc.deploy.monitor.attach import Tail
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import MetricsTail
 from rmc.sweep.index import Index, values_of
 from rmc.sweep.job import TRIAL, Job
 from rmc.sweep.pool import Ending
@@ -121,7 +121,7 @@ class SearchPlan:
         self._study.sampler = optuna.samplers.TPESampler(seed=seed, constant_liar=True)
         trial = self._study.ask(self._distributions)
         job = self._make(name, self._values(trial.params))
-        self._at_work[name] = _Trial(trial, Tail(RunFolder(job.folder).metrics))
+        self._at_work[name] = _Trial(trial, MetricsTail(RunFolder(job.folder).metrics))
         if line is None:
             self.jobs.append(job)
         return job
@@ -166,7 +166,7 @@ def _final_return(job: Job) -> float:
 
 
 class _Trial:
-    def __init__(self, trial: optuna.Trial, tail: Tail) -> None:
+    def __init__(self, trial: optuna.Trial, tail: MetricsTail) -> None:
         self.trial, self.tail = trial, tail
         self.reported: set[int] = set()
 

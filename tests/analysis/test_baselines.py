@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import pickle
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -22,6 +23,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.starts import starts
 from tests import habits
 
 ENV = EnvConfig("InvertedPendulum-v5")
@@ -87,6 +89,27 @@ def test_a_stop_signal_is_heard_and_nothing_is_lost(tmp_path):
     assert run(config(), folder) == 0
     assert of_run(RunFolder(folder)).env_steps == 300
     assert [path.name for path in (folder / "checkpoints").iterdir()] == ["000000000300"]
+
+
+def test_rmc_resume_goes_on_with_it(tmp_path, capsys):
+    """The command that a stopped one prints; what is not said is as it was, also of an older version's run."""
+    folder, stop = tmp_path / "run", StopSignal()
+    stop.requested = True
+    made = config("td3", env=EnvConfig("InvertedPendulum-v5", flicker=0.5), seed=3)
+    assert train(made, folder, Console(width=400), stop) == 130
+    (printed,) = re.findall(r"to go on:\n  rmc (.*)\n", capsys.readouterr().out)
+    raw = json.loads((folder / "config.json").read_bytes())
+    assert raw.pop("format") == 2
+    del raw["env"]["env_kwargs"]
+    (folder / "config.json").write_text(json.dumps(raw))
+    (folder / "history.jsonl").unlink()
+    assert rmc([*printed.split(), "--total-steps", "250", "--episodes", "2"]) == 0
+    result = RunFolder(folder).result()
+    assert (result["env_steps"], result["eval_flicker"]) == (250, 0.5)
+    assert read(RunFolder(folder)) == dataclasses.replace(made, total_steps=250, episodes=2)
+    (start,) = starts(RunFolder(folder))
+    assert (start.env_steps, start.changes) == (1, {"total_steps": [300, 250], "episodes": [5, 2]})
+    assert json.loads((folder / "config.json").read_bytes())["format"] == 2
 
 
 def test_another_agent_is_not_gone_on_with(tmp_path):

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import math
+import random
 import subprocess
 import sys
 from pathlib import Path
@@ -67,6 +69,9 @@ def test_the_actors_hold_the_learner_back() -> None:
     full = bottleneck(vitals(**slow, launcher=HOST | {"host_idle_share": 0.02}), CONFIG)
     assert full is not None
     assert full.advice.startswith("all cores are taken: more machines (--launcher ray)")
+    unknown = bottleneck(vitals(**slow), CONFIG)
+    assert unknown is not None
+    assert unknown.advice.startswith("more --actors would help where cores are free")
 
 
 def test_the_replay_server_holds_both_back() -> None:
@@ -296,3 +301,19 @@ def test_a_real_run_records_its_host(tmp_path: Path) -> None:
     assert all(0.0 <= last[name] <= 1.0 for name in ("host_idle_share", "host_steal_share"))
     assert last["host_load"] >= 0.0
     assert last["host_copy_bytes_per_s"] > 1e6
+
+
+def test_whatever_roles_say_the_doctor_does_not_fail() -> None:
+    """It ends every run, and roles are not trusted."""
+    numbers = [0, -1, 2**63 - 1, math.nan, math.inf, -math.inf, 1e300, 0.5]
+    names = """
+        time updates env_steps env_steps_per_s busy_share waiting_share policy_lag_mean ring_fill eval_update finished
+        checkpoint_update host_cores host_cpus host_load host_idle_share host_steal_share host_copy_bytes_per_s
+        host_memory_bytes host_available_bytes host_swap_bytes
+    """.split()  # noqa: SIM905
+    chance = random.Random(0)
+    for _ in range(300):
+        said = records(30, learner=shares(0.5, "experience"), actor_0=shares(0.9), replay=shares(0.4), launcher=HOST)
+        for record in chance.sample(said, 40):
+            record[chance.choice(names)] = chance.choice(numbers)
+        examine(said, CONFIG)

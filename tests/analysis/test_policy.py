@@ -12,8 +12,9 @@ import torch
 from safetensors.torch import load, save
 
 from rmc.actors.evaluator import first_start
-from rmc.analysis.evaluation import evaluate_checkpoint
+from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.policy import load_policy
+from rmc.analysis.policy_file import read_policy
 from rmc.cli import main
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
@@ -44,9 +45,14 @@ def run(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
 
 
 def make_run(
-    path: Path, agent_config: AgentConfig, env: str, flicker: float = 0.0, env_kwargs: dict[str, Any] | None = None
+    path: Path,
+    agent_config: AgentConfig,
+    env: str,
+    flicker: float = 0.0,
+    env_kwargs: dict[str, Any] | None = None,
+    header: bool = True,
 ) -> RunFolder:
-    """A run's folder with one checkpoint of an agent that was never trained."""
+    """A run's folder with one checkpoint of an agent that was never trained; without ``header`` as of RMC 0.1.0."""
     env_config = EnvConfig(env, flicker=flicker, env_kwargs=env_kwargs or {})
     config = dataclasses.replace(debug(env_config), agent=agent_config)
     folder, spec = open_run(config, path, "fail"), config.window_spec()
@@ -54,10 +60,11 @@ def make_run(
     torch.manual_seed(0)
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
     agent.normalizer.freeze(10, torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
-    progress = json.dumps({"updates": 7, "env_steps": 70}).encode()
-    CheckpointFolder(folder.checkpoints).save(
-        7, {"policy.safetensors": save(agent.policy_weights()), "progress.json": progress, "learner.pt": b""}
-    )
+    progress = {"updates": 7, "env_steps": 70}
+    metadata = dataclasses.replace(config.policy_header(), **progress).metadata() if header else None
+    policy = save(agent.policy_weights(), metadata)
+    files = {"policy.safetensors": policy, "progress.json": json.dumps(progress).encode(), "learner.pt": b""}
+    CheckpointFolder(folder.checkpoints).save(7, files)
     return folder
 
 
@@ -74,7 +81,7 @@ def test_a_loop_of_ones_own_gives_what_an_evaluation_gives(run: RunFolder) -> No
             observation, reward, terminated, truncated, info = env.step(action)
             total, ended = total + float(reward), terminated or truncated
         returns.append(total)
-    found = evaluate_checkpoint(run, run.config(), "latest", episodes=3)
+    found = evaluate_policy(read_policy(run.path), episodes=3)
     assert np.mean(returns) == found["eval_return_mean"]
 
 
@@ -86,7 +93,7 @@ def test_an_evaluation_is_the_same_with_any_number_of_threads(tmp_path: Path) ->
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            found.append(evaluate_checkpoint(run, run.config(), "latest", episodes=10))
+            found.append(evaluate_policy(read_policy(run.path), episodes=10))
             assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
@@ -108,7 +115,9 @@ def test_a_frame_that_is_not_finite_is_missing_or_refused(run: RunFolder, odd: f
     assert np.isfinite(policy.act(bad, missing=True)).all()
 
 
-@pytest.mark.parametrize("observation", [np.ones(1), np.ones(4), 1.0, np.ones((1, 3)), None])
+@pytest.mark.parametrize(
+    "observation", [np.ones(1), np.ones(4), 1.0, np.ones((2, 4)), np.ones((0, 3)), np.ones((1, 1, 3)), None]
+)
 def test_an_observation_of_another_shape_is_refused(tmp_path: Path, observation: Any) -> None:
     policy = load_policy(make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1").path)
     with pytest.raises(ConfigError, match=r"observation='of shape .*the policy reads shape \(3,\)"):
@@ -129,6 +138,7 @@ def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureF
     assert "inputs observation, previous_action, missing, state" in capsys.readouterr().out
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     rng, policy = np.random.default_rng(0), load_policy(run.path)
+    assert session.get_modelmeta().custom_metadata_map == policy.header.metadata()
     feed = {
         "previous_action": np.zeros((3, 1), np.float32),
         "state": np.zeros((3, run.config().window_spec().state), np.float32),

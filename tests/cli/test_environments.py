@@ -74,15 +74,20 @@ def test_an_environment_that_has_gained_an_observation_is_named_by_every_command
     tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = make_run(tmp_path / "run", AGENTS["robust"], SLIDE)
+    older = make_run(tmp_path / "older", AGENTS["robust"], SLIDE, header=False)
     monkeypatch.setattr(habits.Slide, "observation_space", Box(-99.0, 99.0, (4,), np.float32))
     monkeypatch.setattr(habits.Slide, "seen", lambda self: np.zeros(4, np.float32))
     says = f"ENV='{SLIDE}': the environment now has 4 observations, the run was trained with 3; undo that"
     before = sorted(path.name for path in run.path.iterdir())
     out = str(tmp_path / "out.")
-    for words in (["evaluate", str(run.path)], ["export", str(run.path), "--out", f"{out}onnx"]):
+    for words in (["evaluate", str(run.path)], ["export", str(older.path), "--out", f"{out}onnx"]):
         assert says in complaint(words, capsys)
     assert says in complaint(["inspect", str(run.path), "--out", f"{out}png"], capsys)
-    for resume in (lambda: open_run(run.config(), run.path, "resume"), lambda: load_policy(run.path)):
+    for resume in (
+        lambda: open_run(run.config(), run.path, "resume"),
+        load_policy(run.path).make_env,
+        lambda: load_policy(older.path),
+    ):
         with pytest.raises(ConfigError, match="the environment now has 4 observations, the run was trained with 3"):
             resume()
     assert sorted(path.name for path in run.path.iterdir()) == before

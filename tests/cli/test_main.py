@@ -1,6 +1,8 @@
 """The command line: its flags, and that every error is one line and exit status 2 before anything starts."""
 
 import dataclasses
+import json
+import math
 import os
 import re
 import stat
@@ -30,7 +32,7 @@ TRAIN_FLAGS = """
     --init-from --init-parts
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
     --env-timeout --env-kwargs --config --run-dir --if-exists --launcher --device --redis-url
-    --ray-address --all-cpus --tls --dry-run
+    --ray-address --all-cpus --tls --track --track-project --track-tags --dry-run
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
     --missing-flag --impute-missing --initial-priority
@@ -55,6 +57,8 @@ OTHER_FLAGS = {
     "evaluate": ["--episodes", "--seconds", "--flicker", "--checkpoint", "--video", "--json"],
     "export": ["--out", "--checkpoint"],
     "inspect": ["--out", "--checkpoint"],
+    "hub push": ["--checkpoint", "--license", "--private"],
+    "hub pull": ["--out", "--revision"],
     "check-env": [*ENV_FLAGS, "--steps"],
     "baseline": [
         *ENV_FLAGS,
@@ -63,7 +67,8 @@ OTHER_FLAGS = {
     "plot": ["--out", "--by", "--reference"],
     "report": ["--out", "--video"],
     "doctor": [],
-    "stats": [],
+    "stats": ["--json"],
+    "list": ["--json"],
     "attach": [],
     "stop": [],
     "cluster": [],
@@ -127,6 +132,11 @@ def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         ([*DEBUG, "--device", "tpu"], "--device"),
         ([*DEBUG, "--preset", "best"], "--preset"),
         ([*DEBUG, "--sede", "1"], "--sede"),
+        ([*DEBUG, "--track", "mlflow"], "--track"),
+        ([*DEBUG, "--track-project", "mine"], "--track-project='mine': say which tracker"),
+        ([*DEBUG, "--track-tags", "a", "b"], "--track-tags"),
+        ([*DEBUG, "--track", "wandb", "--track-project", "a/b"], "--track-project='a/b'"),
+        ([*DEBUG, "--track", "trackio", "--track-tags", "x" * 65], "--track-tags"),
         ([], "train"),
         (["trian"], "trian"),
         (["train"], "train"),
@@ -136,6 +146,8 @@ def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         ([*DEBUG, "--init-from", "nowhere"], "--init-from='nowhere': no such run"),
         ([*DEBUG, "--init-parts", "policy"], "--init-parts='policy': say whose"),
         (["stats", "/nowhere"], "/nowhere"),
+        (["list"], "FOLDER='runs'"),
+        (["list", "/nowhere"], "/nowhere"),
         (["evaluate", "/nowhere"], "/nowhere"),
         (["role", "actor", "--run", "x", "--redis-url", "unix:///nowhere/redis.sock"], "--redis-url"),
         (["role", "actor"], "--run"),
@@ -256,6 +268,36 @@ def test_runs_without_checkpoint_or_metrics_say_so(capsys: pytest.CaptureFixture
     assert "no metrics yet" in complaint(["stats", str(run.path)], capsys)
     assert "--episodes=0" in complaint(["evaluate", str(run.path), "--episodes", "0"], capsys)
     assert "--flicker=2.0" in complaint(["evaluate", str(run.path), "--flicker", "2"], capsys)
+
+
+def test_stats_and_list_as_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    run = made_run(tmp_path / "runs" / "run")
+    records = [
+        {"role": "replay", "time": 1.0, "env_steps": 700, "replay_ratio": math.inf},
+        {"role": "launcher", "time": 1.0, "wall_s": 9.0},
+        {"role": "evaluator", "eval_return_mean": 4.5, "eval_return_std": 0.5, "eval_update": 5, "eval_env_steps": 600},
+    ]
+    run.metrics.write_text("".join(json.dumps(record) + "\n" for record in records))
+    assert main.run(["stats", str(run.path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["state"], found["env"], found["env_steps"], found["elapsed_s"]) == ("stopped", PENDULUM, 700, 9.0)
+    evaluation = {"return_mean": 4.5, "return_std": 0.5, "update": 5, "env_steps": 600}
+    assert found["last_evaluation"] == found["best_evaluation"] == evaluation
+    assert found["roles"]["replay"] == records[0] | {"replay_ratio": None}  # which JSON cannot say
+    assert (found["eta_s"], found["result"]) == (None, None)
+    assert main.run(["list", str(tmp_path / "runs"), "--json"]) == 0
+    (listed,) = json.loads(capsys.readouterr().out)
+    assert (listed["run"], listed["state"], listed["eval_return"]) == (str(run.path), "stopped", 4.5)
+
+
+def test_a_damaged_run_is_listed_and_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    made_run(tmp_path / "sound")
+    (made_run(tmp_path / "torn").path / "config.json").write_text("{")
+    assert main.run(["list", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"^sound +new ", said, re.MULTILINE)
+    assert re.search(r"^torn +damaged ", said, re.MULTILINE)
+    assert f"config.json='{tmp_path / 'torn' / 'config.json'}': not JSON" in said
 
 
 def test_a_role_needs_its_runs_secret(

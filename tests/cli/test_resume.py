@@ -61,6 +61,15 @@ def test_what_is_said_is_all_that_changes(run: RunFolder) -> None:
         assert (launch.launcher, launch.device) == ("local", "cuda")
 
 
+def test_another_launcher_takes_the_device_alone_along(tmp_path: Path) -> None:
+    path, config = tmp_path / "run", debug(EnvConfig(PENDULUM))
+    last = LaunchOptions(path, "resume", "ray", "cuda", None, "local", all_cpus=True, tls=True)
+    open_run(config, path, "fail", last).unlock()
+    assert parsed("resume", path)[1] == last
+    assert parsed("resume", path, "--launcher", "local")[1] == LaunchOptions(path, "resume", "local", "cuda")
+    assert parsed("resume", path, "--launcher", "ray", "--no-tls")[1] == dataclasses.replace(last, tls=False)
+
+
 def test_a_new_folder_beside_it_begins_with_the_preset(run: RunFolder) -> None:
     config, launch = parsed("train", PENDULUM, "--preset", "debug", "--run-dir", run.path, "--if-exists", "new")
     assert config == debug(EnvConfig(PENDULUM))

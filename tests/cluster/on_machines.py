@@ -223,7 +223,7 @@ def test_a_run_learns_is_stopped_and_goes_on(site: Site) -> None:
     assert len(workers) == 2
     note(test="reached 1000", seconds=time.monotonic() - began, updates=run.newest("evaluator", "eval_update"))
     steps = run.newest("replay", "env_steps")
-    assert "to go on, give the same options" in run.stop()
+    assert "to go on:\n  rmc resume " in run.stop()
     for machine in site.machines.machines:
         assert not machine.processes("rmc.cli.main"), machine.name
     stopped = time.time()

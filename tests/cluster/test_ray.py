@@ -164,7 +164,7 @@ def test_a_node_is_lost_and_another_comes(nodes: Cluster, tmp_path: Path) -> Non
             [sys.executable, "-m", "rmc.cli.main", "stop", str(folder)], env=ENVIRONMENT, capture_output=True, text=True
         )
         assert done.returncode == 0, done.stderr
-        assert "to go on, give the same options" in done.stdout
+        assert "to go on:\n  rmc resume " in done.stdout
         assert training.finish(60) == 130
     assert max(RunFolder(folder).checkpoints.glob("[0-9]*")).is_dir()
 

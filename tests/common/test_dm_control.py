@@ -8,7 +8,7 @@ import pytest
 
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.make import env_spaces, make_env
+from rmc.common.env.make import env_layout, make_env
 from rmc.common.errors import ConfigError
 
 INSTALLED = importlib.util.find_spec("dm_control") is not None
@@ -25,7 +25,8 @@ def test_who_has_it_not_is_told_how_to_get_it() -> None:
 @needs_dm_control
 @pytest.mark.parametrize("env_id", [WALKER, f"shimmy:{WALKER}"])
 def test_a_task_is_an_environment_like_others(env_id: str) -> None:
-    assert env_spaces(EnvConfig(env_id)) == (24, 6, None)
+    layout = env_layout(EnvConfig(env_id))
+    assert (layout.obs_dim, layout.action_dim, layout.time_limit) == (24, 6, None)
     env = make_env(EnvConfig(env_id, flicker=0.5))
     observation, _ = env.reset(seed=1)
     assert observation.shape == (24,)

@@ -44,5 +44,5 @@ def test_every_hint_asks_for_it_and_names_an_extra() -> None:
     ]
     texts = {path: path.read_text() for path in paths}
     assert not [str(path) for path, text in texts.items() if re.search(r"""install ['"]?rmc\\?\[""", text)]
-    asked = {name for text in texts.values() for name in re.findall(r"how_to_install\('([^']*)'\)", text)}
+    asked = {name for text in texts.values() for name in re.findall(r"""how_to_install\(['"]([^'"]*)['"]\)""", text)}
     assert asked == extras.keys() - {"dev"}

@@ -11,7 +11,7 @@ import pytest
 
 from rmc.common.env import wrappers
 from rmc.common.env.config import EnvConfig, read_kwargs, write_kwargs
-from rmc.common.env.make import env_spaces, make_env
+from rmc.common.env.make import env_layout, make_env
 from rmc.common.errors import ConfigError, EnvFault
 from tests import habits
 
@@ -46,7 +46,8 @@ def test_an_environment_gets_an_action_of_its_own(dtype: str, bound: float) -> N
 @pytest.mark.parametrize("shape", ["column", "row", "nested", "tuple"])
 def test_numbers_of_any_shape_are_a_vector(shape: str) -> None:
     env, plain = make_env(habit("Shaped", shape=shape)), make_env(habit("Shaped", shape="plain"))
-    assert env_spaces(habit("Shaped", shape=shape))[:2] == (3, 2)
+    layout = env_layout(habit("Shaped", shape=shape))
+    assert (layout.obs_dim, layout.action_dim) == (3, 2)
     assert env.reset(seed=3)[0].tolist() == plain.reset(seed=3)[0].tolist()
     for _ in range(3):
         seen = env.step(np.array([0.5, -1.0], np.float32))[0]
@@ -164,10 +165,10 @@ def test_other_words_are_refused(words: list[str], says: str) -> None:
 
 def test_a_missing_keyword_comes_with_its_remedy() -> None:
     with pytest.raises(ConfigError) as caught:
-        env_spaces(habit("Wants"))
+        env_layout(habit("Wants"))
     assert "missing a required argument: 'goal'; it takes (goal: float, size: int = 3" in str(caught.value)
     assert "give --env-kwargs NAME=VALUE" in str(caught.value)
-    assert env_spaces(habit("Wants", goal=1.5, size=5))[0] == 5
+    assert env_layout(habit("Wants", goal=1.5, size=5)).obs_dim == 5
 
 
 @pytest.mark.parametrize("env", ["mine.py:Mine-v0", "./mine.py:Mine-v0", "/home/me/mine.py:Mine-v0"])
@@ -190,6 +191,6 @@ def test_a_file_in_place_of_a_module_comes_with_the_right_name(env: str) -> None
 )
 def test_faults_of_its_making_are_one_line(env: str, says: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        env_spaces(habit(env))
+        env_layout(habit(env))
     assert says in str(caught.value)
     assert env in ("LateSpaces", "NoModule") or "habits.py, line " in str(caught.value)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.make import env_spaces, make_env
+from rmc.common.env.make import env_layout, make_env
 from rmc.common.errors import ConfigError
 from tests.memory_env import ANSWER_STEPS
 
@@ -46,7 +46,8 @@ def odd(name: str, observation: gym.Space[Any], action: gym.Space[Any]) -> EnvCo
 
 
 def test_mujoco_environment() -> None:
-    assert env_spaces(EnvConfig("HalfCheetah-v5")) == (17, 6, 1000)
+    layout = env_layout(EnvConfig("HalfCheetah-v5"))
+    assert (layout.obs_dim, layout.action_dim, layout.time_limit) == (17, 6, 1000)
     env = make_env(EnvConfig("HalfCheetah-v5"))
     observation, info = env.reset(seed=3)
     assert observation.dtype == np.float32
@@ -171,7 +172,7 @@ def test_a_users_broken_module_is_one_line_with_its_place(source: str, says: str
     (tmp_path / "broken.py").write_text(source)
     run = _python(
         tmp_path,
-        "from rmc.common.env.make import *; env_spaces(EnvConfig('broken:Broken-v0'))",
+        "from rmc.common.env.make import *; env_layout(EnvConfig('broken:Broken-v0'))",
     )
     assert says in run.stderr.splitlines()[-1]
     assert run.stderr.splitlines()[-1].startswith("rmc.common.errors.ConfigError: ENV='broken:Broken-v0': ")
@@ -186,7 +187,8 @@ def test_a_users_module_in_the_working_folder_does_not_shadow_ours(tmp_path: Pat
     )
     run = _python(
         tmp_path,
-        "from rmc.common.env.make import *; print(env_spaces(EnvConfig('mine:Mine-v0')))",
+        "from rmc.common.env.make import *; layout = env_layout(EnvConfig('mine:Mine-v0')); "
+        "print((layout.obs_dim, layout.action_dim, layout.time_limit))",
     )
     assert (run.returncode, run.stdout.strip()) == (0, "(3, 1, 7)"), run.stderr
 

@@ -8,7 +8,8 @@ import pytest
 
 from rmc.common.env import wrappers
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.make import env_spaces, make_env
+from rmc.common.env.layout import Part
+from rmc.common.env.make import env_layout, make_env
 from rmc.common.env.wrappers import RescaledEnv
 
 CHEETAH, ACTION = "HalfCheetah-v5", np.linspace(-1, 1, 6, dtype=np.float32)
@@ -36,12 +37,12 @@ def test_part_of_the_observation_is_left_out(hide: Any, kept: slice) -> None:
     seen, same_rewards, _ = played(EnvConfig(CHEETAH, hide=hide))
     np.testing.assert_array_equal(seen, clear[:, kept])
     np.testing.assert_array_equal(rewards, same_rewards)
-    assert env_spaces(EnvConfig(CHEETAH, hide=hide))[0] == seen.shape[1]
+    assert env_layout(EnvConfig(CHEETAH, hide=hide)).obs_dim == seen.shape[1]
 
 
 def test_what_depends_on_velocities_goes_with_them() -> None:
-    assert env_spaces(EnvConfig("Ant-v5", hide="velocities"))[0] == 13
-    assert env_spaces(EnvConfig("Ant-v5", hide="positions"))[0] == 105 - 13
+    assert env_layout(EnvConfig("Ant-v5", hide="velocities")).obs_dim == 13
+    assert env_layout(EnvConfig("Ant-v5", hide="positions")).obs_dim == 105 - 13
 
 
 def test_noise_is_gaussian_independent_and_seeded() -> None:
@@ -89,7 +90,7 @@ def test_repeated_actions_add_their_rewards() -> None:
 @pytest.mark.parametrize(("repeat", "limit", "steps"), [(1, 7, 7), (3, 7, 3), (3, 0, 334)])
 def test_a_time_limit_counts_the_environments_steps(repeat: int, limit: int, steps: int) -> None:
     config = EnvConfig(CHEETAH, action_repeat=repeat, time_limit=limit)
-    assert env_spaces(config)[2] == steps
+    assert env_layout(config).time_limit == steps
     env = make_env(config)
     env.reset(seed=0)
     assert [env.step(ACTION)[2:4] for _ in range(steps)] == [(False, False)] * (steps - 1) + [(False, True)]
@@ -138,9 +139,28 @@ gym.register("Parts-v0", entry_point=Parts)
 
 def test_a_dict_of_boxes_is_flattened() -> None:
     config = EnvConfig("Parts-v0")
-    assert env_spaces(config) == (5, 1, None)
+    layout = env_layout(config)
+    assert (layout.obs_dim, layout.action_dim, layout.time_limit) == (5, 1, None)
+    assert layout.observations == (Part("b", 0, 4, (2, 2), "float32"), Part("a", 4, 5, (1,), "float64"))
+    assert layout.actions == (Part("", 0, 1, (1,), "float32"),)
     observation, _ = make_env(config).reset(seed=0)
     assert observation.tolist() == [1, 2, 3, 4, 5]
+
+
+def test_the_layout_names_what_is_shown_of_a_mujoco_body() -> None:
+    """Every part by its name: as many numbers as the observation has, whatever is hidden or stacked."""
+    shown = {
+        hide: env_layout(EnvConfig("Humanoid-v5", hide=hide))  # type: ignore[arg-type]
+        for hide in ("nothing", "velocities", "positions")
+    }
+    names = ["qpos", "qvel", "cinert", "cvel", "qfrc_actuator", "cfrc_ext"]
+    assert [part.name for part in shown["nothing"].observations] == names
+    assert shown["velocities"].observations == (Part("qpos", 0, 22, (22,), "float64"),)
+    assert [part.name for part in shown["positions"].observations] == names[1:]
+    assert [shown[hide].obs_dim for hide in shown] == [348, 22, 326]
+    stacked = env_layout(EnvConfig(CHEETAH, frame_stack=3))
+    assert (stacked.frames, stacked.obs_dim, stacked.observations[-1].stop) == (3, 51, 17)
+    assert (stacked.action_low, stacked.action_high) == ((-1.0,) * 6, (1.0,) * 6)
 
 
 class OldName(gym.Env[np.ndarray, np.ndarray]):

@@ -16,7 +16,7 @@ from rich.console import Console
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor import view
-from rmc.deploy.monitor.attach import Tail, launcher_pid, stop, watch
+from rmc.deploy.monitor.attach import launcher_pid, stop, watch
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
@@ -80,32 +80,6 @@ def test_nobody_to_stop_is_said(folder: RunFolder, tmp_path: Path) -> None:
         stop(folder)
     with pytest.raises(ConfigError, match=r"no config\.json there"):
         stop(RunFolder(tmp_path))
-
-
-def test_records_are_taken_once_and_whole(tmp_path: Path) -> None:
-    path = tmp_path / "metrics.jsonl"
-    tail = Tail(path)
-    assert tail.take() == []
-    with path.open("a") as file:
-        file.write(json.dumps({"role": "a"}) + "\n" + '{"torn": \n' + '{"role": "b"')
-        file.flush()
-        assert tail.take() == [{"role": "a"}]
-        file.write(', "x": 1}\n')
-        file.flush()
-        assert tail.take() == [{"role": "b", "x": 1}]
-    assert tail.take() == []
-
-
-def test_records_after_a_cut_are_taken(tmp_path: Path) -> None:
-    path = tmp_path / "metrics.jsonl"
-    path.write_text(f"{json.dumps({'role': 'a', 'x': 'long' * 99})}\n")
-    tail = Tail(path)
-    tail.take()
-    os.truncate(path, 10)
-    assert tail.take() == []
-    with path.open("a") as file:
-        file.write("\n" + json.dumps({"role": "b"}) + "\n")
-    assert tail.take() == [{"role": "b"}]
 
 
 def test_who_attaches_hears_who_is_silent(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,8 @@ from rmc.common.env.config import EnvConfig
 from rmc.deploy.monitor import metrics_log
 from rmc.deploy.monitor.metrics_log import MetricsLog
 from rmc.deploy.monitor.output import unfailing
-from rmc.deploy.monitor.view import RunStatus, View
+from rmc.deploy.monitor.run_status import RunStatus
+from rmc.deploy.monitor.view import View
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
@@ -34,34 +35,34 @@ def test_a_full_disk_is_told_once_and_over_once(
     folder: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(metrics_log, "RETRY_SECONDS", 0.0)
-    kept = MetricsLog(folder)
-    kept.write({"role": "learner", "x": 1}, 0)
+    kept = MetricsLog(folder, {})
+    kept.write({"role": "learner", "x": 1}, 0, {})
     there = kept._lines
     with open("/dev/full", "ab", buffering=0) as full, caplog.at_level(logging.WARNING):
         kept._lines = full.fileno()  # a real ENOSPC
-        kept.write({"role": "learner", "x": 2}, 0)
-        kept.write({"role": "learner", "x": 3}, 0)
+        kept.write({"role": "learner", "x": 2}, 0, {})
+        kept.write({"role": "learner", "x": 3}, 0, {})
         kept._lines = there
-        kept.write({"role": "learner", "x": 4}, 0)
+        kept.write({"role": "learner", "x": 4}, 0, {})
     kept.close()
     assert lines(folder) == [1, 4]
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == 2
     assert "is not written" in said[0]
     assert "is written again" in said[1]
-    assert len(list(folder.events.glob("events.*"))) == 1  # which goes on, too
+    assert len(list(folder.path.glob("events.*"))) == 1  # which goes on, too
 
 
 def test_no_half_of_a_line_is_left(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept, write = MetricsLog(folder), metrics_log.os.write
-    kept.write({"role": "learner", "x": 1}, 0)
+    kept, write = MetricsLog(folder, {}), metrics_log.os.write
+    kept.write({"role": "learner", "x": 1}, 0, {})
 
     def short(file: int, line: bytes) -> int:
         return write(file, line[:5])
 
     with monkeypatch.context() as patch:
         patch.setattr(metrics_log.os, "write", short)
-        kept.write({"role": "learner", "x": 2}, 0)
+        kept.write({"role": "learner", "x": 2}, 0, {})
     assert lines(folder) == [1]
     kept.close()
 
@@ -78,11 +79,11 @@ def test_a_view_that_cannot_be_written_ends_nothing() -> None:
 @pytest.mark.parametrize("torn", ['{"role": "learner", "x": 1}\n{"role": "lea', '{"role": "lea', "\0\0\0", ""])
 def test_a_torn_line_costs_no_record_after_it(folder: RunFolder, torn: str) -> None:
     folder.metrics.write_text(torn)
-    kept = MetricsLog(folder)
+    kept = MetricsLog(folder, {})
     for x in (2, 3):
-        kept.write({"role": "learner", "x": x}, 0)
+        kept.write({"role": "learner", "x": x}, 0, {})
     os.truncate(folder.metrics, folder.metrics.stat().st_size - 5)  # and while the run goes on
-    kept.write({"role": "learner", "x": 4}, 0)
+    kept.write({"role": "learner", "x": 4}, 0, {})
     kept.close()
     assert [found["x"] for found in folder.records()] == [1, 2, 4][not torn.startswith('{"role": "learner"') :]
     assert b"\n\n" not in folder.metrics.read_bytes()

@@ -14,6 +14,8 @@ import psutil
 import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from rmc.analysis import history
 from rmc.common.bus import redis_connection
@@ -24,7 +26,10 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor import view
 from rmc.deploy.monitor.monitor import Monitor
-from rmc.deploy.monitor.view import MOST_NAMES, UNHEARD_SECONDS, RunStatus, _evaluation, line, table, terminal
+from rmc.deploy.monitor.plain_line import line
+from rmc.deploy.monitor.run_status import MOST_NAMES, UNHEARD_SECONDS, RunStatus
+from rmc.deploy.monitor.table import table
+from rmc.deploy.monitor.view import terminal
 from rmc.deploy.redis.server import RedisServer
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
@@ -67,7 +72,7 @@ def test_any_number_is_shown(monitor: Monitor, value: float) -> None:
         bus.emit(role, {"waiting_for": "credit", **dict.fromkeys(NAMES, value)})
     monitor.watch(bus)
     assert any(said in line(monitor.board) for said in ("credit", "silent")) or not value > 0.5
-    Console(quiet=True).print(table(monitor.board))
+    Console(quiet=True).print(table(monitor.board, 80))
     monitor.close()
 
 
@@ -80,14 +85,14 @@ def test_steps_beyond_what_a_float_counts_are_shown(monitor: Monitor, said: floa
     monitor.take({"role": "learner", "checkpoint_update": 3, "checkpoint_env_steps": said})
     assert monitor.board.env_steps == shown
     assert monitor.board.checkpoint_steps(3) == (shown or None)
-    assert f"steps {shown}/" in line(monitor.board)
+    assert f"{shown:,} of " in line(monitor.board)
     monitor.close()
 
 
 def test_names_are_shown_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """And not taken for a console's markup, which would swallow or refuse them."""
     board = RunStatus("mine:[red]Env[/x]-v0", "debug", 0, 100, 32.0)
-    terminal(200).print(table(board), "run folder /runs/[words] :tada: [/]")
+    terminal(200).print(table(board, 200), "run folder /runs/[words] :tada: [/]")
     shown = capsys.readouterr().out
     assert "mine:[red]Env[/x]-v0 · debug" in shown
     assert "/runs/[words] :tada: [/]" in shown
@@ -103,7 +108,7 @@ def test_whatever_a_role_leaves_out_the_run_goes_on(monitor: Monitor, tmp_path: 
             bus.emit(role, decode_record(encode_record(found)))
         monitor.watch(bus)
         assert line(monitor.board)
-        Console(quiet=True).print(table(monitor.board))
+        Console(quiet=True).print(table(monitor.board, 80))
     monitor.close()
     folder = RunFolder(tmp_path / "run")
     assert 0 <= folder.wall_seconds() < 60
@@ -120,7 +125,7 @@ def test_half_of_an_evaluation_is_none(monitor: Monitor, said: dict[str, float])
     assert monitor._checkpoints.best() is None
     monitor.take({"role": "evaluator", "eval_update": 3, "eval_return_mean": 1})
     assert monitor._checkpoints.best() == 3
-    assert "± - at update 3" in _evaluation(monitor.board)
+    assert "1.0 ± – at update 3" in shown(monitor.board)[0]
     monitor.close()
 
 
@@ -148,8 +153,56 @@ def test_an_evaluation_stands_where_its_checkpoint_was(monitor: Monitor, tmp_pat
     monitor.close()
     lines = [json.loads(text) for text in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert [one.get("eval_env_steps") for one in lines if one["role"] == "evaluator"] == [None, 1_000]
-    events = EventAccumulator(str(tmp_path / "run" / "events")).Reload().Scalars("evaluator/eval_return_mean")
+    events = EventAccumulator(str(tmp_path / "run")).Reload().Scalars("evaluator/eval_return_mean")
     assert [(event.step, event.value) for event in events] == [(1_300, 1.0), (1_000, 2.0)]
+
+
+def test_tensorboard_has_the_main_metrics_and_the_options_under_the_runs_name(
+    monitor: Monitor, tmp_path: Path, config: RunConfig
+) -> None:
+    bus = MemoryBus()
+    bus.emit("learner", {"time": 1.0, "updates_per_s": 45.0, "q_loss": 0.5, "waiting_share": 0.25, "alpha": 0.1})
+    bus.emit("actor-0", {"time": 1.0, "waiting_share": 0.75, "episode_return_mean": 7.0})
+    bus.emit("replay", {"time": 1.0, "env_steps": 900, "env_steps_per_s": 95.0, "waiting_share": math.nan})
+    bus.emit("evaluator", {"time": 1.0, "eval_update": 3, "eval_return_mean": 12.0})
+    monitor.watch(bus)
+    monitor.close()
+    shown = EventMultiplexer().AddRunsFromDirectory(str(tmp_path)).Reload()
+    assert list(shown.Runs()) == ["run"]
+    main = {tag: shown.Scalars("run", tag)[-1].value for tag in shown.GetAccumulator("run").Tags()["scalars"]}
+    assert {tag.removeprefix("Main/"): value for tag, value in main.items() if tag.startswith("Main/")} == {
+        "env_steps_per_s": 95.0, "updates_per_s": 45.0, "episode_return": 7.0, "evaluation_return": 12.0,
+        "waiting_share_learner": 0.25, "waiting_share_actors": 0.75, "q_loss": 0.5,
+    }  # fmt: skip
+    assert min(main).startswith("Main/")  # as TensorBoard sorts
+    told = shown.SummaryMetadata("run", "_hparams_/session_start_info").plugin_data.content
+    hparams = HParamsPluginData.FromString(told).session_start_info.hparams
+    assert hparams["update.gamma"].number_value == config.update.gamma
+    assert hparams["env.id"].string_value == "Pendulum-v1"
+    experiment = HParamsPluginData.FromString(shown.SummaryMetadata("run", "_hparams_/experiment").plugin_data.content)
+    assert [one.name.tag for one in experiment.experiment.metric_infos] == ["Main/evaluation_return"]
+
+
+def test_events_of_earlier_versions_join_the_runs_own(config: RunConfig, tmp_path: Path) -> None:
+    folder = open_run(config, tmp_path / "run", "fail")
+    folder.unlock()
+    (folder.path / "events").mkdir()
+    (folder.path / "events" / "events.out.tfevents.1.host").write_bytes(b"")
+    Monitor(folder, config, Console(quiet=True)).close()
+    assert not list((folder.path / "events").iterdir())
+    assert len(list(folder.path.glob("events.out.tfevents.*"))) == 2
+
+
+def test_evaluations_of_earlier_starts_are_known(config: RunConfig, tmp_path: Path) -> None:
+    folder = open_run(config, tmp_path / "run", "fail")
+    folder.unlock()
+    scores = (3.0, 9.0, 5.0)
+    said = [{"role": "evaluator", "time": 1.0, "eval_return_mean": score, "eval_update": 3} for score in scores]
+    folder.metrics.write_text("".join(json.dumps(record) + "\n" for record in said))
+    monitor = Monitor(folder, config, Console(quiet=True))
+    assert "eval 5 (best 9)" in line(monitor.board)
+    assert "evaluator" not in monitor.board.roles  # it has not spoken in this start
+    monitor.close()
 
 
 def test_new_names_without_end_are_left_out(monitor: Monitor) -> None:
@@ -181,7 +234,7 @@ def test_evaluations_that_found_no_room_are_marked_when_there_is_some(
 def shown(board: RunStatus) -> list[str]:
     """The view as a table, and as a line."""
     console = Console(file=io.StringIO(), width=200)
-    console.print(table(board))
+    console.print(table(board, 200))
     return [console.file.getvalue(), line(board)]  # type: ignore[attr-defined]
 
 
@@ -193,6 +246,8 @@ def shown(board: RunStatus) -> list[str]:
         ("replay-1", {"replay_ratio": 39765.0, "replay_ratio_off": 1}, "replay ratio", "far from"),
         ("learner", {"checkpoint_error": "No space left on device"}, "not saved", "No space left on device"),
         ("launcher", {"not_running": "actor-3"}, "not running", "actor-3"),
+        ("launcher", {"restarts": 3}, "restarts", "3 of roles"),
+        ("actor-0", {"broken_episodes": 2}, "broken", "2 episodes"),
     ],
 )
 def test_what_is_not_as_it_should_be_is_shown(

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from rmc.deploy.monitor.output import Output
-from rmc.deploy.monitor.view import RunStatus, View, terminal
+from rmc.deploy.monitor.run_status import RunStatus
+from rmc.deploy.monitor.view import View, terminal
 
 RMC = f"{sys.executable} -m rmc.cli.main"
 

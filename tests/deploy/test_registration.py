@@ -78,10 +78,26 @@ def test_a_role_whose_environment_has_other_sizes_than_the_launchers_does_not_be
             role.make_env()
 
 
-@pytest.mark.parametrize("spaces", [3, None, [1, 2], [1, 2, "3"], [1.0, 2, 3]])
-def test_sizes_that_are_none_are_refused(spaces: object) -> None:
-    registered = json.loads(to_registration(CONFIG)) | {"spaces": spaces}
-    with pytest.raises(ConfigError, match="must be three numbers"):
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (3, "layout=3: must be an object"),
+        (None, "layout=None: must be an object"),
+        ({"frames": "1"}, "layout frames='1'"),
+        ({"frames": 0}, "layout frames=0"),
+        ({"actions": []}, "layout actions"),
+        ({"observations": [{"name": "", "start": 1, "stop": 3, "shape": [2], "dtype": "float32"}]}, "layout obs"),
+        ({"observations": [{"name": "", "start": 0, "stop": 3, "shape": [2], "dtype": "float32"}]}, "layout obs"),
+        ({"action_low": [9.0]}, "layout action_low"),
+        ({"action_low": [float("nan")]}, "layout action_low"),
+        ({"action_high": []}, "layout action_low"),
+        ({"time_limit": 1.5}, "layout time_limit"),
+    ],
+)
+def test_a_layout_that_is_none_is_refused(change: object, named: str) -> None:
+    registered = json.loads(to_registration(CONFIG))
+    registered["layout"] = registered["layout"] | change if isinstance(change, dict) else change
+    with pytest.raises(ConfigError, match=named):
         from_registration(json.dumps(registered).encode())
 
 

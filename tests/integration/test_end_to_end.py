@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import redis
 
+from rmc.analysis.policy_file import decode
 from tests.integration.running import Training
 
 MANUAL = Path(__file__).parents[2] / "docs" / "manual.md"
@@ -39,10 +40,14 @@ def test_train_evaluate_stats_and_resume(tmp_path: Path) -> None:
     assert abs(result["replay_ratio"] - 32) <= 2 * batch * train / (1500 - warmup) + 32 * 0.05
     assert "before training" in training.text()
     assert "after training" in training.text()
-    assert list((folder / "events").glob("events.out.tfevents.*"))
+    assert list(folder.glob("events.out.tfevents.*"))
     assert {"replay", "learner", "actor-0", "evaluator", "launcher"} <= {
         json.loads(line)["role"] for line in (folder / "metrics.jsonl").read_text().splitlines()
     }
+
+    *_, newest = sorted((folder / "checkpoints").glob("*/policy.safetensors"))  # a copy of which is enough
+    header = decode(newest.read_bytes()).header
+    assert (header.env.id, header.env_steps, header.updates) == (result["env"], 1500, result["updates"])
 
     played = rmc("evaluate", str(folder), "--json")
     assert played.returncode == 0, played.stderr
@@ -50,7 +55,7 @@ def test_train_evaluate_stats_and_resume(tmp_path: Path) -> None:
     assert evaluation["eval_return_mean"] == result["eval_return_mean"]  # the same path, the same starts
     shown = rmc("stats", str(folder))
     assert shown.returncode == 0, shown.stderr
-    assert "environment steps" in shown.stdout
+    assert "InvertedPendulum-v5 · debug · seed 0 · finished" in shown.stdout
 
     with Training(folder, "--total-steps", "2000", "--checkpoint-steps", "500") as resumed:
         assert resumed.finish(170) == 0, resumed.text() + resumed.logs()

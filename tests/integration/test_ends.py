@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import wandb_file
 from tests.integration.running import Training, alive
 
 ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
@@ -72,13 +73,31 @@ def test_a_run_is_watched_and_stopped_from_another_terminal(tmp_path: Path) -> N
         words = [sys.executable, "-m", "rmc.cli.main"]
         with subprocess.Popen([*words, "attach", str(tmp_path / "run")], stdout=subprocess.PIPE, text=True) as watcher:
             assert watcher.stdout is not None
-            assert watcher.stdout.readline().startswith("steps ")
+            assert watcher.stdout.readline().startswith("0% | ")
             done = subprocess.run([*words, "stop", str(tmp_path / "run")], capture_output=True, text=True, timeout=60)
             assert (done.returncode, done.stderr) == (0, "")
-            assert "to go on, give the same options" in done.stdout
+            assert "to go on:\n  rmc resume " in done.stdout
             assert training.finish(30) == 130
-            assert "to go on, give the same options" in watcher.stdout.read()
+            assert "to go on:\n  rmc resume " in watcher.stdout.read()
             assert watcher.wait(30) == 130
     done = subprocess.run([*words, "attach", str(tmp_path / "run")], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert "nobody trains it now" in done.stderr
+
+
+def test_a_tracked_run_ends_with_its_tracker(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    offline = {"WANDB_MODE": "offline"}
+    with Training(folder, "--total-steps", "10000000", "--track", "wandb", environment=offline) as training:
+        training.wait_for_updates()
+        training.wait_for(lambda: list(folder.glob("wandb/offline-run-*/*.wandb")))
+        processes = training.launcher.children(recursive=True)
+        assert any("tracker_process" in " ".join(process.cmdline()) for process in processes)
+        took = training.interrupt()
+        assert training.process.returncode == 130
+        assert took < 15.0
+        assert not alive(processes)
+    (records,) = wandb_file.records(folder)
+    assert wandb_file.exit_codes(records) == [0]
+    assert wandb_file.summary(records)["state"] == "stopped"
+    assert "WARNING" not in training.text()

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from rmc.analysis.evaluation import evaluate_checkpoint
+from rmc.analysis.evaluation import evaluate_policy
+from rmc.analysis.policy_file import read_policy
 from rmc.deploy.run.folder import RunFolder
 from tests.integration.running import Training
 from tests.memory_env import SOLVED_RETURN
@@ -49,4 +50,4 @@ def best_return(folder: Path, env: str, pace: list[str], enough: float) -> float
             time.sleep(1.0)
         training.interrupt()
     run = RunFolder(folder)
-    return float(evaluate_checkpoint(run, run.config(), "best", 10)["eval_return_mean"])
+    return float(evaluate_policy(read_policy(run.path, "best"), 10)["eval_return_mean"])

@@ -1,0 +1,75 @@
+"""Files to and from a repository of the Hugging Face hub; HF_ENDPOINT names another hub."""
+
+import importlib.util
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from rmc.common.checkpoint import POLICY
+from rmc.common.errors import ConfigError
+from rmc.common.extra import how_to_install
+
+SCHEME = "hf://"  # before a repository's name, where a path is asked for
+CARD = "README.md"
+
+
+def check_installed(repo: str) -> None:
+    """Raises ConfigError where the hub's library is missing."""
+    if importlib.util.find_spec("huggingface_hub") is None:
+        raise ConfigError("REPO", repo, f"huggingface-hub is missing; {how_to_install('hub')}")
+
+
+def push(repo: str, files: Mapping[str, bytes], private: bool) -> str:
+    """One commit of these files; a repository that is not there is made. Its address. Raises ConfigError."""
+    from huggingface_hub import CommitOperationAdd, HfApi, get_token
+
+    if get_token() is None:
+        raise ConfigError("HF_TOKEN", None, "no token; set it to one that may write, or run hf auth login")
+    api = HfApi(library_name="rmc")
+    with _in_one_line(repo):
+        api.create_repo(repo, private=private or None, exist_ok=True)
+        added = [CommitOperationAdd(name, content) for name, content in files.items()]
+        return str(api.create_commit(repo, added, commit_message="Upload a policy with RMC").repo_url)
+
+
+def pull(repo: str, revision: str | None = None) -> Path:
+    """A repository's policy, in the hub's own cache. Raises ConfigError."""
+    check_installed(repo)
+    from huggingface_hub import hf_hub_download
+
+    with _in_one_line(repo, revision):
+        return Path(hf_hub_download(repo, POLICY, revision=revision, library_name="rmc"))
+
+
+@contextmanager
+def _in_one_line(repo: str, revision: str | None = None) -> Iterator[None]:
+    """What the hub refuses, as a ConfigError; its library says nothing beside that."""
+    from huggingface_hub import constants, errors
+    from huggingface_hub.utils.logging import set_verbosity
+    from huggingface_hub.utils.tqdm import disable_progress_bars
+
+    disable_progress_bars()
+    set_verbosity(logging.ERROR)
+    try:
+        yield
+    except errors.HFValidationError:
+        raise ConfigError("REPO", repo, "no repository's name; give owner/name") from None
+    except errors.GatedRepoError:
+        raise ConfigError("REPO", repo, f"it wants to be asked; do so at {constants.ENDPOINT}/{repo}") from None
+    except errors.RepositoryNotFoundError:
+        fix = "no such repository, or a private one; check its name, or run hf auth login"
+        raise ConfigError("REPO", repo, fix) from None
+    except errors.RevisionNotFoundError:
+        raise ConfigError("--revision", revision, f"{repo} has no such revision; leave it") from None
+    except errors.RemoteEntryNotFoundError:
+        raise ConfigError("REPO", repo, f"it holds no {POLICY}; rmc hub push puts one there") from None
+    except errors.HfHubHTTPError as error:
+        status = error.response.status_code
+        fix = "use a token that may" if status in (401, 403) else "try again"
+        raise ConfigError("REPO", repo, f"the hub refuses it (HTTP {status}); {fix}") from None
+    except (errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError, errors.HTTPError) as error:  # type: ignore[attr-defined]
+        cause = error.__cause__ if isinstance(error, errors.LocalEntryNotFoundError) and error.__cause__ else error
+        reason = (str(cause).splitlines() or [type(cause).__name__])[0]
+        fix = f"cannot be reached ({reason}); try again with a network"
+        raise ConfigError("HF_ENDPOINT", constants.ENDPOINT, fix) from None

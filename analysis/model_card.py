@@ -1,0 +1,67 @@
+"""A policy's model card: what the hub shows of it."""
+
+from rmc.common.policy_header import PolicyHeader
+
+TEXT = """---
+{data}
+---
+
+# {env} by RMC
+
+A recurrent policy for `{env}`, trained with [RMC](https://arxiv.org/abs/1908.11494), preset `{preset}`, seed {seed}.
+
+| | |
+|---|---|
+| return, mean ± deviation | {judged} |
+| environment steps | {steps:,} |
+| observation, action, state | {sizes} |
+| written by RMC | {rmc} |
+
+```python
+from rmc import load_policy  # pip install 'rmc-rl[hub]'
+
+policy = load_policy("hf://{repo}")
+policy.reset()  # at the start of every episode
+action = policy.act(observation, units="environment")
+```
+
+The file's header has the observation's layout, the action's bounds and all options of the environment.
+"""
+
+
+def card(header: PolicyHeader, repo: str, license_id: str | None) -> str:
+    """Its text, with the data that the hub reads in front; the license is left to whoever pushes."""
+    from huggingface_hub import EvalResult, ModelCardData  # an extra
+
+    results, judged = None, "not evaluated"
+    if header.eval_return_mean is not None and header.eval_return_std is not None:
+        mean, deviation = header.eval_return_mean, header.eval_return_std
+        judged = f"{mean:,.1f} ± {deviation:,.1f} over {header.eval_episodes} episodes"
+        results = [
+            EvalResult(
+                task_type="reinforcement-learning",
+                dataset_type=header.env.id,
+                dataset_name=header.env.id,
+                metric_type="mean_reward",
+                metric_value=f"{mean:.2f} +/- {deviation:.2f}",
+            )
+        ]
+    data = ModelCardData(
+        license=license_id,
+        library_name="rmc",
+        pipeline_tag="reinforcement-learning",
+        tags=["reinforcement-learning", "rmc", header.env.id],
+        model_name=repo.rpartition("/")[2],
+        eval_results=results,
+    )
+    return TEXT.format(
+        data=data.to_yaml(),
+        env=header.env.id,
+        preset=header.preset,
+        seed=header.seed,
+        judged=judged,
+        steps=header.env_steps,
+        sizes=", ".join(map(str, header.sizes().values())),
+        rmc=header.rmc,
+        repo=repo,
+    )

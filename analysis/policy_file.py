@@ -1,0 +1,158 @@
+"""A policy's file, from a path or out of a run: read and judged as a whole before anything acts on it."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError
+
+from rmc.actors.policy_runner import PolicyRunner
+from rmc.analysis import hub
+from rmc.common.agent import Agent
+from rmc.common.bus.metrics_record import is_finite
+from rmc.common.checkpoint import POLICY, PROGRESS
+from rmc.common.errors import ConfigError, MessageError
+from rmc.common.policy_header import METADATA_KEY, PolicyHeader
+from rmc.deploy.run.checkpoint_choice import choose_checkpoint
+from rmc.deploy.run.config import from_dict
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.migrations import FORMAT, migrated
+
+
+@dataclass(frozen=True)
+class PolicyFile:
+    """A policy, and what is known of it."""
+
+    header: PolicyHeader
+    blob: bytes
+    """Safetensors of its weights; a header in there may know less than ``header``."""
+
+    def encode(self) -> bytes:
+        """The file's contents, its header the one here."""
+        return safetensors.torch.save(safetensors.torch.load(self.blob), self.header.metadata())
+
+
+def read_policy(source: str | Path, checkpoint: str = "latest") -> PolicyFile:
+    """A policy's file, that of ``hf://owner/name``, or of a run's ``latest``, ``best`` or numbered checkpoint.
+
+    Raises ConfigError.
+    """
+    if str(source).startswith(hub.SCHEME):
+        source = hub.pull(str(source).removeprefix(hub.SCHEME))
+    path = Path(source)
+    if path.is_dir():
+        return _of_run(RunFolder(path), checkpoint)
+    if checkpoint != "latest":
+        raise ConfigError("--checkpoint", checkpoint, f"{path} is no run's folder; leave it")
+    try:
+        blob = path.read_bytes()
+    except OSError as error:
+        fix = "give a run's folder or a policy.safetensors"
+        raise ConfigError("RUN", str(path), f"cannot be read ({error.strerror}); {fix}") from None
+    try:
+        return decode(blob)
+    except MessageError as error:
+        raise ConfigError("policy file", str(path), str(error)) from None
+
+
+def decode(blob: bytes) -> PolicyFile:
+    """A file's contents as a policy. Raises MessageError, which says what to do about it."""
+    shapes = _shapes(blob)
+    facts = _facts(blob)
+    if facts is None:
+        raise MessageError("no policy", f"its metadata has no {METADATA_KEY}; give the folder of its run")
+    header = _header(facts)
+    _check_shapes(header, shapes)
+    _check_weights(header, blob)
+    return PolicyFile(header, blob)
+
+
+def _shapes(blob: bytes) -> dict[str, tuple[int, ...]]:
+    try:
+        return {name: tuple(value.shape) for name, value in safetensors.torch.load(blob).items()}
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise MessageError("cut, or no safetensors file", f"{error}; copy it again") from None
+
+
+def _facts(blob: bytes) -> Any:
+    """What the header of a whole safetensors file says, before any of it is believed; None where there is none."""
+    length = int.from_bytes(blob[:8], "little")
+    text = json.loads(blob[8 : 8 + length]).get("__metadata__", {}).get(METADATA_KEY)
+    try:
+        return None if text is None else json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise MessageError("damaged header", f"no JSON ({error}); copy it again") from None
+
+
+def _header(facts: Any) -> PolicyHeader:
+    if not isinstance(facts, dict):
+        raise MessageError("damaged header", f"{facts!r} is no object; copy it again")
+    number, sizes, wrote = facts.get("format"), facts.pop("sizes", None), facts.get("rmc")
+    if type(number) is not int or number < 1:
+        raise MessageError("damaged header", f"its format is {number!r}; copy it again")
+    if number > FORMAT:
+        fix = f"RMC {wrote} wrote format {number}, this one reads up to {FORMAT}; install that version"
+        raise MessageError("newer policy", fix)
+    try:
+        header = from_dict(PolicyHeader, migrated(facts) | {"format": FORMAT}, "")
+    except ConfigError as error:
+        raise MessageError("header of another version", f"RMC {wrote} wrote it; {error}") from None
+    if header.sizes() != sizes:
+        raise MessageError("damaged header", f"its sizes are {sizes}, its parts make {header.sizes()}; copy it again")
+    return header
+
+
+def _check_shapes(header: PolicyHeader, found: dict[str, tuple[int, ...]]) -> None:
+    """Before any memory is taken for what a header says. Raises MessageError."""
+    try:
+        with torch.device("meta"):
+            wanted = Agent(header.obs_dim, header.action_dim, header.agent).policy_shapes()
+    except (RuntimeError, OverflowError, TypeError) as error:  # of torch, for sizes that nothing can have
+        reason = str(error).splitlines()[0]
+        raise MessageError("damaged header", f"no networks have its sizes ({reason}); copy it again") from None
+    for name in sorted(wanted.keys() | found.keys()):
+        if wanted.get(name) != found.get(name):
+            fault = f"{name} has shape {found.get(name)}, its header says {wanted.get(name)}; copy it again"
+            raise MessageError("other sizes than its header's", fault)
+
+
+def _check_weights(header: PolicyHeader, blob: bytes) -> None:
+    PolicyRunner(header.obs_dim, header.action_dim, header.agent, envs=1).load(blob)
+
+
+def _of_run(folder: RunFolder, checkpoint: str) -> PolicyFile:
+    if folder.is_baseline():
+        folder.config()  # says so
+    _, files = choose_checkpoint(folder, checkpoint)
+    try:
+        has_header = _shapes(files[POLICY]) and _facts(files[POLICY]) is not None
+        policy = decode(files[POLICY]) if has_header else _of_older_run(folder, files)
+        if policy.header.env.id != folder.settings()["env"]["id"]:
+            raise MessageError("weights", f"not a policy of this run (but of {policy.header.env.id})")
+    except MessageError as error:
+        raise ConfigError("--checkpoint", checkpoint, f"{error}; use another") from None
+    return replace(policy, header=_evaluated(policy.header, folder))
+
+
+def _of_older_run(folder: RunFolder, files: dict[str, bytes]) -> PolicyFile:
+    """Of one whose policies have no headers: its environment is made. Raises ConfigError, MessageError."""
+    config, progress = folder.config(), json.loads(files[PROGRESS])
+    folder.check_sizes(config.env.id, config.sizes())
+    header = replace(config.policy_header(), env_steps=progress["env_steps"], updates=progress["updates"])
+    _check_weights(header, files[POLICY])
+    return PolicyFile(header, files[POLICY])
+
+
+def _evaluated(header: PolicyHeader, folder: RunFolder) -> PolicyHeader:
+    """With how this checkpoint played: when the run ended, or while it trained."""
+    result = folder.result()
+    found = [result] if result is not None and result["updates"] == header.updates else []
+    if not found:
+        found = [record for record in folder.records() if record.get("eval_update") == header.updates]
+    if not found or not all(is_finite(found[-1].get(f"eval_{name}")) for name in ("return_mean", "return_std")):
+        return header
+    mean, deviation, episodes = (found[-1][f"eval_{name}"] for name in ("return_mean", "return_std", "episodes"))
+    return replace(header, eval_return_mean=mean, eval_return_std=deviation, eval_episodes=episodes)

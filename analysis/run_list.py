@@ -1,0 +1,99 @@
+"""The runs in a folder and below it: what became of each, how far it came, how good it is."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.table import Table
+from rich.text import Text
+
+from rmc.analysis.run_paths import run_folders
+from rmc.common.errors import ConfigError
+from rmc.deploy.monitor.figures import duration, number
+from rmc.deploy.monitor.recorded import recorded_status
+from rmc.deploy.monitor.table import STYLES
+from rmc.deploy.run.folder import RunFolder
+
+RECENT_BYTES = 1 << 18  # of each run's metrics
+DAMAGED = "damaged"
+# Each column, and the console's width from which it is shown.
+COLUMNS = {"run": 0, "state": 0, "steps": 0, "return": 0, "best": 60, "done": 72, "time": 84, "env": 110, "agent": 130}
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """One run; of a damaged one its ``run`` and ``fault`` alone. ``eval_return`` is the newest, or the result's."""
+
+    run: str
+    state: str = DAMAGED
+    env: str | None = None
+    agent: str | None = None
+    seed: int | None = None
+    env_steps: int | None = None
+    total_steps: int | None = None
+    eval_return: float | None = None
+    best_return: float | None = None
+    elapsed_s: float | None = None
+    fault: str | None = None
+
+
+def runs(folder: Path) -> list[RunSummary]:
+    """All of them, by name. Raises ConfigError where the folder cannot be read, or holds none."""
+    if not folder.is_dir():
+        raise ConfigError("FOLDER", str(folder), "is no folder; give one that holds runs")
+    found = sorted(map(summary, run_folders(folder)), key=lambda one: one.run)
+    if not found:
+        raise ConfigError("FOLDER", str(folder), "holds no run; rmc train makes one, in runs/ unless told otherwise")
+    return found
+
+
+def summary(path: Path) -> RunSummary:
+    """What is known of a run; that it is damaged, where it cannot be read."""
+    folder = RunFolder(path)
+    try:
+        board, result = recorded_status(folder, RECENT_BYTES), folder.result() or {}
+    except (ConfigError, OSError) as error:
+        return RunSummary(str(path), fault=str(error))
+    returns = [one.return_mean for one in (board.best, board.last) if one is not None]
+    returns += [result["eval_return_mean"]] if result else []
+    return RunSummary(
+        str(path),
+        str(board.state),
+        board.env,
+        board.preset,
+        board.seed,
+        result.get("env_steps", board.env_steps),
+        board.total_steps,
+        returns[-1] if returns else None,
+        max(returns, default=None),
+        result.get("wall_s", board.elapsed_s),
+    )
+
+
+def table(found: Sequence[RunSummary], folder: Path, width: int) -> Table:
+    """A row for each, with as many columns as there is room for; names are relative to ``folder``."""
+    shown = [name for name, least in COLUMNS.items() if width >= least]
+    drawn = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    for name in shown:
+        right = name in ("steps", "return", "best", "done", "time")
+        drawn.add_column(name, justify="right" if right else "left", no_wrap=right, overflow="fold")
+    for one in found:
+        cells = _cells(one, folder)
+        drawn.add_row(*(cells[name] for name in shown))
+    return drawn
+
+
+def _cells(one: RunSummary, folder: Path) -> dict[str, str | Text]:
+    done = min(1.0, one.env_steps / one.total_steps) if one.env_steps is not None and one.total_steps else None
+    return {
+        "run": os.path.relpath(one.run, folder),
+        "state": Text(one.state, STYLES.get(one.state, "red")),
+        "steps": number(one.env_steps, ","),
+        "return": number(one.eval_return, ",.1f"),
+        "best": number(one.best_return, ",.1f"),
+        "done": number(done, ".0%"),
+        "time": duration(one.elapsed_s),
+        "env": one.env or number(None),
+        "agent": f"{one.agent} · {one.seed}" if one.agent else number(None),
+    }

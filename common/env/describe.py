@@ -1,0 +1,58 @@
+"""What the numbers of a made environment are: which parts its observation has, and which of them are shown."""
+
+from typing import Any
+
+import gymnasium as gym
+
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.layout import EnvLayout, Part
+from rmc.common.env.spaces import bounds, parts
+from rmc.common.env.wrappers import Env
+
+
+def structure(env: gym.Env[Any, Any]) -> dict[str, int]:
+    """Names and sizes of the observation's parts in order, where the environment tells them (MuJoCo's bodies)."""
+    named = getattr(env.unwrapped, "observation_structure", None) or {}
+    return {name: size for name, size in named.items() if not name.startswith("skipped")}
+
+
+def shown(env: gym.Env[Any, Any], hide: str) -> slice | None:
+    """Positions come first, and what follows is velocities and what depends on them; None shows all."""
+    positions = structure(env).get("qpos", 0)
+    return {"nothing": None, "velocities": slice(0, positions), "positions": slice(positions, None)}[hide]
+
+
+def layout_of(env: Env, config: EnvConfig) -> EnvLayout:
+    """Of an environment as ``make_env`` gives it."""
+    given, taken = env.get_wrapper_attr("given"), env.get_wrapper_attr("taken")
+    low, high = bounds(taken)
+    limit = env.spec.max_episode_steps if env.spec else None
+    return EnvLayout(
+        _of_slice(_named(parts(given), structure(env)), shown(env, config.hide)),
+        config.frame_stack,
+        parts(taken),
+        tuple(low.tolist()),
+        tuple(high.tolist()),
+        None if limit is None else -(-limit // config.action_repeat),
+    )
+
+
+def _named(found: tuple[Part, ...], names: dict[str, int]) -> tuple[Part, ...]:
+    """One box in the parts that the environment says it has."""
+    if len(found) != 1 or sum(names.values()) != found[0].stop:
+        return found
+    named, at = [], 0
+    for name, size in names.items():
+        if size:
+            named.append(Part(name, at, at + size, (size,), found[0].dtype))
+            at += size
+    return tuple(named)
+
+
+def _of_slice(found: tuple[Part, ...], seen: slice | None) -> tuple[Part, ...]:
+    """Those that are shown; ``seen`` begins and ends with parts."""
+    if seen is None:
+        return found
+    first, last, _ = seen.indices(found[-1].stop)
+    kept = [part for part in found if first <= part.start and part.stop <= last]
+    return tuple(Part(part.name, part.start - first, part.stop - first, part.shape, part.dtype) for part in kept)

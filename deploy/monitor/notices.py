@@ -1,0 +1,58 @@
+"""What a user should notice about a run: what is wrong with it, and who waits for what."""
+
+from collections import defaultdict
+from statistics import mean
+from typing import Any
+
+from rmc.deploy.monitor.figures import number
+from rmc.deploy.monitor.run_status import RunStatus
+
+MOST_SILENT = 3  # that are named
+WAITING_SHARE = 0.5  # from which a role is said to wait
+
+
+def notices(board: RunStatus) -> dict[str, str]:
+    """What is not as it should be, by its heading."""
+    off = board.replay("replay_ratio_off", max)
+    restarts, broken = board.get("launcher", "restarts"), board.broken_episodes
+    found = {
+        "not running": "" if board.is_over else board.get("launcher", "not_running"),
+        "silent": _silent(board),
+        "not saved": board.get("learner", "checkpoint_error"),
+        "damaged": _damaged(board),
+        "replay ratio": f"far from {board.replay_ratio:g}, see the troubleshooting page" if off else "",
+        "restarts": f"{number(restarts, ',')} of roles that died" if restarts else "",
+        "broken": f"{number(broken, ',')} episodes, by the environment's faults" if broken else "",
+    }
+    return {name: str(text) for name, text in found.items() if text}
+
+
+def waits(board: RunStatus) -> str:
+    """Who waits most of the time, and for what; roles of a kind that wait for the same are counted."""
+    silent = board.silent()
+    groups: dict[tuple[str, str], dict[str, float]] = defaultdict(dict)
+    for role, record in sorted(board.roles.items()):
+        share, reason = record.get("waiting_share", 0.0), record.get("waiting_for")
+        if role not in silent and share > WAITING_SHARE and reason and role != "evaluator":
+            groups[role.partition("-")[0], str(reason)][role] = share
+    return ", ".join(f"{count(shares)} {mean(shares.values()):.0%} for {why}" for (_, why), shares in groups.items())
+
+
+def count(roles: dict[str, Any]) -> str:
+    """The name of one, or how many of a kind: ``8 actors``."""
+    first = next(iter(roles))
+    kind = {"actor": "actors", "replay": "replay servers"}.get(first.partition("-")[0], "roles")
+    return first if len(roles) == 1 else f"{len(roles)} {kind}"
+
+
+def _damaged(board: RunStatus) -> str:
+    """What was found damaged and passed over."""
+    counts = {"windows of the ring": board.replay("damaged_windows", sum)}
+    counts["newer checkpoints"] = board.get("learner", "damaged_checkpoints")
+    return ", ".join(f"{number(count, ',')} {name}" for name, count in counts.items() if count)
+
+
+def _silent(board: RunStatus) -> str:
+    found = [f"{who} for {seconds:,.0f} s" for who, seconds in board.silent().items()]
+    more = len(found) - MOST_SILENT
+    return ", ".join(found[:MOST_SILENT]) + (f" and {more} more" if more > 0 else "")

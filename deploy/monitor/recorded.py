@@ -1,0 +1,72 @@
+"""The state of a run out of its folder: of any version, also a baseline's, whether or not it is trained now."""
+
+import json
+from dataclasses import asdict
+from typing import Any
+
+from rmc.common.bus.metrics_record import is_finite
+from rmc.common.errors import ConfigError
+from rmc.deploy.monitor.notices import notices
+from rmc.deploy.monitor.run_status import RunStatus
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import RECENT_BYTES, MetricsTail
+from rmc.deploy.run.state import run_state
+
+
+def recorded_status(folder: RunFolder, recent_bytes: int = RECENT_BYTES) -> RunStatus:
+    """As its metrics say. Raises ConfigError where the folder is no run's or is damaged."""
+    board = empty_status(folder)
+    try:
+        board.state = run_state(folder)
+    except ValueError as error:
+        raise ConfigError("RUN", str(folder.path), f".lock is damaged ({error}); remove that file") from None
+    catch_up(board, MetricsTail(folder.metrics, recent_bytes))
+    if board.state == "finished" and (result := folder.result()) is not None:
+        board.final_steps = int(result["env_steps"])
+    return board
+
+
+def status_json(folder: RunFolder, board: RunStatus) -> dict[str, Any]:
+    """All of it as ``rmc stats --json`` prints it; a number that JSON has not, like infinity, is null."""
+    found = {
+        "run": str(folder.path),
+        "state": board.state,
+        "env": board.env,
+        "preset": board.preset,
+        "seed": board.seed,
+        "env_steps": board.env_steps,
+        "total_steps": board.total_steps,
+        "share_done": board.share_done,
+        "elapsed_s": board.elapsed_s,
+        "eta_s": board.eta_s,
+        "last_evaluation": board.last and asdict(board.last),
+        "best_evaluation": board.best and asdict(board.best),
+        "notices": notices(board),
+        "roles": board.roles,
+        "result": folder.result(),
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(found), parse_constant=lambda _: None)
+    return plain
+
+
+def catch_up(board: RunStatus, tail: MetricsTail) -> None:
+    """Take in what is new."""
+    for record in tail.take():
+        board.take(record)
+
+
+def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus:
+    """By ``config.json`` alone. Raises ConfigError."""
+    said = folder.settings()
+    env = _part(said, "env").get("id")
+    preset = said.get("preset") or f"{said.get('algorithm')}-{said.get('settings')}"
+    seed, total, ratio = said.get("seed"), said.get("total_steps"), _part(said, "replay").get("replay_ratio", 0.0)
+    if not (isinstance(env, str) and isinstance(seed, int) and isinstance(total, int) and is_finite(ratio)):
+        fix = "config.json has no env, seed or total_steps; restore it, or take another run"
+        raise ConfigError("RUN", str(folder.path), fix)
+    return RunStatus(env, str(preset), seed, total, ratio, expected)
+
+
+def _part(said: dict[str, Any], name: str) -> dict[str, Any]:
+    found = said.get(name, {})
+    return found if isinstance(found, dict) else {}

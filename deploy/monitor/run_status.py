@@ -1,0 +1,169 @@
+"""The newest state of a run: what its roles said last, its evaluations, how fast it goes and when it ends."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import mean
+from typing import Any
+
+from rmc.common.bus.metrics_record import is_finite
+from rmc.deploy.monitor.pace import Pace
+from rmc.deploy.run.state import State
+
+MOST_NAMES = 1000
+LARGEST_STEP = 2**63 - 1  # that TensorBoard takes
+SILENT_SECONDS = 5.0  # after which a role's silence is shown; it speaks every second
+LAUNCHER_SECONDS = 15.0  # the same of the launcher, which speaks every 5
+UNHEARD_SECONDS = 30.0  # of a role that has not spoken yet: it imports, and makes its environments
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Deterministic episodes of one checkpoint; None is what the record did not say."""
+
+    return_mean: float
+    return_std: float | None
+    update: int | None
+    env_steps: int | None
+
+
+class RunStatus:
+    """The newest value of everything, by role."""
+
+    def __init__(
+        self,
+        env: str,
+        preset: str,
+        seed: int,
+        total_steps: int,
+        replay_ratio: float,
+        expected: tuple[str, ...] = (),
+    ) -> None:
+        """``expected`` are the roles that are about to speak."""
+        self._since = dict.fromkeys(expected, time.time())  # of those that have not spoken
+        self.state: State | None = "training"  # None where it has ended, and how is not known
+        self.env, self.preset, self.seed, self.total_steps = env, preset, seed, total_steps
+        self.replay_ratio = replay_ratio
+        self.roles: dict[str, dict[str, Any]] = {}
+        self.last: Evaluation | None = None
+        self.best: Evaluation | None = None
+        self.final_steps: int | None = None  # once the run has its result
+        self._pace = Pace()
+
+    @property
+    def is_over(self) -> bool:
+        """Then nobody is expected to speak."""
+        return self.state != "training"
+
+    def take(self, record: dict[str, Any]) -> None:
+        """Take in a record; what it does not name stays as it was, and of a role there are ``MOST_NAMES`` at most."""
+        role = record["role"]
+        known = self.roles.get(role, {})
+        if role == "launcher" and _number(record.get("start_s")) < _number(known.get("start_s")):
+            self._pace.forget()  # of another start
+        room = MOST_NAMES - len(known)
+        new = record if len(record) <= room else {name: record[name] for name in record if name in known}
+        if role in self.roles:
+            self.roles[role] = known | new
+        else:  # afresh: another thread may be going through the old one
+            self.roles = {**self.roles, role: dict(new)}
+        self.take_evaluation(record)
+        if role.startswith("replay") and "env_steps" in record and _number(self.get("learner", "updates_per_s")) > 0:
+            self._pace.note(_number(record.get("time")), self.env_steps)
+
+    def take_evaluation(self, record: dict[str, Any]) -> None:
+        """Take in what a record says of an evaluation, if it is one: half of an evaluation is none."""
+        score, deviation = record.get("eval_return_mean"), record.get("eval_return_std")
+        if record["role"] != "evaluator" or not is_finite(score) or not is_finite(record.get("eval_update")):
+            return
+        deviation = deviation if is_finite(deviation) else None
+        at = _steps(record.get("eval_env_steps"))
+        self.last = Evaluation(float(score), deviation, _steps(record["eval_update"]), at)
+        if self.best is None or self.last.return_mean > self.best.return_mean:
+            self.best = self.last
+
+    def silent(self) -> dict[str, float]:
+        """Who has said nothing for long, and for how many seconds. While Redis is away, which is why, it alone."""
+        if self.is_over:
+            return {}
+        now, launcher = time.time(), self.roles.get("launcher", {})
+        if launcher.get("redis_away_s"):
+            return {"Redis": launcher["redis_away_s"] + now - launcher.get("time", now)}
+        unheard = {role: now - since for role, since in self._since.items() if role not in self.roles}
+        quiet = {role: now - record.get("time", now) for role, record in self.roles.items()}
+        return {role: seconds for role, seconds in unheard.items() if seconds > UNHEARD_SECONDS} | {
+            role: seconds
+            for role, seconds in sorted(quiet.items())
+            if seconds > (LAUNCHER_SECONDS if role == "launcher" else SILENT_SECONDS)
+        }
+
+    def get(self, role: str, name: str) -> Any:
+        """The newest value, or None."""
+        return self.roles.get(role, {}).get(name)
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps committed to the ring."""
+        if self.final_steps is not None:
+            return self.final_steps
+        steps = self.replay("env_steps", sum) or self.get("learner", "env_steps") or 0
+        return _steps(steps) or 0
+
+    @property
+    def share_done(self) -> float:
+        """Environment steps over the run's total, 0 to 1."""
+        return min(1.0, self.env_steps / max(1, self.total_steps))
+
+    @property
+    def elapsed_s(self) -> float | None:
+        """Seconds trained, over all starts of the run."""
+        said, spoke = self.get("launcher", "wall_s"), self.get("launcher", "time")
+        if not is_finite(said):
+            return None
+        since = 0.0 if self.is_over or not is_finite(spoke) else max(0.0, time.time() - spoke)
+        return float(said) + since
+
+    @property
+    def eta_s(self) -> float | None:
+        """Seconds to the end at the rate of the last minute of this start; None where that is not known yet."""
+        rate = self._pace.steps_per_s
+        if rate is None or self.is_over:
+            return None
+        return max(0, self.total_steps - self.env_steps) / rate
+
+    def checkpoint_steps(self, update: int | None) -> int | None:
+        """Environment steps at the checkpoint of that update, or None where the learner has said them of another."""
+        steps = self.get("learner", "checkpoint_env_steps")
+        known = update is not None and update == self.get("learner", "checkpoint_update")
+        return _steps(steps) if known else None
+
+    def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:
+        """The sum or mean ``over`` all replay servers, or None."""
+        found = [record[name] for role, record in self.roles.items() if role.startswith("replay") and name in record]
+        return over(found) if found else None
+
+    @property
+    def episode_return(self) -> float | None:
+        """Mean of the actors' newest episode returns."""
+        values = [record["episode_return_mean"] for record in self.roles.values() if "episode_return_mean" in record]
+        return sum(values) / len(values) if values else None
+
+    @property
+    def broken_episodes(self) -> int:
+        """How many the environment's own faults have ended."""
+        return sum(record.get("broken_episodes", 0) for record in self.roles.values())
+
+    @property
+    def policy_lag(self) -> float | None:
+        """Weight versions between what acts and the newest, at insertion."""
+        return self.replay("policy_lag_mean", mean)
+
+
+def _number(value: Any) -> float:
+    """A number out of a record, 0 where it is none."""
+    return value if is_finite(value) else 0.0
+
+
+def _steps(value: Any) -> int | None:
+    """Steps out of a record; None where they can be none."""
+    return min(int(value), LARGEST_STEP) if is_finite(value) and value >= 0 else None

@@ -1,0 +1,133 @@
+"""The process that follows a run's ``metrics.jsonl`` and hands it to a tracker, until its standard input ends.
+
+Standard output carries what the user should know, a line each; whatever libraries print goes to its log.
+"""
+
+import json
+import os
+import select
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Protocol
+
+from rmc.common.bus.metrics_record import is_finite
+from rmc.deploy.monitor.main_metrics import evaluation_metrics, main_metrics
+from rmc.deploy.monitor.recorded import empty_status
+from rmc.deploy.monitor.run_status import RunStatus
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import MetricsTail
+from rmc.deploy.run.tracking import Tracking, kept_tracking
+
+ROW_SECONDS = 10.0  # between rows
+LOOK_SECONDS = 1.0
+Tell = Callable[[str], None]
+
+
+class TrackedRun(Protocol):
+    """A run in a tracker. Its methods may raise anything."""
+
+    def log(self, values: dict[str, Any], env_steps: int) -> None:
+        """A row of numbers at an environment step."""
+
+    def finish(self, summary: dict[str, Any], video: Path | None, env_steps: int) -> None:
+        """Log the end, and return when all has arrived."""
+
+
+def main() -> None:
+    """The entry point: a run's folder, and from which byte of its metrics on."""
+    told = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    folder, read_from = RunFolder(Path(sys.argv[1])), int(sys.argv[2])
+
+    def tell(text: str) -> None:
+        with suppress(OSError):  # the launcher has died
+            told.write(" ".join(text.split()) + "\n")
+
+    _tell_first_warning(tell)
+    try:
+        tracking = kept_tracking(folder.path)
+        assert tracking is not None
+        _follow(folder, _begin(folder, tracking, tell), read_from)
+    except Exception as error:
+        tell(f"{_first_line(error)}; the run goes on without it")
+        raise
+
+
+def _begin(folder: RunFolder, tracking: Tracking, tell: Tell) -> TrackedRun:
+    if tracking.tracker == "wandb":
+        from rmc.deploy.monitor import wandb_run  # extras, and slow to import
+
+        return wandb_run.WandbRun(folder, tracking, tell)
+    from rmc.deploy.monitor import trackio_run
+
+    return trackio_run.TrackioRun(folder, tracking)
+
+
+def _tell_first_warning(tell: Tell) -> None:
+    """Of a library's, like that of a full disk; all are in the log."""
+    shown = warnings.showwarning
+    told: list[Warning | str] = []
+
+    def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
+        shown(message, category, *where)
+        if not told and issubclass(category, UserWarning):
+            told.append(message)
+            tell(str(message))
+
+    warnings.showwarning = show  # type: ignore[assignment]
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def _follow(folder: RunFolder, run: TrackedRun, read_from: int) -> None:
+    """A row now and then, one for each evaluation, and the end."""
+    board, tail = empty_status(folder), MetricsTail(folder.metrics, read_from=read_from)
+    due, end = time.monotonic() + ROW_SECONDS, None
+    while end is None:
+        end = _end_of_run()
+        for record in tail.take():
+            board.take(record)
+            if values := evaluation_metrics(record):
+                run.log(values, _at(board, record))
+        if time.monotonic() >= due or end is not None:
+            due = time.monotonic() + ROW_SECONDS
+            run.log(row(board), board.env_steps)
+    video = end.pop("video", None)
+    run.finish(end, Path(video) if video else None, end.get("env_steps", board.env_steps))
+
+
+def _end_of_run() -> dict[str, Any] | None:
+    """What the launcher says last, None while it says nothing; of one that was killed, that."""
+    ready, _, _ = select.select([sys.stdin], [], [], LOOK_SECONDS)
+    if not ready:
+        return None
+    said = sys.stdin.read()
+    return dict(json.loads(said)) if said else {"state": "lost"}
+
+
+def _at(board: RunStatus, evaluation: dict[str, Any]) -> int:
+    """Where the evaluated checkpoint stood, if that is known."""
+    at = evaluation.get("eval_env_steps")
+    return int(at) if is_finite(at) else board.env_steps
+
+
+def row(board: RunStatus) -> dict[str, float]:
+    """What is logged: the main metrics, and all of every role but single actors and the evaluator."""
+    roles = {
+        f"{role}/{name}": float(value)
+        for role, record in board.roles.items()
+        if not role.startswith(("actor-", "evaluator"))
+        for name, value in record.items()
+        if name != "time" and is_finite(value)
+    }
+    return main_metrics(board) | roles
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""A run in Trackio, which keeps runs on this machine, or in a Space of Hugging Face where its variables name one."""
+
+from pathlib import Path
+from typing import Any
+
+import trackio
+
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.tracking import Tracking
+
+
+class TrackioRun:
+    """Called as the run's folder and the tracker's id: Trackio goes on with a run by its name."""
+
+    def __init__(self, folder: RunFolder, tracking: Tracking) -> None:
+        self._run = trackio.init(
+            tracking.project,
+            f"{folder.path.name}-{tracking.id}",
+            config={**folder.settings(), "tags": list(tracking.tags)},
+            resume="allow",
+            embed=False,
+            auto_log_gpu=False,
+            auto_log_cpu=False,
+        )
+
+    def log(self, values: dict[str, Any], env_steps: int) -> None:
+        """A row of numbers at an environment step."""
+        self._run.log(values, step=env_steps)
+
+    def finish(self, summary: dict[str, Any], video: Path | None, env_steps: int) -> None:
+        """Log the end, and return when all has arrived."""
+        numbers = {name: value for name, value in summary.items() if isinstance(value, int | float)}
+        end: dict[str, Any] = {f"result/{name}": value for name, value in numbers.items()}
+        if video is not None:
+            end["video"] = trackio.Video(video)
+        self._run.log(end, step=env_steps)
+        self._run.finish()  # type: ignore[no-untyped-call]

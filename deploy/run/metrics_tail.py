@@ -1,0 +1,48 @@
+"""Reads a run's ``metrics.jsonl``, also while it grows, and without parsing all of one that is long."""
+
+import mmap
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from rmc.deploy.run.folder import parse_record
+
+RECENT_BYTES = 16 << 20  # at the end of a file, within which every role has said all of its metrics
+EVALUATION = b'"eval_return_mean"'
+
+
+class MetricsTail:
+    """The records of a file: first every evaluation and what is recent, then what is new at each look."""
+
+    def __init__(self, path: Path, recent_bytes: int = RECENT_BYTES, read_from: int = 0) -> None:
+        """``read_from`` is the byte from which on records are wanted; then there are no evaluations before."""
+        self._path, self._recent_bytes, self._position = path, recent_bytes, read_from
+
+    def take(self) -> list[dict[str, Any]]:
+        """Those that are new since the last call."""
+        with suppress(FileNotFoundError), self._path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            before: list[dict[str, Any]] = []
+            if self._position == 0 and size > self._recent_bytes:
+                before, self._position = _evaluations(file, size - self._recent_bytes)
+            self._position = min(self._position, size)  # it may have been cut
+            file.seek(self._position)
+            text = file.read()
+            whole = text[: text.rfind(b"\n") + 1]
+            self._position += len(whole)
+            return [*before, *filter(None, map(parse_record, whole.splitlines()))]
+        return []
+
+
+def _evaluations(file: BinaryIO, size: int) -> tuple[list[dict[str, Any]], int]:
+    """The evaluations in the lines that are whole within the first ``size`` bytes, and where those lines end."""
+    found = []
+    with mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ) as content:
+        end = content.rfind(b"\n") + 1
+        at = content.find(EVALUATION, 0, end)
+        while at >= 0:
+            stop = content.find(b"\n", at)
+            found.append(parse_record(content[content.rfind(b"\n", 0, at) + 1 : stop]))
+            at = content.find(EVALUATION, stop, end)
+    return [record for record in found if record is not None], end

@@ -1,0 +1,27 @@
+"""What became of a run: whether it is trained now, and how it ended."""
+
+from typing import Literal
+
+from rmc.deploy.run.folder import RunFolder
+
+State = Literal["new", "training", "finished", "stopped", "failed", "lost"]
+STOPPED = 130  # exit status after Ctrl-C, as shells have it
+
+
+def run_state(folder: RunFolder) -> State:
+    """Lost is one whose launcher was killed: it neither trains nor has ended. Raises ConfigError, ValueError."""
+    if folder.trainer() is not None:
+        return "training"
+    if folder.result() is not None:
+        return "finished"
+    status = folder.ended()
+    if status is None:
+        return _unended(folder)
+    return "stopped" if status == STOPPED else "failed"
+
+
+def _unended(folder: RunFolder) -> State:
+    lock = folder.path / ".lock"
+    if lock.exists() and lock.read_text().startswith("training"):
+        return "lost"
+    return "stopped" if folder.metrics.exists() else "new"

@@ -1,0 +1,99 @@
+"""Which tracker follows a run: chosen on the command line, kept in the run's folder for when it goes on."""
+
+import dataclasses
+import importlib.util
+import json
+import logging
+import re
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+from rmc.common.errors import ConfigError
+from rmc.common.extra import how_to_install
+from rmc.common.whole_file import write_whole
+from rmc.deploy.run.folder import RunFolder, read_object
+from rmc.deploy.run.launch_options import LaunchOptions, Tracker
+
+PROJECT = "rmc"
+LONGEST_TAG = 64  # characters that wandb takes
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """A run as its tracker knows it; the ``id`` stays over all starts."""
+
+    tracker: Tracker
+    project: str
+    tags: tuple[str, ...]
+    id: str
+
+
+def choose_tracking(options: LaunchOptions) -> Tracking | None:
+    """What the options ask for; where they say nothing, what the run's folder has. Raises ConfigError."""
+    resumes = options.run_dir is not None and options.if_exists == "resume"
+    before = kept_tracking(options.run_dir) if options.run_dir is not None and resumes else None
+    if options.track == "off":
+        return None
+    tracker = options.track or (before.tracker if before else None)
+    if tracker is None:
+        _refuse_without_tracker(options)
+        return None
+    project = options.track_project or (before.project if before else PROJECT)
+    tags = options.track_tags or (before.tags if before else ())
+    _check(tracker, project, tags)
+    same = before is not None and (before.tracker, before.project) == (tracker, project)
+    return Tracking(tracker, project, tags, before.id if same and before else secrets.token_hex(4))
+
+
+def _refuse_without_tracker(options: LaunchOptions) -> None:
+    for name, given in (("--track-project", options.track_project), ("--track-tags", options.track_tags)):
+        if given:
+            raise ConfigError(name, given, "say which tracker: --track wandb or --track trackio")
+
+
+def _check(tracker: str, project: str, tags: tuple[str, ...]) -> None:
+    if importlib.util.find_spec(tracker) is None:
+        raise ConfigError("--track", tracker, f"{tracker} is not installed; {_how_to_install(tracker)}")
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", project):
+        fix = "take up to 100 letters, digits, and _ . - after the first"
+        raise ConfigError("--track-project", project, fix)
+    for tag in tags:
+        if not (tag.isprintable() and 1 <= len(tag) <= LONGEST_TAG):
+            raise ConfigError("--track-tags", tag, f"take tags of 1 to {LONGEST_TAG} characters")
+
+
+def _how_to_install(tracker: str) -> str:
+    return how_to_install("wandb") if tracker == "wandb" else how_to_install("trackio")
+
+
+def keep_tracking(folder: RunFolder, tracking: Tracking | None) -> None:
+    """Write it into the run's folder, or that there is none."""
+    if tracking is None:
+        _file(folder.path).unlink(missing_ok=True)
+    else:
+        write_whole(_file(folder.path), f"{json.dumps(dataclasses.asdict(tracking))}\n".encode())
+
+
+def kept_tracking(path: Path) -> Tracking | None:
+    """That of a run's folder, None where it has none. Raises ConfigError where the file is damaged."""
+    try:
+        said = read_object(_file(path))
+    except FileNotFoundError:
+        return None
+    except ConfigError:
+        said = {}
+    if not _is_whole(said):
+        raise ConfigError("tracking.json", str(_file(path)), "is damaged; remove it, and give --track again")
+    return Tracking(said["tracker"], said["project"], tuple(said["tags"]), said["id"])
+
+
+def _is_whole(said: dict[str, Any]) -> bool:
+    texts = said.get("project"), said.get("id"), *(said["tags"] if isinstance(said.get("tags"), list) else [None])
+    return said.get("tracker") in get_args(Tracker) and all(isinstance(text, str) for text in texts)
+
+
+def _file(path: Path) -> Path:
+    return path / "tracking.json"

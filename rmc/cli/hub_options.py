@@ -1,0 +1,43 @@
+"""``rmc hub`` as dataclasses."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class Push:
+    """Put a policy and its model card into a repository of the Hugging Face hub."""
+
+    run: Positional[Path]
+    """The run's folder, or a policy file."""
+    repo: Positional[str]
+    """owner/name; made where it is not there."""
+    checkpoint: str = "latest"
+    """latest, best of those evaluated while it trained, or the number of a checkpoint."""
+    license: str | None = None
+    """What the model card says, like mit or cc-by-4.0; by default nothing."""
+    private: bool = False
+    """Make a repository that others cannot see, where it is not there."""
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Get a policy from a repository of the Hugging Face hub."""
+
+    repo: Positional[str]
+    """owner/name."""
+    out: Path = Path("policy.safetensors")
+    """The file to write."""
+    revision: str | None = None
+    """A branch, tag or commit; by default the newest."""
+
+
+@dataclass(frozen=True)
+class Hub:
+    """Share policies on the Hugging Face hub."""
+
+    action: Annotated[Push, tyro.conf.subcommand("push")] | Annotated[Pull, tyro.conf.subcommand("pull")]

@@ -1,0 +1,145 @@
+"""Policies to and from a hub, in processes of their own: its library reads the environment when it is imported."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from safetensors.numpy import save
+
+from rmc.analysis.policy_file import decode
+from rmc.cli import main
+from tests.analysis.hub_stub import TOKEN, Hub
+from tests.analysis.test_policy import AGENTS, make_run
+from tests.cli.test_main import complaint
+
+Call = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def hub() -> Iterator[Hub]:
+    found = Hub()
+    yield found
+    found.close()
+
+
+@pytest.fixture(scope="module")
+def call(hub: Hub, tmp_path_factory: pytest.TempPathFactory) -> Call:
+    """Python in a process of its own, beside that hub; large files go the way of git-lfs, not through hf-xet."""
+    home = tmp_path_factory.mktemp("home")
+
+    def run(*words: str, folder: Path, token: str = TOKEN, **more: str) -> subprocess.CompletedProcess[str]:
+        named = {"HF_ENDPOINT": hub.url, "HF_HOME": str(home), "HF_TOKEN": token, "HF_HUB_DISABLE_XET": "1"}
+        words = (sys.executable, *words)
+        environment = os.environ | named | more
+        return subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
+
+    return run
+
+
+RMC = ("-m", "rmc.cli.main", "hub")
+
+
+def test_what_is_pushed_comes_back_and_its_card_says_what_it_is(hub: Hub, call: Call, tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
+    result = {"eval_return_mean": -1234.5, "eval_return_std": 9.25, "eval_episodes": 10, "initial_return_mean": 0.0}
+    run.write_result(result | {"env_steps": 70, "updates": 7, "wall_s": 1.0})
+    pushed = call(*RMC, "push", "run", "me/swings", "--license", "mit", "--private", folder=tmp_path)
+    summary = "Pendulum-v1 after 70 environment steps, return -1,234.5 ± 9.2 over 10 episodes\n"
+    assert (pushed.returncode, pushed.stderr) == (0, ""), pushed.stderr
+    assert pushed.stdout == f"{hub.url}/me/swings: {summary}"
+    assert hub.private == {"me/swings"}
+    files = hub.repos["me/swings"]
+    assert sorted(files) == ["README.md", "policy.safetensors"]
+    assert list(hub.large.values()) == [files["policy.safetensors"]]
+    assert decode(files["policy.safetensors"]).header.eval_return_mean == -1234.5
+    front, text = files["README.md"].decode().split("---\n")[1:]
+    data = yaml.safe_load(front)
+    assert (data["license"], data["library_name"], data["pipeline_tag"]) == ("mit", "rmc", "reinforcement-learning")
+    (entry,) = data["model-index"][0]["results"]
+    assert entry["metrics"][0]["value"] == "-1234.50 +/- 9.25"
+    for row in ("return, mean ± deviation | -1,234.5 ± 9.2 over 10 episodes", "environment steps | 70"):
+        assert f"| {row} |" in text
+    pulled = call(*RMC, "pull", "me/swings", "--out", "back.safetensors", folder=tmp_path, token="")
+    assert (pulled.returncode, pulled.stderr, pulled.stdout) == (0, "", f"back.safetensors: {summary}")
+    assert (tmp_path / "back.safetensors").read_bytes() == files["policy.safetensors"]
+
+
+def test_the_cards_lines_load_it(hub: Hub, call: Call, tmp_path: Path) -> None:
+    make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
+    for _ in range(2):  # into a repository that is there, too
+        pushed = call(*RMC, "push", "run", "me/bare", folder=tmp_path)
+        assert (pushed.returncode, pushed.stderr) == (0, "")
+    card = hub.repos["me/bare"]["README.md"].decode()
+    front, text = card.split("---\n")[1:]
+    assert not {"license", "model-index"} & yaml.safe_load(front).keys()
+    assert "| return, mean ± deviation | not evaluated |" in text
+    lines = text.split("```python\n")[1].split("```")[0]
+    assert len([line for line in lines.splitlines() if line]) <= 5
+    code = f"observation = [1.0, 0.0, 0.5]\n{lines}\nprint(action.shape, abs(action[0]) <= 2)"
+    done = call("-c", code, folder=tmp_path, token="")
+    assert (done.returncode, done.stderr, done.stdout) == (0, "", "(1,) True\n")
+
+
+WRONG = [
+    (["push", "run", "me/x"], "", "HF_TOKEN=None: no token; set it to one that may write, or run hf auth login"),
+    (["push", "run", "me/x"], "hf_reads", "REPO='me/x': the hub refuses it (HTTP 401); use a token that may"),
+    (["push", "run", "others/x"], TOKEN, "REPO='others/x': the hub refuses it (HTTP 403); use a token that may"),
+    (["push", "run", "a/b/c"], TOKEN, "REPO='a/b/c': no repository's name; give owner/name"),
+    (["push", "nothing", "me/x"], TOKEN, "RUN='nothing': cannot be read"),
+    (["pull", "me/nothing"], "", "REPO='me/nothing': no such repository, or a private one"),
+    (["pull", "me/empty"], "", "REPO='me/empty': it holds no policy.safetensors"),
+    (["pull", "me/empty", "--revision", "v9"], "", "--revision='v9': me/empty has no such revision; leave it"),
+    (["pull", "me/other"], "", "no policy: its metadata has no rmc.policy"),
+    (["pull", "me/other", "--out", "policy.zip"], "", "--out='policy.zip': give a name that ends in .safetensors"),
+]
+MANY = """
+import json, os, sys
+from rmc.cli import main
+for words, token in json.loads(sys.argv[1]):
+    os.environ["HF_TOKEN"] = token
+    sys.stderr.write(f"{main.run(['hub', *words])}\\n")
+"""
+
+
+def test_what_goes_wrong_is_one_line(hub: Hub, call: Call, tmp_path: Path) -> None:
+    make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
+    hub.repos |= {"me/empty": {}, "me/other": {"policy.safetensors": save({})}}
+    cases = json.dumps([[words, token] for words, token, _ in WRONG])
+    done = call("-c", MANY, cases, folder=tmp_path)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+    said = done.stderr.splitlines()
+    assert len(said) == 2 * len(WRONG), done.stderr
+    for (_, _, expected), line, status in zip(WRONG, said[::2], said[1::2], strict=True):
+        assert line.startswith("rmc: ")
+        assert expected in line
+        assert status == "2"
+    assert not (tmp_path / "policy.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "more"),
+    [("push run me/x", {}), ("push run me/x", {"HF_HUB_OFFLINE": "1"}), ("pull x", {"HF_HUB_OFFLINE": "1"})],
+)
+def test_without_a_network_one_line_says_what_was_tried(
+    words: str, more: dict[str, str], call: Call, tmp_path: Path
+) -> None:
+    make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
+    done = call(*RMC, *words.split(), folder=tmp_path, HF_ENDPOINT="http://127.0.0.1:9", **more)
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("rmc: HF_ENDPOINT='http://127.0.0.1:9': cannot be reached ("), line
+
+
+def test_without_the_extra_one_line_says_how_to_get_it(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "huggingface_hub" else name)
+    monkeypatch.setattr("rmc.analysis.hub.how_to_install", lambda extra: f"pip install 'rmc-rl[{extra}]'")
+    for words in (["hub", "push", "run", "me/swings"], ["hub", "pull", "me/swings"]):
+        assert "huggingface-hub is missing; pip install 'rmc-rl[hub]'" in complaint(words, capsys)
+    assert main.run(["hub"]) == 2

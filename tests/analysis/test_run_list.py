@@ -1,0 +1,96 @@
+"""The runs below a folder: of every kind and state, the damaged told, none of them fatal."""
+
+import io
+import json
+import time
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from rmc.analysis.run_list import RunSummary, runs, table
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.presets import debug
+
+RESULT = {
+    "env_steps": 1500, "updates": 336, "wall_s": 21.0, "eval_return_mean": 11.5, "eval_return_std": 0.5,
+    "eval_episodes": 10, "initial_return_mean": 5.0,
+}  # fmt: skip
+
+
+def made(path: Path, status: int | None, scores: tuple[float, ...] = ()) -> RunFolder:
+    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), path, "fail")
+    records = [
+        {"role": "replay", "time": time.time(), "env_steps": 700},
+        {"role": "launcher", "time": time.time(), "wall_s": 9.0},
+        *({"role": "evaluator", "eval_return_mean": score, "eval_update": 5} for score in scores),
+    ]
+    folder.metrics.write_text("".join(json.dumps(record) + "\n" for record in records))
+    folder.unlock(status)
+    return folder
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    made(tmp_path / "finished", 0).write_result(RESULT)
+    made(tmp_path / "sweep" / "0001" / "stopped", 130, (20.0, 10.0))
+    made(tmp_path / "failed", 1)
+    baseline = tmp_path / "sac"
+    (baseline / "checkpoints").mkdir(parents=True)
+    said = {"algorithm": "sac", "settings": "zoo", "env": {"id": "Hopper-v5"}, "seed": 3, "total_steps": 1000}
+    (baseline / "config.json").write_text(json.dumps(said))
+    lines = [{"role": "learner", "env_steps": 400, "updates": 300}, {"role": "launcher", "wall_s": 4.0}]
+    (baseline / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (made(tmp_path / "torn", 0).path / "config.json").write_text('{"env": {"id"')
+    (made(tmp_path / "without", 0).path / "config.json").unlink()
+    (made(tmp_path / "lock", 0).path / ".lock").write_text("ended perhaps")
+    made(tmp_path / "result", 0).result_file.write_text("[]")
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "config.json").write_text("{}")  # of another program
+    return tmp_path
+
+
+def test_every_run_is_found_with_what_became_of_it(root: Path) -> None:
+    found = {str(Path(one.run).relative_to(root)): one for one in runs(root)}
+    states = {name: one.state for name, one in found.items()}
+    assert states == {
+        "failed": "failed", "finished": "finished", "sac": "stopped", "sweep/0001/stopped": "stopped",
+        "torn": "damaged", "without": "damaged", "lock": "damaged", "result": "damaged",
+    }  # fmt: skip
+    stopped = found["sweep/0001/stopped"]
+    assert (stopped.env_steps, stopped.eval_return, stopped.best_return, stopped.elapsed_s) == (700, 10.0, 20.0, 9.0)
+    finished = found["finished"]
+    assert (finished.env_steps, finished.eval_return, finished.elapsed_s) == (1500, 11.5, 21.0)
+    sac = found["sac"]
+    assert (sac.agent, sac.env, sac.seed, sac.env_steps, sac.total_steps) == ("sac-zoo", "Hopper-v5", 3, 400, 1000)
+    for name in ("torn", "without", "lock", "result"):
+        fault = found[name].fault
+        assert fault is not None
+        assert str(root / name) in fault
+        assert "\n" not in fault
+
+
+@pytest.mark.parametrize("width", [40, 80, 120, 250])
+def test_the_table_fits_and_says_state_steps_and_return(root: Path, width: int) -> None:
+    console = Console(file=io.StringIO(), width=width)
+    console.print(table(runs(root), root, width))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert max(map(len, text.splitlines())) <= width
+    for said in ("finished", "1,500", "11.5", "stopped", "700", "damaged", "sac"):
+        assert said in text
+    assert ("Hopper-v5" in text) is (width >= 110)
+
+
+def test_a_folder_without_runs_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="holds no run"):
+        runs(tmp_path)
+    with pytest.raises(ConfigError, match=r"FOLDER='.*/nowhere': is no folder"):
+        runs(tmp_path / "nowhere")
+
+
+def test_a_folder_that_is_a_run_is_listed(root: Path) -> None:
+    assert [one.state for one in runs(root / "finished")] == ["finished"]
+    assert isinstance(runs(root / "finished")[0], RunSummary)

@@ -1,0 +1,53 @@
+"""What became of a run is told from its folder alone."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.presets import debug
+from rmc.deploy.run.state import run_state
+
+RESULT = ("env_steps", "updates", "wall_s", "eval_return_mean", "eval_return_std", "eval_episodes")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    return open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+
+
+def test_a_run_is_trained_until_it_ends(folder: RunFolder) -> None:
+    assert run_state(folder) == "training"
+    folder.unlock(130)
+    assert run_state(folder) == "stopped"
+
+
+@pytest.mark.parametrize("status", [1, 2])
+def test_any_other_end_is_a_failure(folder: RunFolder, status: int) -> None:
+    folder.unlock(status)
+    assert run_state(folder) == "failed"
+
+
+def test_a_run_with_a_result_is_finished(folder: RunFolder) -> None:
+    folder.write_result(dict.fromkeys((*RESULT, "initial_return_mean"), 1.0))
+    assert run_state(folder) == "training"
+    folder.unlock(0)
+    assert run_state(folder) == "finished"
+
+
+def test_one_whose_launcher_was_killed_is_lost(folder: RunFolder) -> None:
+    lock = folder.path / ".lock"
+    said = lock.read_text()
+    folder.unlock()
+    lock.write_text(said)
+    assert run_state(folder) == "lost"
+
+
+def test_one_that_nobody_has_trained_is_new(folder: RunFolder) -> None:
+    folder.unlock()
+    assert run_state(folder) == "new"
+    folder.metrics.write_text(json.dumps({"role": "learner"}) + "\n")
+    assert run_state(folder) == "stopped"  # as runs of earlier versions noted it

@@ -1,0 +1,125 @@
+"""What a run looks like while it goes: on terminals of any size, in a pipe, with and without colour."""
+
+import io
+import time
+
+import pytest
+from rich.console import Console
+
+from rmc.deploy.monitor import run_status
+from rmc.deploy.monitor.plain_line import line
+from rmc.deploy.monitor.run_status import RunStatus
+from rmc.deploy.monitor.table import table
+
+WIDTHS = (40, 80, 120, 250)
+SECONDS = 40  # that the board's history lasts
+RATE = 95  # environment steps a second
+
+
+def board(actors: int = 2, start: float = 0.0) -> RunStatus:
+    """A run at 120 000 of a million steps, with two evaluations; its records begin at a start's second."""
+    made, now = RunStatus("HalfCheetah-v5", "robust", 1, 1_000_000, 32.0), time.time()
+    for ago in range(SECONDS, -1, -1):
+        at = {"time": now - ago}
+        made.take({"role": "launcher", **at, "wall_s": 1270.0 - ago, "start_s": start + SECONDS - ago})
+        made.take({"role": "learner", **at, "updates": 45_123, "updates_per_s": 45.2, "q_loss": 0.3, "busy_share": 1.0})
+        made.take({"role": "learner", **at, "latent_rank": 31.0, "alpha": 0.1, "curiosity_share": 0.02})
+        steps = {"env_steps": 120_000 - ago * RATE, "env_steps_per_s": float(RATE)}
+        made.take({"role": "replay", **at, **steps, "waiting_share": 0.8, "waiting_for": "draws"})
+    for index in range(actors):
+        waits = {"waiting_share": 0.9, "waiting_for": "credit", "busy_share": 0.1}
+        made.take({"role": f"actor-{index}", "time": now, **waits, "episode_return_mean": 3_900.0})
+    for score, at_step in ((4_402.0, 100_000), (4_310.2, 118_000)):
+        said = {"eval_return_mean": score, "eval_return_std": 120.5, "eval_update": 40_000, "eval_env_steps": at_step}
+        made.take({"role": "evaluator", "time": now, **said})
+    return made
+
+
+def drawn(of: RunStatus, width: int, height: int | None, **console: bool) -> list[str]:
+    file = io.StringIO()
+    Console(file=file, width=width, **console).print(table(of, width, height))  # type: ignore[arg-type]
+    return file.getvalue().splitlines()
+
+
+@pytest.mark.parametrize("actors", [1, 32, 300])
+@pytest.mark.parametrize("trouble", [False, True])
+@pytest.mark.parametrize("height", [14, 40, None])
+@pytest.mark.parametrize("width", WIDTHS)
+def test_what_matters_is_there_at_every_size(width: int, height: int | None, trouble: bool, actors: int) -> None:
+    """In 15 rows, too, of which the cursor takes one."""
+    of = board(actors)
+    if trouble:
+        of.take({"role": "learner", "time": time.time(), "checkpoint_error": "No space left on device"})
+        of.take({"role": "launcher", "time": time.time(), "wall_s": 1270.0, "start_s": SECONDS, "restarts": 3})
+        of.take({"role": "actor-0", "time": time.time() - 20})
+    rows = drawn(of, width, height)
+    assert height is None or len(rows) <= height
+    assert max(map(len, rows)) <= width
+    text = " ".join(" ".join(row.split()) for row in rows)
+    for said in ("robust · seed 1 · training", "12.0%", "120,000 of 1,000,000, 95 /s", "0:21:10, ETA 2:34:", "45.2 /s"):
+        assert said in text
+    for said in ("4,310.2 ± 120.5 at", "118,000", "4,402.0 ± 120.5 at", "100,000", "draws"):
+        assert said in text
+    assert ("credit" in text) is not (trouble and actors == 1)
+    for said in ("No space left on device", "3 of roles that died", "actor-0 for 20 s"):
+        assert (said in text) is trouble
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_details_fill_the_room_that_is_left(width: int) -> None:
+    assert "latent rank" not in " ".join(drawn(board(), min(width, 80), 14))
+    assert "latent rank" in " ".join(drawn(board(), width, 40))
+
+
+def test_many_actors_share_a_row_where_rows_are_few() -> None:
+    assert any("32 actors" in row and "90%" in row for row in drawn(board(32), 80, 14))
+    assert any("actor-31" in row for row in drawn(board(32), 80, None))
+
+
+def test_a_terminal_has_colour_unless_it_asks_for_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    cyan, escape = "\x1b[36m", "\x1b"
+    assert cyan in "".join(drawn(board(), 80, 14, force_terminal=True))
+    assert escape not in "".join(drawn(board(), 80, 14, force_terminal=False))
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert cyan not in "".join(drawn(board(), 80, 14, force_terminal=True))
+
+
+def test_the_plain_line_says_how_far_it_is_and_who_waits() -> None:
+    said = line(board(4))
+    assert said.startswith("12% | 120,000 of 1,000,000 steps | 45 updates/s | eval 4,310 (best 4,402) | 0:21:10, ETA ")
+    assert said.endswith(" | waiting: 4 actors 90% for credit, replay 80% for draws")
+    assert line(RunStatus("Env-v0", "debug", 0, 100, 1.0)) == "0% | 0 of 100 steps | – updates/s | eval – | –, ETA –"
+
+
+def test_the_end_is_told_from_the_last_minute_of_this_start() -> None:
+    of = board()
+    assert of.eta_s == pytest.approx(880_000 / RATE)
+    resumed, now = board(start=100.0), time.time()
+    resumed.take({"role": "launcher", "time": now, "wall_s": 1270.0, "start_s": 0.0})
+    assert resumed.eta_s is None  # of another start nothing is taken over
+    for second in range(12):
+        resumed.take({"role": "replay", "time": now + second, "env_steps": 120_000 + 10 * second})
+    assert resumed.eta_s == pytest.approx((880_000 - 110) / 10)
+
+
+def test_no_end_is_told_before_the_learner_learns_or_while_no_steps_come() -> None:
+    of, now = RunStatus("Env-v0", "debug", 0, 100_000, 1.0), time.time()
+    for second in range(30):
+        of.take({"role": "replay", "time": now + second, "env_steps": 100 * second})  # of the warm-up
+    assert of.eta_s is None
+    of.take({"role": "learner", "time": now, "updates_per_s": 5.0})
+    for second in range(30, 60):
+        of.take({"role": "replay", "time": now + second, "env_steps": 3_000})
+    assert of.eta_s is None
+
+
+def test_the_time_goes_on_until_the_run_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    of, now = board(), time.time()
+    monkeypatch.setattr(run_status.time, "time", lambda: now + 100)
+    assert of.elapsed_s == pytest.approx(1370, abs=2)
+    of.state = "finished"
+    assert of.elapsed_s == 1270
+    assert "ETA" not in line(of)
+    assert "finished" in drawn(of, 80, None)[0]

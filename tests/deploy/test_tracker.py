@@ -1,0 +1,221 @@
+"""A run in real trackers: what arrives, that a resume goes on with it, and that no tracker's trouble is the run's."""
+
+import json
+import logging
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from imageio_ffmpeg import write_frames
+
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.monitor import tracker as tracker_module
+from rmc.deploy.monitor.tracker import Tracker, start_tracker
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.presets import debug
+from rmc.deploy.run.tracking import Tracking, keep_tracking
+from tests import wandb_file
+
+CLOSED = "http://127.0.0.1:9"  # no service of anyone's
+RESULT = {"state": "finished", "env_steps": 1500, "eval_return_mean": 11.5, "env": "InvertedPendulum-v5"}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
+    monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_BASE_URL", CLOSED)
+    monkeypatch.setenv("HOME", str(tmp_path))  # where a login would be
+    monkeypatch.delenv("WANDB_API_KEY", raising=False)
+    made = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "first", "fail")
+    made.unlock()
+    return made
+
+
+def started(folder: RunFolder, name: Any) -> Tracker:
+    keep_tracking(folder, Tracking(name, "my-project", ("a", "b"), "0123abcd"))
+    tracker = start_tracker(folder)
+    assert tracker is not None
+    return tracker
+
+
+def trained(folder: RunFolder, env_steps: int, score: float) -> None:
+    """What a start of a run says in its metrics."""
+    now = time.time()
+    records = [
+        {"role": "learner", "time": now, "q_loss": 0.5, "updates_per_s": 45.0, "waiting_share": 0.1},
+        {"role": "actor-0", "time": now, "waiting_share": 0.9, "waiting_for": "credit"},
+        {"role": "replay", "time": now, "env_steps": env_steps, "env_steps_per_s": 95.0},
+        {"role": "evaluator", "time": now, "eval_return_mean": score, "eval_update": 3, "eval_env_steps": env_steps},
+    ]
+    with folder.metrics.open("a") as file:
+        file.writelines(json.dumps(record) + "\n" for record in records)
+
+
+def video(path: Path) -> str:
+    writer = write_frames(str(path), (32, 32))
+    writer.send(None)
+    for _ in range(3):
+        writer.send(bytes(32 * 32 * 3))
+    writer.close()
+    return str(path)
+
+
+def test_wandb_has_the_run_over_its_starts(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
+    for env_steps, end in ((700, {"state": "stopped"}), (1500, {**RESULT, "video": video(folder.path / "video.mp4")})):
+        tracker = started(folder, "wandb")
+        trained(folder, env_steps, env_steps / 100)
+        tracker.close(end)
+    assert not caplog.messages
+    starts = wandb_file.records(folder.path)
+    assert len(starts) == 2
+    for records, env_steps in zip(starts, (700, 1500), strict=True):
+        (run,) = (record.run for record in records if record.HasField("run"))
+        assert (run.run_id, run.display_name, run.project, list(run.tags)) == (
+            "0123abcd",
+            "first",
+            "my-project",
+            ["a", "b"],
+        )
+        config = wandb_file.items(run.config.update)
+        assert config["env"]["id"] == "InvertedPendulum-v5"
+        assert config["update"]["gamma"] == folder.config().update.gamma
+        rows = wandb_file.rows(records)
+        (evaluation,) = (row for row in rows if "Main/evaluation_return" in row)
+        assert (evaluation["env_steps"], evaluation["Main/evaluation_return"]) == (env_steps, env_steps / 100)
+        (newest,) = (row for row in rows if "Main/q_loss" in row)
+        assert newest["Main/waiting_share_actors"] == 0.9
+        assert newest["replay/env_steps_per_s"] == 95.0
+        assert not any(name.startswith("actor-") for name in newest)
+        assert wandb_file.exit_codes(records) == [0]
+    summary = wandb_file.summary(starts[1])
+    assert (summary["state"], summary["eval_return_mean"]) == ("finished", 11.5)
+    (film,) = folder.path.glob("wandb/offline-run-*/files/media/videos/*.mp4")
+    assert film.read_bytes() == (folder.path / "video.mp4").read_bytes()
+
+
+def test_trackio_has_the_run_over_its_starts(
+    folder: RunFolder, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for env_steps, end in ((700, {"state": "stopped"}), (1500, {**RESULT, "video": video(folder.path / "video.mp4")})):
+        tracker = started(folder, "trackio")
+        trained(folder, env_steps, env_steps / 100)
+        tracker.close(end)
+    assert not caplog.messages
+    with sqlite3.connect(tmp_path / "trackio" / "my-project.db") as store:
+        rows = store.execute("select run_name, run_id, step, metrics from metrics order by id").fetchall()
+        ((config,),) = store.execute("select config from configs").fetchall()
+    store.close()
+    assert {row[0] for row in rows} == {"first-0123abcd"}
+    assert len({row[1] for row in rows}) == 1
+    found = [(step, json.loads(metrics)) for *_, step, metrics in rows]
+    returns = [(step, one["Main/evaluation_return"]) for step, one in found if "Main/evaluation_return" in one]
+    assert returns == [(700, 7.0), (1500, 15.0)]
+    assert [one["Main/q_loss"] for _, one in found if "Main/q_loss" in one] == [0.5, 0.5]
+    step, last = found[-1]
+    assert (step, last["result/eval_return_mean"], last["video"]["_type"]) == (1500, 11.5, "trackio.video")
+    assert (tmp_path / "trackio" / "media" / last["video"]["file_path"]).stat().st_size > 100
+    about = json.loads(config)
+    assert (about["env"]["id"], about["tags"]) == ("InvertedPendulum-v5", ["a", "b"])
+
+
+@pytest.mark.parametrize("key", [None, "a" * 40])
+def test_without_login_or_network_wandb_is_recorded_offline_and_that_is_said_once(
+    folder: RunFolder, key: str | None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.delenv("WANDB_MODE")
+    if key is not None:
+        monkeypatch.setenv("WANDB_API_KEY", key)
+    tracker = started(folder, "wandb")
+    trained(folder, 700, 7.0)
+    tracker.close(RESULT)
+    (said,) = caplog.messages
+    assert said.startswith("wandb: ")
+    assert said.endswith(f"; recorded offline, and wandb sync {folder.path}/wandb/offline-run-* sends it")
+    (records,) = wandb_file.records(folder.path)
+    assert any(row.get("Main/evaluation_return") == 7.0 for row in wandb_file.rows(records))
+
+
+def test_a_disk_that_takes_nothing_is_said_and_the_run_goes_on(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("TRACKIO_DIR", "/dev/full/trackio")
+    tracker = started(folder, "trackio")
+    trained(folder, 700, 7.0)
+    tracker.close(RESULT)
+    assert caplog.messages
+    assert all(said.startswith("trackio: ") for said in caplog.messages)
+    assert len(caplog.messages) == 1
+
+
+def test_one_that_dies_is_said_once(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
+    tracker = started(folder, "trackio")
+    tracker._process.kill()
+    tracker._process.wait()
+    for _ in range(3):
+        tracker.look()
+    tracker.close(RESULT)
+    (said,) = caplog.messages
+    assert "its process has ended; the run goes on without it" in said
+
+
+def test_one_that_hangs_is_not_waited_for(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(tracker_module, "FINISH_SECONDS", 0.5)
+    tracker = started(folder, "trackio")
+    tracker._process.send_signal(signal.SIGSTOP)
+    began = time.monotonic()
+    for _ in range(100):
+        tracker.look()
+    assert time.monotonic() - began < 0.5
+    tracker.close(RESULT)
+    assert time.monotonic() - began < 5.0
+    assert tracker._process.poll() is not None
+    (said,) = caplog.messages
+    assert "not all has arrived within" in said
+
+
+def test_one_whose_launcher_was_killed_ends_by_itself(folder: RunFolder) -> None:
+    keep_tracking(folder, Tracking("wandb", "my-project", (), "0123abcd"))
+    code = (
+        "import os, sys, pathlib\n"
+        "from rmc.deploy.monitor.tracker import start_tracker\n"
+        "from rmc.deploy.run.folder import RunFolder\n"
+        "print(start_tracker(RunFolder(pathlib.Path(sys.argv[1])))._process.pid, flush=True)\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(folder.path)], capture_output=True, text=True, timeout=60)
+    deadline = time.monotonic() + 60
+    while psutil.pid_exists(int(done.stdout)) and psutil.Process(int(done.stdout)).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    (records,) = wandb_file.records(folder.path)
+    assert wandb_file.exit_codes(records) == [1]
+    assert wandb_file.summary(records)["state"] == "lost"
+
+
+def test_it_is_told_no_secret_of_the_run(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RMC_SECRET", "hush")
+    tracker = started(folder, "trackio")
+    process = psutil.Process(tracker._process.pid)
+    while not (environment := process.environ()):  # the kernel has none to show amid the start of a program
+        time.sleep(0.01)
+    tracker.close(RESULT)
+    assert "hush" not in environment.values()
+    assert environment["HOME"] == os.environ["HOME"]
+
+
+def test_a_run_whose_tracker_cannot_be_started_goes_on(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
+    (folder.path / "tracking.json").write_text("{")
+    with caplog.at_level(logging.WARNING):
+        assert start_tracker(folder) is None
+    assert "the run is not tracked: tracking.json=" in caplog.text

@@ -1,0 +1,70 @@
+"""Which tracker follows a run is chosen once, and goes on with the run's folder."""
+
+import dataclasses
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.presets import debug
+from rmc.deploy.run.tracking import PROJECT, Tracking, choose_tracking, keep_tracking, kept_tracking
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    made = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    made.unlock()
+    return made
+
+
+def chosen(folder: RunFolder, **options: Any) -> Tracking | None:
+    return choose_tracking(dataclasses.replace(LaunchOptions(folder.path, "resume", "local", "cpu", None), **options))
+
+
+def test_a_new_run_is_in_no_tracker_unless_asked(folder: RunFolder) -> None:
+    assert chosen(folder) is None
+    tracking = chosen(folder, track="wandb", track_tags=("a", "b"))
+    assert tracking is not None
+    assert (tracking.tracker, tracking.project, tracking.tags) == ("wandb", PROJECT, ("a", "b"))
+
+
+def test_a_run_that_goes_on_stays_the_same_in_its_tracker(folder: RunFolder) -> None:
+    first = chosen(folder, track="trackio", track_project="mine", track_tags=("a",))
+    keep_tracking(folder, first)
+    assert kept_tracking(folder.path) == chosen(folder) == chosen(folder, track="trackio") == first
+    tagged = chosen(folder, track_tags=("c",))
+    assert first is not None
+    assert tagged == dataclasses.replace(first, tags=("c",))
+    for elsewhere in ({"track": "wandb"}, {"track_project": "other"}):
+        other = chosen(folder, **elsewhere)
+        assert other is not None
+        assert other.id != first.id
+    assert chosen(folder, if_exists="new") is None
+
+
+def test_it_can_be_left(folder: RunFolder) -> None:
+    keep_tracking(folder, chosen(folder, track="wandb"))
+    keep_tracking(folder, chosen(folder, track="off"))
+    assert chosen(folder) is None
+    keep_tracking(folder, None)  # once more
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"tracker": "mlflow", "project": "x", "tags": [], "id": "y"}'])
+def test_a_damaged_note_is_named(folder: RunFolder, text: str) -> None:
+    (folder.path / "tracking.json").write_text(text)
+    with pytest.raises(ConfigError, match=r"^tracking\.json='.*': is damaged; remove it, and give --track again$"):
+        chosen(folder)
+
+
+@pytest.mark.parametrize("tracker", ["wandb", "trackio"])
+def test_a_missing_extra_is_said(folder: RunFolder, tracker: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == tracker else there(name))
+    with pytest.raises(ConfigError, match=rf"--track='{tracker}': {tracker} is not installed; pip install .*{tracker}"):
+        chosen(folder, track=tracker)

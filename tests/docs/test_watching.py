@@ -1,0 +1,68 @@
+"""The commands of docs/watching.md and docs/trackers.md run as they are printed."""
+
+import json
+import re
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from rmc.analysis.run_list import DAMAGED
+from rmc.deploy.run.state import State
+
+DOCS = Path(__file__).parents[2] / "docs"
+WATCHING, TRACKERS = ((DOCS / f"{name}.md").read_text() for name in ("watching", "trackers"))
+SHORT = ("--launcher", "lockstep", "--total-steps", "600")
+
+
+def rmc(at: Path, *words: str) -> str:
+    command = [sys.executable, "-m", "rmc.cli.main", *words]
+    done = subprocess.run(command, cwd=at, capture_output=True, text=True, timeout=150, check=False)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
+    return done.stdout
+
+
+def test_a_run_is_watched(tmp_path: Path) -> None:
+    trained = rmc(tmp_path, "train", "InvertedPendulum-v5", "--preset", "debug", "--run-dir", "runs/first", *SHORT)
+    assert re.search(r"^\d+% \| \d+ of 600 steps \| .* updates/s \| eval .* \| 0:00:\d\d$", trained, re.MULTILINE)
+    stats, as_json, listed = (rmc(tmp_path, *words.split()) for words in re.findall(r"```sh\nrmc (.*)\n```", WATCHING))
+    assert "InvertedPendulum-v5 · debug · seed 0 · finished" in stats
+    assert "600 of 600" in stats
+    assert "latent rank" in stats
+    assert json.loads(as_json)["state"] == "finished"
+    assert re.search(r"^first +finished +600 .* 100%$", listed, re.MULTILINE)
+    (one,) = json.loads(rmc(tmp_path, "list", "runs", "--json"))
+    assert (one["state"], one["env_steps"]) == ("finished", 600)
+
+
+def test_every_state_is_told() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| ", WATCHING.split("| state | says |")[1], re.MULTILINE)
+    assert rows == [*get_args(State), DAMAGED]
+
+
+@pytest.mark.timeout(300)
+def test_runs_are_tracked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
+    for words in re.findall(r"```sh\nrmc (.*)\n```", TRACKERS):
+        assert "no video" not in rmc(tmp_path, *words.split(), *SHORT)
+    assert len(list(tmp_path.glob("runs/tracked/wandb/offline-run-*/*.wandb"))) == 1
+    assert len(list(tmp_path.glob("runs/tracked/wandb/offline-run-*/files/media/videos/*.mp4"))) == 1
+    assert results(tmp_path / "trackio" / "pendulum.db", "here-") == [600]
+    (code,) = re.findall(r"```python\n(.*?)```", TRACKERS, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=150)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    assert len(results(tmp_path / "trackio" / "rmc.db", "python-")) == 1
+
+
+def results(file: Path, name: str) -> list[int]:
+    """The final environment steps of Trackio's runs of that name."""
+    store = sqlite3.connect(file)
+    rows = store.execute("select metrics from metrics where run_name like ?", (f"{name}%",)).fetchall()
+    store.close()
+    found = [json.loads(metrics) for (metrics,) in rows]
+    assert all("video" in one for one in found if "result/env_steps" in one)
+    return [one["result/env_steps"] for one in found if "result/env_steps" in one]
