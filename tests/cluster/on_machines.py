@@ -216,7 +216,9 @@ def test_every_node_is_there(site: Site) -> None:
 
 
 def test_a_sweeps_runs_are_spread_over_the_machines_and_come_to_the_head(site: Site) -> None:
-    words = "sweep InvertedPendulum-v5 --preset debug --total-steps 1200 --seeds 1-2 --launcher ray --sweep-dir /root/sweep"
+    words = (
+        "sweep InvertedPendulum-v5 --preset debug --total-steps 1200 --seeds 1-2 --launcher ray --sweep-dir /root/sweep"
+    )
     began = time.monotonic()
     said = site.head.run(f"{RMC} {words}", seconds=400.0).stdout
     note(test="sweep", seconds=time.monotonic() - began)
