@@ -10,7 +10,7 @@ from rmc.common.checkpoint import POLICY
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
 
-SCHEME = "hf://"  # before a repository's name, where a path is asked for
+SCHEME = "hf:/"  # before a repository's name, where a path is asked for; a Path keeps but one of its slashes
 CARD = "README.md"
 
 

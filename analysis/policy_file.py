@@ -41,7 +41,7 @@ def read_policy(source: str | Path, checkpoint: str = "latest") -> PolicyFile:
     Raises ConfigError.
     """
     if str(source).startswith(hub.SCHEME):
-        source = hub.pull(str(source).removeprefix(hub.SCHEME))
+        source = hub.pull(str(source).removeprefix(hub.SCHEME).lstrip("/"))
     path = Path(source)
     if path.is_dir():
         return _of_run(RunFolder(path), checkpoint)

@@ -1,13 +1,14 @@
 """The runs in a folder and below it: what became of each, how far it came, how good it is."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.table import Table
 from rich.text import Text
 
+from rmc.analysis.run_paths import run_folders
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.figures import duration, number
 from rmc.deploy.monitor.recorded import recorded_status
@@ -41,18 +42,10 @@ def runs(folder: Path) -> list[RunSummary]:
     """All of them, by name. Raises ConfigError where the folder cannot be read, or holds none."""
     if not folder.is_dir():
         raise ConfigError("FOLDER", str(folder), "is no folder; give one that holds runs")
-    found = sorted(map(summary, _run_folders(folder)), key=lambda one: one.run)
+    found = sorted(map(summary, run_folders(folder)), key=lambda one: one.run)
     if not found:
         raise ConfigError("FOLDER", str(folder), "holds no run; rmc train makes one, in runs/ unless told otherwise")
     return found
-
-
-def _run_folders(folder: Path) -> Iterator[Path]:
-    """Those of rmc train, rmc baseline and sweeps, however deep; nothing below a run is looked at."""
-    for path, below, files in os.walk(folder):
-        if "checkpoints" in below and not {"config.json", "metrics.jsonl", ".lock"}.isdisjoint(files):
-            below.clear()
-            yield Path(path)
 
 
 def summary(path: Path) -> RunSummary:

@@ -13,6 +13,8 @@ def expanded(path: Path) -> list[Path]:
 
     Raises ConfigError where a folder or a pattern has none.
     """
+    if (path / "config.json").exists():
+        return [path]
     if path.is_dir():
         found = sorted(run_folders(path))
         if not found:
@@ -28,8 +30,8 @@ def expanded(path: Path) -> list[Path]:
 
 
 def run_folders(folder: Path) -> Iterator[Path]:
-    """All runs in it, however deep; nothing below a run is looked at."""
+    """Those of rmc train, rmc baseline and sweeps, however deep; nothing below a run is looked at."""
     for path, below, files in os.walk(folder):
-        if "config.json" in files:
+        if "checkpoints" in below and not {"config.json", "metrics.jsonl", ".lock"}.isdisjoint(files):
             below.clear()
             yield Path(path)

@@ -10,8 +10,8 @@ import tyro
 
 BASIC = frozenset(
     {
-        "id", "flicker", "env_kwargs", "config_file", "preset", "seed", "total_steps", "actors", "run_dir", "if_exists",
-        "init_from", "launcher", "device", "redis_url", "ray_address", "dry_run", "capacity", "replay_ratio",
+        "id", "flicker", "env_kwargs", "config_file", "preset", "seed", "total_steps", "actors", "run_dir",
+        "init_from", "launcher", "device", "redis_url", "dry_run", "capacity", "replay_ratio",
         "learning_rate", "curiosity", "batch_size", "checkpoint_steps", "episodes", "threads", "track",
     }
 )  # fmt: skip

@@ -69,11 +69,11 @@ class Train:
     actors: int = 1
     """Actor processes."""
     run_dir: Path | None = None
-    """The run's folder; by default runs/<env>__<preset>__<seed>__<time>. Of one that is there, ENV need not be said."""
+    """The run's folder; by default runs/<env>__<preset>__<seed>__<time>."""
     if_exists: IfExists = "resume"
     """What to do if the run's folder is there: go on, refuse, or take a new one beside it."""
     init_from: str | None = None
-    """A run, or RUN:CHECKPOINT, whose networks and normaliser a new run begins with."""
+    """RUN or RUN:CHECKPOINT whose networks and normaliser it begins with."""
     init_parts: InitParts = "all"
     """What is taken of them: all; the memory and what predicts; or what it takes to act."""
     launcher: Launcher = "local"

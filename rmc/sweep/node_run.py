@@ -30,7 +30,7 @@ class NodeRun:
         self._lock = take_lock(self._place / "lock")
         self._folder, self._log = self._place / name, self._place / "log"
         if brought.known:
-            unpack(brought, self._folder)
+            unpack(brought, self._folder, {})
         self._process = spawn([*words, "--run-dir", str(self._folder)], self._log)
 
     def look(self, known: Known, copy: bool) -> tuple[int | None, Parcel | None, bytes]:

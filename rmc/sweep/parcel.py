@@ -1,7 +1,6 @@
 """What a run's folder has that another copy of it lacks, to be sent there. The replay ring is never in it."""
 
 import io
-import shutil
 import tarfile
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -39,18 +38,14 @@ def pack(folder: Path, known: Known) -> Parcel:
     return Parcel(folders, now, content.getvalue())
 
 
-def unpack(parcel: Parcel, folder: Path) -> None:
-    """Make a folder like the one that was packed; its own ring stays."""
+def unpack(parcel: Parcel, folder: Path, before: Known) -> None:
+    """Make a copy like the folder that was packed. Of what is not in that, only what came ``before`` is removed."""
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     with tarfile.open(fileobj=io.BytesIO(parcel.tar)) as tar:
         tar.extractall(folder, filter="data")
     for name in parcel.folders:
         (folder / name).mkdir(parents=True, exist_ok=True)
-    for path in sorted(folder.rglob("*"), reverse=True):
-        name = str(path.relative_to(folder))
-        if name.split("/")[0] == "replay" or name in parcel.known or name in parcel.folders:
-            continue
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+    for name in before.keys() - parcel.known.keys():
+        (folder / name).unlink(missing_ok=True)
+        with suppress(OSError):  # other files are in it
+            (folder / name).parent.rmdir()

@@ -10,10 +10,10 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.process.role import StopSignal
 from rmc.deploy.monitor.attach import STOP_SECONDS
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.state import STOPPED
 from rmc.sweep.job import Job
 
 LOOK_SECONDS = 0.2
-STOPPED = 130  # how a run ends that was asked to
 State = Literal["waiting", "running", "finished", "pruned", "stopped", "failed"]
 OVER = ("finished", "pruned")  # which are not run again
 

@@ -63,7 +63,7 @@ class RayRun:
         self._log = job.log.read_bytes() if job.log.exists() else b""
         brought = pack(job.folder, {}) if job.folder.exists() else Parcel([], {}, b"")
         self._actor = ray.remote(NodeRun).options(**needs).remote(job.words, job.name, brought, os.getcwd())
-        self._known: Known = {}  # of its files, those that are here
+        self._known: Known = brought.known  # of its files, those that are here
         self._asked: Any = self._actor.look.remote(self._known, True)
         self._begun, self._look_at, self._copy_at = False, 0.0, 0.0
 
@@ -86,7 +86,7 @@ class RayRun:
         return None if status is None else self._end(status)
 
     def _take(self, parcel: Parcel, log: bytes) -> None:
-        unpack(parcel, self._job.folder)
+        unpack(parcel, self._job.folder, self._known)
         self._known = parcel.known
         self._job.log.parent.mkdir(parents=True, exist_ok=True)
         self._job.log.write_bytes(self._log + log)

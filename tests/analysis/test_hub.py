@@ -83,6 +83,10 @@ def test_the_cards_lines_load_it(hub: Hub, call: Call, tmp_path: Path) -> None:
     code = f"observation = [1.0, 0.0, 0.5]\n{lines}\nprint(action.shape, abs(action[0]) <= 2)"
     done = call("-c", code, folder=tmp_path, token="")
     assert (done.returncode, done.stderr, done.stdout) == (0, "", "(1,) True\n")
+    words = ("-m", "rmc.cli.main", "evaluate", "hf://me/bare", "--episodes", "1")
+    played = call(*words, folder=tmp_path, token="")
+    assert (played.returncode, played.stderr) == (0, "")
+    assert "Pendulum-v1: return" in played.stdout
 
 
 WRONG = [

@@ -215,6 +215,30 @@ def test_every_node_is_there(site: Site) -> None:
     assert site.head.run("stat -c %a /root/.ray/auth_token").stdout.strip() == "600"
 
 
+def test_a_sweeps_runs_are_spread_over_the_machines_and_come_to_the_head(site: Site) -> None:
+    words = (
+        "sweep InvertedPendulum-v5 --preset debug --total-steps 1200 --seeds 1-2 --launcher ray --sweep-dir /root/sweep"
+    )
+    began = time.monotonic()
+    said = site.head.run(f"{RMC} {words}", seconds=400.0).stdout
+    note(test="sweep", seconds=time.monotonic() - began)
+    assert "2 of 2: seed " in said
+    index = [json.loads(line) for line in site.head.run("cat /root/sweep/sweep.jsonl").stdout.splitlines()]
+    assert [(line["run"], line["state"], line["env_steps"]) for line in index] == [
+        ("seed=1", "finished", 1200),
+        ("seed=2", "finished", 1200),
+    ]
+    kept = site.head.run("find /root/sweep -name policy.safetensors -o -name result.json -o -name ring").stdout
+    assert kept.count("result.json") == 2
+    assert "policy.safetensors" in kept
+    assert "/ring" not in kept
+    events = site.head.run("find /root/sweep -name 'events.out*'").stdout
+    assert all(f".{machine.name}." in events for machine in (site.alpha, site.beta))  # TensorBoard's names say where
+    for machine in site.machines.machines:
+        assert not machine.processes("rmc.cli.main"), machine.name
+        assert not machine.run("ls /tmp/rmc-sweep-0", check=False).stdout
+
+
 def test_a_run_learns_is_stopped_and_goes_on(site: Site) -> None:
     began = time.monotonic()
     run = Run(site, "learning", *LEARNING, "--actors", "2")

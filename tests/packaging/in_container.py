@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 
 from tests.packaging.container import Image
-from tests.packaging.test_container import DOCKERFILE, ROOT, STRANGER
+from tests.packaging.test_container import CHROOT, DOCKERFILE, ROOT, STRANGER
 
 pytestmark = [
     pytest.mark.timeout(1800),
-    pytest.mark.skipif(os.geteuid() != 0, reason="wants root, for chroot"),
+    CHROOT,
     pytest.mark.skipif(shutil.which("debootstrap") is None, reason="wants debootstrap, a package of Debian's"),
 ]
 RELEASE, PACKAGES = "bookworm", "python3,python3-venv,ca-certificates"

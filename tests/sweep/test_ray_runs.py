@@ -93,7 +93,10 @@ def test_a_copy_is_like_the_folder_and_only_what_changed_is_sent(tmp_path: Path)
     (copy / "replay").mkdir(parents=True)
     (copy / "checkpoints" / "0").mkdir(parents=True)
     (copy / "checkpoints" / "0" / "policy").write_text("old")
-    unpack(parcel, copy)
+    (copy / "notes").write_text("mine")
+    unpack(parcel, copy, {"checkpoints/0/policy": (3, 0)})
+    assert (copy / "notes").read_text() == "mine"
+    (copy / "notes").unlink()
     assert (
         _content(copy) == _content(source) == {"checkpoints/1/policy": "one", "metrics.jsonl": "first\n", "secret": "s"}
     )
@@ -107,7 +110,7 @@ def test_a_copy_is_like_the_folder_and_only_what_changed_is_sent(tmp_path: Path)
     (source / "checkpoints" / "1").rename(source / "checkpoints" / "2")
     (source / "events").mkdir()
     later = pack(source, parcel.known)
-    unpack(later, copy)
+    unpack(later, copy, parcel.known)
     assert _content(copy) == {"checkpoints/2/policy": "one", "metrics.jsonl": "first\nsecond\n", "secret": "s"}
     assert (copy / "events").is_dir()
     with tarfile.open(fileobj=io.BytesIO(later.tar)) as tar:
