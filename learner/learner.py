@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import safetensors.torch
@@ -21,24 +21,21 @@ from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Bus, Version
 from rmc.common.checkpoint import POLICY, PROGRESS, STATE, CheckpointFolder
 from rmc.common.errors import CheckpointError, FencedError, RmcError
-from rmc.common.metrics import Means, Rate
 from rmc.common.policy_header import PolicyHeader
 from rmc.common.replay import ObservationStatistics, Replay, Sample, SampleStatus
-from rmc.common.window import BoolArray, WindowSpec
+from rmc.common.window import WindowSpec
 from rmc.learner.batch import clear_padding, importance_weights
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.learner.device_update import DeviceUpdate, HostCopy
-from rmc.learner.diagnostics import SLICE, latent_rank, measurable, staleness
+from rmc.learner.learner_metrics import Drawn, LearnerMetrics, needs_weights
 from rmc.learner.pipelined_update import PipelinedUpdate
 from rmc.learner.update import UpdateResult, make_update
 
 log = logging.getLogger(__name__)
 NOT_OURS = (pickle.UnpicklingError, EOFError, RuntimeError, LookupError, ValueError, TypeError, AttributeError)
-METRICS_UPDATES = 20  # updates between looks at the update's metrics: each look waits for the device
 LARGE_REWARD = 1e4  # a step's, from which it is the likely cause of a divergence
 SAVE_AGAIN_SECONDS = 10.0  # after a checkpoint that could not be written
 LOOK_SECONDS = 5.0  # between looks, while waiting, whether Redis still has the weights
-INSIGHT_UPDATES = 500  # updates between looks at what takes longer: the latent's rank and the states' staleness
 
 
 def bf16_is_native(device: torch.device) -> bool:
@@ -46,14 +43,6 @@ def bf16_is_native(device: torch.device) -> bool:
     if device.type == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
-
-
-class Drawn(NamedTuple):
-    """What is kept of a batch while it is learnt from; (B,) each."""
-
-    serial: NDArray[np.int64]
-    weights_update: NDArray[np.int64]
-    measurable: BoolArray
 
 
 class Learner:
@@ -88,8 +77,7 @@ class Learner:
         self.updates = self.env_steps = self.last_checkpoint = self._checkpoint_steps = 0
         self.finished = self._fenced = self._diverged = self._evaluation_due = False
         self._observed_before = ObservationStatistics.none(spec.obs_dim)  # by the run that this one began with
-        self._means, self._rate, self._waiting = Means(), Rate(), ""
-        self._unexplained: list[float] = []  # of every observation dimension, since the last look at it
+        self._waiting = ""
         self._largest_reward = 0.0  # that was learnt from, as it was scaled
         self._look_at = 0.0  # when to ask next whether Redis still has the weights
         self._published: Version | None = None  # last
@@ -105,6 +93,7 @@ class Learner:
             else DeviceUpdate(self.update, spec, config.batch_size)
         )
         self._drawn: deque[Drawn] = deque()  # what is being learnt from
+        self._metrics = LearnerMetrics(self.agent, spec, replay)
         self._returning: deque[tuple[NDArray[np.int64], HostCopy]] = deque()  # priorities, and of which windows
         checkpoints.lock()
         floor = max(self._resume(), checkpoints.last_epoch())
@@ -154,12 +143,12 @@ class Learner:
         self._largest_reward = max(self._largest_reward, float(np.abs(rows["reward"]).max()))
         weights = importance_weights(values, sample.total_weight, sample.windows, self.config.importance_exponent)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
-        self._drawn.append(Drawn(rows["serial"].copy(), rows["weights_update"].copy(), measurable(rows, self.spec)))
+        self._drawn.append(Drawn.of(rows, self.spec))
         number = self.updates + len(self._drawn)
         beta = self.update.config.beta(self.env_steps)
         for updated in self._updated(raw, torch.from_numpy(weights), beta, number):
             self._finish(updated)
-        if number % self.config.publish_updates == 0 or number % INSIGHT_UPDATES == 1:
+        if number % self.config.publish_updates == 0 or needs_weights(number):
             self._finish_pending()
 
     def _finish_pending(self) -> None:
@@ -172,8 +161,7 @@ class Learner:
         drawn = self._drawn.popleft()
         self._returning.append((drawn.serial, HostCopy(updated.priorities)))
         self._return_priorities(leave=self._updated.in_flight)
-        self._measure(updated)
-        self._measure_age(drawn)
+        self._metrics.measure(self.updates, updated, drawn)
         if self.updates % self.config.publish_updates == 0:
             self.publish()
 
@@ -187,28 +175,6 @@ class Learner:
         while len(self._returning) > leave:
             serials, priorities = self._returning.popleft()
             self.replay.update_priorities(serials, priorities.wait().numpy())
-
-    def _measure(self, updated: UpdateResult) -> None:
-        if self.updates % METRICS_UPDATES == 0:
-            for name, value in updated.metrics.items():
-                self._means.add(name, float(value))
-        if self.updates % INSIGHT_UPDATES == 1:
-            rank, deviation = latent_rank(updated.hidden[updated.observed])
-            self._means.add("latent_rank", rank)
-            self._means.add("latent_deviation", deviation)
-            self._unexplained = [round(share, 4) for share in updated.observation_unexplained.tolist()]
-
-    def _measure_age(self, drawn: Drawn) -> None:
-        """How old what was sampled is: in weight versions, and in what today's weights would remember instead."""
-        if self.updates % METRICS_UPDATES == 0:
-            age = self.updates - drawn.weights_update
-            self._means.add("sample_age_mean", float(age.mean()))
-            self._means.add("sample_age_max", float(age.max()))
-        if self.updates % INSIGHT_UPDATES == 1:
-            for serial in drawn.serial[drawn.measurable][:SLICE].tolist():
-                episode = self.replay.episode(serial)
-                for name, value in (staleness(self.agent, self.spec, episode) if episode is not None else {}).items():
-                    self._means.add(name, value)
 
     def publish(self) -> None:
         """Broadcast the policy with the newest observation statistics frozen into it. Raises FencedError."""
@@ -337,10 +303,8 @@ class Learner:
         return self._waiting
 
     def metrics(self) -> dict[str, Any]:
-        unexplained, self._unexplained = self._unexplained, []
         return {
             "updates": self.updates,
-            "updates_per_s": self._rate.take(self.updates),
             "env_steps": self.env_steps,
             "beta": self.update.config.beta(self.env_steps),
             "epoch": self.epoch,
@@ -348,8 +312,7 @@ class Learner:
             "checkpoint_env_steps": self._checkpoint_steps,
             "checkpoint_error": self._checkpoint_error,
             "damaged_checkpoints": self._damaged_checkpoints,
-            **({"observation_unexplained": unexplained} if unexplained else {}),
-            **self._means.take(),
+            **self._metrics.take(self.updates),
         }
 
     def close(self) -> None:

@@ -1,0 +1,76 @@
+"""What the learner says of its updates, of the latent, and of how old what it learns from is.
+
+Shapes: B batch.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rmc.common.agent import Agent
+from rmc.common.metrics import Means, Rate
+from rmc.common.replay import Replay
+from rmc.common.window import BoolArray, Rows, WindowSpec
+from rmc.learner.diagnostics import SLICE, latent_rank, measurable, staleness
+from rmc.learner.update import UpdateResult
+
+METRICS_UPDATES = 20  # updates between looks at the update's metrics: each look waits for the device
+INSIGHT_UPDATES = 500  # updates between looks at what takes longer: the latent's rank and the states' staleness
+
+
+class Drawn(NamedTuple):
+    """What is kept of a batch while it is learnt from; (B,) each."""
+
+    serial: NDArray[np.int64]
+    weights_update: NDArray[np.int64]
+    measurable: BoolArray
+
+    @classmethod
+    def of(cls, rows: Rows, spec: WindowSpec) -> "Drawn":
+        """Of (B,) rows, which may be overwritten then."""
+        return cls(rows["serial"].copy(), rows["weights_update"].copy(), measurable(rows, spec))
+
+
+def needs_weights(update: int) -> bool:
+    """Whether the measurement after that update reads the agent's weights."""
+    return update % INSIGHT_UPDATES == 1
+
+
+class LearnerMetrics:
+    """Gathers between two records."""
+
+    def __init__(self, agent: Agent, spec: WindowSpec, replay: Replay) -> None:
+        self._agent, self._spec, self._replay = agent, spec, replay
+        self._means, self._rate = Means(), Rate()
+        self._unexplained: list[float] = []  # of every observation dimension, since the last look at it
+
+    def measure(self, update: int, updated: UpdateResult, drawn: Drawn) -> None:
+        """After an update."""
+        if update % METRICS_UPDATES == 0:
+            age = update - drawn.weights_update
+            means = {"sample_age_mean": age.mean(), "sample_age_max": age.max(), **updated.metrics}
+            for name, value in means.items():
+                self._means.add(name, float(value))
+        if needs_weights(update):
+            rank, deviation = latent_rank(updated.hidden[updated.observed])
+            self._means.add("latent_rank", rank)
+            self._means.add("latent_deviation", deviation)
+            self._unexplained = [round(share, 4) for share in updated.observation_unexplained.tolist()]
+            self._measure_staleness(drawn)
+
+    def _measure_staleness(self, drawn: Drawn) -> None:
+        """How far stored states are from what today's weights would remember."""
+        for serial in drawn.serial[drawn.measurable][:SLICE].tolist():
+            episode = self._replay.episode(serial)
+            for name, value in (staleness(self._agent, self._spec, episode) if episode is not None else {}).items():
+                self._means.add(name, value)
+
+    def take(self, updates: int) -> dict[str, Any]:
+        """The metrics since the last call."""
+        unexplained, self._unexplained = self._unexplained, []
+        return {
+            "updates_per_s": self._rate.take(updates),
+            **({"observation_unexplained": unexplained} if unexplained else {}),
+            **self._means.take(),
+        }
