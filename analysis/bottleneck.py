@@ -5,6 +5,7 @@ from math import ceil, floor
 from rmc.analysis.finding import Finding
 from rmc.analysis.vitals import Vitals
 from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.preflight import learner_threads
 
 SATURATED = 0.8  # busy for more of the time is as busy as a stage gets
 IDLE = 0.2  # waiting for more of the time is worth a word
@@ -106,11 +107,6 @@ def busy_threads(vitals: Vitals, config: RunConfig, cores: int) -> float:
     others = [vitals.busy(kind) or 0.0 for kind in ("actor", "replay", "evaluator")]
     counts = [len(vitals.of(kind)) for kind in ("actor", "replay", "evaluator")]
     return learner * learner_threads(config, cores) + sum(n * busy for n, busy in zip(counts, others, strict=True))
-
-
-def learner_threads(config: RunConfig, cores: int) -> int:
-    """What ``--threads 0`` stands for on a machine of so many cores."""
-    return config.learner.threads or max(1, cores - 1)
 
 
 def host_cores(vitals: Vitals) -> int:

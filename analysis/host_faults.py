@@ -2,10 +2,11 @@
 
 from statistics import median
 
-from rmc.analysis.bottleneck import busy_threads, free_cores, host_cores, learner_threads
+from rmc.analysis.bottleneck import busy_threads, free_cores, host_cores
 from rmc.analysis.finding import Finding
 from rmc.analysis.vitals import Vitals
 from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.preflight import learner_threads
 
 CROWDED = 1.15  # threads that are busy, for each core
 IDLE_CORES = 0.1  # of all cores: where more are idle, nobody fights for them

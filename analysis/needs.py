@@ -4,14 +4,14 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 
-from rmc.analysis.bottleneck import busy_threads, learner_threads
+from rmc.analysis.bottleneck import busy_threads
 from rmc.analysis.host_faults import CROWDED
 from rmc.analysis.vitals import Vitals
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.trial import RoleUse, Trial
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import Machine
-from rmc.deploy.run.preflight import DISK_RESERVE
+from rmc.deploy.run.preflight import DISK_RESERVE, learner_threads
 from rmc.replay_server import ring
 
 KEPT_BESIDE = 2  # checkpoints beside the newest: the best, and the one that is being written

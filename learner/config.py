@@ -52,6 +52,11 @@ class UpdateConfig:
     """Updates over which the policy that checkpoints hold, and evaluations play, is averaged, at most a tenth of those
     made; actors have the newest. 0 does not average."""
 
+    def halves_are_apart(self) -> bool:
+        """Whether memory and world model read nothing of critics, policy and temperature, nor of a common norm."""
+        online = self.latent_target == self.target_memory == "online"
+        return self.scheme == 3 and self.update_order == "joint" and online and not self.clip_norm
+
     def beta(self, env_steps: int) -> float:
         """beta after so many environment steps."""
         return self.curiosity * max(0.0, 1.0 - env_steps / self.curiosity_steps)

@@ -26,11 +26,9 @@ from rmc.common.errors import RmcError
 from rmc.common.process.parent_death import exit_with_parent
 from rmc.common.window import WindowSpec
 from rmc.learner.batch import Batch, view_batch
-from rmc.learner.config import UpdateConfig
 from rmc.learner.optimizers import begin_moments
 from rmc.learner.update import (
     MODEL_PARTS,
-    TRAINS_MEMORY,
     VALUE_PARTS,
     JointUpdate,
     ModelPass,
@@ -42,14 +40,6 @@ NUMBER = struct.Struct("q")
 TITLE = "rmc learner: memory and world model"  # of the other process
 ENDED = "the process of memory and world model has ended; the lines above say why"
 ALIGNMENT = 64  # bytes, a cache line
-
-
-def can_be_apart(config: UpdateConfig) -> bool:
-    """Whether nothing flows from the value's half of an update to the model's."""
-    online = config.latent_target == config.target_memory == "online"
-    return (
-        config.update_order == "joint" and TRAINS_MEMORY[config.scheme] == {"model"} and online and not config.clip_norm
-    )
 
 
 @dataclass(frozen=True)

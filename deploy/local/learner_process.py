@@ -14,9 +14,8 @@ from rmc.common.shard import Shard
 from rmc.deploy.local.role_process import Process, RunConnection, until_taken, wait_for_room
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.preflight import check_device, cores
+from rmc.deploy.run.preflight import check_device, cores, learner_threads
 from rmc.learner.learner import Learner
-from rmc.learner.pipelined_update import can_be_apart
 from rmc.learner.replay_client import ReplayClient
 from rmc.learner.sharded_replay import ShardedReplay
 
@@ -25,8 +24,8 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
     """The learner's process; checkpoints go to ``folder``. Its last record says ``finished`` where the run is."""
     secret, process = place.secret(), Process(place)
     config, spec, bus = process.config, process.config.window_spec(), process.bus
-    threads = config.learner.threads or max(min(2, cores()), cores() - 1)
-    model_threads = (threads + 1) // 2 if device == "cpu" and can_be_apart(config.update) and threads > 1 else 0
+    threads = learner_threads(config, cores())
+    model_threads = (threads + 1) // 2 if device == "cpu" and config.update.halves_are_apart() and threads > 1 else 0
     torch.set_num_threads(1 if model_threads else threads)  # until the model's half has its process
     check_device(device)
     wait_for_room(bus, Learner.name, process.stop)

@@ -62,3 +62,10 @@ def check_device(device: str) -> None:
 
         if not torch.cuda.is_available():
             raise ConfigError("--device", device, "PyTorch sees no CUDA device; use --device cpu")
+
+
+def learner_threads(config: RunConfig, cores: int) -> int:
+    """What ``--threads 0`` stands for on so many cores: all but one, and both of two where an update has two halves."""
+    all_but_one = max(1, cores - 1)
+    most = max(all_but_one, min(2, cores)) if config.update.halves_are_apart() else all_but_one
+    return config.learner.threads or most

@@ -12,7 +12,7 @@ from rmc.common.agent_config import AgentConfig
 from rmc.common.errors import RmcError
 from rmc.learner.config import UpdateConfig
 from rmc.learner.device_update import DeviceUpdate
-from rmc.learner.pipelined_update import PipelinedUpdate, can_be_apart
+from rmc.learner.pipelined_update import PipelinedUpdate
 from rmc.learner.update import JointUpdate, make_update
 from tests.learner.rows import SPEC
 from tests.learner.test_device_update import BATCH, host_batch
@@ -119,5 +119,5 @@ def test_a_process_that_ends_is_told():
     ],
 )
 def test_what_flows_back_stays_in_one_process(other):
-    assert can_be_apart(ROBUST)
-    assert not can_be_apart(UpdateConfig(**{"scheme": 3, **other}))  # type: ignore[arg-type]
+    assert ROBUST.halves_are_apart()
+    assert not UpdateConfig(**{"scheme": 3, **other}).halves_are_apart()  # type: ignore[arg-type]
