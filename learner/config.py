@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+MODEL_PROCESS = "rmc learner: memory and world model"  # the title of the process that has this half of an update
+
 
 @dataclass(frozen=True)
 class UpdateConfig:

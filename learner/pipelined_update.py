@@ -26,6 +26,7 @@ from rmc.common.errors import RmcError
 from rmc.common.process.parent_death import exit_with_parent
 from rmc.common.window import WindowSpec
 from rmc.learner.batch import Batch, view_batch
+from rmc.learner.config import MODEL_PROCESS
 from rmc.learner.optimizers import begin_moments
 from rmc.learner.update import (
     MODEL_PARTS,
@@ -37,7 +38,6 @@ from rmc.learner.update import (
 
 AHEAD = 2  # batches that the model's half may be ahead
 NUMBER = struct.Struct("q")
-TITLE = "rmc learner: memory and world model"  # of the other process
 ENDED = "the process of memory and world model has ended; the lines above say why"
 ALIGNMENT = 64  # bytes, a cache line
 
@@ -168,7 +168,7 @@ class PipelinedUpdate:
             exit_with_parent(parent)
             for number in (signal.SIGINT, signal.SIGTERM):  # the other one hears them
                 signal.signal(number, signal.SIG_IGN)
-            setproctitle.setproctitle(TITLE)
+            setproctitle.setproctitle(MODEL_PROCESS)
             _close_all_but(requests.fileno())
             torch.set_num_threads(self._threads[1])
             slots = cycle(self._slots)

@@ -20,6 +20,7 @@ from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import open_run
+from rmc.learner.config import MODEL_PROCESS
 
 TRAINED_SECONDS = 10.0  # of updates, which are measured
 LONGEST_SECONDS = 180.0  # until the first of them
@@ -134,6 +135,8 @@ def _name(words: list[str], commands: dict[str, tuple[str, ...]]) -> str:
     for role, command in commands.items():
         if tuple(words[-len(command) :]) == command:
             return role
+    if MODEL_PROCESS in words:
+        return "learner (model)"
     if "rmc.cli.fork_server" in words:
         return "fork server"
     return "redis" if words and words[-1].endswith("redis.sock") else "environments"

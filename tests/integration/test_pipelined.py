@@ -9,7 +9,7 @@ import psutil
 import pytest
 
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.learner.pipelined_update import TITLE
+from rmc.learner.config import MODEL_PROCESS
 from tests.integration.running import Training, alive
 
 pytestmark = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core: the update has one process")
@@ -20,7 +20,7 @@ def halves(training: Training) -> list[psutil.Process]:
     found = []
     for process in training.launcher.children(recursive=True):
         try:
-            if TITLE in " ".join(process.cmdline()):
+            if MODEL_PROCESS in " ".join(process.cmdline()):
                 found.append(process)
         except psutil.NoSuchProcess:
             continue
