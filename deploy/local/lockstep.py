@@ -104,6 +104,11 @@ class Lockstep:
         self.server.checkpoint()
         self._restart_due = True
 
+    def emit_metrics(self, clock: BusyClock) -> None:
+        """Of every role; all have one thread, and so its shares."""
+        for role in self.roles:
+            self.bus.emit(role.name, {"time": time.time(), **role.metrics(), **clock.shares()})
+
     def close(self) -> None:
         """Close every role; the learner saves first."""
         for role in self.roles:
@@ -120,9 +125,9 @@ def train(config: RunConfig, folder: Path, watch: Callable[[Bus], None], stop: S
             clock.busy()
             if time.monotonic() >= due:
                 due = time.monotonic() + METRICS_PERIOD
-                for role in run.roles:
-                    run.bus.emit(role.name, {"time": time.time(), **role.metrics(), **clock.shares()})
+                run.emit_metrics(clock)
                 watch(run.bus)
+        run.emit_metrics(clock)
     finally:
         run.close()
         watch(run.bus)

@@ -86,10 +86,21 @@ def busy(server: RedisServer) -> Iterator[None]:
 
     thread = threading.Thread(target=run_script)
     thread.start()
-    time.sleep(0.1)
-    yield
-    client.execute_command("SCRIPT", "KILL")
-    thread.join()
+    try:
+        while not _is_busy(client):
+            time.sleep(0.01)
+        yield
+    finally:
+        client.execute_command("SCRIPT", "KILL")
+        thread.join()
+
+
+def _is_busy(client: redis.Redis) -> bool:
+    try:
+        client.ping()
+    except redis.exceptions.RedisError:
+        return True
+    return False
 
 
 @contextmanager

@@ -203,8 +203,9 @@ TRAIN = ["train", "InvertedPendulum-v5", "--run-dir"]
     [
         ({"config.json": "5"}, "must be an object", [["stats"], ["attach"], ["stop"], ["plot"], ["evaluate"], TRAIN]),
         ({"config.json": "{"}, "not JSON", [["stats"], ["stop"], ["plot"], ["evaluate"], ["export"], TRAIN]),
-        ({"config.json": "{}"}, "is missing", [["stats"], ["plot"], ["evaluate"]]),
-        ({"config.json": BASELINE}, "is a baseline's run", [["stats"], ["export"], ["inspect"], TRAIN]),
+        ({"config.json": "{}"}, "is missing", [["plot"], ["inspect"]]),
+        ({"config.json": "{}"}, "has no env, seed or total_steps", [["stats"]]),
+        ({"config.json": BASELINE}, "is a baseline's run", [["export"], ["inspect"], TRAIN]),
         ({"config.json": BASELINE}, "nobody trains it now", [["stop"], ["attach"]]),
         ({"config.json": BASELINE}, "no baseline's of this version ('env')", [["plot"], ["evaluate"]]),
         ({"config.json": OURS, "result.json": '{"a": 1}'}, "result.json", [["plot"], ["stats"]]),

@@ -147,12 +147,12 @@ def learner() -> None:
             say("resumed", number=found[0], same=newest and _same(said, self.update.state_dict()))
         return epoch
 
-    def slower(self: Any, raw: Any, importance: Any, beta: float) -> Any:
+    def slower(self: Any, raw: Any, importance: Any, beta: float, number: int) -> Any:
         began = time.monotonic()
         if strikes("nan"):
             importance = importance * float("nan")  # with which the loss is a mean
             say("nan")
-        result = update(self, raw, importance, beta)
+        result = update(self, raw, importance, beta, number)
         time.sleep((times_slower() - 1) * (time.monotonic() - began))
         return result
 
