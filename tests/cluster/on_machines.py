@@ -330,9 +330,9 @@ def test_the_learners_node_is_lost(endless: Run) -> None:
     steps, updates = endless.newest("replay", "env_steps"), endless.newest("learner", "updates")
     checkpoint = int(site.head.run(f"ls {endless.folder}/checkpoints | grep -E '^[0-9]+$' | tail -n 1").stdout)
     lost.kill("raylet/raylet")
-    away = endless.wait_for(lambda: not lost.processes("rmc.cli.main learner"))
+    away = endless.wait_for(lambda: not lost.processes("rmc.cli.main role learner"))
     back = endless.wait_for(
-        lambda: any(m.processes("rmc.cli.main learner") for m in site.machines.machines if m is not lost), seconds=180
+        lambda: any(m.processes("rmc.cli.main role learner") for m in site.machines.machines if m is not lost), seconds=180
     )
     endless.wait_for_updates(50)
     assert where(endless, "learner") is not lost

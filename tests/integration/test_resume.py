@@ -80,7 +80,8 @@ def test_a_changed_ratio_and_rate_count_from_there(tmp_path):
     _, files = CheckpointFolder(folder / "checkpoints").latest()
     (folder / "state").write_bytes(files["learner.pt"])
     state = torch.load(folder / "state", weights_only=True)
-    assert [group["lr"] for group in state["optimizers"][0]["param_groups"]] == [1e-5, 1e-5, 3e-4]
+    rates = [group["lr"] for optimizer in state["optimizers"] for group in optimizer["param_groups"]]
+    assert rates == [1e-5, 1e-5, 1e-5, 3e-4]  # memory, world model; critics and policy, temperature
     told = rmc(f"rmc stats {folder}", tmp_path).stdout
     assert "4 starts; from step 1,5" in told
     assert "--replay-ratio 32 to 4, --learning-rate 0.0003 to 1e-05" in told

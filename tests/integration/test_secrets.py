@@ -16,7 +16,7 @@ from tests.integration.running import Training
 from tests.integration.telling_env import TELLS
 
 TELLING, PLAYERS = "tests.integration.telling_env:Telling-v0", ("actor", "evaluator")  # beside the launcher
-COMMANDS = ("main train", "main actor", "main evaluator", "main learner", "main replay")
+COMMANDS = ("main train", "main role actor", "main role evaluator", "main role learner", "main role replay")
 ENDLESS = ("--total-steps", "100000000", "--checkpoint-steps", "500")
 PASSWORD = "hunter2-of-the-users-own-redis"
 
