@@ -98,6 +98,11 @@ def _say_version() -> int:
 def _parse_and_run(words: list[str]) -> int:
     from rmc.cli import parser
     from rmc.common.bus.redis_url import without_passwords
+    from rmc.deploy.local.role_environment import SECRET_VARIABLE, URL_VARIABLE
+
+    if words[:1] != ["role"]:  # they are a role's alone: no environment, and nothing that it starts, is to inherit them
+        for name in (SECRET_VARIABLE, URL_VARIABLE):
+            os.environ.pop(name, None)
 
     words = parser.renamed(words)
     try:

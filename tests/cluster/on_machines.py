@@ -332,7 +332,8 @@ def test_the_learners_node_is_lost(endless: Run) -> None:
     lost.kill("raylet/raylet")
     away = endless.wait_for(lambda: not lost.processes("rmc.cli.main role learner"))
     back = endless.wait_for(
-        lambda: any(m.processes("rmc.cli.main role learner") for m in site.machines.machines if m is not lost), seconds=180
+        lambda: any(m.processes("rmc.cli.main role learner") for m in site.machines.machines if m is not lost),
+        seconds=180,
     )
     endless.wait_for_updates(50)
     assert where(endless, "learner") is not lost

@@ -17,7 +17,7 @@ from rmc.deploy.run.starts import starts
 from rmc.replay_server.recovery import open_store
 from tests.integration.running import ENVIRONMENT, Training
 
-SIZES = "--hidden 16 --embedding 16 --heads 16 16 --total-steps 2400 --actors 2 --replay-ratio 8".split()  # noqa: SIM905
+SIZES = "--hidden 16 --embedding 16 --heads 16 16 --total-steps 8000 --actors 2 --replay-ratio 8".split()  # noqa: SIM905
 
 
 def rmc(words: str, cwd) -> subprocess.CompletedProcess[str]:
@@ -50,7 +50,7 @@ def test_the_printed_command_goes_on(launcher, tmp_path):
     done = rmc(printed, tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     result = RunFolder(folder).result()
-    assert 2_400 <= result["env_steps"] < 2_400 + 2 * config.slack_steps()
+    assert 8_000 <= result["env_steps"] < 8_000 + 2 * config.slack_steps()
     assert RunFolder(folder).config() == config
     assert [start.changes for start in starts(RunFolder(folder))] == [{}, {}]
     assert {start.launch["launcher"] for start in starts(RunFolder(folder))} == {launcher}
