@@ -29,6 +29,7 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
 TICK_SECONDS = 0.1
+UNREACHABLE_SECONDS = 1.0  # without its socket, until a replay server is started again
 OUTAGE_SECONDS = 86_400.0  # of a Redis that answered once, until a role that is started amid it gives up
 KEPT_SECONDS = 3600  # in a user's Redis, after the end
 log = logging.getLogger(__name__)
@@ -63,7 +64,8 @@ class LocalRun:
         except BaseException:
             self._leave.close()
             raise
-        self._shards, self._listening = config.shards(), set[str]()
+        self._shards = config.shards()
+        self._listening: dict[str, tuple[int | None, float]] = {}  # who listened, and when it was seen last
         self.supervisor = Supervisor(
             commands(config, folder, self._sockets.path, device),
             lambda role: {URL_VARIABLE: redis_url or self._url(role), PATIENCE_VARIABLE: str(OUTAGE_SECONDS)},
@@ -87,15 +89,25 @@ class LocalRun:
         self.supervisor.tend()
 
     def _end_unreachable(self) -> None:
-        """A replay server whose socket others have removed is started again, and listens again."""
+        """A replay server whose socket others have removed is started again, and listens again.
+
+        One that ends removes it, too: it is given the time to say why.
+        """
         for shard in self._shards:
-            socket = self._sockets.path / f"{shard.role}.sock"
+            role, socket, now = (
+                self.supervisor.roles[shard.role],
+                self._sockets.path / f"{shard.role}.sock",
+                time.monotonic(),
+            )
+            pid, seen = self._listening.get(shard.role, (role.pid, now))
             if socket.exists():
-                self._listening.add(shard.role)
-            elif shard.role in self._listening:
+                self._listening[shard.role] = role.pid, now
+            elif pid != role.pid:
+                self._listening.pop(shard.role)
+            elif now - seen > UNREACHABLE_SECONDS:
                 log.warning("%s was removed; starting %s again", socket, shard.role)
-                self._listening.remove(shard.role)
-                self.supervisor.roles[shard.role].signal(signal.SIGKILL)
+                self._listening.pop(shard.role)
+                role.signal(signal.SIGKILL)
 
     def finished(self) -> bool:
         """Whether the learner has ended in order."""
