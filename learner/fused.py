@@ -2,9 +2,11 @@
 
 ``fuse`` swaps the GRU and the heads of an Agent for these. Under bfloat16 autocast each is one node of the gradient's
 graph: products by torch, all between them by ``learner/kernels.py``, weight gradients in one product over all steps.
+Weights are rounded once an update, not once a product.
 Without autocast, and on a GPU, they are what they were. Shapes: B batch, T time, N = B T, S nets side by side.
 """
 
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import numpy as np
@@ -43,6 +45,36 @@ def _applies(x: Tensor) -> bool:
     return x.device.type == "cpu" and torch.is_autocast_enabled("cpu") and torch.get_autocast_dtype("cpu") is BF16
 
 
+class Rounded(nn.Module):
+    """A module that keeps its weights in bfloat16, too, rounded again where one was written since.
+
+    What writes a weight without torch's knowledge rounds it itself: see ``learner/optimizers.py``.
+    """
+
+    def weights(self) -> list[Tensor]:
+        """Those that products in bfloat16 read."""
+        raise NotImplementedError
+
+    def bf16(self) -> list[Tensor]:
+        """They in bfloat16, always in the same memory."""
+        weights, state = self.weights(), self.__dict__
+        versions = [weight._version for weight in weights]
+        if "_rounded" not in state:
+            state["_rounded"] = [torch.empty_like(weight, dtype=BF16) for weight in weights]
+        if state.get("_versions") != versions:
+            for low, weight in zip(state["_rounded"], weights, strict=True):
+                low.copy_(weight.detach())
+            state["_versions"] = versions
+        rounded: list[Tensor] = state["_rounded"]
+        return rounded
+
+
+def rounded_weights(modules: Iterable[nn.Module]) -> dict[Tensor, Tensor]:
+    """Every weight of theirs that is kept in bfloat16, too, and that."""
+    parts = [part for module in modules for part in module.modules() if isinstance(part, Rounded)]
+    return {weight: low for part in parts for weight, low in zip(part.weights(), part.bf16(), strict=True)}
+
+
 class FusedAgent(Agent):
     """Fills missing frames with every weight rounded once for all steps, not once a step."""
 
@@ -56,8 +88,11 @@ class FusedAgent(Agent):
             return _fill(self, observation, missing, prev_action, state)
 
 
-class FusedGRU(nn.GRU):
+class FusedGRU(Rounded, nn.GRU):
     """One layer, batch first."""
+
+    def weights(self) -> list[Tensor]:
+        return [self.weight_ih_l0, self.weight_hh_l0]
 
     def forward(self, x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         """(B, T, E), (1, B, H) -> (B, T, H) and (1, B, H)."""
@@ -66,13 +101,16 @@ class FusedGRU(nn.GRU):
             return plain
         with torch.autocast("cpu", enabled=False):
             sequence: Tensor = _GRU.apply(  # type: ignore[no-untyped-call]
-                x, hidden[0], self.weight_ih_l0, self.weight_hh_l0, self.bias_ih_l0, self.bias_hh_l0
+                x, hidden[0], self.bf16(), self.weight_ih_l0, self.weight_hh_l0, self.bias_ih_l0, self.bias_hh_l0
             )
         return sequence, sequence[:, -1].unsqueeze(0)
 
 
-class FusedHead(nn.Sequential):
+class FusedHead(Rounded, nn.Sequential):
     """Linear, ReLU, Linear, ReLU, Linear."""
+
+    def weights(self) -> list[Tensor]:
+        return [layer.weight for layer in self if isinstance(layer, nn.Linear) and not isinstance(layer, Float32Linear)]
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., in) -> (..., out)."""
@@ -81,11 +119,15 @@ class FusedHead(nn.Sequential):
             return plain
         layers = [layer for layer in self if isinstance(layer, nn.Linear)]
         parameters = [part for one in layers for part in (one.weight.t().unsqueeze(0), one.bias.unsqueeze(0))]
-        return _heads(x, x.new_empty(*x.shape[:-1], 0), isinstance(layers[-1], Float32Linear), parameters)[0]
+        low = [weight.t().unsqueeze(0) for weight in self.bf16()]
+        return _heads(x, x.new_empty(*x.shape[:-1], 0), low, parameters)[0]
 
 
-class FusedTwinQ(TwinQ):
+class FusedTwinQ(Rounded, TwinQ):
     """Both critics."""
+
+    def weights(self) -> list[Tensor]:
+        return [layer.weight for layer in self.layers[:-1] if isinstance(layer, StackedLinear)]
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """(B, T, Z), (B, T, A) -> (2, B, T) in float32."""
@@ -93,14 +135,14 @@ class FusedTwinQ(TwinQ):
             return super().forward(features, action)
         stacks = [layer for layer in self.layers if isinstance(layer, StackedLinear)]
         parameters = [part for one in stacks for part in (one.weight, one.bias[:, 0])]
-        return _heads(features, action, True, parameters).squeeze(-1)
+        return _heads(features, action, self.bf16(), parameters).squeeze(-1)
 
 
-def _heads(features: Tensor, action: Tensor, float32_last: bool, parameters: list[Tensor]) -> Tensor:
+def _heads(features: Tensor, action: Tensor, low: list[Tensor], parameters: list[Tensor]) -> Tensor:
     """(..., Z), (..., A) -> (S, ..., out)."""
     flat = (x.flatten(0, -2) for x in (features, action))
     with torch.autocast("cpu", enabled=False):
-        out: Tensor = _Heads.apply(*flat, float32_last, *parameters)  # type: ignore[no-untyped-call]
+        out: Tensor = _Heads.apply(*flat, low, *parameters)  # type: ignore[no-untyped-call]
     return out.reshape(out.shape[0], *features.shape[:-1], out.shape[-1])
 
 
@@ -117,7 +159,9 @@ def _fill(
     gru, size = agent.memory.gru, agent.config.hidden
     nets = agent.next_frame.net, agent.memory.embed
     linear = [layer for net in nets for layer in net if isinstance(layer, nn.Linear)]
-    w1, w2, w3, w_embed, wi, wh = (w.to(BF16).t() for w in (*(x.weight for x in linear), *gru.all_weights[0][:2]))
+    assert isinstance(nets[0], Rounded)
+    assert isinstance(gru, Rounded)
+    w1, w2, w3, w_embed, wi, wh = (w.t() for w in (*nets[0].bf16(), linear[-1].weight.to(BF16), *gru.bf16()))
     b1, b2, b3, b_embed = (x.bias for x in linear)
     bi, bh = (b.numpy() for b in gru.all_weights[0][2:])
     inputs = agent.memory.inputs(observation, missing, prev_action).to(BF16)
@@ -143,54 +187,56 @@ class _GRU(torch.autograd.Function):
     """h_t for all t, and the way back through time."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, hidden: Tensor, wi: Tensor, wh: Tensor, bi: Tensor, bh: Tensor) -> Tensor:
-        (b, t, e), h = x.shape, hidden.shape[1]
+    def forward(
+        ctx: Any, x: Tensor, hidden: Tensor, rounded: list[Tensor], _wi: Tensor, _wh: Tensor, bi: Tensor, bh: Tensor
+    ) -> Tensor:
+        (b, t, e), h, (wi, wh) = x.shape, hidden.shape[1], rounded
         x_low = x.to(BF16).transpose(0, 1).reshape(t * b, e)
-        wi_low, wh_low = wi.to(BF16), wh.to(BF16)
-        gi, gh = torch.mm(x_low, wi_low.t()).view(t, b, 3 * h), torch.empty(b, 3 * h, dtype=BF16)
+        gi, gh = torch.mm(x_low, wi.t()).view(t, b, 3 * h), torch.empty(b, 3 * h, dtype=BF16)
         states, gate_cache = torch.empty(t + 1, b, h), torch.empty(t, b, 4 * h)
         states_low = torch.empty(t + 1, b, h, dtype=BF16)
         states[0], states_low[0] = hidden, hidden
-        of_x, of_h, all_h, low, gates = _bits(gi), _bits(gh), states.numpy(), _bits(states_low), gate_cache.numpy()
-        bias_i, bias_h = bi.detach().numpy(), bh.detach().numpy()
-        for k in range(t):
-            torch.mm(states_low[k], wh_low.t(), out=gh)
-            kernels.gru_step(of_x[k], of_h, bias_i, bias_h, all_h[k], gates[k], all_h[k + 1], low[k + 1])
-        ctx.save_for_backward(x_low, wi_low, wh_low, states, states_low, gate_cache)
+        of_h, all_h, low, wh_t = _bits(gh), states.numpy(), _bits(states_low), wh.t()
+        biases = bi.detach().numpy(), bh.detach().numpy()
+        by_step = states_low[:-1].unbind(0), _bits(gi), all_h[:-1], gate_cache.numpy(), all_h[1:], low[1:]
+        for before, of_x, h_before, gates, h_after, low_after in zip(*by_step, strict=True):
+            torch.mm(before, wh_t, out=gh)
+            kernels.gru_step(of_x, of_h, *biases, h_before, gates, h_after, low_after)
+        ctx.save_for_backward(x_low, wi, wh, states, states_low, gate_cache)
         return states[1:].transpose(0, 1)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        x_low, wi_low, wh_low, states, states_low, gate_cache = ctx.saved_tensors
+        x_low, wi, wh, states, states_low, gate_cache = ctx.saved_tensors
         t, b, h = gate_cache.shape[0], gate_cache.shape[1], states.shape[2]
-        grads, d, grad_recurrent = (
-            grad.float().transpose(0, 1).contiguous(),
-            torch.zeros(b, h),
-            torch.zeros(b, h, dtype=BF16),
-        )
+        grads, d = grad.float().transpose(0, 1).contiguous(), torch.zeros(b, h)
+        grad_recurrent = torch.zeros(b, h, dtype=BF16)
         dgi, dgh = torch.empty(t, b, 3 * h, dtype=BF16), torch.empty(t, b, 3 * h, dtype=BF16)
         dbi, dbn = torch.zeros(3 * h), torch.zeros(h)
         grad_state, by_product, biases = d.numpy(), _bits(grad_recurrent), (dbi.numpy(), dbn.numpy())
-        by_step = grads.numpy(), states.numpy(), gate_cache.numpy(), _bits(dgi), _bits(dgh)
-        for k in reversed(range(t)):
-            out, h_before, gates, of_i, of_h = (array[k] for array in by_step)
+        by_step = grads.numpy(), states[:-1].numpy(), gate_cache.numpy(), _bits(dgi), _bits(dgh)
+        backwards = zip(*(array[::-1] for array in by_step), reversed(dgh.unbind(0)), strict=True)
+        for out, h_before, gates, of_i, of_h, d_gates in backwards:
             kernels.gru_step_back(grad_state, by_product, out, h_before, gates, of_i, of_h, *biases)
-            torch.mm(dgh[k], wh_low, out=grad_recurrent)
+            torch.mm(d_gates, wh, out=grad_recurrent)
         flat_i, flat_h = dgi.view(t * b, 3 * h), dgh.view(t * b, 3 * h)
-        dx = torch.mm(flat_i, wi_low).view(t, b, -1).transpose(0, 1) if ctx.needs_input_grad[0] else None
+        dx = torch.mm(flat_i, wi).view(t, b, -1).transpose(0, 1) if ctx.needs_input_grad[0] else None
         dwi, dwh = torch.mm(flat_i.t(), x_low).float(), torch.mm(flat_h.t(), states_low[:-1].view(t * b, h)).float()
-        return dx, d + grad_recurrent, dwi, dwh, dbi, torch.cat([dbi[: 2 * h], dbn])
+        return dx, d + grad_recurrent, None, dwi, dwh, dbi, torch.cat([dbi[: 2 * h], dbn])
 
 
 class _Heads(torch.autograd.Function):
-    """S nets that read the same (N, Z) and (N, A): weights (S, in, out), biases (S, out) -> (S, N, out) float32."""
+    """S nets that read the same (N, Z) and (N, A): weights (S, in, out), biases (S, out) -> (S, N, out) float32.
+
+    ``rounded`` has the weights in bfloat16, but for a last layer whose products are in float32.
+    """
 
     @staticmethod
-    def forward(ctx: Any, features: Tensor, action: Tensor, float32_last: bool, *parameters: Tensor) -> Tensor:
-        w1, b1, w2, b2, w3, b3 = parameters
+    def forward(ctx: Any, features: Tensor, action: Tensor, rounded: list[Tensor], *parameters: Tensor) -> Tensor:
+        w1, b1, _, b2, w3, b3 = parameters
         x = torch.cat([features.to(BF16), action.to(BF16)], dim=1)
-        low = w1.to(BF16), w2.to(BF16), w3 if float32_last else w3.to(BF16)
+        low = rounded if len(rounded) == 3 else [*rounded, w3]  # the last layer's products may be in float32
         hidden: list[Tensor] = []
         out = torch.empty(w1.shape[0], len(x), w3.shape[2])
         for net in range(w1.shape[0]):

@@ -19,6 +19,7 @@ ONE, TWO, HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
 EXP_RANGE = np.float32(87.0)  # beyond it float32 overflows
 LOG2_E, LN_2 = np.float32(1.0 / np.log(2.0)), np.float32(np.log(2.0))
 TAYLOR = tuple(np.float32(x) for x in (1 / 720, 1 / 120, 1 / 24, 1 / 6, 1 / 2, 1.0, 1.0))  # of exp
+BLOCK = 1024  # elements that several loops pass over while they are in the first cache
 FAST = {"contract", "reassoc", "nsz", "arcp"}  # all of fastmath but the promise that nothing is NaN or infinite
 
 
@@ -161,3 +162,41 @@ def dot_back(grad: Floats, x: Bits, w: Floats, out: Bits, dw: Floats, db: Floats
             db[j] += _up(out[i, j])
         for j in range(x.shape[1]):
             dw[j] += grad[i] * _up(x[i, j])
+
+
+@_compiled
+def adam(
+    w: Floats, grad: Floats, mean: Floats, square: Floats, low: Bits, step: Floats,
+    rate: float, beta1: float, beta2: float, eps: float,
+) -> None:  # fmt: skip
+    """A step of Adam (Kingma and Ba, 2015, algorithm 1) in place, and ``low`` <- w in bfloat16; (K,), ``step`` (1,).
+
+    ``low`` may be (0,): then nothing is rounded.
+    """
+    step[0] += ONE
+    by_mean, by_square = np.float32(1.0 - beta1), np.float32(1.0 - beta2)
+    decay, floor = np.float32(beta2), np.float32(eps)
+    size = np.float32(rate / (1.0 - beta1 ** np.float64(step[0])))
+    root = np.float32(1.0 / np.sqrt(1.0 - beta2 ** np.float64(step[0])))
+    for begin in range(0, w.size, BLOCK):
+        end = min(begin + BLOCK, w.size)
+        x, g, m, v = w[begin:end], grad[begin:end], mean[begin:end], square[begin:end]
+        for j in range(x.size):
+            first, second = m[j] + by_mean * (g[j] - m[j]), decay * v[j] + by_square * g[j] * g[j]
+            m[j], v[j] = first, second
+            x[j] -= size * first / (np.sqrt(second) * root + floor)
+        if low.size:
+            lower(x, low[begin:end])
+
+
+@_compiled
+def polyak(target: Floats, w: Floats, low: Bits, weight: float) -> None:
+    """target <- target + weight (w - target), and ``low`` <- it in bfloat16, as in ``adam``; (K,)."""
+    share = np.float32(weight)
+    for begin in range(0, w.size, BLOCK):
+        end = min(begin + BLOCK, w.size)
+        x, y = target[begin:end], w[begin:end]
+        for j in range(x.size):
+            x[j] += share * (y[j] - x[j])
+        if low.size:
+            lower(x, low[begin:end])

@@ -1,11 +1,70 @@
-"""Adam for parts of an agent, and its saved states."""
+"""Adam for parts of an agent, its saved states, and Polyak's average; on a CPU in one pass over memory each."""
 
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from rmc.common.agent import Agent
+from rmc.learner import kernels
 from rmc.learner.config import UpdateConfig
+from rmc.learner.fused import rounded_weights
+
+NOT_ROUNDED = np.empty(0, np.uint16)
+
+
+class CompiledAdam(torch.optim.Adam):
+    """torch's Adam by ``learner/kernels.py``, which rounds weights for the next products in the same pass."""
+
+    def __init__(self, groups: list[dict[str, Any]], rounded: Mapping[Tensor, Tensor]) -> None:
+        """``rounded`` has the weights that are kept in bfloat16, too."""
+        super().__init__(groups, fused=True)
+        self._rounded = rounded
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        """Move all that has a gradient, each with a step count of its own."""
+        assert closure is None
+        for group in self.param_groups:
+            rates = group["lr"], *group["betas"], group["eps"]
+            moving = [parameter for parameter in group["params"] if parameter.grad is not None]
+            begin_moments(self, moving)
+            for parameter in moving:
+                self._move(parameter, rates)
+
+    def _move(self, parameter: Tensor, rates: tuple[float, ...]) -> None:
+        state, gradient = self.state[parameter], parameter.grad
+        assert gradient is not None
+        moments = _flat(state["exp_avg"]), _flat(state["exp_avg_sq"])
+        low, step = _low(self._rounded, parameter), state["step"].view(1).numpy()
+        kernels.adam(_flat(parameter), _flat(gradient), *moments, low, step, *rates)
+
+
+@torch.no_grad()
+def follow(target: nn.Module, source: nn.Module, weight: float) -> None:
+    """target <- target + weight (source - target), parameter by parameter; ``weight`` from 0 to 1."""
+    pairs = list(zip(target.parameters(), source.parameters(), strict=True))
+    if pairs[0][0].device.type != "cpu":
+        torch._foreach_lerp_([old for old, _ in pairs], [new for _, new in pairs], weight)
+        return
+    rounded = rounded_weights([target])
+    for old, new in pairs:
+        kernels.polyak(_flat(old), _flat(new), _low(rounded, old), weight)
+
+
+def _flat(tensor: Tensor) -> NDArray[np.float32]:
+    """Its numbers as they lie in memory: (K,)."""
+    flat: NDArray[np.float32] = tensor.detach().view(-1).numpy()
+    return flat
+
+
+def _low(rounded: Mapping[Tensor, Tensor], weight: Tensor) -> NDArray[np.uint16]:
+    """(K,) its copy in bfloat16, or (0,) where there is none."""
+    low = rounded.get(weight)
+    return NOT_ROUNDED if low is None else low.view(-1).view(torch.uint16).numpy()
 
 
 def adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
@@ -20,8 +79,11 @@ def adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
         },
         {"params": [agent.log_alpha] if "log_alpha" in parts else [], "lr": config.alpha_learning_rate},
     ]
-    on_gpu = agent.log_alpha.device.type == "cuda"
-    return torch.optim.Adam([group for group in groups if group["params"]], fused=True, capturable=on_gpu)
+    groups = [group for group in groups if group["params"]]
+    device = agent.log_alpha.device.type
+    if device != "cpu":
+        return torch.optim.Adam(groups, fused=True, capturable=device == "cuda")
+    return CompiledAdam(groups, rounded_weights(getattr(agent, part) for part in ["memory", *heads]))
 
 
 def by_optimizer(saved: list[dict[str, Any]], optimizers: list[torch.optim.Adam]) -> list[dict[str, Any]]:
@@ -38,9 +100,9 @@ def by_optimizer(saved: list[dict[str, Any]], optimizers: list[torch.optim.Adam]
     return states
 
 
-def begin_moments(optimizer: torch.optim.Adam) -> None:
+def begin_moments(optimizer: torch.optim.Adam, parameters: Iterable[Tensor]) -> None:
     """Adam's moments, which it would make in its first step: where they are not loaded."""
-    for parameter in (value for group in optimizer.param_groups for value in group["params"]):
+    for parameter in parameters:
         if parameter not in optimizer.state:
             zeros = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
             optimizer.state[parameter] = {"step": torch.zeros(()), **zeros}

@@ -139,11 +139,21 @@ class PipelinedUpdate:
     def _start(self) -> None:
         """Share what both halves touch, and fork; before it, nothing may have run on several threads."""
         update = self._update
-        begin_moments(update.optimizers[0])
-        moments = [value for state in update.optimizers[0].state.values() for value in state.values()]
+        optimizer = update.optimizers[0]
+        begin_moments(optimizer, (value for group in optimizer.param_groups for value in group["params"]))
+        moments = [value for state in optimizer.state.values() for value in state.values()]
         averages = [value for name, value in update.average.items() if name.startswith(MODEL_PARTS)]
         own = [value for name, value in update.agent.named_parameters() if name.startswith(MODEL_PARTS)]
-        _share([*own, *moments, *averages, *update.agent.normalizer.buffers(), update.curiosity_variance])
+        _share(
+            [
+                *own,
+                *moments,
+                *averages,
+                *update.agent.normalizer.buffers(),
+                update.curiosity_variance,
+                update.imputer_turns,
+            ]
+        )
         self._slots = [self._make_slot() for _ in range(AHEAD + 1)]
         ours, theirs = socket.socketpair()
         parent, self._pipe = os.getpid(), ours

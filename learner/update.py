@@ -20,12 +20,13 @@ from rmc.learner.batch import Batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.diagnostics import Trace, model_metrics, unexplained_change, value_metrics
 from rmc.learner.fused import fuse
-from rmc.learner.optimizers import adam, by_optimizer
+from rmc.learner.optimizers import adam, by_optimizer, follow
 from rmc.learner.unroll import impute, unroll
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 MODEL_PARTS = ("memory", "world_model", "next_frame")
 VALUE_PARTS = ("critic", "policy", "log_alpha")
+IMPUTER_UPDATES = 8  # between those of what imputes, as long as no frame was ever missing: nothing reads it then
 AVERAGE_UPDATES = 10  # updates between moves of the policy's average, which reads and writes all that acts
 TRAINS_MEMORY = {  # the paper's table 1
     1: {"model", "value"},
@@ -44,6 +45,7 @@ class ModelPass(NamedTuple):
     next_z: Tensor  # (B, L_t, Z), what the target reads, without gradient
     curiosity: Tensor  # (B, L_t), scaled where configured
     curiosity_variance: Tensor  # (2,), as it is after this batch
+    imputer_turns: Tensor  # (3,), as they are after this batch
     hidden: Tensor  # (B, L_t + 1, H), for the latent's rank
     observation_unexplained: Tensor  # (O,), see ``diagnostics.unexplained_change``; (0,) without grounding
     metrics: dict[str, Tensor]  # scalars
@@ -72,6 +74,8 @@ Losses = dict[str, Tensor]
 class JointUpdate:
     """Agent, targets and optimiser, and the update that moves them together."""
 
+    _imputer_updates = IMPUTER_UPDATES
+
     def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> None:
         device = agent.log_alpha.device
         if bf16 and device.type == "cpu":
@@ -84,6 +88,7 @@ class JointUpdate:
         self.optimizers = self._make_optimizers()
         self.generator = torch.Generator(device).manual_seed(seed)
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
+        self.imputer_turns = torch.zeros(3, device=device)  # updates, whether a frame was ever missing, the last loss
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
         return [adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, VALUE_PARTS)]
@@ -123,10 +128,14 @@ class JointUpdate:
             i, curiosity_variance = self._scaled(losses.curiosity(error, d, m), m)
             next_z = (self._to_bf16(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:].detach()
         loss_values = {"model_loss": losses.model_loss(error, d, m)}
-        observation_losses, unexplained = self._observation_losses(o, memory, prediction, batch, m)
-        loss_values |= observation_losses
+        fill_loss, turns = self._fill_loss(o, memory, batch, m)
+        grounding_loss, unexplained = self._grounding_loss(o, prediction, batch, m)
+        loss_values |= fill_loss | grounding_loss
         metrics = model_metrics(_detached(loss_values), change, i, d, m, c.model_norm)
-        return loss_values, ModelPass(z, next_z, i, curiosity_variance, memory.hidden.detach(), unexplained, metrics)
+        if agent.next_frame is not None:
+            metrics["fill_loss"] = turns[2]
+        hidden = memory.hidden.detach()
+        return loss_values, ModelPass(z, next_z, i, curiosity_variance, turns, hidden, unexplained, metrics)
 
     def value_pass(self, batch: Batch, model: ModelPass, beta: Tensor) -> tuple[Losses, ValuePass]:
         """Intuition: one policy sample for every step serves both the target and the policy loss."""
@@ -162,26 +171,36 @@ class JointUpdate:
         observed = batch.observation_valid[:, self.burn_in :]
         return UpdateResult(value.priorities, metrics, model.hidden, observed, model.observation_unexplained)
 
-    def _observation_losses(
-        self, o: Tensor, memory: MemoryOutput, prediction: Prediction, batch: Batch, m: Tensor
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        """The losses of what predicts observations, where configured, and what the world model leaves unexplained."""
-        agent, steps = self.agent, slice(self.burn_in, None)
-        a, r, seen = batch.action[:, steps], batch.reward[:, steps], _seen(batch)[:, steps]
-        now, after, seen_now, seen_after = o[:, steps][:, :-1], o[:, steps][:, 1:], seen[:, :-1], seen[:, 1:]
-        loss_values = {}
-        if agent.next_frame is not None:
-            with self._autocast():
-                expected = agent.next_frame(self._to_bf16(memory.hidden.detach()[:, :-1]), now, a)
-            loss_values["fill_loss"] = losses.fill_loss(expected, after, seen_after, m)
-        if not agent.config.grounding:
-            return loss_values, o.new_zeros(0)
-        predicted = now + prediction.observation_change.float()
-        grounded = seen_after if agent.config.impute_missing else seen_after * seen_now
-        loss_values["grounding_loss"] = losses.grounding_loss(
-            predicted, after, prediction.reward.float(), r, grounded, m
-        )
-        return loss_values, unexplained_change(predicted.detach() - now, after - now, m * seen_after * seen_now)
+    def _fill_loss(self, o: Tensor, memory: MemoryOutput, batch: Batch, m: Tensor) -> tuple[Losses, Tensor]:
+        """The loss of what imputes, where it is configured and its turn, and ``imputer_turns`` after this batch."""
+        imputer, steps = self.agent.next_frame, slice(self.burn_in, None)
+        if imputer is None:
+            return {}, self.imputer_turns
+        updates, was_missing, loss = self.imputer_turns.unbind()
+        was_missing = torch.maximum(was_missing, batch.missing.any().float())
+        if not self._trains_imputer(was_missing):
+            return {}, torch.stack([updates + 1, was_missing, loss])
+        with self._autocast():
+            now, after, a = o[:, steps][:, :-1], o[:, steps][:, 1:], batch.action[:, steps]
+            expected = imputer(self._to_bf16(memory.hidden.detach()[:, :-1]), now, a)
+        loss = losses.fill_loss(expected, after, _seen(batch)[:, steps][:, 1:], m)
+        return {"fill_loss": loss}, torch.stack([updates + 1, was_missing, loss.detach()])
+
+    def _trains_imputer(self, was_missing: Tensor) -> bool:
+        """A GPU would have to wait to be asked, so there it is always trained."""
+        on_cpu, period = was_missing.device.type == "cpu", self._imputer_updates
+        return not on_cpu or bool(was_missing) or int(self.imputer_turns[0]) % period == 0
+
+    def _grounding_loss(self, o: Tensor, prediction: Prediction, batch: Batch, m: Tensor) -> tuple[Losses, Tensor]:
+        """The loss of predicted observations, where configured, and what the world model leaves unexplained."""
+        if not self.agent.config.grounding:
+            return {}, o.new_zeros(0)
+        steps = slice(self.burn_in, None)
+        r, seen, now, after = batch.reward[:, steps], _seen(batch)[:, steps], o[:, steps][:, :-1], o[:, steps][:, 1:]
+        predicted, both = now + prediction.observation_change.float(), seen[:, 1:] * seen[:, :-1]
+        grounded = seen[:, 1:] if self.agent.config.impute_missing else both
+        loss = losses.grounding_loss(predicted, after, prediction.reward.float(), r, grounded, m)
+        return {"grounding_loss": loss}, unexplained_change(predicted.detach() - now, after - now, m * both)
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
@@ -208,29 +227,28 @@ class JointUpdate:
 
     def step(self, optimizers: Iterable[torch.optim.Adam], loss_values: Iterable[Tensor]) -> Tensor:
         """Backward from the losses' sum, clip, Adam; returns the gradient's norm before clipping."""
-        self.agent.zero_grad(set_to_none=True)
+        parameters = list(self.agent.parameters())
+        for parameter in parameters:
+            parameter.grad = None
         sum(loss_values, torch.zeros_like(self.agent.log_alpha)).backward()  # type: ignore[no-untyped-call]
-        gradients = [value.grad for value in self.agent.parameters() if value.grad is not None]
+        gradients = [value.grad for value in parameters if value.grad is not None]
         norm = nn.utils.get_total_norm(gradients)
         if self.config.clip_norm:
-            nn.utils.clip_grads_with_norm_(self.agent.parameters(), self.config.clip_norm, norm)
+            nn.utils.clip_grads_with_norm_(parameters, self.config.clip_norm, norm)
         for optimizer in optimizers:
             optimizer.step()
         return norm.detach()
 
     def follow_model(self, model: ModelPass) -> None:
-        """What follows the memory's step: its target by Polyak, and the running variance."""
+        """What follows the memory's step: its target by Polyak, the running variance, the imputer's turns."""
         if self._has_target_memory:
-            self._polyak(self.target_memory.parameters(), self.agent.memory.parameters())
+            follow(self.target_memory, self.agent.memory, 1.0 - self.config.polyak)
         self.curiosity_variance.copy_(model.curiosity_variance)
+        self.imputer_turns.copy_(model.imputer_turns)
 
     def follow_value(self) -> None:
         """What follows the critics' step: their target by Polyak."""
-        self._polyak(self.target_critic.parameters(), self.agent.critic.parameters())
-
-    @torch.no_grad()
-    def _polyak(self, target: Iterable[Tensor], source: Iterable[Tensor]) -> None:
-        torch._foreach_lerp_(list(target), list(source), 1.0 - self.config.polyak)
+        follow(self.target_critic, self.agent.critic, 1.0 - self.config.polyak)
 
     @torch.no_grad()
     def update_ema(self, updates: int, parts: tuple[str, ...] = MODEL_PARTS + VALUE_PARTS) -> None:
@@ -255,6 +273,7 @@ class JointUpdate:
             "average": self.average,
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "curiosity_variance": self.curiosity_variance,
+            "imputer_turns": self.imputer_turns,
             "generator": self.generator.get_state(),
         }
 
@@ -271,6 +290,7 @@ class JointUpdate:
             for group, ours in zip(optimizer.param_groups, own, strict=True):
                 group.update(ours)  # of this config and this device, whatever wrote the checkpoint
         self.curiosity_variance.copy_(state["curiosity_variance"])
+        self.imputer_turns.copy_(state.get("imputer_turns", torch.zeros(3)))  # version 0.1.0 trained it at every update
         self._resume_noise(state["generator"].cpu())
 
     def _resume_noise(self, state: Tensor) -> None:
@@ -287,6 +307,7 @@ class AlternateUpdate(JointUpdate):
     Each has an optimiser of its own, so that a memory that several losses train is moved by several.
     """
 
+    _imputer_updates = 1  # it has a stage of its own
     _STAGES = (
         ("world_model", ("model_loss", "grounding_loss")),
         ("next_frame", ("fill_loss",)),

@@ -69,9 +69,13 @@ class SocketServer:
         self._learner = 0  # the newest epoch that has introduced itself, or that the bus knows
         self.refused: Counter[str] = Counter()  # connections ended for a fault of theirs, by reason
 
-    def poll(self, timeout: float) -> bool:
-        """Serve whoever is ready, waiting up to ``timeout`` seconds for the first; whether there was anyone."""
-        ready = self._selector.select(timeout)
+    def wait(self, seconds: float) -> None:
+        """Wait until somebody is ready, at most so long."""
+        self._selector.select(seconds)
+
+    def poll(self) -> bool:
+        """Serve whoever is ready; whether there was anyone."""
+        ready = self._selector.select(0.0)
         for key, events in ready:
             if key.data is None:
                 self._accept()

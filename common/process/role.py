@@ -13,7 +13,7 @@ from rmc.common.process.outage import OutageLog
 
 METRICS_PERIOD = 1.0  # seconds between a role's metrics records, which are its heartbeat too
 STOP_PERIOD = 0.5  # seconds between looks at the bus's stop key
-IDLE_SLEEP = 0.002  # seconds slept when a step had nothing to do
+IDLE_SECONDS = 0.002  # slept after a step that had nothing to do
 RECONNECT_SLEEP = 0.5  # seconds between tries while Redis is away or full
 
 
@@ -87,10 +87,12 @@ def run_role(
     bus: Bus,
     stop: StopSignal,
     finished: Callable[[], bool] = lambda: False,
+    idle_seconds: float = IDLE_SECONDS,
 ) -> None:
     """Step a role until it is stopped, fenced or finished; always closes it.
 
-    Redis away or full is waited out here; every other error ends the role.
+    It sleeps ``idle_seconds`` after a step that had nothing to do; 0 is for one that has waited itself. Redis away or
+    full is waited out here; every other error ends the role.
     """
     clock = BusyClock()
     pulse = Heartbeat(role, bus, clock)
@@ -100,7 +102,7 @@ def run_role(
                 if role.step():
                     clock.busy()
                 else:
-                    time.sleep(IDLE_SLEEP)
+                    time.sleep(idle_seconds)
                     clock.wait(role.waiting_for())
             except (BusUnavailable, BusFull) as error:
                 time.sleep(RECONNECT_SLEEP)

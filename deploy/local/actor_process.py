@@ -12,6 +12,8 @@ from rmc.deploy.local.role_process import Process, RunConnection, wait_for_room
 from rmc.deploy.run.config import RunConfig
 from rmc.learner.initial_priority import InitialPriority
 
+ACTOR_IDLE_SECONDS = 0.01  # an actor that waits looks at Redis every 0.02 s
+EVALUATOR_IDLE_SECONDS = 0.05  # of 0.1 s
 EVALUATOR_NICENESS = 10  # it must not take the learner's core
 
 
@@ -27,7 +29,7 @@ def run_actor(place: RunConnection, index: int) -> None:
     actor = Actor(
         index, config.seed, process.make_env, spec, config.agent, config.actor, process.bus, priority_fn=priority_fn
     )
-    run_role(actor, process.bus, process.stop)
+    run_role(actor, process.bus, process.stop, idle_seconds=ACTOR_IDLE_SECONDS)
 
 
 def initial_priority(config: RunConfig, index: int) -> InitialPriority | None:
@@ -45,4 +47,4 @@ def run_evaluator(place: RunConnection) -> None:
     torch.set_num_threads(1)
     os.nice(EVALUATOR_NICENESS)
     evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, process.bus)
-    run_role(evaluator, process.bus, process.stop)
+    run_role(evaluator, process.bus, process.stop, idle_seconds=EVALUATOR_IDLE_SECONDS)

@@ -28,7 +28,7 @@ from rmc.deploy.redis.users import LAUNCHER, RedisUsers
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
-TICK_SECONDS = 0.1
+TICK_SECONDS = 0.2  # between looks at the roles and their metrics: a look costs 3 ms
 UNREACHABLE_SECONDS = 1.0  # without its socket, until a replay server is started again
 OUTAGE_SECONDS = 86_400.0  # of a Redis that answered once, until a role that is started amid it gives up
 KEPT_SECONDS = 3600  # in a user's Redis, after the end

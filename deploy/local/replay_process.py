@@ -27,4 +27,4 @@ def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> N
     context = tls.server_context(place.tls_folder) if place.tls_folder is not None else None
     sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size, context)
     process.bus.announce_replay(server.owner, sockets.address)
-    run_role(ReplayProcess(server, sockets), process.bus, process.stop)
+    run_role(ReplayProcess(server, sockets), process.bus, process.stop, idle_seconds=0.0)

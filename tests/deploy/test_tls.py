@@ -67,7 +67,8 @@ class Served:
 
     def _serve(self) -> None:
         while not self._over.is_set():
-            self.sockets.poll(0.02)
+            self.sockets.wait(0.02)
+            self.sockets.poll()
 
     def close(self) -> None:
         self._over.set()

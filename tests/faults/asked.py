@@ -71,7 +71,7 @@ class Asked:
 
     def _heard(self) -> bytes:
         """What the server answers at once."""
-        while self._server.poll(0.0):
+        while self._server.poll():
             with suppress(BlockingIOError):
                 return self._client.recv(1 << 20, socket.MSG_DONTWAIT)
         return b""

@@ -40,8 +40,9 @@ def make(order: str = "joint", device: str = "cpu", bf16: bool = False) -> Joint
     return make_update(agent, SPEC.burn_in, config, 3, bf16)
 
 
-def host_batch(seed: int, pinned: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+def host_batch(seed: int, pinned: bool = False, missing: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
     rows = random_rows(BATCH, seed)
+    rows["missing"] *= missing
     clear_padding(rows, SPEC)
     raw = torch.from_numpy(rows.view("u1").reshape(BATCH, -1))
     importance = torch.from_numpy(np.random.default_rng(seed).uniform(0.5, 1.0, BATCH).astype(np.float32))
@@ -79,6 +80,7 @@ def test_nothing_in_an_update_waits_for_the_host(order, monkeypatch):
     for module in (update.agent, update.target_critic, update.target_memory):
         module.to("meta")
     update.curiosity_variance = update.curiosity_variance.to("meta")
+    update.imputer_turns = update.imputer_turns.to("meta")
     raw = torch.empty(BATCH, SPEC.dtype.itemsize, dtype=torch.uint8, device="meta")
     importance, beta = torch.empty(BATCH, device="meta"), torch.empty((), device="meta")
     view_batch(raw, importance, SPEC)  # makes its constants

@@ -23,6 +23,9 @@ AGENTS = {
     "embedding beside": AgentConfig(
         hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden+embedding", grounding=False
     ),
+    "imputing": AgentConfig(
+        hidden=SPEC.state - SPEC.obs_dim, embedding=7, heads=(10, 9), head_input="hidden", impute_missing=True
+    ),
 }
 
 
@@ -46,7 +49,7 @@ def test_it_is_the_same_update(agent, bf16):
     in_turn, apart = DeviceUpdate(plain, SPEC, BATCH), PipelinedUpdate(update, SPEC, BATCH)
     expected, found = [], []
     for step in range(1, 41):
-        raw, importance = host_batch(step)
+        raw, importance = host_batch(step, missing=step > 20)  # what imputes is trained at some updates, then at all
         for updated, results in ((in_turn, expected), (apart, found)):
             results += copy.deepcopy(updated(raw, importance, 0.1 * step, step))
         if step % 15 == 0:  # as before weights are read

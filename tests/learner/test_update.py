@@ -319,3 +319,38 @@ def test_a_checkpoint_does_not_bring_its_step_sizes_along(order: str) -> None:
     after(to_batch(random_rows(8)), BETA)
     steps = [(new - old).abs().max() for new, old in zip(after.agent.critic.parameters(), moved, strict=True)]
     assert 0 < max(steps) < 2e-5
+
+
+IMPUTING = dataclasses.replace(ROBUST, impute_missing=True)
+WITH_FRAMES = dataclasses.replace(SPEC, state=IMPUTING.state_size(SPEC.obs_dim))
+
+
+def moves_of_the_imputer(update: JointUpdate, updates: int, missing_from: int, begin: int = 0) -> list[int]:
+    """The updates at which it moves; frames are missing in batches from ``missing_from`` on, for one batch."""
+    moves, weight = [], update.agent.next_frame.net[0].weight  # type: ignore[union-attr]
+    for number in range(begin, begin + updates):
+        rows, before = random_rows(8, number, WITH_FRAMES), weight.detach().clone()
+        rows["missing"] *= number == missing_from
+        update(to_batch(rows, WITH_FRAMES), BETA)
+        moves += [number] if not torch.equal(weight, before) else []
+    return moves
+
+
+def test_what_imputes_is_trained_seldom_until_a_frame_is_missing():
+    update = make(IMPUTING)
+    assert moves_of_the_imputer(update, 30, missing_from=19) == [0, 8, 16, *range(19, 30)]
+    assert moves_of_the_imputer(make(IMPUTING, update_order="alternate"), 4, missing_from=99) == [0, 1, 2, 3]
+
+
+def test_its_turns_go_on_from_a_checkpoint_and_it_says_its_last_loss():
+    before, after = make(IMPUTING), make(IMPUTING)
+    assert moves_of_the_imputer(before, 5, missing_from=99) == [0]
+    rows = random_rows(8, 4, WITH_FRAMES)
+    rows["missing"] = 0
+    batch = to_batch(rows, WITH_FRAMES)
+    after.load_state_dict(before.state_dict())
+    assert moves_of_the_imputer(after, 8, missing_from=99, begin=5) == [8]
+    assert after(batch, BETA).metrics["fill_loss"] == after(batch, BETA).metrics["fill_loss"] > 0
+    older = {name: value for name, value in before.state_dict().items() if name != "imputer_turns"}
+    after.load_state_dict(older)  # as of a version that trained it at every update
+    assert moves_of_the_imputer(after, 2, missing_from=99, begin=5) == [5]

@@ -52,7 +52,8 @@ class Served:
 
     def _loop(self) -> None:
         while not self._stop.is_set():
-            self.sockets.poll(0.01)
+            self.sockets.wait(0.01)
+            self.sockets.poll()
 
     def close(self) -> None:
         self._stop.set()
