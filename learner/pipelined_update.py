@@ -54,8 +54,10 @@ class Slot:
 
     def write(self, model: ModelPass, norm: Tensor) -> None:
         """Put the model's half in."""
-        for place, tensor in zip(_tensors(self.model), _tensors(model), strict=True):
+        for place, tensor in zip(self.model[:-1], model[:-1], strict=True):
             place.copy_(tensor.detach())
+        for name, value in model.metrics.items():
+            self.model.metrics[name].copy_(value)
         self.norm.copy_(norm)
 
 
@@ -169,7 +171,7 @@ class PipelinedUpdate:
         with torch.no_grad():
             model = self._update.model_pass(view_batch(raw, importance, self._spec))[1]  # for its shapes and types
         slot = Slot(raw, importance, torch.zeros(()), model, norm)
-        _share([raw, importance, slot.beta, norm, *_tensors(model)])
+        _share([raw, importance, slot.beta, norm, *model[:-1], *model.metrics.values()])
         return slot
 
     def _be_the_other(self, parent: int, requests: socket.socket) -> NoReturn:
@@ -200,11 +202,6 @@ class PipelinedUpdate:
         update.follow_model(model)
         update.update_ema(number, MODEL_PARTS)
         slot.write(model, norm)
-
-
-def _tensors(model: ModelPass) -> list[Tensor]:
-    """In a fixed order."""
-    return [*model[:-1], *model.metrics.values()]
 
 
 def _share(tensors: Iterable[Tensor]) -> None:
