@@ -35,7 +35,7 @@ from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.server import ReplayServer
 
 CHUNK = 16  # windows an entry
-BEHIND = 1024  # entries that a simulated actor sends ahead of what is acknowledged
+BEHIND = 256  # entries that a simulated actor sends ahead of what is acknowledged: of 32 actors they fit into Redis
 KEPT_UP = 0.95  # of what is offered
 
 
@@ -123,9 +123,14 @@ def _unused() -> tuple[float, float]:
     return machine.idle + machine.iowait, machine.steal
 
 
-def _committed(bus: RedisBus, actors: int) -> int:
+def _acknowledged(bus: RedisBus, actors: int) -> list[int]:
+    """Entries of each actor that are committed."""
     acks = [bus.ack(actor) for actor in range(actors)]
-    return CHUNK * sum(ack.id.seq for ack in acks if ack is not None)
+    return [0 if ack is None else ack.id.seq for ack in acks]
+
+
+def _committed(bus: RedisBus, actors: int) -> int:
+    return CHUNK * sum(_acknowledged(bus, actors))
 
 
 def _pin(numbers: dict[str, list[int]], alone: str) -> None:
@@ -138,11 +143,11 @@ def _pin(numbers: dict[str, list[int]], alone: str) -> None:
 
 
 def measure(spec: WindowSpec, shards: int, actors: int, alone: str, rate: float, seconds: float) -> Point:
-    """One load for so many seconds, after two to get going."""
+    """One load for so many seconds, two after the first commits: loading code and filling Redis take longer."""
     with _system(spec, shards, actors, rate) as (bus, numbers):
         if alone:
             _pin(numbers, alone)
-        while len(bus.actors()) < actors:
+        while not all(_acknowledged(bus, actors)):
             time.sleep(0.05)
         time.sleep(2.0)
         before = {kind: _cpu(found) for kind, found in numbers.items()}

@@ -1,0 +1,144 @@
+"""Whether a change cost return or speed: three short trainings, beside the committed lines of earlier ones.
+
+    make guard
+    python -m studies.guard [--only HalfCheetah-v5 Walker2d-v5 cue] [--seed 1] [--record]
+
+Takes about 20 minutes on two quiet cores, and goes on where it was interrupted. --record adds its lines to
+studies/results/guard.jsonl. The return is the mean of a run's last three evaluations. Speed is updates a second over
+GFLOP/s of the update's own products, timed before and after the run in the same process: a slow hour slows both.
+"""
+
+import argparse
+import json
+import shlex
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from rmc.analysis.history import of_run
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.folder import RunFolder
+from studies.study import RESULTS, RUNS, commit
+
+LINES = RESULTS / "guard.jsonl"
+CUE = (
+    "--hidden 64 --embedding 64 --heads 128 128 --head-input hidden+embedding --normalize-observations "
+    "--learning-rate 5e-4 --polyak 0.99 --target-memory ema --batch-size 16 --capacity 5000 --warmup-steps 1000 "
+    "--priority-exponent 0 --episodes 10 --replay-ratio 32 --alpha-learning-rate 5e-3"
+)
+TASKS = {
+    "HalfCheetah-v5": "HalfCheetah-v5 --total-steps 60000",
+    "Walker2d-v5": "Walker2d-v5 --total-steps 60000",
+    "cue": f"tests.memory_env:Memory12-v0 {CUE} --total-steps 10000",
+}
+EVALUATIONS = 3  # the last ones, of which the return is the mean
+WARM = 1_000  # updates before speeds count
+RETURN_TOLERANCE = 0.8  # of the least return that a line has: three seeds leave much to chance
+SPEED_TOLERANCE = 0.9  # of the lines' median
+PRODUCT = 120, 274, 300  # rows, inputs, outputs: a layer of robust's heads
+PRODUCT_SECONDS = 3.0
+
+
+@dataclass(frozen=True)
+class Line:
+    """A task trained once."""
+
+    task: str
+    seed: int
+    commit: str
+    episode_return: float
+    updates_per_s: float
+    gflops: float
+
+    @property
+    def speed(self) -> float:
+        """Updates for every thousand GFLOP that the machine had in that time."""
+        return 1000.0 * self.updates_per_s / self.gflops
+
+
+def trained(task: str, seed: int, code: str) -> Line:
+    """Train it. Raises ConfigError where that fails."""
+    folder = RUNS / "guard" / f"{code.rstrip('+')}-{task}-{seed}"
+    words = ["train", *shlex.split(TASKS[task]), "--seed", str(seed), "--run-dir", str(folder)]
+    before = gflops()
+    ended = subprocess.run([sys.executable, "-m", "rmc.cli.main", *words], check=False, stdout=subprocess.DEVNULL)
+    if ended.returncode:
+        raise ConfigError(task, shlex.join(words), f"it ended with {ended.returncode}; {folder}/logs say why")
+    run = RunFolder(folder)
+    last = [one.return_mean for one in of_run(run).evaluations[-EVALUATIONS:]]
+    return Line(task, seed, code, statistics.fmean(last), updates_per_s(run), (before + gflops()) / 2)
+
+
+def updates_per_s(run: RunFolder) -> float:
+    """The median of what its learner said a second."""
+    speeds = [
+        record["updates_per_s"]
+        for record in run.records()
+        if record["role"] == "learner" and record.get("updates", 0) > WARM and "updates_per_s" in record
+    ]
+    return statistics.median(speeds)
+
+
+def gflops() -> float:
+    """Of a product like those of an update, on one core, in bfloat16."""
+    rows, inputs, outputs = PRODUCT
+    x, w = torch.randn(rows, inputs).bfloat16(), torch.randn(inputs, outputs).bfloat16()
+    products, start = 0, time.perf_counter()
+    while (seconds := time.perf_counter() - start) < PRODUCT_SECONDS:
+        for _ in range(100):
+            torch.mm(x, w)
+        products += 100
+    return 2e-9 * products * rows * inputs * outputs / seconds
+
+
+def committed() -> list[Line]:
+    """The lines of earlier runs."""
+    return [Line(**json.loads(line)) for line in LINES.read_text().splitlines()] if LINES.exists() else []
+
+
+def verdict(line: Line, before: Iterable[Line]) -> str:
+    """In words: ``ok``, what is worse, or that there is nothing to compare with."""
+    before = [one for one in before if one.task == line.task]
+    if not before:
+        return "nothing to compare with"
+    least, usual = min(one.episode_return for one in before), statistics.median(one.speed for one in before)
+    worse = []
+    if line.episode_return < RETURN_TOLERANCE * least:
+        worse.append(f"return below {RETURN_TOLERANCE:.0%} of {least:,.1f}, the least of {len(before)} lines")
+    if line.speed < SPEED_TOLERANCE * usual:
+        worse.append(f"speed below {SPEED_TOLERANCE:.0%} of {usual:,.1f}, the median of {len(before)} lines")
+    return "; ".join(worse) or "ok"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--only", nargs="+", choices=list(TASKS), default=list(TASKS))
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--record", action="store_true", help=f"add the lines to studies/results/{LINES.name}")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    before, code, ok = committed(), commit(), True
+    print(f"{'task':15} {'seed':>4} {'return':>9} {'updates/s':>10} {'GFLOP/s':>8} {'speed':>7}  verdict", flush=True)
+    for task in options.only:
+        try:
+            line = trained(task, options.seed, code)
+        except ConfigError as error:
+            sys.exit(f"studies.guard: {error}")
+        said = verdict(line, before)
+        ok = ok and "below" not in said
+        figures = f"{line.episode_return:9,.1f} {line.updates_per_s:10,.1f} {line.gflops:8,.1f} {line.speed:7,.1f}"
+        print(f"{task:15} {line.seed:4} {figures}  {said}", flush=True)
+        if options.record:
+            with LINES.open("a") as file:
+                file.write(json.dumps(asdict(line)) + "\n")
+    sys.exit(0 if ok else 1)
+
+
+if __name__ == "__main__":
+    main()
