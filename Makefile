@@ -21,7 +21,7 @@ demo: $(STAMP)
 	$(BIN)/rmc train HalfCheetah-v5 --total-steps $(DEMO_STEPS)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadscope --durations=25 --durations-min=5
+	$(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder --durations=25 --durations-min=5
 
 # The newest Python that every wheel resolves for, without torch, whose wheels there bring gigabytes of CUDA: all that
 # never imports it, in an environment of its own.

@@ -1,7 +1,7 @@
 """What every folder shares: a real Redis, the check that a test leaves nothing behind, and who runs beside whom.
 
-``make test`` has two workers: one for the tests that compute and do not mind how long that takes, at a low priority,
-and one for all others, which watch processes by the clock and so run one at a time.
+``make test`` has two workers. One begins with the tests that only compute, at a low priority; all others are dealt out
+module by module, those with trainings of their own first.
 """
 
 import os
@@ -20,6 +20,7 @@ PATIENT = (  # tests that only compute
     "actors/", "learner/", "studies/", "analysis/test_baselines", "analysis/test_policy", "docs/test_documents",
     "analysis/test_video", "integration/test_learning", "integration/test_lockstep", "integration/test_variants",
 )  # fmt: skip
+LONG = "integration/", "sweep/", "docs/", "faults/", "cli/", "packaging/"  # with trainings of their own
 NICENESS = 10
 SHARED_MEMORY = Path("/dev/shm")
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
@@ -45,11 +46,11 @@ def redis_url() -> Iterator[str]:
         shutil.rmtree(folder)
 
 
-class TwoGroups(LoadScopeScheduling):  # type: ignore[misc]
-    """A worker for each."""
+class ByModule(LoadScopeScheduling):  # type: ignore[misc]
+    """One scope for all patient tests, one for each other module."""
 
     def _split_scope(self, nodeid: str) -> str:
-        return "patient" if is_patient(nodeid) else "prompt"
+        return "patient" if is_patient(nodeid) else nodeid.partition("::")[0]
 
 
 def is_patient(nodeid: str) -> bool:
@@ -57,15 +58,20 @@ def is_patient(nodeid: str) -> bool:
     return nodeid.removeprefix("tests/").startswith(PATIENT)
 
 
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> TwoGroups:
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByModule:
     """Of ``--dist loadscope``."""
-    return TwoGroups(config, log)
+    return ByModule(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What only computes first, then what takes long: else one worker would wait for the other at the end."""
+    items.sort(key=lambda item: (not is_patient(item.nodeid), not item.nodeid.removeprefix("tests/").startswith(LONG)))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """The patient worker steps back."""
-    if WORKER and is_patient(item.nodeid):
-        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+    """A patient test steps back, where another worker may watch processes by the clock."""
+    if WORKER:
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS if is_patient(item.nodeid) else 0)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
