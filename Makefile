@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo wheel site test test-faults test-cluster test-container test-dm-control test-newest lint docs bench peers clean
+.PHONY: env demo wheel site guard test test-faults test-cluster test-container test-dm-control test-newest lint docs bench peers clean
 
 env: $(STAMP)
 
@@ -95,6 +95,10 @@ docs: $(STAMP)
 	$(BIN)/python -m docs.generate
 	$(BIN)/python -m docs.fault_table
 
+# Short trainings beside the committed lines of earlier ones, for every change of a default: some 20 minutes, two quiet cores.
+guard: $(STAMP)
+	$(BIN)/python -m studies.guard
+
 # Each beside what a user would pick instead, where make peers has installed that. Results: docs/performance.md.
 BENCHMARKS := replay ingest learner actor weights growth memory cuda end-to-end
 
@@ -110,7 +114,7 @@ peers: $(VENV)-peers/.installed $(VENV)-reverb/.installed
 $(VENV)-peers/.installed: Makefile
 	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
 	$(@D)/bin/python -m pip install --quiet torch==2.13.0
-	$(@D)/bin/python -m pip install --quiet stable-baselines3==2.9.2 cpprb==11.0.0 'gymnasium[mujoco]'
+	$(@D)/bin/python -m pip install --quiet stable-baselines3==2.9.2 sbx-rl==0.28.0 cpprb==11.0.0 'gymnasium[mujoco]'
 	@touch $@
 
 $(VENV)-reverb/.installed: Makefile

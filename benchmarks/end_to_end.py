@@ -1,12 +1,12 @@
-"""Wall time from the command to a policy of 2 000 and one of 4 000 on HalfCheetah, beside stable-baselines3's SAC.
+"""Wall time from the command to a policy of 2 000 and one of 4 000 on HalfCheetah, beside SAC in JAX and in torch.
 
-    python -m benchmarks.end_to_end [--env ENV] [--goals 2000 4000] [--seeds 1 2 3] [--every 5000]
+    python -m benchmarks.end_to_end [--env ENV] [--goals 2000 4000] [--seeds 1 2 3] [--every 5000] [--peers PEER ...]
 
 A goal is reached at the second of two consecutive evaluations above it, each of 5 deterministic episodes, every 5 000
-environment steps; the clock starts with the process. Ours is ``rmc train`` as it comes; SAC has its defaults, and what
-rl-baselines3-zoo found best for this environment: 10 000 random steps before the first update, and the defaults. Each
-has all cores for itself. One run after another: what results/end-to-end.jsonl has already is not run again, so that an
-interrupted benchmark goes on where it was.
+environment steps; the clock starts with the process. Ours is ``rmc train`` as it comes. SAC of stable-baselines3 has
+its defaults, or what rl-baselines3-zoo found best for this environment: 10 000 random steps before the first update.
+SBX's has that too, an update a step, in calls of one or eight. Each has all cores for itself, one run after another.
+What results/end-to-end.jsonl has already is not run again: an interrupted benchmark goes on where it was.
 """
 
 import json
@@ -29,7 +29,13 @@ from benchmarks.harness import HERE, Row, command, parser, peer_python, save
 CURVES = HERE / "results" / "end-to-end.jsonl"
 EPISODES = 5
 LIMIT_SECONDS = 3600.0
-LEARNING_STARTS = {"stable-baselines3 SAC, defaults": 100, "stable-baselines3 SAC, rl-zoo": 10_000}
+PEERS = {  # script, and its arguments after the shared ones
+    "stable-baselines3 SAC, defaults": ("sb3_end_to_end", 100),
+    "stable-baselines3 SAC, rl-zoo": ("sb3_end_to_end", 10_000),
+    "SBX SAC, 1 update a call": ("sbx_end_to_end", 1, 2),
+    "SBX SAC, 8 updates a call": ("sbx_end_to_end", 8, 2),
+    "SBX SAC, 8 updates a call, 1 thread": ("sbx_end_to_end", 8, 1),
+}
 Point = tuple[float, float]  # seconds since the command, return
 
 
@@ -48,10 +54,11 @@ def ours(env: str, seed: int, every: int) -> Iterator[Point]:
             _end(process)
 
 
-def sac(python: Path, learning_starts: int, env: str, seed: int, every: int) -> Iterator[Point]:
-    """The same of the peer, which prints a line for each."""
-    began, script = time.time(), str(HERE / "peers" / "sb3_end_to_end.py")
-    process = _started([str(python), script, env, *map(str, (seed, every, EPISODES, learning_starts))])
+def sac(python: Path, peer: str, env: str, seed: int, every: int) -> Iterator[Point]:
+    """The same of a peer, which prints a line for each."""
+    name, *arguments = PEERS[peer]
+    began, script = time.time(), str(HERE / "peers" / f"{name}.py")
+    process = _started([str(python), script, env, *map(str, (seed, every, EPISODES, *arguments))])
     assert process.stdout is not None
     try:
         for line in process.stdout:
@@ -120,7 +127,7 @@ def _rows(env: str, goal: float, times: dict[str, list[float]], seeds: int) -> l
     middle = {who: statistics.median(all_) for who, all_ in times.items()}
     range_ = {who: (min(all_), max(all_) if math.isfinite(max(all_)) else None) for who, all_ in times.items()}
     rows = []
-    for peer in LEARNING_STARTS:
+    for peer in PEERS:
         theirs = middle.get(peer)
         ratio = None if theirs is None else theirs / middle["ours"]
         spread = {"ours": range_["ours"]} | ({"peer": range_[peer]} if peer in range_ else {})
@@ -135,11 +142,12 @@ def main() -> None:
     made.add_argument("--goals", type=float, nargs="+", default=[2000.0, 4000.0])
     made.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     made.add_argument("--every", type=int, default=5000, help="environment steps between evaluations")
+    made.add_argument("--peers", nargs="*", choices=list(PEERS), default=list(PEERS), metavar="PEER")
     options = made.parse_args()
     python = peer_python("peers")
     runners: dict[str, Callable[[str, int, int], Iterator[Point]]] = {"ours": ours}
     if python:
-        runners |= {peer: partial(sac, python, starts) for peer, starts in LEARNING_STARTS.items()}
+        runners |= {peer: partial(sac, python, peer) for peer in options.peers}
     curves: dict[str, list[list[Point]]] = {who: [] for who in runners}
     for seed, who in product(options.seeds, runners):
         key = {"who": who, "env": options.env, "seed": seed, "every": options.every}

@@ -10,16 +10,24 @@ from benchmarks.harness import HERE
 
 PAGE = HERE.parent / "docs" / "performance.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
-HEAD = "| what | ours | compared with | ratio | ceiling in the same run | day |\n|---|---|---|---|---|---|\n"
+HEAD = (
+    "| what | ours | beside it, and how many times as good ours is | of the ceiling in the same run | day |\n"
+    "|---|---|---|---|---|\n"
+)
 
 
-def newest() -> list[dict[str, Any]]:
-    """Of each name and peer the last row, in the order of the names."""
-    found: dict[tuple[str, str], dict[str, Any]] = {}
+def newest() -> dict[str, list[dict[str, Any]]]:
+    """By name the newest day's rows, one a peer; how it grows has a table of its own."""
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
     for path in sorted((HERE / "results").glob("[0-9]*.json")):
         for row in json.loads(path.read_text()):
-            found[row["name"], row["peer"]] = {**row, "day": path.stem}
-    return [found[key] for key in sorted(found)]
+            rows[row["name"], row["peer"]] = {**row, "day": path.stem}
+    by_name: dict[str, list[dict[str, Any]]] = {}
+    for name, peer in sorted(rows):
+        if not name.startswith("growth"):
+            by_name.setdefault(name, []).append(rows[name, peer])
+    last_day = {name: max(row["day"] for row in own) for name, own in by_name.items()}
+    return {name: [row for row in own if row["day"] == last_day[name]] for name, own in by_name.items()}
 
 
 def number(value: float) -> str:
@@ -34,24 +42,33 @@ def _range(row: dict[str, Any], of: str, value: float) -> str:
     return f"{number(value)} ({number(least)} to {'never' if largest is None else number(largest)})"
 
 
-def line(row: dict[str, Any]) -> str:
-    """One row of the table."""
-    peer, value, ratio, limit = row["peer"], row["peer_value"], row["ratio"], row["limit"]
-    if peer:
-        peer = f"{peer}: " + ("not installed" if value is None else _range(row, "peer", value))
-    ceiling = "" if limit is None else f"{row['limit_is']}: {_range(row, 'limit', limit)}"
-    if limit and row["unit"].endswith("/s"):
-        ceiling += f"; ours is {100 * row['ours'] / limit:.1f} %"
-    better = "" if ratio is None else f"{ratio:.2f}"
-    ours = f"{_range(row, 'ours', row['ours'])} {row['unit']}"
-    return f"| {row['name']} | {ours} | {peer} | {better} | {ceiling} | {row['day']} |"
+def _beside(row: dict[str, Any]) -> str:
+    if row["peer_value"] is None:
+        return f"{row['peer']}: not installed"
+    ratio = "" if row["ratio"] is None else f", **{row['ratio']:.2f}**"
+    return f"{row['peer']} {_range(row, 'peer', row['peer_value'])}{ratio}"
+
+
+def _ceiling(row: dict[str, Any]) -> str:
+    if row["limit"] is None:
+        return ""
+    value = f"{row['limit_is']} {_range(row, 'limit', row['limit'])}"
+    return f"{100 * row['ours'] / row['limit']:.0f} % of {value}" if row["unit"].endswith("/s") else value
+
+
+def line(rows: list[dict[str, Any]]) -> str:
+    """One line of the table: a measurement with all its peers."""
+    first = rows[0]
+    ours = f"{_range(first, 'ours', first['ours'])} {first['unit']}"
+    beside = "; ".join(_beside(row) for row in rows if row["peer"])
+    return f"| {first['name']} | {ours} | {beside} | {_ceiling(first)} | {first['day']} |"
 
 
 def main() -> None:
     text = PAGE.read_text()
     before, rest = text.split(BEGIN)
     after = rest.split(END)[1]
-    table = HEAD + "\n".join(line(row) for row in newest())
+    table = HEAD + "\n".join(map(line, newest().values()))
     PAGE.write_text(f"{before}{BEGIN}\n{table}\n{END}{after}")
 
 

@@ -34,7 +34,7 @@ def test_half_the_time_is_twice_as_good() -> None:
     ours, peer = turns([10.0], order, "ours"), turns([20.0], order, "peer")
     (row,) = compare("x", "ms", ours, {"peer": peer}, rounds=1, less_is_better=True)
     assert row.ratio == 2.0
-    assert "| 2.00 |" in line({**vars(row), "day": "today"})
+    assert "| 10 ms | peer 20, **2.00** |  | today |" in line([{**vars(row), "day": "today"}])
 
 
 def test_a_goal_is_reached_at_the_second_of_two_evaluations_above_it() -> None:
