@@ -25,10 +25,10 @@ Floats = NDArray[np.float32]
 
 def _of_shape(weights: dict[str, Tensor], name: str, like: Tensor) -> Tensor:
     """Out of ``weights``. Raises KeyError, ValueError."""
-    found = weights.pop(name)
-    if found.shape != like.shape:
-        raise ValueError(f"{name} has shape {tuple(found.shape)}, expected {tuple(like.shape)}")
-    return found
+    value = weights.pop(name)
+    if value.shape != like.shape:
+        raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {tuple(like.shape)}")
+    return value
 
 
 def _check_finite(weights: dict[str, Tensor]) -> None:

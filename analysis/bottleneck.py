@@ -14,7 +14,7 @@ IDLE = 0.2  # waiting for more of the time is worth a word
 def bottleneck(vitals: Vitals, config: RunConfig) -> Finding | None:
     """The one stage that the others wait for; None where the records do not say."""
     stages = (redis_bound, replay_bound, learner_bound, actor_bound, delivery_bound, balanced)
-    return next((found for stage in stages if (found := stage(vitals, config)) is not None), None)
+    return next((finding for stage in stages if (finding := stage(vitals, config)) is not None), None)
 
 
 def redis_bound(vitals: Vitals, _: RunConfig) -> Finding | None:

@@ -58,13 +58,13 @@ def export(policy: PolicyFile, out: Path) -> None:
     example = (two[0], two[1], torch.zeros(2, dtype=torch.bool), two[2])
     rows = torch.export.Dim("rows", min=1)
     with _quiet():
-        made = torch.onnx.export(
+        program = torch.onnx.export(
             _Step(agent).eval(), example, input_names=INPUTS, output_names=OUTPUTS,
             dynamic_shapes=({0: rows},) * 4, dynamo=True,
         )  # fmt: skip
-        assert made is not None
-        made.model.metadata_props.update(header.metadata())
-        made.save(str(out), external_data=False)
+        assert program is not None
+        program.model.metadata_props.update(header.metadata())
+        program.save(str(out), external_data=False)
 
 
 @contextlib.contextmanager

@@ -75,27 +75,27 @@ def objects(path: Path, *names: str) -> dict[str, dict[str, Any]]:
 
 def _object(line: bytes, place: str, names: Sequence[str]) -> dict[str, Any]:
     try:
-        found = json.loads(line)
+        value = json.loads(line)
     except ValueError as error:
         raise ConfigError("RUNS", place, f"not JSON ({error}); mend the line, or remove it") from None
-    if not isinstance(found, dict) or not found.keys() >= set(names):
+    if not isinstance(value, dict) or not value.keys() >= set(names):
         raise ConfigError("RUNS", place, f"must be an object with {', '.join(names)}; mend the line, or remove it")
-    return found
+    return value
 
 
 def _of_line(raw: dict[str, Any], place: str) -> History:
     try:
-        found = History(**{**raw, "evaluations": [Evaluation(**one) for one in raw["evaluations"]]})
+        history = History(**{**raw, "evaluations": [Evaluation(**one) for one in raw["evaluations"]]})
     except TypeError as error:
         raise ConfigError("RUNS", place, f"not a history ({error}); mend the line, or remove it") from None
-    numbers: list[Any] = [found.seed, found.env_steps, found.updates, found.transitions, found.wall_s]
-    numbers += [] if found.initial_return is None else [found.initial_return]
-    numbers += [value for one in found.evaluations for value in dataclasses.astuple(one)]
-    texts = found.agent, found.env, found.commit
-    if not (found.evaluations and all(map(is_finite, numbers)) and all(isinstance(text, str) for text in texts)):
+    numbers: list[Any] = [history.seed, history.env_steps, history.updates, history.transitions, history.wall_s]
+    numbers += [] if history.initial_return is None else [history.initial_return]
+    numbers += [value for one in history.evaluations for value in dataclasses.astuple(one)]
+    texts = history.agent, history.env, history.commit
+    if not (history.evaluations and all(map(is_finite, numbers)) and all(isinstance(text, str) for text in texts)):
         fix = "not a history (its evaluations, numbers and names); mend the line, or remove it"
         raise ConfigError("RUNS", place, fix)
-    return found
+    return history
 
 
 def of_run(folder: RunFolder) -> History:
@@ -178,25 +178,25 @@ def _stack(env: EnvConfig) -> list[str]:
 
 def _seen(env: EnvConfig) -> str:
     plain = EnvConfig(env.id)
-    told = ("frame_stack", "env_timeout", "env_kwargs")  # elsewhere, or in words of its own
-    names = [item.name for item in dataclasses.fields(env) if item.name not in told]
+    separate = ("frame_stack", "env_timeout", "env_kwargs")  # elsewhere, or in words of its own
+    names = [item.name for item in dataclasses.fields(env) if item.name not in separate]
     odd = [name for name in names if getattr(env, name) != getattr(plain, name)]
-    said = (f"{name.replace('_', ' ')} {getattr(env, name)}" for name in odd)
-    return ", ".join([env.id, *write_kwargs(env.env_kwargs), *said])
+    options = (f"{name.replace('_', ' ')} {getattr(env, name)}" for name in odd)
+    return ", ".join([env.id, *write_kwargs(env.env_kwargs), *options])
 
 
 def _evaluations(records: list[dict[str, Any]]) -> list[Evaluation]:
     """In order of environment steps; of a checkpoint played twice, what came last."""
     steps = {r["updates"]: r["env_steps"] for r in records if _says(r, "learner", "updates", "env_steps")}
     walls = {r["time"]: r["wall_s"] for r in records if _says(r, "launcher", "time", "wall_s")}
-    found = {}
+    evaluations = {}
     for record in records:
         if _says(record, "evaluator", "time", "eval_update", "eval_return_mean", "eval_return_std"):
             updates, own = record["eval_update"], _says(record, "evaluator", "eval_env_steps")
             at = int(record["eval_env_steps"] if own else _between(updates, steps))  # of ours only the update is known
             wall, mean, std = _between(record["time"], walls), record["eval_return_mean"], record["eval_return_std"]
-            found[at] = Evaluation(at, updates, wall, mean, std)
-    return [found[at] for at in sorted(found)]
+            evaluations[at] = Evaluation(at, updates, wall, mean, std)
+    return [evaluations[at] for at in sorted(evaluations)]
 
 
 def _says(record: dict[str, Any], role: str, *names: str) -> bool:

@@ -107,8 +107,8 @@ class Policy:
         noise = self._rng.standard_normal(shape, np.float32) if explore else None
         action, state = runner.act(seen, self._prev_action, absent, self._state, noise)
         self._prev_action, self._state[:] = action, state
-        found = action.copy() if units == "agent" else self._in_environment(action)
-        return found if np.ndim(observation) == 2 else found[0]
+        result = action.copy() if units == "agent" else self._in_environment(action)
+        return result if np.ndim(observation) == 2 else result[0]
 
     def _begin(self, rows: int) -> PolicyRunner:
         """What acts in so many episodes; new ones begin after ``reset``."""

@@ -85,7 +85,7 @@ def _stepped(actor: Actor, envs: int) -> int:
 
 
 def main() -> None:
-    parser = harness.parser(__doc__)
+    parser = harness.argument_parser(__doc__)
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--envs", type=int, nargs="+", default=[8, 32, 64, 128], help="environments of the actor")
     options = parser.parse_args()

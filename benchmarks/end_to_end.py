@@ -24,7 +24,7 @@ from itertools import pairwise, product
 from pathlib import Path
 
 from benchmarks import PEER_ENVIRONMENT
-from benchmarks.harness import HERE, Row, command, parser, peer_python, save
+from benchmarks.harness import HERE, Row, argument_parser, command, peer_python, save
 
 CURVES = HERE / "results" / "end-to-end.jsonl"
 EPISODES = 5
@@ -41,9 +41,9 @@ def ours(env: str, seed: int, every: int) -> Iterator[Point]:
         process = _started([sys.executable, "-m", "rmc.cli.main", *words, "--checkpoint-steps", str(every)])
         try:
             for line in _lines(run / "metrics.jsonl", process):
-                found = json.loads(line)
-                if "eval_return_mean" in found:
-                    yield found["time"] - began, found["eval_return_mean"]
+                record = json.loads(line)
+                if "eval_return_mean" in record:
+                    yield record["time"] - began, record["eval_return_mean"]
         finally:
             _end(process)
 
@@ -109,9 +109,9 @@ def run(points: Iterator[Point], goals: list[float]) -> list[Point]:
 
 def _known(key: dict[str, object]) -> list[Point] | None:
     for line in CURVES.read_text().splitlines() if CURVES.exists() else []:
-        found = json.loads(line)
-        if all(found[name] == value for name, value in key.items()):
-            return [(seconds, value) for seconds, value in found["points"]]
+        row = json.loads(line)
+        if all(row[name] == value for name, value in key.items()):
+            return [(seconds, value) for seconds, value in row["points"]]
     return None
 
 
@@ -130,12 +130,12 @@ def _rows(env: str, goal: float, times: dict[str, list[float]], seeds: int) -> l
 
 
 def main() -> None:
-    made = parser(__doc__)
-    made.add_argument("--env", default="HalfCheetah-v5")
-    made.add_argument("--goals", type=float, nargs="+", default=[2000.0, 4000.0])
-    made.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    made.add_argument("--every", type=int, default=5000, help="environment steps between evaluations")
-    options = made.parse_args()
+    parser = argument_parser(__doc__)
+    parser.add_argument("--env", default="HalfCheetah-v5")
+    parser.add_argument("--goals", type=float, nargs="+", default=[2000.0, 4000.0])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--every", type=int, default=5000, help="environment steps between evaluations")
+    options = parser.parse_args()
     python = peer_python("peers")
     runners: dict[str, Callable[[str, int, int], Iterator[Point]]] = {"ours": ours}
     if python:

@@ -82,7 +82,7 @@ def _look(launcher: psutil.Process, seen: dict[str, list[float]]) -> None:
 
 
 def main() -> None:
-    parser = harness.parser(__doc__)
+    parser = harness.argument_parser(__doc__)
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--preset", default="robust")
     parser.add_argument("--total-steps", type=int, default=6000)

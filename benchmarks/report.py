@@ -15,11 +15,11 @@ HEAD = "| what | ours | compared with | ratio | ceiling in the same run | day |\
 
 def newest() -> list[dict[str, Any]]:
     """Of each name and peer the last row, in the order of the names."""
-    found: dict[tuple[str, str], dict[str, Any]] = {}
+    last: dict[tuple[str, str], dict[str, Any]] = {}
     for path in sorted((HERE / "results").glob("[0-9]*.json")):
         for row in json.loads(path.read_text()):
-            found[row["name"], row["peer"]] = {**row, "day": path.stem}
-    return [found[key] for key in sorted(found)]
+            last[row["name"], row["peer"]] = {**row, "day": path.stem}
+    return [last[key] for key in sorted(last)]
 
 
 def number(value: float) -> str:

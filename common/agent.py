@@ -302,8 +302,8 @@ class Agent(nn.Module):
 
     def policy_shapes(self) -> dict[str, tuple[int, ...]]:
         """Of ``policy_weights``; also of an agent on the device ``meta``, which takes no memory."""
-        found = self.state_dict().items()
-        return {name: tuple(value.shape) for name, value in found if name.startswith(self._acting())}
+        state = self.state_dict().items()
+        return {name: tuple(value.shape) for name, value in state if name.startswith(self._acting())}
 
     def broadcast_weights(self) -> dict[str, Tensor]:
         """What actors are sent: the critics, too, where they rate their windows."""

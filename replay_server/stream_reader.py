@@ -140,9 +140,9 @@ class StreamReader:
         """The bodies, but for those with a faulty row, which are refused."""
         ends = np.cumsum([0 if body is None else len(body) for body in bodies])
         kept = list(bodies)
-        for index, found in enumerate(np.split(faults, ends[:-1])):
-            if found.any():
-                self._refuse(entries[index], MessageError("window", FAULTS[found[found > 0][0]]))
+        for index, of_body in enumerate(np.split(faults, ends[:-1])):
+            if of_body.any():
+                self._refuse(entries[index], MessageError("window", FAULTS[of_body[of_body > 0][0]]))
                 kept[index] = None
         return kept
 
@@ -153,15 +153,15 @@ class StreamReader:
 
     def _stamped(self, entries: list[Entry], bodies: list[Rows | None]) -> Rows:
         """All bodies as one array; the origin comes from the entry ids, whatever the sender wrote."""
-        found = [(entry, body) for entry, body in zip(entries, bodies, strict=True) if body is not None and len(body)]
+        parts = [(entry, body) for entry, body in zip(entries, bodies, strict=True) if body is not None and len(body)]
         block = np.dtype((np.void, self.spec.dtype.itemsize))  # copies whole rows rather than fields
-        blocks = [np.empty(0, block), *(body.view(block) for _, body in found)]
+        blocks = [np.empty(0, block), *(body.view(block) for _, body in parts)]
         rows: Rows = np.concatenate(blocks).view(self.spec.dtype)
-        counts = [len(body) for _, body in found]
+        counts = [len(body) for _, body in parts]
         starts = np.cumsum([0, *counts[:-1]]) if counts else np.zeros(0, np.int64)
-        rows["actor"] = np.repeat([entry.actor for entry, _ in found], counts)
-        rows["epoch"] = np.repeat([entry.id.epoch for entry, _ in found], counts)
-        rows["seq"] = np.repeat([entry.id.seq for entry, _ in found], counts)
+        rows["actor"] = np.repeat([entry.actor for entry, _ in parts], counts)
+        rows["epoch"] = np.repeat([entry.id.epoch for entry, _ in parts], counts)
+        rows["seq"] = np.repeat([entry.id.seq for entry, _ in parts], counts)
         rows["k"] = np.arange(len(rows)) - np.repeat(starts, counts)
         return rows
 

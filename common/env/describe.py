@@ -37,22 +37,22 @@ def layout_of(env: Env, config: EnvConfig) -> EnvLayout:
     )
 
 
-def _named(found: tuple[Part, ...], names: dict[str, int]) -> tuple[Part, ...]:
+def _named(boxes: tuple[Part, ...], names: dict[str, int]) -> tuple[Part, ...]:
     """One box in the parts that the environment says it has."""
-    if len(found) != 1 or sum(names.values()) != found[0].stop:
-        return found
+    if len(boxes) != 1 or sum(names.values()) != boxes[0].stop:
+        return boxes
     named, at = [], 0
     for name, size in names.items():
         if size:
-            named.append(Part(name, at, at + size, (size,), found[0].dtype))
+            named.append(Part(name, at, at + size, (size,), boxes[0].dtype))
             at += size
     return tuple(named)
 
 
-def _of_slice(found: tuple[Part, ...], seen: slice | None) -> tuple[Part, ...]:
+def _of_slice(all_parts: tuple[Part, ...], seen: slice | None) -> tuple[Part, ...]:
     """Those that are shown; ``seen`` begins and ends with parts."""
     if seen is None:
-        return found
-    first, last, _ = seen.indices(found[-1].stop)
-    kept = [part for part in found if first <= part.start and part.stop <= last]
+        return all_parts
+    first, last, _ = seen.indices(all_parts[-1].stop)
+    kept = [part for part in all_parts if first <= part.start and part.stop <= last]
     return tuple(Part(part.name, part.start - first, part.stop - first, part.shape, part.dtype) for part in kept)

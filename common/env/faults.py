@@ -22,10 +22,10 @@ def asked(what: str, call: Callable[..., ResultT], *given: Any) -> ResultT:
     except RmcError:
         raise
     except RAISED as error:
-        raise EnvFault(f"the environment's {what} raises {told(error)}") from error
+        raise EnvFault(f"the environment's {what} raises {describe_error(error)}") from error
 
 
-def told(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """An error of a user's code in a line, with the innermost place in a file of theirs, if there is any."""
     while error.__cause__ is not None and not _users_places(error):  # gymnasium raises some errors anew
         error = error.__cause__

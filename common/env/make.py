@@ -24,7 +24,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.env.describe import layout_of, shown, structure
-from rmc.common.env.faults import RAISED, asked, one_line, told
+from rmc.common.env.faults import RAISED, asked, describe_error, one_line
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.process_state import ApartCall
 from rmc.common.env.spaces import space_fault
@@ -48,15 +48,15 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
     _redirect_mujoco_warnings()
     with ApartCall(config.id, "make", config.env_timeout):
         spec = find_spec(config.id)
-        made: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
-    fault = asked("spaces", lambda: space_fault(made.observation_space, made.action_space))
-    if fault is None and config.hide != "nothing" and not structure(made):
+        env: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
+    fault = asked("spaces", lambda: space_fault(env.observation_space, env.action_space))
+    if fault is None and config.hide != "nothing" and not structure(env):
         fault = f"it does not say which observations are {config.hide}; --hide is for MuJoCo's bodies, like Ant-v5"
     if fault is not None:
         with suppress(*RAISED):
-            made.close()
+            env.close()
         raise ConfigError("ENV", config.id, fault)
-    return _as_seen(made, config, config.time_limit or spec.max_episode_steps)
+    return _as_seen(env, config, config.time_limit or spec.max_episode_steps)
 
 
 def _make(known: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
@@ -73,7 +73,7 @@ def _make(known: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
         if isinstance(error, TypeError) and (fault := _keyword_fault(spec)) is not None:
             raise ConfigError("ENV", config.id, fault) from None
         if not config.id.startswith(DM_CONTROL):
-            raise EnvFault(f"the environment cannot be made: {told(error)}") from error
+            raise EnvFault(f"the environment cannot be made: {describe_error(error)}") from error
         fix = f"dm_control cannot make it ({one_line(error)}); it wants MuJoCo 3: {how_to_install('dm-control')}"
         raise ConfigError("ENV", config.id, fix) from None
 
@@ -93,9 +93,9 @@ def _keyword_fault(spec: EnvSpec) -> str | None:
 
 def entry_point(spec: EnvSpec) -> Callable[..., Any]:
     """What makes the environment: its class, or a function."""
-    made_by = spec.entry_point
-    assert made_by is not None
-    return gym.envs.registration.load_env_creator(made_by) if isinstance(made_by, str) else made_by
+    factory = spec.entry_point
+    assert factory is not None
+    return gym.envs.registration.load_env_creator(factory) if isinstance(factory, str) else factory
 
 
 def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> Env:
@@ -136,7 +136,7 @@ def further_env(make_env: Callable[[], Env], what: str) -> Env:
         return make_env()
     except Exception as error:
         fix = "where only one can exist, take --actors 1 --envs-per-actor 1 --episodes 0"
-        raise RmcError(f"{what} cannot be made beside the others ({told(error)}); {fix}") from error
+        raise RmcError(f"{what} cannot be made beside the others ({describe_error(error)}); {fix}") from error
 
 
 def first_env(config: EnvConfig) -> Env:
@@ -201,7 +201,7 @@ def _import_users_module(env_id: str, module: str) -> None:
         fix = f"start from the folder that holds {module}" if ours else f"{module} needs it; install it"
         raise ConfigError("ENV", env_id, f"{error}; {fix}") from None
     except RAISED as error:
-        raise ConfigError("ENV", env_id, f"{module} cannot be imported: {told(error)}") from None
+        raise ConfigError("ENV", env_id, f"{module} cannot be imported: {describe_error(error)}") from None
 
 
 def _import_dm_control(env_id: str) -> None:

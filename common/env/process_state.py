@@ -101,12 +101,12 @@ class ApartCall(EnvCall):
         if ours.dtype is None and now.dtype is not None:  # torch was imported meanwhile
             torch = sys.modules["torch"]
             ours = ours._replace(dtype=torch.float32, threads=now.threads, device=torch.device("cpu"))
-        found = {name: getattr(now, name) for name in sorted(ours.differences(now))}
+        changed = {name: getattr(now, name) for name in sorted(ours.differences(now))}
         if self._random is not None and self._random != _random_state():
-            found["random"] = None
-        ApartCall.changed |= found
+            changed["random"] = None
+        ApartCall.changed |= changed
         ours.install(now)
-        ApartCall.theirs = now if set(found) - {"handlers", "random"} else None
+        ApartCall.theirs = now if set(changed) - {"handlers", "random"} else None
 
 
 def _random_state() -> tuple[Any, ...]:

@@ -43,13 +43,13 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
         self.observation_space = _box(gym.spaces.flatdim(env.observation_space))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        found = asked("reset", partial(self.env.reset, seed=seed, options=options))
-        observation, info = _values("reset", found, RESET)
+        result = asked("reset", partial(self.env.reset, seed=seed, options=options))
+        observation, info = _values("reset", result, RESET)
         return vector(self.given, observation), _own(info)
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        found = asked("step", self.env.step, self._stretched(action))
-        observation, reward, terminated, truncated, info = _values("step", found, STEP)
+        result = asked("step", self.env.step, self._stretched(action))
+        observation, reward, terminated, truncated, info = _values("step", result, STEP)
         ends = _bool("terminated", terminated), _bool("truncated", truncated)
         return vector(self.given, observation), _number("reward", reward), *ends, _own(info)
 
@@ -71,21 +71,21 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
         return gym.spaces.unflatten(self.taken, scaled.astype(np.float64))
 
 
-def _values(method: str, found: Any, wanted: tuple[str, ...]) -> Sequence[Any]:
-    if isinstance(found, tuple | list) and len(found) == len(wanted):
-        return found
-    given = f"{len(found)} values" if isinstance(found, tuple | list) else f"a {type(found).__name__}"
-    raise EnvFault(f"the environment's {method} gives {given}; return ({', '.join(wanted)})")
+def _values(method: str, result: Any, wanted: tuple[str, ...]) -> Sequence[Any]:
+    if isinstance(result, tuple | list) and len(result) == len(wanted):
+        return result
+    shape = f"{len(result)} values" if isinstance(result, tuple | list) else f"a {type(result).__name__}"
+    raise EnvFault(f"the environment's {method} gives {shape}; return ({', '.join(wanted)})")
 
 
 def _number(name: str, value: Any, wanted: str = "a number") -> float:
     """A number, also as an array of one."""
     if isinstance(value, float):
         return float(value)
-    found = array(name, value, wanted)
-    if found.size != 1:
+    numbers = array(name, value, wanted)
+    if numbers.size != 1:
         raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}; return {wanted}")
-    return float(found.item())
+    return float(numbers.item())
 
 
 def _bool(name: str, value: Any) -> bool:

@@ -39,7 +39,7 @@ class EnvCall:
     def __exit__(self, *_: object) -> None:
         EnvCall.current = self._outer
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """That it hangs, and where, in a line."""
         frame = sys._current_frames().get(self.thread)
         at = traceback.extract_stack(frame)[-1] if frame is not None else None
@@ -85,7 +85,7 @@ def _arm(seconds: float) -> None:
 
 def _end(call: EnvCall) -> None:
     with suppress(OSError, ValueError):
-        os.write(STDERR, f"rmc: {call.told()}\n".encode())
+        os.write(STDERR, f"rmc: {call.describe()}\n".encode())
         sys.stdout.flush()
     descendants.end_children()  # a simulator that the environment has started
     os._exit(HUNG_STATUS)

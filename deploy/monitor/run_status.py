@@ -117,11 +117,11 @@ class RunStatus:
     @property
     def elapsed_s(self) -> float | None:
         """Seconds trained, over all starts of the run."""
-        said, spoke = self.get("launcher", "wall_s"), self.get("launcher", "time")
-        if not is_finite(said):
+        wall_s, spoke = self.get("launcher", "wall_s"), self.get("launcher", "time")
+        if not is_finite(wall_s):
             return None
         since = 0.0 if self.is_over or not is_finite(spoke) else max(0.0, time.time() - spoke)
-        return float(said) + since
+        return float(wall_s) + since
 
     @property
     def eta_s(self) -> float | None:
@@ -139,8 +139,8 @@ class RunStatus:
 
     def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:
         """The sum or mean ``over`` all replay servers, or None."""
-        found = [record[name] for role, record in self.roles.items() if role.startswith("replay") and name in record]
-        return over(found) if found else None
+        values = [record[name] for role, record in self.roles.items() if role.startswith("replay") and name in record]
+        return over(values) if values else None
 
     @property
     def episode_return(self) -> float | None:

@@ -70,8 +70,8 @@ def scratch_folder(run: str) -> Path:
     """
     folder = Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{run[-8:]}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    found = folder.lstat()
-    if found.st_uid != os.getuid() or found.st_mode & 0o077:
+    status = folder.lstat()
+    if status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise RuntimeError(f"{folder} is not private; remove it")
     return folder
 

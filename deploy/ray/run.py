@@ -278,9 +278,11 @@ class ClusterRun:
 
     def stop(self, reason: str) -> None:
         """Ask every role to end, and wait until the learner's last checkpoint is on the head."""
-        told = [role_handle.handle.stopping.remote(True) for role_handle in self._hosts.values() if role_handle.running]
-        if told:
-            ray.wait(told, num_returns=len(told), timeout=TOLD_SECONDS)
+        replies = [
+            role_handle.handle.stopping.remote(True) for role_handle in self._hosts.values() if role_handle.running
+        ]
+        if replies:
+            ray.wait(replies, num_returns=len(replies), timeout=TOLD_SECONDS)
         with suppress(BusUnavailable, BusFull):
             self.bus.request_stop(reason)
         deadline = time.monotonic() + STOP_SECONDS + self._saving()

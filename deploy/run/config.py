@@ -188,10 +188,10 @@ def _value(kind: Any, value: Any, path: str) -> Any:
             return tuple(_value(part, item, path) for part, item in zip(parts, value, strict=True))
     elif _matches(kind, value):
         return float(value) if kind is float else value
-    raise ConfigError(path, value, f"must be {_told(kind)}")
+    raise ConfigError(path, value, f"must be {_expected(kind)}")
 
 
-def _told(kind: Any) -> str:
+def _expected(kind: Any) -> str:
     """What is asked for, in words."""
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(repr, get_args(kind)))}"

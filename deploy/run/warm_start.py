@@ -72,9 +72,9 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
     torch.save(update.state_dict(), learnt)
     weights = {name: value.contiguous() for name, value in update.policy_weights().items()}
     policy = safetensors.torch.save(weights, config.policy_header().metadata())
-    made = {STATE: learnt.getvalue(), POLICY: policy, PROGRESS: json.dumps(progress).encode()}
+    checkpoint = {STATE: learnt.getvalue(), POLICY: policy, PROGRESS: json.dumps(progress).encode()}
     return InitialCheckpoint(
-        made, {"asked": [init_from, parts], "run": str(folder.path), "checkpoint": number, "parts": parts}
+        checkpoint, {"asked": [init_from, parts], "run": str(folder.path), "checkpoint": number, "parts": parts}
     )
 
 

@@ -119,9 +119,9 @@ def _complaint(words: list[str]) -> str:
     """What is wrong with words that cannot be parsed; it quotes them."""
     from rmc.cli import complaint, parser
 
-    with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.suppress(SystemExit):
+    with contextlib.redirect_stderr(io.StringIO()) as stderr, contextlib.suppress(SystemExit):
         parser.parse(words)
-    return f"{complaint.as_line(said.getvalue())} (see rmc --help)"
+    return f"{complaint.as_line(stderr.getvalue())} (see rmc --help)"
 
 
 def _complain(message: str, status: int) -> int:

@@ -132,15 +132,15 @@ def _parsed(words: list[str], defaults: dict[str, Any]) -> Any:
 
 def renamed(words: list[str]) -> list[str]:
     """The words with the new names of options, each of whose old ones is warned of."""
-    found = []
+    new_words = []
     for word in words:
         flag, equals, value = word.partition("=")
         no = "no-" if flag.startswith("--no-") else ""
         new = RENAMED.get(flag.replace("_", "-").removeprefix(f"--{no}")) if flag.startswith("--") else None
         if new is not None:
             log.warning("%s is called --%s%s now; the old name goes in the next version", flag, no, new)
-        found.append(f"--{no}{new}{equals}{value}" if new is not None else word)
-    return found
+        new_words.append(f"--{no}{new}{equals}{value}" if new is not None else word)
+    return new_words
 
 
 def option_names(kind: type) -> list[str]:

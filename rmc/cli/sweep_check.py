@@ -54,11 +54,11 @@ def check_values(spec: Spec, on_this_machine: bool) -> None:
 
 
 def _check(place: str, value: Any, spec: Spec, words: list[str]) -> None:
-    with contextlib.redirect_stderr(io.StringIO()) as said:
+    with contextlib.redirect_stderr(io.StringIO()) as output:
         try:
             parser.parse(["train", spec.env, *words])
         except SystemExit:
-            raise ConfigError(place, value, complaint.as_line(said.getvalue())) from None
+            raise ConfigError(place, value, complaint.as_line(output.getvalue())) from None
 
 
 def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:

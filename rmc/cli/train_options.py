@@ -134,5 +134,5 @@ class Resume(Train):
 
 def resuming(config: RunConfig, launch: LaunchOptions) -> Resume:
     """The command that goes on with such a run, and changes nothing."""
-    said = vars(from_config(config, launch))
-    return Resume(**said | {"env": KnownEnvOptions(**dataclasses.asdict(config.env)), "run_dir": tyro.MISSING})
+    options = vars(from_config(config, launch))
+    return Resume(**options | {"env": KnownEnvOptions(**dataclasses.asdict(config.env)), "run_dir": tyro.MISSING})

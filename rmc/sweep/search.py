@@ -145,10 +145,10 @@ class SearchPlan:
     def _evaluations(self, job: Job) -> list[tuple[int, Evaluation]]:
         """By which evaluation of a run it is: the steps themselves differ a little from run to run."""
         try:
-            found = of_run(RunFolder(job.folder)).evaluations
+            evaluations = of_run(RunFolder(job.folder)).evaluations
         except ConfigError:  # none yet
             return []
-        by_step = {round(one.env_steps / self._checkpoint_steps): one for one in found}
+        by_step = {round(one.env_steps / self._checkpoint_steps): one for one in evaluations}
         return sorted(by_step.items(), key=lambda pair: pair[0])
 
     def end(self, job: Job, ending: Ending) -> None:

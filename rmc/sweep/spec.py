@@ -176,7 +176,7 @@ def read_seeds(raw: Any) -> tuple[int, ...]:
     """Of a list of whole numbers, of one, or of words like ``1-3,7``. Raises ConfigError."""
     if isinstance(raw, str):
         ends = [re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip()) for part in raw.split(",")]
-        pairs = [(int(found[1]), int(found[2] or found[1])) for found in ends if found]
+        pairs = [(int(match[1]), int(match[2] or match[1])) for match in ends if match]
         if len(pairs) < len(ends) or any(not 0 <= high - low < MOST for low, high in pairs):
             raise ConfigError("seeds", raw, SEEDS_FIX)
         seeds = [seed for low, high in pairs for seed in range(low, high + 1)]
@@ -189,23 +189,23 @@ def read_seeds(raw: Any) -> tuple[int, ...]:
 
 def read_grid(words: Sequence[str]) -> dict[str, list[Any]]:
     """Of ``NAME=VALUE,VALUE…`` words. Raises ConfigError."""
-    found: dict[str, list[Any]] = {}
+    grid: dict[str, list[Any]] = {}
     for name, text in _pairs("--grid", words):
-        found[name] = read_values(text)
-    return found
+        grid[name] = read_values(text)
+    return grid
 
 
 def read_ranges(words: Sequence[str]) -> dict[str, Range | list[Any]]:
     """Of ``NAME=LOW..HIGH``, ``NAME=LOW..HIGH:log`` or ``NAME=CHOICE,CHOICE…`` words. Raises ConfigError."""
-    found: dict[str, Range | list[Any]] = {}
+    ranges: dict[str, Range | list[Any]] = {}
     for name, text in _pairs("--search", words):
         ends = re.fullmatch(r"(.+?)\.\.(.+?)(:log)?", text)
         if ends is None:
-            found[name] = read_values(text)
+            ranges[name] = read_values(text)
         else:
             low, high = read_values(ends[1])[0], read_values(ends[2])[0]
-            found[name] = _checked_range(f"search.{name}", low, high, bool(ends[3]))
-    return found
+            ranges[name] = _checked_range(f"search.{name}", low, high, bool(ends[3]))
+    return ranges
 
 
 def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:

@@ -193,7 +193,7 @@ def test_an_area_is_over_partial_views_only(tmp_path, capsys):
     lines = [{"agent": "RMC", "env": "Hopper-v5", "seed": seed, "returns": returns} for seed in (1, 2)]
     (tmp_path / "lines").write_text("\n".join(map(json.dumps, lines)))
     assert generalisation.area(returns) == 20.0
-    generalisation.tell(tmp_path / "lines")
+    generalisation.report(tmp_path / "lines")
     assert capsys.readouterr().out == "Hopper-v5, RMC: 20 (20, 20)\n"
 
 
@@ -201,7 +201,7 @@ def test_averages_are_judged_by_a_runs_second_half(tmp_path, capsys):
     both = {"averaged": [9, 2, 4, 6], "newest": [9, 1, 3, 8]}
     line = {"agent": "RMC", "env": "Hopper-v5", "seed": 1, "env_steps": [10, 20, 30, 40]} | both
     (tmp_path / "lines").write_text(json.dumps(line))
-    averaging.tell(tmp_path / "lines")
+    averaging.report(tmp_path / "lines")
     assert capsys.readouterr().out.splitlines() == [
         "RMC, Hopper-v5, seed 1, averaged: mean 5, worst 4, deviation 1 of 2 checkpoints",
         "RMC, Hopper-v5, seed 1, newest: mean 6, worst 3, deviation 2 of 2 checkpoints",
