@@ -92,7 +92,7 @@ class Rollout:
     def step(self) -> bool:
         """One reset or step; whether there is more to play."""
         if self._length >= 0:
-            action, state = self._runner.act(self._seen, self._prev_action, self._missing, self._state, None)
+            action, state = self._runner.act(self._observation, self._prev_action, self._missing, self._state, None)
             self._prev_action, self._state[:] = action, state
         try:
             over = self._begin() if self._length < 0 else self._step_environment(self._prev_action[0])
@@ -125,7 +125,7 @@ class Rollout:
         return bool(terminated or truncated or self._length >= self._longest)
 
     def _see(self, observation: Floats, info: dict[str, Any]) -> None:
-        self._seen, self._missing = observation[None], np.array([bool(info.get("missing", False))])
+        self._observation, self._missing = observation[None], np.array([bool(info.get("missing", False))])
 
     def _judge(self, over: bool) -> None:
         late = self._clock() >= self._deadline

@@ -114,8 +114,8 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
     written = json.dumps({"format": FORMAT} | asdict(config), indent=2)
     write_whole(folder.path / "config.json", f"{written}\n".encode())
     folder.write_sizes(sizes)
-    for left in set(folder.checkpoints.glob("[0-9]*")) - set(_states(folder)):  # by a crash amid a save
-        shutil.rmtree(left)
+    for leftover in set(folder.checkpoints.glob("[0-9]*")) - set(_states(folder)):  # by a crash amid a save
+        shutil.rmtree(leftover)
     return folder
 
 
@@ -167,8 +167,8 @@ class SB3Adapter:
         self, observation: Floats, _prev_action: Floats, _missing: NDArray[np.bool_], state: Floats, _: Floats | None
     ) -> tuple[Floats, Floats]:
         """(N, O) -> (N, A), as ``PolicyRunner.act``; of the rest nothing is used."""
-        seen = self._scaled(observation)
-        action, self._state = self._model.predict(seen, self._state, self._begins, deterministic=True)
+        scaled = self._scaled(observation)
+        action, self._state = self._model.predict(scaled, self._state, self._begins, deterministic=True)
         self._begins = np.zeros(1, np.bool_)
         return action.astype(np.float32), state
 

@@ -69,14 +69,14 @@ def actor_bound(vitals: Vitals, config: RunConfig) -> Finding | None:
 
 def _faster_actors(vitals: Vitals, config: RunConfig, learner: float) -> str:
     """As many actors as would keep the learner busy, where there are cores for them."""
-    wanted = ceil(config.actors / max(learner, 0.01))
+    actors = ceil(config.actors / max(learner, 0.01))
     ratio = f"--replay-ratio {config.replay.replay_ratio / max(learner, 0.01):.3g} would use the learner's idle time"
     shards, free = config.replay.replay_shards, free_cores(vitals)
     if free is None:
         return f"more --actors would help where cores are free; with what there is, {ratio}"
     if free < 1.0:
         return f"all cores are taken: more machines (--launcher ray) would help, and {ratio}"
-    affordable = min(wanted, config.actors + floor(free)) // shards * shards
+    affordable = min(actors, config.actors + floor(free)) // shards * shards
     return f"--actors {max(affordable, config.actors + shards)} would help; with what there is, {ratio}"
 
 

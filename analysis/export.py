@@ -39,9 +39,9 @@ class _Step(nn.Module):
         """See the module's docstring."""
         if self.agent.config.impute_missing:  # as ``Policy.act`` has it
             missing = missing | ~torch.isfinite(observation).all(1)
-        seen = self.agent.normalizer(observation, missing).unsqueeze(1)
+        normalized = self.agent.normalizer(observation, missing).unsqueeze(1)
         now = missing.unsqueeze(1), previous_action.unsqueeze(1), state
-        remembered, _, state = self.agent.unroll(seen, *now)
+        remembered, _, state = self.agent.unroll(normalized, *now)
         mean, _ = self.agent.policy(self.agent.features(remembered).squeeze(1))
         return torch.tanh(mean), state
 

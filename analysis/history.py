@@ -140,13 +140,13 @@ def describe(path: Path) -> About:
     """Of a run of RMC, or of a baseline. Raises ConfigError."""
     folder = RunFolder(path)
     if folder.is_baseline():
-        theirs = baseline_settings.read(folder)
-        per_update = baseline_settings.transitions_per_update(theirs)
-        return About(_with(theirs.name, _stack(theirs.env)), _seen(theirs.env), theirs.seed, per_update)
+        baseline = baseline_settings.read(folder)
+        per_update = baseline_settings.transitions_per_update(baseline)
+        return About(_with(baseline.name, _stack(baseline.env)), _env_label(baseline.env), baseline.seed, per_update)
     config = folder.config()
     name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
     agent = _with(name, [*_changes(config), *_stack(config.env)])
-    return About(agent, _seen(config.env), config.seed, config.learner.batch_size * _trained_steps(config))
+    return About(agent, _env_label(config.env), config.seed, config.learner.batch_size * _trained_steps(config))
 
 
 def _trained_steps(config: RunConfig) -> int:
@@ -176,7 +176,7 @@ def _stack(env: EnvConfig) -> list[str]:
     return [f"--frame-stack {env.frame_stack}"] if env.frame_stack > 1 else []
 
 
-def _seen(env: EnvConfig) -> str:
+def _env_label(env: EnvConfig) -> str:
     plain = EnvConfig(env.id)
     separate = ("frame_stack", "env_timeout", "env_kwargs")  # elsewhere, or in words of its own
     names = [item.name for item in dataclasses.fields(env) if item.name not in separate]
@@ -204,7 +204,7 @@ def _says(record: dict[str, Any], role: str, *names: str) -> bool:
     return record.get("role") == role and all(is_finite(record.get(name)) for name in names)
 
 
-def _between(at: float, known: dict[Any, Any]) -> float:
+def _between(at: float, points: dict[Any, Any]) -> float:
     """What lies at ``at`` on the line through the points that are known."""
-    places = sorted(known)
-    return float(np.interp(at, places, [known[place] for place in places])) if places else 0.0
+    places = sorted(points)
+    return float(np.interp(at, places, [points[place] for place in places])) if places else 0.0

@@ -53,11 +53,11 @@ def long_warm_up(vitals: Vitals, config: RunConfig) -> Finding | None:
     missing = config.replay.warmup_steps - steps
     if vitals.last("learner", "updates") > 0 or missing <= 0 or sum(rates) <= 0.0:
         return None
-    left = missing / sum(rates)
-    if left < WARM_UP_SECONDS:
+    seconds = missing / sum(rates)
+    if seconds < WARM_UP_SECONDS:
         return None
     measured = (
-        f"{steps:,.0f} of {config.replay.warmup_steps:,} steps at {sum(rates):,.0f} a second, {left:,.0f} s to go"
+        f"{steps:,.0f} of {config.replay.warmup_steps:,} steps at {sum(rates):,.0f} a second, {seconds:,.0f} s to go"
     )
     return Finding(
         "long warm-up", measured, f"--warmup-steps {config.replay.warmup_steps // 4}, or more --actors, would help"

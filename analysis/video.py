@@ -17,7 +17,7 @@ from rmc.actors.evaluator import LONGEST_EPISODE
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.faults import asked
+from rmc.common.env.faults import call_env
 from rmc.common.env.make import entry_point, find_spec, make_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError, EnvFault
@@ -46,7 +46,7 @@ def prepare(env: EnvConfig, out: Path) -> None:
 
 def _mode_fault(env: EnvConfig) -> str | None:
     """Why an environment has no pictures, as far as it can be told without making it."""
-    factory = asked("entry point", lambda: entry_point(find_spec(env.id)))
+    factory = call_env("entry point", lambda: entry_point(find_spec(env.id)))
     metadata = getattr(factory, "metadata", None)
     modes = metadata.get("render_modes") or [] if isinstance(metadata, dict) else []
     if isinstance(factory, type) and MODE not in modes:

@@ -97,17 +97,17 @@ def reached(points: list[Point], goal: float) -> float | None:
 
 def run(points: Iterator[Point], goals: list[float]) -> list[Point]:
     """Until the last goal is reached, or an hour has gone."""
-    seen: list[Point] = []
+    curve: list[Point] = []
     for point in points:
-        seen.append(point)
+        curve.append(point)
         print(f"  {point[0]:6.0f} s {point[1]:8.0f}", flush=True)
-        if reached(seen, max(goals)) is not None or point[0] > LIMIT_SECONDS:
+        if reached(curve, max(goals)) is not None or point[0] > LIMIT_SECONDS:
             break
     points.close()  # type: ignore[attr-defined]
-    return seen
+    return curve
 
 
-def _known(key: dict[str, object]) -> list[Point] | None:
+def _saved_curve(key: dict[str, object]) -> list[Point] | None:
     for line in CURVES.read_text().splitlines() if CURVES.exists() else []:
         row = json.loads(line)
         if all(row[name] == value for name, value in key.items()):
@@ -121,11 +121,11 @@ def _rows(env: str, goal: float, times: dict[str, list[float]], seeds: int) -> l
     range_ = {who: (min(all_), max(all_) if math.isfinite(max(all_)) else None) for who, all_ in times.items()}
     rows = []
     for peer in LEARNING_STARTS:
-        theirs = middle.get(peer)
-        ratio = None if theirs is None else theirs / middle["ours"]
+        peer_seconds = middle.get(peer)
+        ratio = None if peer_seconds is None else peer_seconds / middle["ours"]
         spread = {"ours": range_["ours"]} | ({"peer": range_[peer]} if peer in range_ else {})
         name = f"time to {goal:g}, {env}"
-        rows.append(Row(name, "s", middle["ours"], peer, theirs, ratio, None, "", spread, seeds, command()))
+        rows.append(Row(name, "s", middle["ours"], peer, peer_seconds, ratio, None, "", spread, seeds, command()))
     return rows
 
 
@@ -143,7 +143,7 @@ def main() -> None:
     curves: dict[str, list[list[Point]]] = {who: [] for who in runners}
     for seed, who in product(options.seeds, runners):
         key = {"who": who, "env": options.env, "seed": seed, "every": options.every}
-        points = _known(key)
+        points = _saved_curve(key)
         if points is None:
             print(f"{who}, seed {seed}", flush=True)
             points = run(runners[who](options.env, seed, options.every), options.goals)

@@ -87,7 +87,7 @@ def compare(
         pairs = list(zip(values["ours"], values.get(peer, []), strict=False))
         ratios = [b / a if less_is_better else a / b for a, b in pairs]
         times = {"ours": values["ours"], "peer": values.get(peer, []), "limit": values.get("limit", [])}
-        medians = {key: statistics.median(seen) if seen else None for key, seen in times.items()}
+        medians = {key: statistics.median(samples) if samples else None for key, samples in times.items()}
         assert medians["ours"] is not None
         rows.append(
             Row(
@@ -99,7 +99,7 @@ def compare(
                 statistics.median(ratios) if ratios else None,
                 medians["limit"],
                 limit[0] if limit else "",
-                {key: (min(seen), max(seen)) for key, seen in times.items() if seen},
+                {key: (min(samples), max(samples)) for key, samples in times.items() if samples},
                 rounds,
                 command(),
             )

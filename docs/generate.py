@@ -129,10 +129,10 @@ def page() -> str:
         "",
         "Written by `make docs` from the code. Defaults are `robust`'s; what `paper` has otherwise is in brackets.",
     ]
-    ours, theirs = robust(EnvConfig("")), paper(EnvConfig(""))
+    defaults, paper_config = robust(EnvConfig("")), paper(EnvConfig(""))
     for part, title in TITLES.items():
         lines += ["", f"## {title}", "", HEAD, RULE]
-        configs = (ours, theirs) if part == "run" else (getattr(ours, part), getattr(theirs, part))
+        configs = (defaults, paper_config) if part == "run" else (getattr(defaults, part), getattr(paper_config, part))
         lines += _rows(*configs)
         if part == "run":
             lines += ["", "Which of them may change when a run goes on: [Resume a run](resume.md#what-may-change)."]
@@ -142,11 +142,11 @@ def page() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _rows(ours: Any, theirs: Any) -> list[str]:
-    help_texts = _docstrings(type(ours))
+def _rows(defaults: Any, paper_config: Any) -> list[str]:
+    help_texts = _docstrings(type(defaults))
     rows = []
-    for item in dataclasses.fields(ours):
-        value, other = getattr(ours, item.name), getattr(theirs, item.name)
+    for item in dataclasses.fields(defaults):
+        value, other = getattr(defaults, item.name), getattr(paper_config, item.name)
         if dataclasses.is_dataclass(value) or item.name == "id":
             continue
         default = _text(value) if value == other or item.name == "preset" else f"{_text(value)} ({_text(other)})"

@@ -82,16 +82,16 @@ class Ring:
 
     def holds(self, serials: Serials) -> NDArray[np.bool_]:
         """Which of (n,) windows are in the ring, whole as far as their serial tells."""
-        known = (serials >= self.progress.valid_from) & (serials < self.progress.next_serial)
-        held: NDArray[np.bool_] = known & (self.rows["serial"][serials % self.capacity] == serials)
+        valid = (serials >= self.progress.valid_from) & (serials < self.progress.next_serial)
+        held: NDArray[np.bool_] = valid & (self.rows["serial"][serials % self.capacity] == serials)
         return held
 
     def gather(self, slots: Slots, out: Rows) -> NDArray[np.bool_]:
         """Copy whole rows (B,) into ``out``; which of them are still windows, in their place."""
         np.take(self._blocks, slots, out=out.view(self._blocks.dtype), mode="clip")  # clip: unbuffered
         serials = out["serial"]
-        known = (serials >= self.progress.valid_from) & (serials < self.progress.next_serial)
-        sound: NDArray[np.bool_] = known & (serials % self.capacity == slots) & (row_faults(out, self.spec) == 0)
+        valid = (serials >= self.progress.valid_from) & (serials < self.progress.next_serial)
+        sound: NDArray[np.bool_] = valid & (serials % self.capacity == slots) & (row_faults(out, self.spec) == 0)
         return sound
 
     def forget(self, slots: Slots) -> None:

@@ -40,7 +40,7 @@ class StreamReader:
         self.spec, self.bus, self._shard = spec, bus, shard
         self.refused: Counter[str] = Counter()  # dead letters by reason
         self.gaps = 0  # entries whose number does not follow their predecessor's
-        self._asked: dict[int, EntryId] = {}  # past which entry an actor was asked to send again
+        self._resends: dict[int, EntryId] = {}  # past which entry an actor was asked to send again
         self._actors = {actor for actor in range(actors) if shard.owns(actor)}
         self._rounds = 0
         self._entry_bytes = ROUND_BYTES  # the largest entry of the last round that had any
@@ -58,7 +58,7 @@ class StreamReader:
 
     def sends_again(self, actor: int, before: EntryId) -> None:
         """An actor's stream was dropped, so that it sends again what came after that entry."""
-        self._asked[actor] = before
+        self._resends[actor] = before
         self.gaps += 1
 
     def _cursors(self, positions: Mapping[int, StreamPosition]) -> dict[int, EntryId]:
@@ -94,7 +94,7 @@ class StreamReader:
             for actor, epoch in newest.items()
             if epoch > last.get(actor, BEFORE_ALL).epoch
         }
-        taken: list[Entry] = []
+        accepted: list[Entry] = []
         broken: dict[int, EntryId] = {}
         for entry in entries:
             before = last.get(entry.actor, BEFORE_ALL)
@@ -110,8 +110,8 @@ class StreamReader:
                 broken[entry.actor] = before
                 continue
             last[entry.actor] = entry.id
-            taken.append(entry)
-        return taken, broken
+            accepted.append(entry)
+        return accepted, broken
 
     def _lacks_entries(self, before: EntryId, entry: Entry) -> bool:
         """Whether Redis has lost what comes between, and its actor may still have it.
@@ -119,10 +119,10 @@ class StreamReader:
         It has not where it was asked before, nor where the ring does not know this life at all: what is missing
         then was trimmed after another ring's commit.
         """
-        known = entry.id.epoch == before.epoch
-        if entry.id.seq == (before.seq + 1 if known else 0):
+        same_epoch = entry.id.epoch == before.epoch
+        if entry.id.seq == (before.seq + 1 if same_epoch else 0):
             return False
-        if known and self._asked.get(entry.actor) != before:
+        if same_epoch and self._resends.get(entry.actor) != before:
             return True
         self.gaps += 1
         return False

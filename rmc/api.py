@@ -78,10 +78,10 @@ def resume(
         settings["replay"] = replace(config.replay, replay_ratio=replay_ratio)
     if learning_rate is not None:
         settings["update"] = replace(config.update, learning_rate=learning_rate)
-    return _train(replace(config, **_given(settings)), replace(options, **_given(how)))
+    return _train(replace(config, **_not_none(settings)), replace(options, **_not_none(how)))
 
 
-def _given(values: dict[str, Any]) -> dict[str, Any]:
+def _not_none(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 

@@ -75,8 +75,8 @@ class Study:
         if unknown := set(only or ()) - set(self.agents):
             raise ConfigError("--only", sorted(unknown), f"use some of {', '.join(map(repr, self.agents))}")
         size = self.scales[scale]
-        wanted = [agent for agent in self.agents if only is None or agent in only]
-        return [self._job(scale, *one) for one in product(seeds or size.seeds, envs or size.envs, wanted)]
+        agents = [agent for agent in self.agents if only is None or agent in only]
+        return [self._job(scale, *one) for one in product(seeds or size.seeds, envs or size.envs, agents)]
 
     def _job(self, scale: str, seed: int, env: str, agent: str) -> Job:
         words = [env if word == "ENV" else word for word in self.agents[agent]]

@@ -24,13 +24,13 @@ def shown(env: gym.Env[Any, Any], hide: str) -> slice | None:
 
 def layout_of(env: Env, config: EnvConfig) -> EnvLayout:
     """Of an environment as ``make_env`` gives it."""
-    given, taken = env.get_wrapper_attr("given"), env.get_wrapper_attr("taken")
-    low, high = bounds(taken)
+    observations, actions = env.get_wrapper_attr("raw_observation_space"), env.get_wrapper_attr("raw_action_space")
+    low, high = bounds(actions)
     limit = env.spec.max_episode_steps if env.spec else None
     return EnvLayout(
-        _of_slice(_named(parts(given), structure(env)), shown(env, config.hide)),
+        _of_slice(_named(parts(observations), structure(env)), shown(env, config.hide)),
         config.frame_stack,
-        parts(taken),
+        parts(actions),
         tuple(low.tolist()),
         tuple(high.tolist()),
         None if limit is None else -(-limit // config.action_repeat),
@@ -49,10 +49,10 @@ def _named(boxes: tuple[Part, ...], names: dict[str, int]) -> tuple[Part, ...]:
     return tuple(named)
 
 
-def _of_slice(all_parts: tuple[Part, ...], seen: slice | None) -> tuple[Part, ...]:
-    """Those that are shown; ``seen`` begins and ends with parts."""
-    if seen is None:
+def _of_slice(all_parts: tuple[Part, ...], part_range: slice | None) -> tuple[Part, ...]:
+    """Those that are shown; ``part_range`` begins and ends with parts."""
+    if part_range is None:
         return all_parts
-    first, last, _ = seen.indices(all_parts[-1].stop)
+    first, last, _ = part_range.indices(all_parts[-1].stop)
     kept = [part for part in all_parts if first <= part.start and part.stop <= last]
     return tuple(Part(part.name, part.start - first, part.stop - first, part.shape, part.dtype) for part in kept)

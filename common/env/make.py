@@ -24,7 +24,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.env.describe import layout_of, shown, structure
-from rmc.common.env.faults import RAISED, asked, describe_error, one_line
+from rmc.common.env.faults import RAISED, call_env, describe_error, one_line
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.process_state import ApartCall
 from rmc.common.env.spaces import space_fault
@@ -49,7 +49,7 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
     with ApartCall(config.id, "make", config.env_timeout):
         spec = find_spec(config.id)
         env: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
-    fault = asked("spaces", lambda: space_fault(env.observation_space, env.action_space))
+    fault = call_env("spaces", lambda: space_fault(env.observation_space, env.action_space))
     if fault is None and config.hide != "nothing" and not structure(env):
         fault = f"it does not say which observations are {config.hide}; --hide is for MuJoCo's bodies, like Ant-v5"
     if fault is not None:
@@ -59,9 +59,9 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
     return _as_seen(env, config, config.time_limit or spec.max_episode_steps)
 
 
-def _make(known: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
+def _make(registered: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
     """As gymnasium makes it, without a limit."""
-    spec = copy(known)
+    spec = copy(registered)
     spec.max_episode_steps = None
     spec.order_enforce = False  # roles reset and step in order; the check costs time at every step
     spec.kwargs = {**spec.kwargs, **config.env_kwargs, **({"render_mode": "rgb_array"} if render else {})}
@@ -101,18 +101,18 @@ def entry_point(spec: EnvSpec) -> Callable[..., Any]:
 def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> Env:
     """The environment as the agent sees it: each wrapper only where it does something."""
     seen_part = shown(env, config.hide)
-    seen: Env = RescaledEnv(env)  # the innermost: it judges what the user's own code gives
+    wrapped: Env = RescaledEnv(env)  # the innermost: it judges what the user's own code gives
     if limit:
-        seen = gym.wrappers.TimeLimit(seen, limit)
+        wrapped = gym.wrappers.TimeLimit(wrapped, limit)
     if config.action_repeat > 1:
-        seen = gym.wrappers.RepeatAction(seen, config.action_repeat)
+        wrapped = gym.wrappers.RepeatAction(wrapped, config.action_repeat)
     if seen_part is not None:
-        seen = ObservationSlice(seen, seen_part)
+        wrapped = ObservationSlice(wrapped, seen_part)
     if config.noise:
-        seen = Noise(seen, config.noise)
+        wrapped = Noise(wrapped, config.noise)
     if config.flicker:
-        seen = Flicker(seen, config.flicker)
-    return FrameStack(seen, config.frame_stack) if config.frame_stack > 1 else seen
+        wrapped = Flicker(wrapped, config.flicker)
+    return FrameStack(wrapped, config.frame_stack) if config.frame_stack > 1 else wrapped
 
 
 def checked_reset(env: Env, seed: int | None) -> tuple[Floats, dict[str, Any]]:

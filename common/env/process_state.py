@@ -80,15 +80,15 @@ class ApartCall(EnvCall):
     A step is not looked at for changes of its own. Signals' handlers stay ours.
     """
 
-    theirs: ProcessState | None = None  # where it differs from ours
+    env_state: ProcessState | None = None  # where it differs from ours
     changed: dict[str, Any] = {}  # noqa: RUF012 - by any environment of this process: what, and into what
 
     def __enter__(self) -> "ApartCall":
         super().__enter__()
-        self._ours = ProcessState.read() if self.name != "step" or ApartCall.theirs is not None else None
+        self._ours = ProcessState.read() if self.name != "step" or ApartCall.env_state is not None else None
         self._random = _random_state() if self.name == "make" else None
-        if self._ours is not None and ApartCall.theirs is not None:
-            ApartCall.theirs._replace(handlers=self._ours.handlers).install(self._ours)
+        if self._ours is not None and ApartCall.env_state is not None:
+            ApartCall.env_state._replace(handlers=self._ours.handlers).install(self._ours)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -106,7 +106,7 @@ class ApartCall(EnvCall):
             changed["random"] = None
         ApartCall.changed |= changed
         ours.install(now)
-        ApartCall.theirs = now if set(changed) - {"handlers", "random"} else None
+        ApartCall.env_state = now if set(changed) - {"handlers", "random"} else None
 
 
 def _random_state() -> tuple[Any, ...]:

@@ -60,14 +60,14 @@ def _numbers(box: gym.Space[Any], value: Any) -> NDArray[np.float32]:
     return np.array(numbers, np.float32).ravel()  # a copy: some environments write into the same one again
 
 
-def array(name: str, value: Any, wanted: str) -> NDArray[Any]:
-    """What is of numbers as an array; no copy. Raises EnvFault with what is ``wanted`` where it is none."""
+def array(name: str, value: Any, expected: str) -> NDArray[Any]:
+    """What is of numbers as an array; no copy. Raises EnvFault with what is ``expected`` where it is none."""
     try:
         numbers = np.asarray(value)
     except RAISED:  # a list whose rows differ, or a tensor on another device
         numbers = np.empty(0, object)
     if numbers.dtype.kind not in NUMBERS:
-        raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}; return {wanted}")
+        raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}; return {expected}")
     return numbers
 
 

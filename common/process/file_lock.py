@@ -16,7 +16,7 @@ def take_lock(path: Path, patience: float = LOCK_SECONDS) -> int | None:
     handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     began = time.monotonic()
     warned = False
-    while not _taken(handle):
+    while not _try_lock(handle):
         if time.monotonic() >= began + patience:
             os.close(handle)
             return None
@@ -27,7 +27,7 @@ def take_lock(path: Path, patience: float = LOCK_SECONDS) -> int | None:
     return handle
 
 
-def _taken(handle: int) -> bool:
+def _try_lock(handle: int) -> bool:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

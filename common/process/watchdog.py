@@ -61,12 +61,12 @@ def start() -> None:
 
 def _watch() -> None:
     """Counts looks, not seconds: a process that was stopped for a while has not hung."""
-    seen, looks, arm_at = EnvCall.current, 0, float("-inf")
+    watched, looks, arm_at = EnvCall.current, 0, float("-inf")
     while True:
         time.sleep(LOOK_SECONDS)
         call = EnvCall.current
-        looks = looks + 1 if call is seen else 0
-        seen, seconds = call, EnvCall.armed if call is None else call.seconds
+        looks = looks + 1 if call is watched else 0
+        watched, seconds = call, EnvCall.armed if call is None else call.seconds
         over = looks * LOOK_SECONDS >= seconds
         if over and call is not None:
             _end(call)

@@ -58,13 +58,13 @@ class RunStatus:
     def take(self, record: dict[str, Any]) -> None:
         """Take in a record; what it does not name stays as it was, and of a role there are ``MOST_NAMES`` at most."""
         role = record["role"]
-        known = self.roles.get(role, {})
-        if role == "launcher" and _number(record.get("start_s")) < _number(known.get("start_s")):
+        current = self.roles.get(role, {})
+        if role == "launcher" and _number(record.get("start_s")) < _number(current.get("start_s")):
             self._pace.forget()  # of another start
-        room = MOST_NAMES - len(known)
-        new = record if len(record) <= room else {name: record[name] for name in record if name in known}
+        room = MOST_NAMES - len(current)
+        new = record if len(record) <= room else {name: record[name] for name in record if name in current}
         if role in self.roles:
-            self.roles[role] = known | new
+            self.roles[role] = current | new
         else:  # afresh: another thread may be going through the old one
             self.roles = {**self.roles, role: dict(new)}
         self.take_evaluation(record)
@@ -134,8 +134,8 @@ class RunStatus:
     def checkpoint_steps(self, update: int | None) -> int | None:
         """Environment steps at the checkpoint of that update, or None where the learner has said them of another."""
         steps = self.get("learner", "checkpoint_env_steps")
-        known = update is not None and update == self.get("learner", "checkpoint_update")
-        return _steps(steps) if known else None
+        saved = update is not None and update == self.get("learner", "checkpoint_update")
+        return _steps(steps) if saved else None
 
     def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:
         """The sum or mean ``over`` all replay servers, or None."""

@@ -49,14 +49,14 @@ def down(path: Path, console: Console) -> None:
     _ray("down", "-y", str(path))
     if config["provider"]["type"] != "local":
         return
-    left = {}
+    running = {}
     for address in [config["provider"]["head_ip"], *config["provider"]["worker_ips"]]:
         _ssh(config, address, _stop_command(config))
         count = _ssh(config, address, LEFT).strip().splitlines()[-1:]
         if count != ["0"]:
-            left[address] = " ".join(count) or "no answer"
-    if left:
-        raise RmcError(f"{path}: Ray still runs on {left}; ssh there and run ray stop --force")
+            running[address] = " ".join(count) or "no answer"
+    if running:
+        raise RmcError(f"{path}: Ray still runs on {running}; ssh there and run ray stop --force")
     console.print("no process of Ray is left on any node")
 
 

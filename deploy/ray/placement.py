@@ -50,8 +50,10 @@ def check_room(config: RunConfig, device: str) -> None:
     """Raises ConfigError where no node can hold the learner."""
     need = bundle(config, device)
     if not any(node["Alive"] and holds(node, need) for node in ray.nodes()):
-        wanted = ", ".join(f"{amount:g} {name}" for name, amount in need.items())
-        fix = f"no node of the cluster has {wanted}, which the learner and what is beside it take; start one that has"
+        resources = ", ".join(f"{amount:g} {name}" for name, amount in need.items())
+        fix = (
+            f"no node of the cluster has {resources}, which the learner and what is beside it take; start one that has"
+        )
         raise ConfigError("--device", device, fix)
 
 

@@ -100,10 +100,10 @@ class RoleActor:
         self.prepare()
         logs = self.log_folder()
         logs.mkdir(exist_ok=True)
-        self._role = RoleProcess(self._here(task.command), self._environment(), logs)
+        self._role = RoleProcess(self._on_this_node(task.command), self._environment(), logs)
         self._start()
 
-    def _here(self, command: RoleCommand) -> RoleCommand:
+    def _on_this_node(self, command: RoleCommand) -> RoleCommand:
         return replace(command, words=tuple(map(self._filled, command.words)))
 
     def _filled(self, text: str) -> str:

@@ -234,8 +234,8 @@ class ClusterRun:
             for role_handle in actors
             if role_handle.running and role_handle.node == node["NodeManagerAddress"]
         ]
-        taken = sum(one.cpus for one in self._hosts.values() if one.running and one.node == node["NodeManagerAddress"])
-        short = need["CPU"] - (node["Resources"]["CPU"] - taken)
+        used = sum(one.cpus for one in self._hosts.values() if one.running and one.node == node["NodeManagerAddress"])
+        short = need["CPU"] - (node["Resources"]["CPU"] - used)
         going = [role_handle for role_handle in actors if not role_handle.running] + (
             there[-ceil(short) :] if short > 0 else []
         )
@@ -360,8 +360,8 @@ def _port(folder: RunFolder, ip: str) -> tuple[int, bool]:
     had = int(note.read_text()) if note.exists() else None
     ports = list(range(FIRST_PORT, LAST_PORT + 1))
     own = zlib.crc32(folder.name.encode()) % len(ports)  # runs that begin together do not want the same
-    wanted = [*([had] if had else []), *ports[own:], *ports[:own]]
-    for port in wanted:
+    candidates = [*([had] if had else []), *ports[own:], *ports[:own]]
+    for port in candidates:
         with socket.socket() as probe, suppress(OSError):
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((ip, port))

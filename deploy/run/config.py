@@ -170,9 +170,9 @@ def from_dict(kind: type[ConfigT], raw: Any, path: str) -> ConfigT:
     if not isinstance(raw, dict):
         raise ConfigError(path.rstrip(". "), raw, "must be an object")
     hints = get_type_hints(kind)
-    known = {item.name for item in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    for name in sorted(set(raw) ^ known):
-        fix = "is missing; the run was made by another version" if name in known else "no such option in this version"
+    names = {item.name for item in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    for name in sorted(set(raw) ^ names):
+        fix = "is missing; the run was made by another version" if name in names else "no such option in this version"
         raise ConfigError(f"{path}{name}", raw.get(name), fix)
     return kind(**{name: _value(hints[name], value, f"{path}{name}") for name, value in raw.items()})
 

@@ -49,9 +49,9 @@ def choose_tracking(options: LaunchOptions) -> Tracking | None:
 
 
 def _refuse_without_tracker(options: LaunchOptions) -> None:
-    for name, given in (("--track-project", options.track_project), ("--track-tags", options.track_tags)):
-        if given:
-            raise ConfigError(name, given, "say which tracker: --track wandb or --track trackio")
+    for name, value in (("--track-project", options.track_project), ("--track-tags", options.track_tags)):
+        if value:
+            raise ConfigError(name, value, "say which tracker: --track wandb or --track trackio")
 
 
 def _check(tracker: str, project: str, tags: tuple[str, ...]) -> None:

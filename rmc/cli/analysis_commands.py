@@ -82,8 +82,8 @@ def _check_baselines(what: str) -> None:
 
 def _result_line(played: dict[str, Any]) -> str:
     mean, deviation, flicker = (played[f"eval_{name}"] for name in ("return_mean", "return_std", "flicker"))
-    seen = f" with {flicker:.0%} of the frames missing" if flicker else ""
-    text = f"{played['env']}{seen}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
+    missing = f" with {flicker:.0%} of the frames missing" if flicker else ""
+    text = f"{played['env']}{missing}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
     return f"{text}{cut_note(played)}, after {played['env_steps']:,} environment steps"
 
 

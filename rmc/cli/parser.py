@@ -153,15 +153,15 @@ def option_names(kind: type) -> list[str]:
 
 def _check_once(option: str, words: list[str]) -> None:
     """Of two, the parser would drop the first without a word."""
-    given = [word for word in words if word.partition("=")[0].replace("_", "-") == option]
-    if len(given) > 1:
-        raise ConfigError(option, " ".join(given), "is there twice; give all of NAME=VALUE after one")
+    uses = [word for word in words if word.partition("=")[0].replace("_", "-") == option]
+    if len(uses) > 1:
+        raise ConfigError(option, " ".join(uses), "is there twice; give all of NAME=VALUE after one")
 
 
 def _named_preset(words: list[str]) -> Preset:
     """The preset must be known before the options, whose defaults it gives; a wrong one is refused later."""
-    given = [word.partition("=")[2] for word in words if word.startswith("--preset=")]
-    given += [after for word, after in itertools.pairwise(words) if word == "--preset"]
-    if "paper" in given[-1:]:
+    presets = [word.partition("=")[2] for word in words if word.startswith("--preset=")]
+    presets += [after for word, after in itertools.pairwise(words) if word == "--preset"]
+    if "paper" in presets[-1:]:
         return "paper"
-    return "debug" if "debug" in given[-1:] else "robust"
+    return "debug" if "debug" in presets[-1:] else "robust"

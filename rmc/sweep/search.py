@@ -62,10 +62,10 @@ class SearchPlan:
         self._at_work: dict[str, _Trial] = {}
         self.todo: list[Job] = []
         self._index = index
-        self.jobs = [self._known(line) for name, line in index.lines.items() if name.startswith(TRIAL)]
+        self.jobs = [self._earlier_job(line) for name, line in index.lines.items() if name.startswith(TRIAL)]
         self._names = self._all_names()
 
-    def _known(self, line: dict[str, Any]) -> Job:
+    def _earlier_job(self, line: dict[str, Any]) -> Job:
         """Tell Optuna of a trial of before, or take it up again."""
         name, values = str(line["run"]), values_of(line)
         job = self._make(name, values)

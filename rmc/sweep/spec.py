@@ -65,8 +65,8 @@ class Spec:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for names and lists that make no sense; values are judged by the parser of rmc train."""
-        for part, given in (("options", self.options), ("grid", self.grid)):
-            for name, value in given.items():
+        for part, table in (("options", self.options), ("grid", self.grid)):
+            for name, value in table.items():
                 check_name(f"{part}.{name}", name, value)
         for name, values in self.grid.items():
             if not isinstance(values, list) or not values:
@@ -130,11 +130,11 @@ def read_spec(path: Path, words: Sequence[str]) -> Spec:
     return Spec(raw["env"], seeds, options, grid, search, tuple(words))
 
 
-def _check_keys(place: str, raw: dict[str, Any], known: Sequence[str]) -> None:
+def _check_keys(place: str, raw: dict[str, Any], names: Sequence[str]) -> None:
     for name, value in raw.items():
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean {near[0]}?" if near else f"use {', '.join(known)}"
+        if name not in names:
+            near = difflib.get_close_matches(name, names, 1)
+            hint = f"did you mean {near[0]}?" if near else f"use {', '.join(names)}"
             raise ConfigError(f"{place}{name}", value, f"no such key; {hint}")
 
 
@@ -147,8 +147,8 @@ def _search(raw: dict[str, Any]) -> Search:
     kinds = {"trials": int, "sampler_seed": int, "prune": bool, "ranges": dict}
     for name, value in raw.items():
         if type(value) is not kinds[name]:
-            wanted = {int: "a whole number", bool: "true or false", dict: "a table, [search.ranges]"}[kinds[name]]
-            raise ConfigError(f"search.{name}", value, f"write {wanted}")
+            expected = {int: "a whole number", bool: "true or false", dict: "a table, [search.ranges]"}[kinds[name]]
+            raise ConfigError(f"search.{name}", value, f"write {expected}")
     ranges = {name: _range(f"search.{name}", value) for name, value in raw.get("ranges", {}).items()}
     return Search(**{**raw, "ranges": _plain_names(ranges)})
 

@@ -70,7 +70,7 @@ def test_check_env_names_what_is_changed(capsys: pytest.CaptureFixture[str]) -> 
         "the random generators that all share",
     ):  # fmt: skip
         assert words in said
-    ApartCall.changed, ApartCall.theirs = {}, None
+    ApartCall.changed, ApartCall.env_state = {}, None
     main.run(["check-env", "tests.counting_env:Counting-v0", "--steps", "50"])
     assert "it changes" not in capsys.readouterr().out
 
