@@ -103,14 +103,14 @@ def _shared_memory() -> set[str]:
 
 
 def _running_children() -> list[psutil.Process]:
-    found = []
+    results = []
     for child in psutil.Process().children(recursive=True):
         try:
             if child.status() != psutil.STATUS_ZOMBIE and child.cmdline():
-                found.append(child)
+                results.append(child)
         except psutil.NoSuchProcess:
             continue
-    return found
+    return results
 
 
 @pytest.fixture(autouse=True)

@@ -20,9 +20,9 @@ def rmc(at: Path, *words: str) -> tuple[subprocess.CompletedProcess[str], set[st
     """A command, and which of the slow libraries it imported."""
     command = [sys.executable, "-c", TOLD, *words]
     done = subprocess.run(command, cwd=at, capture_output=True, text=True, timeout=60, check=False)
-    said, told, imported = done.stdout.rpartition("IMPORTED")
-    assert told, done.stderr
-    done.stdout = said
+    output, marker, imported = done.stdout.rpartition("IMPORTED")
+    assert marker, done.stderr
+    done.stdout = output
     return done, set(imported.split())
 
 

@@ -151,13 +151,13 @@ for _ in range(2):
 
 
 def test_forks_do_not_draw_the_same_numbers() -> None:
-    said = subprocess.run([sys.executable, "-c", FORKS_THAT_DRAW], capture_output=True, text=True, check=True).stdout
-    first, second = map(float, said.split())
+    output = subprocess.run([sys.executable, "-c", FORKS_THAT_DRAW], capture_output=True, text=True, check=True).stdout
+    first, second = map(float, output.split())
     assert first != second
 
 
 def test_what_its_roles_import_is_there_before_it_forks() -> None:
     """Else each role has a copy of its own: some 100 MB, and seconds at every start."""
     ask = "import sys; from rmc.cli import fork_server as one; one._import_all(); print(*sys.modules)"
-    said = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True).stdout
-    assert "rmc.actors.actor" in said.split()
+    output = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True).stdout
+    assert "rmc.actors.actor" in output.split()

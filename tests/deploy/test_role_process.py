@@ -41,8 +41,8 @@ def test_a_role_waits_for_a_redis_that_is_coming_back(short: Path, caplog: pytes
         time.sleep(0.7)
         with server:
             waiting.result().ping()
-    (said,) = caplog.messages
-    assert said.startswith(f"waiting up to 20 s for the Redis at unix://{short}/redis.sock: ")
+    (message,) = caplog.messages
+    assert message.startswith(f"waiting up to 20 s for the Redis at unix://{short}/redis.sock: ")
 
 
 @pytest.fixture

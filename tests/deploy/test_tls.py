@@ -39,9 +39,9 @@ def free_port() -> int:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("certificate")
-    tls.make_certificate(made)
-    return made
+    certificate = tmp_path_factory.mktemp("certificate")
+    tls.make_certificate(certificate)
+    return certificate
 
 
 def test_the_key_is_private(folder: Path) -> None:
@@ -78,9 +78,9 @@ class Served:
 
 @pytest.fixture
 def served(folder: Path) -> Iterator[Served]:
-    made = Served(folder)
-    yield made
-    made.close()
+    ours = Served(folder)
+    yield ours
+    ours.close()
 
 
 def draw(client: ReplayClient, batch: int) -> np.ndarray:
@@ -187,8 +187,8 @@ def test_who_is_refused_there_reads_one_line_without_the_password(
     assert "\n" not in str(raised.value)
     assert "password@" not in str(raised.value)
     assert "another@" not in str(raised.value)
-    said = {"password": "invalid", "the server's is another": "certificate verify failed"}.get(wrong, "")
-    assert said in str(raised.value)
+    message = {"password": "invalid", "the server's is another": "certificate verify failed"}.get(wrong, "")
+    assert message in str(raised.value)
 
 
 def test_a_redis_without_tls_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

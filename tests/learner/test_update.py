@@ -123,8 +123,8 @@ def test_what_fills_blanks_trains_itself_alone():
     parts, *_ = update.forward(to_batch(random_rows(8, spec=spec), spec), BETA)
     named = dict(update.agent.named_parameters())
     for loss in parts:
-        found = torch.autograd.grad(parts[loss], list(named.values()), retain_graph=True, allow_unused=True)
-        reached = {name for name, grad in zip(named, found, strict=True) if grad is not None and grad.abs().sum() > 0}
+        grads = torch.autograd.grad(parts[loss], list(named.values()), retain_graph=True, allow_unused=True)
+        reached = {name for name, grad in zip(named, grads, strict=True) if grad is not None and grad.abs().sum() > 0}
         assert reached
         own = part(update, "next_frame.")
         assert reached == own if loss == "fill_loss" else not reached & own, loss
@@ -154,11 +154,11 @@ def test_padded_burn_in_starts_from_the_stored_state():
     rows["first"] = SPEC.burn_in
     rows["observation"][:, : SPEC.burn_in] = 0.0
     batch, update = to_batch(rows), make(PAPER)
-    found = unroll(update.agent.memory, batch.observation, batch, SPEC.burn_in).hidden
+    hidden = unroll(update.agent.memory, batch.observation, batch, SPEC.burn_in).hidden
     n = SPEC.burn_in
     o, missing, previous = batch.observation[:, n:], batch.missing[:, n:], batch.prev_action[:, n:]
     alone = update.agent.memory(o, missing, previous, batch.state).hidden
-    assert torch.equal(found, alone)
+    assert torch.equal(hidden, alone)
 
 
 def test_burn_in_gets_no_gradient():

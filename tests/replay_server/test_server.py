@@ -537,8 +537,8 @@ def test_a_changed_ratio_counts_from_there(ratio: float, make: Make, bus: Memory
                 count += 1
             assert server.waiting_for() == "windows"
         stats = server.stats()
-        told = (stats["env_steps"] - 480) * ratio  # from where it changed
-        assert told - batch <= count * batch <= told + slack * ratio + batch
+        allowed = (stats["env_steps"] - 480) * ratio  # from where it changed
+        assert allowed - batch <= count * batch <= allowed + slack * ratio + batch
         assert not stats["replay_ratio_off"]
         close(server)
 

@@ -92,15 +92,15 @@ FREE = ReplayConfig(capacity=5000, replay_ratio=1e9, warmup_steps=0)
 
 @pytest.fixture
 def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serve]:
-    made: list[Served] = []
+    started: list[Served] = []
 
     def build(config: ReplayConfig = FREE, address: str = "", windows: int = 200, total: int = 10**9) -> Served:
         folder = tmp_path_factory.mktemp("s")
-        made.append(Served(folder / "replay", address or f"unix:{folder}/r.sock", config, windows, total))
-        return made[-1]
+        started.append(Served(folder / "replay", address or f"unix:{folder}/r.sock", config, windows, total))
+        return started[-1]
 
     yield build
-    for served in made:
+    for served in started:
         served.close()
 
 
@@ -312,8 +312,8 @@ def away_for(served: Served, sample: Sample, reason: str, caplog: pytest.LogCapt
     lawful, client = served.replay.sample, served.client(0)
     served.replay.sample = lambda *_: sample  # type: ignore[method-assign]
     assert [client.sample(8).draw for _ in range(3)] == [SampleStatus.WAIT] * 3
-    (said,) = [record.message for record in caplog.records if "is away" in record.message]
-    assert f"is away: {reason}: " in said
+    (message,) = [record.message for record in caplog.records if "is away" in record.message]
+    assert f"is away: {reason}: " in message
     served.replay.sample = lawful  # type: ignore[method-assign]
     assert client.sample(8).draw is SampleStatus.BATCH
     client.close()
@@ -517,9 +517,9 @@ def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> Non
         assert draws[-1].env_steps == 200 * SPEC.train
         client.update_priorities(np.arange(16), np.full(16, 3.0, np.float32))
         assert client.statistics().count == 200 * SPEC.train
-        found = client.episode(7)  # every window here is an episode of its own
-        assert found is not None
-        assert found["serial"].tolist() == [7]
+        episode = client.episode(7)  # every window here is an episode of its own
+        assert episode is not None
+        assert episode["serial"].tolist() == [7]
         assert client.episode(999) is None
         served.close()
         served.close = lambda: None  # type: ignore[method-assign]
@@ -530,7 +530,12 @@ def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> Non
 def test_it_listens_on_the_interface_named_alone(serve: Serve) -> None:
     served = serve(address="tcp:127.0.0.1:0")
     port = int(served.address.rpartition(":")[2])
-    own = [found.address for each in psutil.net_if_addrs().values() for found in each if found.family == socket.AF_INET]
+    own = [
+        address.address
+        for each in psutil.net_if_addrs().values()
+        for address in each
+        if address.family == socket.AF_INET
+    ]
     for other in {"127.0.0.2", *own} - {"127.0.0.1"}:
         with pytest.raises(OSError, match=r"refused|assign"), socket.create_connection((other, port), 5.0):
             pass
