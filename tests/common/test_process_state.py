@@ -20,7 +20,7 @@ from tests.counting_env import CountingEnv
 
 @pytest.fixture(autouse=True)
 def nothing_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ApartCall, "theirs", None)
+    monkeypatch.setattr(ApartCall, "env_state", None)
     monkeypatch.setattr(ApartCall, "changed", {})
 
 
