@@ -22,7 +22,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import SAME_AGENT
 from rmc.deploy.run.presets import preset_config
 
-UNTOLD = SAME_AGENT | {"seed", "preset", "env.id"}  # makes no other agent
+OMITTED = SAME_AGENT | {"seed", "preset", "env.id"}  # makes no other agent
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def _with(name: str, words: list[str]) -> str:
 def _changes(config: RunConfig) -> list[str]:
     """Options that differ from the preset's, as they are typed."""
     was, now = flat(preset_config(config.preset, config.env)), flat(config)
-    return [_typed(path, now[path]) for path in now if path not in UNTOLD and now[path] != was[path]]
+    return [_typed(path, now[path]) for path in now if path not in OMITTED and now[path] != was[path]]
 
 
 def _typed(path: str, value: Any) -> str:

@@ -87,6 +87,17 @@ def pytest_unconfigure() -> None:
 
 
 @pytest.fixture
+def one_thread() -> Iterator[None]:
+    """PyTorch computes in one thread, so that the bits are the same everywhere."""
+    import torch  # slow, and most tests need none
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def run_name(request: pytest.FixtureRequest) -> str:
     """A run name that no other test has."""
     return f"{request.node.name}-{os.urandom(4).hex()}"

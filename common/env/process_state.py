@@ -116,7 +116,7 @@ def _random_state() -> tuple[Any, ...]:
     return str(np.random.get_state()[1]), random.getstate()[1][:-1], seed  # type: ignore[index] # noqa: NPY002
 
 
-TOLD = {
+DESCRIPTIONS = {
     "folder": "its working folder ({})",
     "numpy_errors": "numpy's error state",
     "dtype": "torch's default dtype ({})",
@@ -130,4 +130,4 @@ TOLD = {
 
 def changes() -> list[str]:
     """What environments have changed of this process so far, in words."""
-    return [TOLD[name].format(value) for name, value in ApartCall.changed.items()]
+    return [DESCRIPTIONS[name].format(value) for name, value in ApartCall.changed.items()]

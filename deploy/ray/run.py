@@ -62,7 +62,7 @@ LOST_SECONDS = 120.0  # within which a role's host may be lost for good twice
 STOP_SECONDS = 20.0  # for all roles to end in order and for the last checkpoint to reach the head
 PATIENCE_SECONDS = 120.0  # of a role that starts while launcher and Redis are being started again
 FIRST_PORT, LAST_PORT = 6380, 6479  # for Redis; 6379 is Ray's
-TOLD_SECONDS = 2.0  # for hosts to hear that the run ends
+NOTICE_SECONDS = 2.0  # for hosts to hear that the run ends
 log = logging.getLogger(__name__)
 
 
@@ -282,7 +282,7 @@ class ClusterRun:
             role_handle.handle.stopping.remote(True) for role_handle in self._hosts.values() if role_handle.running
         ]
         if replies:
-            ray.wait(replies, num_returns=len(replies), timeout=TOLD_SECONDS)
+            ray.wait(replies, num_returns=len(replies), timeout=NOTICE_SECONDS)
         with suppress(BusUnavailable, BusFull):
             self.bus.request_stop(reason)
         deadline = time.monotonic() + STOP_SECONDS + self._saving()

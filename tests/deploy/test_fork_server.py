@@ -38,37 +38,19 @@ def fork(shared: ForkServer, log: Path, *words: str, **environment: str) -> Fork
         return shared.fork(words, environment, file.fileno())
 
 
+def fork_actor(shared: ForkServer, log: Path, index: str, **environment: str) -> ForkedProcess:
+    return fork(shared, log, "role", "actor", "--run", "x", "--index", index, **environment)
+
+
 def test_it_is_rmc_with_its_words(shared: ForkServer, tmp_path: Path) -> None:
-    role = fork(
-        shared,
-        tmp_path / "log",
-        "role",
-        "actor",
-        "--run",
-        "x",
-        "--index",
-        "0",
-        RMC_REDIS_URL="unix:///nowhere",
-        RMC_PATIENCE="0",
-    )
+    role = fork_actor(shared, tmp_path / "log", "0", RMC_REDIS_URL="unix:///nowhere", RMC_PATIENCE="0")
     assert role.wait(20) == 2
     assert "--redis-url='unix:///nowhere'" in (tmp_path / "log").read_text()
     assert role.poll() == 2  # it is still known
 
 
 def test_it_leads_a_group_has_its_title_and_dies_of_a_signal(shared: ForkServer, tmp_path: Path) -> None:
-    role = fork(
-        shared,
-        tmp_path / "log",
-        "role",
-        "actor",
-        "--run",
-        "x",
-        "--index",
-        "7",
-        RMC_REDIS_URL="unix:///a",
-        RMC_PATIENCE="99",
-    )
+    role = fork_actor(shared, tmp_path / "log", "7", RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99")
     assert os.getpgid(role.pid) == role.pid
     assert role.poll() is None
     with pytest.raises(subprocess.TimeoutExpired):

@@ -31,15 +31,6 @@ def server() -> Iterator[RedisServer]:
 
 
 @pytest.fixture
-def handlers() -> Iterator[None]:
-    """Those of this process are back afterwards."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-@pytest.fixture
 def place(server: RedisServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunConnection:
     """Of a run whose Redis goes away as soon as its learner has finished."""
 

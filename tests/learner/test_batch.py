@@ -3,7 +3,7 @@
 import numpy as np
 
 from rmc.learner.batch import clear_padding, importance_weights
-from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
+from tests.learner.rows import SPEC, random_rows, spoil_padding, to_batch
 
 
 def test_fields_match_the_rows():
@@ -58,9 +58,6 @@ def test_importance_weights_against_the_formula():
 def test_padding_is_cleared_and_nothing_else_touched():
     rows = random_rows(16)
     clean = rows.copy()
-    observed, stepped = observation_valid(rows), step_valid(rows)
-    rows["observation"][~observed] = np.nan
-    rows["missing"][~observed] = 1
-    rows["action"][~stepped] = rows["reward"][~stepped] = np.inf
+    spoil_padding(rows)
     clear_padding(rows, SPEC)
     assert (rows == clean).all()

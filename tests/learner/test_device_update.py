@@ -13,21 +13,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from rmc.common.agent import Agent
-from rmc.common.agent_config import AgentConfig
 from rmc.learner.batch import clear_padding, view_batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.device_update import WARM_UP, CopiesAhead, CudaGraph, DeviceUpdate, HostCopy
 from rmc.learner.update import JointUpdate, make_update
+from tests.learner.agents import ROBUST
 from tests.learner.rows import SPEC, random_rows
 
-EVERYTHING = AgentConfig(
-    hidden=SPEC.state,
-    embedding=7,
-    heads=(10, 9),
-    layer_norm=True,
-    head_input="hidden+embedding",
-    normalize_observations=True,
-)
 BATCH = 8
 
 
@@ -36,7 +28,7 @@ def make(order: str = "joint", device: str = "cpu", bf16: bool = False) -> Joint
     config = UpdateConfig(
         update_order=order, latent_target="ema", target_memory="ema", curiosity=0.1, curiosity_scale="std", n_step=2
     )  # type: ignore[arg-type]
-    agent = Agent(SPEC.obs_dim, SPEC.action_dim, EVERYTHING).to(device)
+    agent = Agent(SPEC.obs_dim, SPEC.action_dim, ROBUST).to(device)
     return make_update(agent, SPEC.burn_in, config, 3, bf16)
 
 

@@ -11,10 +11,10 @@ from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.learner.config import UpdateConfig
 from rmc.learner.update import make_update
+from tests.learner.agents import PAPER
 from tests.learner.plain_update import PlainUpdate
 from tests.learner.rows import SPEC, random_rows, to_batch
 
-PAPER = AgentConfig(hidden=SPEC.state, embedding=0, heads=(10, 9), grounding=False)
 ROBUST = AgentConfig(
     hidden=SPEC.state,
     embedding=7,
