@@ -41,8 +41,8 @@ class UpdateConfig:
     """In schemes 4 to 6: the policy's loss also reaches the memory by the state that Q reads, not by the policy's
     own input alone."""
     update_order: Literal["joint", "alternate"] = "joint"
-    """joint takes all losses from the parameters as they stood, in one step. alternate takes them one after the
-    other, each from what the one before left, with optimisers of their own (algorithm 1 as printed)."""
+    """All losses from the parameters as they stood, in one step; or one after the other. In turn, each starts from
+    what the one before left, with an optimiser of its own (algorithm 1 as printed)."""
     model_norm: Literal["l1", "l2"] = "l1"
     """How the world model's error is measured, as loss and as curiosity."""
     n_step: int = 1

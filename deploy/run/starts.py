@@ -79,8 +79,8 @@ def resume_command(folder: RunFolder) -> str:
 
 def last_launch(folder: RunFolder, launcher: Launcher | None = None) -> LaunchOptions:
     """How the run was started last; with another ``launcher`` only its device is taken. As by default if not known."""
-    known = starts(folder)
-    kept = {name: value for name, value in known[-1].launch.items() if name in KEPT} if known else {}
+    past_starts = starts(folder)
+    kept = {name: value for name, value in past_starts[-1].launch.items() if name in KEPT} if past_starts else {}
     last = dataclasses.replace(LaunchOptions(folder.path), **kept)
     if launcher in (None, last.launcher):
         return last
