@@ -115,7 +115,7 @@ def test_a_copy_is_like_the_folder_and_only_what_changed_is_sent(tmp_path: Path)
     assert (copy / "events").is_dir()
     with tarfile.open(fileobj=io.BytesIO(later.tar)) as tar:
         assert sorted(tar.getnames()) == ["checkpoints/2/policy", "metrics.jsonl"]
-    with tarfile.open(fileobj=io.BytesIO(pack(source, later.known).tar)) as tar:
+    with tarfile.open(fileobj=io.BytesIO(pack(source, later.stamps).tar)) as tar:
         assert tar.getnames() == []
 
 
