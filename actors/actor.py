@@ -191,19 +191,19 @@ class Actor:
         if self._version is None or newest > self._version:
             self._take_weights(self._bus.weights())
 
-    def _take_weights(self, found: tuple[Version, bytes] | None) -> None:
+    def _take_weights(self, newest: tuple[Version, bytes] | None) -> None:
         """A policy that cannot be read is refused, and the one before goes on."""
-        if found is None:
+        if newest is None:
             return
         try:
-            self._runner.load(found[1])
+            self._runner.load(newest[1])
             if self._priority_fn is not None:
-                self._priority_fn.load(found[1])
+                self._priority_fn.load(newest[1])
         except MessageError as error:
             self._refused_weights += 1
-            log.warning("%s: refused %s: %s", self.name, found[0], error)
+            log.warning("%s: refused %s: %s", self.name, newest[0], error)
         else:
-            self._version = found[0]
+            self._version = newest[0]
 
     def _poll_ack(self) -> None:
         now = self._clock()

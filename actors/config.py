@@ -25,8 +25,8 @@ class ActorConfig:
     stride: int = 0
     """Steps between the starts of two windows; fewer than are trained let them overlap; 0 is as many, no overlap."""
     state_strategy: Literal["zero", "stored", "burn-in", "episode"] = "burn-in"
-    """What a window's memory starts from: zeros; the state that the actor stored; that state, then burned in; or
-    zeros at the start of the episode, all of which is the window, as long as the time limit allows."""
+    """What a window's memory starts from: zeros; the actor's stored state; that state, then burned in; or zeros at the
+    episode's start. In the last case the window is the whole episode, up to the time limit."""
     reward_scale: float = 1.0
     """Rewards are multiplied by this to learn from; returns are told as the environment gives them."""
     refresh_steps: int = 400

@@ -92,7 +92,7 @@ class Rollout:
     def step(self) -> bool:
         """One reset or step; whether there is more to play."""
         if self._length >= 0:
-            action, state = self._runner.act(self._seen, self._prev_action, self._missing, self._state, None)
+            action, state = self._runner.act(self._observation, self._prev_action, self._missing, self._state, None)
             self._prev_action, self._state[:] = action, state
         try:
             over = self._begin() if self._length < 0 else self._step_environment(self._prev_action[0])
@@ -125,7 +125,7 @@ class Rollout:
         return bool(terminated or truncated or self._length >= self._longest)
 
     def _see(self, observation: Floats, info: dict[str, Any]) -> None:
-        self._seen, self._missing = observation[None], np.array([bool(info.get("missing", False))])
+        self._observation, self._missing = observation[None], np.array([bool(info.get("missing", False))])
 
     def _judge(self, over: bool) -> None:
         late = self._clock() >= self._deadline
@@ -209,10 +209,10 @@ class Evaluator:
             return None
         self._next_look = self._clock() + POLL_SECONDS
         newest = self._bus.latest_version(evaluate=True)
-        found = self._bus.weights(evaluate=True) if newest not in (None, self._version) else None
-        if found is None:
+        weights = self._bus.weights(evaluate=True) if newest not in (None, self._version) else None
+        if weights is None:
             return None
-        self._version, blob = found
+        self._version, blob = weights
         if not self._load(blob):
             return None
         episodes, seconds = self._config.episodes, self._config.evaluation_seconds
@@ -245,7 +245,7 @@ class Evaluator:
         self._env.close()
 
 
-def told(match: Rollout) -> dict[str, Any]:
+def evaluation_metrics(match: Rollout) -> dict[str, Any]:
     """What an evaluation is told by, in records and results."""
     return {
         "eval_return_mean": float(np.mean(match.returns)),
@@ -259,4 +259,4 @@ def _record(match: Rollout, version: Version) -> dict[str, Any]:
     broken = {"eval_broken_episodes": match.broken}
     if not match.returns:
         return broken
-    return broken | told(match) | {"eval_steps": match.steps, "eval_update": version.update}
+    return broken | evaluation_metrics(match) | {"eval_steps": match.steps, "eval_update": version.update}

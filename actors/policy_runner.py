@@ -25,10 +25,10 @@ Floats = NDArray[np.float32]
 
 def _of_shape(weights: dict[str, Tensor], name: str, like: Tensor) -> Tensor:
     """Out of ``weights``. Raises KeyError, ValueError."""
-    found = weights.pop(name)
-    if found.shape != like.shape:
-        raise ValueError(f"{name} has shape {tuple(found.shape)}, expected {tuple(like.shape)}")
-    return found
+    value = weights.pop(name)
+    if value.shape != like.shape:
+        raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {tuple(like.shape)}")
+    return value
 
 
 def _check_finite(weights: dict[str, Tensor]) -> None:
@@ -111,8 +111,8 @@ class PolicyRunner:
         self._norm = (torch.ones(embedding), torch.zeros(embedding)) if normed else ()
         self._gru = _GRU(self._from_embedding, self._from_hidden, envs, config.hidden)
         self._head = _head(features, config.heads, 2 * action_dim, envs)
-        known = config.hidden + obs_dim + action_dim
-        self._next_frame = _head(known, config.heads, obs_dim, envs) if config.impute_missing else ()
+        input_dim = config.hidden + obs_dim + action_dim
+        self._next_frame = _head(input_dim, config.heads, obs_dim, envs) if config.impute_missing else ()
 
     def start(self) -> tuple[Floats, Floats]:
         """Previous action (N, A) and state (N, S) at the start of episodes: new zeros."""
@@ -129,8 +129,8 @@ class PolicyRunner:
         except (SafetensorError, KeyError, ValueError) as error:
             raise MessageError("weights", f"not a policy of this run ({error})") from None
         rates = self._config.initial_priority == "actor"
-        if left := [name for name in weights if not (rates and name.startswith(CRITIC_PARTS))]:
-            raise MessageError("weights", f"not a policy of this run (it also has {', '.join(left)})")
+        if unread := [name for name in weights if not (rates and name.startswith(CRITIC_PARTS))]:
+            raise MessageError("weights", f"not a policy of this run (it also has {', '.join(unread)})")
         for copy in copies:  # only now, so that what is refused changes nothing
             copy()
 
@@ -154,16 +154,16 @@ class PolicyRunner:
         a = tanh(mean + std * noise); without noise, tanh(mean). The state returned is a buffer that
         the next call may overwrite; none of the arguments is changed.
         """
-        seen, hidden = self._seen(observation, prev_action, missing), state[:, : self._config.hidden]
+        filled, hidden = self._read_input(observation, prev_action, missing), state[:, : self._config.hidden]
         if self._next_frame and missing.any():
             self._input[missing, : self._obs_dim] = self._expected(state, prev_action)[missing]
         if self._config.head_input == "observation":
-            x, new_hidden = seen[:, : self._obs_dim], self._gru.out.zero_()
+            x, new_hidden = filled[:, : self._obs_dim], self._gru.out.zero_()
         else:
-            embedding = self._embedded(seen)
+            embedding = self._embedded(filled)
             x = new_hidden = self._gru(embedding, torch.from_numpy(hidden))
             if self._skip:
-                skip = embedding if self._config.head_input == "hidden+embedding" else seen
+                skip = embedding if self._config.head_input == "hidden+embedding" else filled
                 x = torch.cat([x, skip[:, : self._skip]], 1)
         for layer in self._head:
             x = layer(x)
@@ -172,7 +172,7 @@ class PolicyRunner:
             new_state = np.concatenate([new_state, self._input[:, : self._obs_dim]], 1)
         return self._action(x.numpy(), noise), new_state
 
-    def _seen(self, observation: Floats, prev_action: Floats, missing: BoolArray) -> Tensor:
+    def _read_input(self, observation: Floats, prev_action: Floats, missing: BoolArray) -> Tensor:
         x = self._input
         normalized = x[:, : self._obs_dim]
         if self._config.normalize_observations:

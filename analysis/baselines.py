@@ -27,7 +27,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from rmc.actors.config import EvaluatorConfig
-from rmc.actors.evaluator import first_start, play_episodes, told
+from rmc.actors.evaluator import evaluation_metrics, first_start, play_episodes
 from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, read, validate
 from rmc.analysis.evaluation import FINAL_EPISODES, Progress, Watch
 from rmc.common.env.make import env_layout, make_env
@@ -114,8 +114,8 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
     written = json.dumps({"format": FORMAT} | asdict(config), indent=2)
     write_whole(folder.path / "config.json", f"{written}\n".encode())
     folder.write_sizes(sizes)
-    for left in set(folder.checkpoints.glob("[0-9]*")) - set(_states(folder)):  # by a crash amid a save
-        shutil.rmtree(left)
+    for leftover in set(folder.checkpoints.glob("[0-9]*")) - set(_states(folder)):  # by a crash amid a save
+        shutil.rmtree(leftover)
     return folder
 
 
@@ -167,8 +167,8 @@ class SB3Adapter:
         self, observation: Floats, _prev_action: Floats, _missing: NDArray[np.bool_], state: Floats, _: Floats | None
     ) -> tuple[Floats, Floats]:
         """(N, O) -> (N, A), as ``PolicyRunner.act``; of the rest nothing is used."""
-        seen = self._scaled(observation)
-        action, self._state = self._model.predict(seen, self._state, self._begins, deterministic=True)
+        scaled = self._scaled(observation)
+        action, self._state = self._model.predict(scaled, self._state, self._begins, deterministic=True)
         self._begins = np.zeros(1, np.bool_)
         return action.astype(np.float32), state
 
@@ -223,13 +223,13 @@ class _Run(BaseCallback):
 
     def _arguments(self, choice: Choice, vec: VecEnv) -> dict[str, Any]:
         network = dict(choice.network) | ({"activation_fn": torch.nn.ReLU} if choice.relu else {})
-        found = dict(choice.arguments) | ({"policy_kwargs": network} if network else {})
+        arguments = dict(choice.arguments) | ({"policy_kwargs": network} if network else {})
         if self.config.algorithm in OFF_POLICY:
-            found["buffer_size"] = self._buffer_size
+            arguments["buffer_size"] = self._buffer_size
         if choice.noise:
             size = vec.action_space.shape or (1,)
-            found["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, choice.noise))
-        return found
+            arguments["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, choice.noise))
+        return arguments
 
     def _save(self) -> None:
         """Beside the last one, which goes once this is whole; its progress, written last, says that."""
@@ -284,7 +284,9 @@ class _Run(BaseCallback):
         opponent, seed = SB3Adapter(self._model, _scaled_by(self._vec)), first_start(self.config.seed, final)
         watch = Progress(self._console, f"evaluation at step {self.steps:,}")
         seconds = EvaluatorConfig.evaluation_seconds
-        return told(play_episodes(opponent, lambda: make_env(self.config.env), episodes, seed, seconds, watch))
+        return evaluation_metrics(
+            play_episodes(opponent, lambda: make_env(self.config.env), episodes, seed, seconds, watch)
+        )
 
     def _first_evaluation(self) -> float:
         """Of what it was before any training, once for the folder."""
@@ -294,12 +296,12 @@ class _Run(BaseCallback):
         return float(read_object(initial, "eval_return_mean")["eval_return_mean"])
 
     def _evaluate(self) -> None:
-        found = self._play(self.config.episodes, final=False)
+        result = self._play(self.config.episodes, final=False)
         self._write_progress()
-        self._write("evaluator", {**found, "eval_update": self.updates, "eval_env_steps": self.steps})
-        mean, deviation = found["eval_return_mean"], found["eval_return_std"]
-        said = f"environment step {self.steps:,}: return {mean:,.1f} ± {deviation:,.1f}, {self._wall():,.0f} s"
-        self._console.print(said)
+        self._write("evaluator", {**result, "eval_update": self.updates, "eval_env_steps": self.steps})
+        mean, deviation = result["eval_return_mean"], result["eval_return_std"]
+        line = f"environment step {self.steps:,}: return {mean:,.1f} ± {deviation:,.1f}, {self._wall():,.0f} s"
+        self._console.print(line)
 
     def _write_progress(self) -> None:
         self._write("launcher", {"wall_s": self._wall()})
@@ -350,7 +352,7 @@ def evaluate(
     match = play_episodes(SB3Adapter(model, scaled), lambda: make_env(env), episodes, seed, seconds, watch)
     bare.close()
     about = {"env": env.id, "preset": config.name, "seed": config.seed, **progress}
-    return about | told(match) | {"eval_flicker": env.flicker}
+    return about | evaluation_metrics(match) | {"eval_flicker": env.flicker}
 
 
 def _scaled_by(vec: VecEnv) -> Callable[[Floats], Floats]:

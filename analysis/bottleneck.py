@@ -14,7 +14,7 @@ IDLE = 0.2  # waiting for more of the time is worth a word
 def bottleneck(vitals: Vitals, config: RunConfig) -> Finding | None:
     """The one stage that the others wait for; None where the records do not say."""
     stages = (redis_bound, replay_bound, learner_bound, actor_bound, delivery_bound, balanced)
-    return next((found for stage in stages if (found := stage(vitals, config)) is not None), None)
+    return next((finding for stage in stages if (finding := stage(vitals, config)) is not None), None)
 
 
 def redis_bound(vitals: Vitals, _: RunConfig) -> Finding | None:
@@ -69,14 +69,14 @@ def actor_bound(vitals: Vitals, config: RunConfig) -> Finding | None:
 
 def _faster_actors(vitals: Vitals, config: RunConfig, learner: float) -> str:
     """As many actors as would keep the learner busy, where there are cores for them."""
-    wanted = ceil(config.actors / max(learner, 0.01))
+    actors = ceil(config.actors / max(learner, 0.01))
     ratio = f"--replay-ratio {config.replay.replay_ratio / max(learner, 0.01):.3g} would use the learner's idle time"
     shards, free = config.replay.replay_shards, free_cores(vitals)
     if free is None:
         return f"more --actors would help where cores are free; with what there is, {ratio}"
     if free < 1.0:
         return f"all cores are taken: more machines (--launcher ray) would help, and {ratio}"
-    affordable = min(wanted, config.actors + floor(free)) // shards * shards
+    affordable = min(actors, config.actors + floor(free)) // shards * shards
     return f"--actors {max(affordable, config.actors + shards)} would help; with what there is, {ratio}"
 
 

@@ -44,18 +44,18 @@ def grouped(histories: Sequence[History]) -> Groups:
         if one not in runs:
             runs.append(one)
     return {
-        env: {name: runs for agent, all_runs in agents.items() for name, runs in _told_apart(agent, all_runs).items()}
+        env: {name: runs for agent, all_runs in agents.items() for name, runs in _comparable(agent, all_runs).items()}
         for env, agents in alike.items()
     }
 
 
-def _told_apart(agent: str, runs: list[History]) -> dict[str, list[History]]:
+def _comparable(agent: str, runs: list[History]) -> dict[str, list[History]]:
     """What may be averaged, by its name: finished or not, as long as each other, each seed once."""
     alike: dict[tuple[bool, int], list[History]] = {}
     for run in sorted(runs, key=lambda run: (not run.finished, run.env_steps)):
         key = next((key for key in alike if key[0] == run.finished and run.env_steps <= SAME_LENGTH * key[1]), None)
         alike.setdefault(key or (run.finished, run.env_steps), []).append(run)
-    found: dict[str, list[History]] = {}
+    groups: dict[str, list[History]] = {}
     for (finished, steps), same in alike.items():
         state = "" if finished else ", unfinished"
         name = agent if len(alike) == 1 else f"{agent}{state}, {steps:,} steps"
@@ -63,8 +63,8 @@ def _told_apart(agent: str, runs: list[History]) -> dict[str, list[History]]:
         for run in sorted(same, key=lambda run: run.seed):
             seeds.append(run.seed)
             again = f", run {seeds.count(run.seed)} of its seed" if seeds.count(run.seed) > 1 else ""
-            found.setdefault(name + again, []).append(run)
-    return found
+            groups.setdefault(name + again, []).append(run)
+    return groups
 
 
 def curve(run: History, by: Axis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -85,14 +85,14 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
 
     columns = min(COLUMNS, len(groups))
     rows = -(-len(groups) // columns)
-    agents = list(dict.fromkeys(agent for found in groups.values() for agent in found))
+    agents = list(dict.fromkeys(agent for runs in groups.values() for agent in runs))
     names = [textwrap.fill(_named(agent, groups), LEGEND_WIDTH) for agent in agents]
     legend = LEGEND_LINE * sum(name.count("\n") + 1 for name in names) / columns
     figure = Figure(figsize=(1.0 + 5.0 * columns, 0.6 + 3.3 * rows + legend), layout="constrained")
     panels = list(figure.subplots(rows, columns, squeeze=False).flat)
     handles: dict[str, Any] = {}
-    for panel, (env, found) in zip(panels, groups.items(), strict=False):
-        for agent, runs in found.items():
+    for panel, (env, by_agent) in zip(panels, groups.items(), strict=False):
+        for agent, runs in by_agent.items():
             handles.setdefault(agent, _draw_agent(panel, runs, by, f"C{agents.index(agent) % 10}"))
         panel.set_title(env)
         panel.set_xlabel(LABELS[by])
@@ -119,7 +119,7 @@ def _draw_agent(panel: Any, runs: list[History], by: Axis, color: str) -> Any:
 
 
 def _named(agent: str, groups: Groups) -> str:
-    counts = [len(found[agent]) for found in groups.values() if agent in found]
+    counts = [len(by_agent[agent]) for by_agent in groups.values() if agent in by_agent]
     fewest, most = min(counts), max(counts)
     how = "interquartile mean, 95 %" if fewest >= ENOUGH_SEEDS else "each a line"
     seeds = f"{fewest}" if fewest == most else f"{fewest} to {most}"
@@ -133,20 +133,20 @@ def last_returns(runs: list[History]) -> Scores:
 
 def tables(groups: Groups, reference: str | None) -> list[Table]:
     """One an environment, a line an agent; beside ``reference``, an agent, where there is one. Raises ConfigError."""
-    agents = {agent for found in groups.values() for agent in found}
+    agents = {agent for by_agent in groups.values() for agent in by_agent}
     if reference is not None and reference not in agents:
         raise ConfigError("--reference", reference, f"use one of {', '.join(map(repr, sorted(agents)))}")
-    return [_table(env, found, reference) for env, found in groups.items()]
+    return [_table(env, by_agent, reference) for env, by_agent in groups.items()]
 
 
-def _table(env: str, found: dict[str, list[History]], reference: str | None) -> Table:
-    made = Table(title=env, title_justify="left", box=None, pad_edge=False)
+def _table(env: str, by_agent: dict[str, list[History]], reference: str | None) -> Table:
+    table = Table(title=env, title_justify="left", box=None, pad_edge=False)
     columns = ["agent", "seeds", "return", f"worst of last {LAST}", "steps", "updates", "wall s"]
     for name in [*columns, *(["scaled", "P(better)"] if reference else [])]:
-        made.add_column(name, justify="left" if name == "agent" else "right", no_wrap=name != "agent")
-    for agent, runs in found.items():
-        made.add_row(agent, *_cells(runs), *(_beside(runs, found.get(reference, [])) if reference else []))
-    return made
+        table.add_column(name, justify="left" if name == "agent" else "right", no_wrap=name != "agent")
+    for agent, runs in by_agent.items():
+        table.add_row(agent, *_cells(runs), *(_beside(runs, by_agent.get(reference, [])) if reference else []))
+    return table
 
 
 def _cells(runs: list[History]) -> list[str]:

@@ -28,13 +28,13 @@ IN_TRAINING: tuple[Diagnosis, ...] = (
 def examine(records: Sequence[Record], config: RunConfig) -> list[Finding]:
     """All that is found, the gravest first; empty where too little was recorded to judge."""
     vitals = Vitals(records)
-    found = [diagnosis(vitals, config) for diagnosis in ALWAYS]
+    findings = [diagnosis(vitals, config) for diagnosis in ALWAYS]
     training = vitals.training()
-    if training.seconds >= LEAST_SECONDS and not any(found):
-        found += [diagnosis(training, config) for diagnosis in IN_TRAINING]
+    if training.seconds >= LEAST_SECONDS and not any(findings):
+        findings += [diagnosis(training, config) for diagnosis in IN_TRAINING]
         whole = Vitals(records, math.inf)  # for what is rare, or compared with the time before training
-        found += [run_faults.evaluator_starved(whole, config), host_faults.slow_memory(whole, config)]
-    return [finding for finding in found if finding is not None]
+        findings += [run_faults.evaluator_starved(whole, config), host_faults.slow_memory(whole, config)]
+    return [finding for finding in findings if finding is not None]
 
 
 def examine_run(folder: RunFolder) -> tuple[list[Finding], float]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.faults import RAISED, told
+from rmc.common.env.faults import RAISED, describe_error
 from rmc.common.env.make import first_env, make_env
 from rmc.common.env.process_state import changes
 from rmc.common.env.watched_env import WatchedEnv
@@ -69,21 +69,21 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
         lambda: _hints(env, played),
         lambda: _second(config),
     ]
-    found: list[str] = []
-    while stages and not _faults(found):  # what comes later needs what was before to be sound
-        found += stages.pop(0)()
+    lines: list[str] = []
+    while stages and not _faults(lines):  # what comes later needs what was before to be sound
+        lines += stages.pop(0)()
     if changed := changes():
-        found.append(f"note: it changes {', '.join(changed)} of its process; training keeps its own apart")
-    for line in [*_facts(env, played), *dict.fromkeys(found)]:
+        lines.append(f"note: it changes {', '.join(changed)} of its process; training keeps its own apart")
+    for line in [*_facts(env, played), *dict.fromkeys(lines)]:
         console.print(line, soft_wrap=True)
     env.close()
-    sound = not _faults(found)
+    sound = not _faults(lines)
     console.print("it can be trained on" if sound else "mend the fault first")
     return 0 if sound else 1
 
 
-def _faults(found: list[str]) -> list[str]:
-    return [text for text in found if text.startswith("fault: ")]
+def _faults(lines: list[str]) -> list[str]:
+    return [text for text in lines if text.startswith("fault: ")]
 
 
 def _gymnasiums_notes(env: gym.Env[Any, Any]) -> Iterator[str]:
@@ -102,7 +102,7 @@ def _guarded(action: Callable[[], None]) -> Iterator[str]:
         except EnvFault as fault:
             yield f"fault: {fault}"
         except RAISED as error:  # whatever a user's environment raises is a finding
-            yield f"fault: {told(error)}"
+            yield f"fault: {describe_error(error)}"
     for text in dict.fromkeys(_plain(str(warning.message)) for warning in caught):
         yield f"note: {text}"
 
@@ -159,7 +159,8 @@ def _second(config: EnvConfig) -> Iterator[str]:
         env.step(np.zeros(env.action_space.shape or (), np.float32))
         env.close()
     except Exception as error:
-        yield f"note: no second one can be beside it ({told(error)}); take --actors 1 --envs-per-actor 1 --episodes 0"
+        fix = "take --actors 1 --envs-per-actor 1 --episodes 0"
+        yield f"note: no second one can be beside it ({describe_error(error)}); {fix}"
 
 
 def _reward_notes(sizes: NDArray[np.float64]) -> Iterator[str]:

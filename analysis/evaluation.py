@@ -10,7 +10,7 @@ import safetensors.torch
 import torch
 from rich.console import Console
 
-from rmc.actors.evaluator import Rollout, first_start, play_episodes, told
+from rmc.actors.evaluator import Rollout, evaluation_metrics, first_start, play_episodes
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.analysis.policy_file import PolicyFile
 from rmc.common.agent import Agent
@@ -58,7 +58,7 @@ def evaluate_blob(
     with _one_thread():
         seed = first_start(header.seed, final=True)
         match = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
-    return told(match) | {"eval_flicker": env.flicker}
+    return evaluation_metrics(match) | {"eval_flicker": env.flicker}
 
 
 def policy_env(header: PolicyHeader, config: EnvConfig) -> Env:

@@ -39,9 +39,9 @@ class _Step(nn.Module):
         """See the module's docstring."""
         if self.agent.config.impute_missing:  # as ``Policy.act`` has it
             missing = missing | ~torch.isfinite(observation).all(1)
-        seen = self.agent.normalizer(observation, missing).unsqueeze(1)
+        normalized = self.agent.normalizer(observation, missing).unsqueeze(1)
         now = missing.unsqueeze(1), previous_action.unsqueeze(1), state
-        remembered, _, state = self.agent.unroll(seen, *now)
+        remembered, _, state = self.agent.unroll(normalized, *now)
         mean, _ = self.agent.policy(self.agent.features(remembered).squeeze(1))
         return torch.tanh(mean), state
 
@@ -58,13 +58,13 @@ def export(policy: PolicyFile, out: Path) -> None:
     example = (two[0], two[1], torch.zeros(2, dtype=torch.bool), two[2])
     rows = torch.export.Dim("rows", min=1)
     with _quiet():
-        made = torch.onnx.export(
+        program = torch.onnx.export(
             _Step(agent).eval(), example, input_names=INPUTS, output_names=OUTPUTS,
             dynamic_shapes=({0: rows},) * 4, dynamo=True,
         )  # fmt: skip
-        assert made is not None
-        made.model.metadata_props.update(header.metadata())
-        made.save(str(out), external_data=False)
+        assert program is not None
+        program.model.metadata_props.update(header.metadata())
+        program.save(str(out), external_data=False)
 
 
 @contextlib.contextmanager

@@ -22,7 +22,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import SAME_AGENT
 from rmc.deploy.run.presets import preset_config
 
-UNTOLD = SAME_AGENT | {"seed", "preset", "env.id"}  # makes no other agent
+OMITTED = SAME_AGENT | {"seed", "preset", "env.id"}  # makes no other agent
 
 
 @dataclass(frozen=True)
@@ -75,27 +75,27 @@ def objects(path: Path, *names: str) -> dict[str, dict[str, Any]]:
 
 def _object(line: bytes, place: str, names: Sequence[str]) -> dict[str, Any]:
     try:
-        found = json.loads(line)
+        value = json.loads(line)
     except ValueError as error:
         raise ConfigError("RUNS", place, f"not JSON ({error}); mend the line, or remove it") from None
-    if not isinstance(found, dict) or not found.keys() >= set(names):
+    if not isinstance(value, dict) or not value.keys() >= set(names):
         raise ConfigError("RUNS", place, f"must be an object with {', '.join(names)}; mend the line, or remove it")
-    return found
+    return value
 
 
 def _of_line(raw: dict[str, Any], place: str) -> History:
     try:
-        found = History(**{**raw, "evaluations": [Evaluation(**one) for one in raw["evaluations"]]})
+        history = History(**{**raw, "evaluations": [Evaluation(**one) for one in raw["evaluations"]]})
     except TypeError as error:
         raise ConfigError("RUNS", place, f"not a history ({error}); mend the line, or remove it") from None
-    numbers: list[Any] = [found.seed, found.env_steps, found.updates, found.transitions, found.wall_s]
-    numbers += [] if found.initial_return is None else [found.initial_return]
-    numbers += [value for one in found.evaluations for value in dataclasses.astuple(one)]
-    texts = found.agent, found.env, found.commit
-    if not (found.evaluations and all(map(is_finite, numbers)) and all(isinstance(text, str) for text in texts)):
+    numbers: list[Any] = [history.seed, history.env_steps, history.updates, history.transitions, history.wall_s]
+    numbers += [] if history.initial_return is None else [history.initial_return]
+    numbers += [value for one in history.evaluations for value in dataclasses.astuple(one)]
+    texts = history.agent, history.env, history.commit
+    if not (history.evaluations and all(map(is_finite, numbers)) and all(isinstance(text, str) for text in texts)):
         fix = "not a history (its evaluations, numbers and names); mend the line, or remove it"
         raise ConfigError("RUNS", place, fix)
-    return found
+    return history
 
 
 def of_run(folder: RunFolder) -> History:
@@ -140,13 +140,13 @@ def describe(path: Path) -> About:
     """Of a run of RMC, or of a baseline. Raises ConfigError."""
     folder = RunFolder(path)
     if folder.is_baseline():
-        theirs = baseline_settings.read(folder)
-        per_update = baseline_settings.transitions_per_update(theirs)
-        return About(_with(theirs.name, _stack(theirs.env)), _seen(theirs.env), theirs.seed, per_update)
+        baseline = baseline_settings.read(folder)
+        per_update = baseline_settings.transitions_per_update(baseline)
+        return About(_with(baseline.name, _stack(baseline.env)), _env_label(baseline.env), baseline.seed, per_update)
     config = folder.config()
     name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
     agent = _with(name, [*_changes(config), *_stack(config.env)])
-    return About(agent, _seen(config.env), config.seed, config.learner.batch_size * _trained_steps(config))
+    return About(agent, _env_label(config.env), config.seed, config.learner.batch_size * _trained_steps(config))
 
 
 def _trained_steps(config: RunConfig) -> int:
@@ -162,7 +162,7 @@ def _with(name: str, words: list[str]) -> str:
 def _changes(config: RunConfig) -> list[str]:
     """Options that differ from the preset's, as they are typed."""
     was, now = flat(preset_config(config.preset, config.env)), flat(config)
-    return [_typed(path, now[path]) for path in now if path not in UNTOLD and now[path] != was[path]]
+    return [_typed(path, now[path]) for path in now if path not in OMITTED and now[path] != was[path]]
 
 
 def _typed(path: str, value: Any) -> str:
@@ -176,27 +176,27 @@ def _stack(env: EnvConfig) -> list[str]:
     return [f"--frame-stack {env.frame_stack}"] if env.frame_stack > 1 else []
 
 
-def _seen(env: EnvConfig) -> str:
+def _env_label(env: EnvConfig) -> str:
     plain = EnvConfig(env.id)
-    told = ("frame_stack", "env_timeout", "env_kwargs")  # elsewhere, or in words of its own
-    names = [item.name for item in dataclasses.fields(env) if item.name not in told]
+    separate = ("frame_stack", "env_timeout", "env_kwargs")  # elsewhere, or in words of its own
+    names = [item.name for item in dataclasses.fields(env) if item.name not in separate]
     odd = [name for name in names if getattr(env, name) != getattr(plain, name)]
-    said = (f"{name.replace('_', ' ')} {getattr(env, name)}" for name in odd)
-    return ", ".join([env.id, *write_kwargs(env.env_kwargs), *said])
+    options = (f"{name.replace('_', ' ')} {getattr(env, name)}" for name in odd)
+    return ", ".join([env.id, *write_kwargs(env.env_kwargs), *options])
 
 
 def _evaluations(records: list[dict[str, Any]]) -> list[Evaluation]:
     """In order of environment steps; of a checkpoint played twice, what came last."""
     steps = {r["updates"]: r["env_steps"] for r in records if _says(r, "learner", "updates", "env_steps")}
     walls = {r["time"]: r["wall_s"] for r in records if _says(r, "launcher", "time", "wall_s")}
-    found = {}
+    evaluations = {}
     for record in records:
         if _says(record, "evaluator", "time", "eval_update", "eval_return_mean", "eval_return_std"):
             updates, own = record["eval_update"], _says(record, "evaluator", "eval_env_steps")
             at = int(record["eval_env_steps"] if own else _between(updates, steps))  # of ours only the update is known
             wall, mean, std = _between(record["time"], walls), record["eval_return_mean"], record["eval_return_std"]
-            found[at] = Evaluation(at, updates, wall, mean, std)
-    return [found[at] for at in sorted(found)]
+            evaluations[at] = Evaluation(at, updates, wall, mean, std)
+    return [evaluations[at] for at in sorted(evaluations)]
 
 
 def _says(record: dict[str, Any], role: str, *names: str) -> bool:
@@ -204,7 +204,7 @@ def _says(record: dict[str, Any], role: str, *names: str) -> bool:
     return record.get("role") == role and all(is_finite(record.get(name)) for name in names)
 
 
-def _between(at: float, known: dict[Any, Any]) -> float:
+def _between(at: float, points: dict[Any, Any]) -> float:
     """What lies at ``at`` on the line through the points that are known."""
-    places = sorted(known)
-    return float(np.interp(at, places, [known[place] for place in places])) if places else 0.0
+    places = sorted(points)
+    return float(np.interp(at, places, [points[place] for place in places])) if places else 0.0

@@ -54,10 +54,10 @@ def speed(config: RunConfig, records: list[dict[str, Any]]) -> Speed:
 
 
 def _slope(vitals: Vitals, role: str, name: str) -> float:
-    found = vitals.series(role, name)
-    if len(found) < 2:
+    series = vitals.series(role, name)
+    if len(series) < 2:
         return 0.0
-    (began, before), (ended, after) = found[0], found[-1]
+    (began, before), (ended, after) = series[0], series[-1]
     return (after - before) / max(ended - began, 1e-9)
 
 
@@ -102,14 +102,14 @@ def _role_memory(kind: str, each: list[int]) -> Need:
 def disk(config: RunConfig, trial: Trial, seconds: float, machine: Machine) -> list[Need]:
     """The ring, the checkpoints, what is recorded until the end, and all."""
     rows, kept = ring_bytes(config), config.learner.keep_checkpoints + KEPT_BESIDE
-    made = config.total_steps // config.learner.checkpoint_steps + 1
-    saved, said = min(kept, made) * trial.checkpoint_bytes, trial.record_bytes_per_s * seconds
+    count = config.total_steps // config.learner.checkpoint_steps + 1
+    saved, records = min(kept, count) * trial.checkpoint_bytes, trial.record_bytes_per_s * seconds
     free = max(0, machine.free_disk_bytes - DISK_RESERVE)
     return [
         Need("disk, ring", megabytes(rows)),
-        Need(f"disk, {min(kept, made)} checkpoints", megabytes(saved)),
-        Need("disk, metrics", megabytes(said)),
-        Need("disk, all", megabytes(rows + saved + said), f"{megabytes(free)} free", rows + saved + said <= free),
+        Need(f"disk, {min(kept, count)} checkpoints", megabytes(saved)),
+        Need("disk, metrics", megabytes(records)),
+        Need("disk, all", megabytes(rows + saved + records), f"{megabytes(free)} free", rows + saved + records <= free),
     ]
 
 

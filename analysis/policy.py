@@ -101,14 +101,14 @@ class Policy:
         """
         if units not in UNITS:
             raise ConfigError("units", units, f"use one of {UNITS}")
-        seen, absent = self._read(observation, missing)
-        runner = self._begin(len(seen))
+        rows, absent = self._read(observation, missing)
+        runner = self._begin(len(rows))
         shape = self._prev_action.shape
         noise = self._rng.standard_normal(shape, np.float32) if explore else None
-        action, state = runner.act(seen, self._prev_action, absent, self._state, noise)
+        action, state = runner.act(rows, self._prev_action, absent, self._state, noise)
         self._prev_action, self._state[:] = action, state
-        found = action.copy() if units == "agent" else self._in_environment(action)
-        return found if np.ndim(observation) == 2 else found[0]
+        result = action.copy() if units == "agent" else self._in_environment(action)
+        return result if np.ndim(observation) == 2 else result[0]
 
     def _begin(self, rows: int) -> PolicyRunner:
         """What acts in so many episodes; new ones begin after ``reset``."""
@@ -128,30 +128,30 @@ class Policy:
 
     def _read(self, observation: ArrayLike, missing: bool | BoolArray) -> tuple[Floats, BoolArray]:
         """(N, O), and (N,) whether each counts as missing. Raises ConfigError; nothing is remembered of it then."""
-        seen = self._rows(observation)
+        rows = self._rows(observation)
         absent = np.array(missing, bool)
-        if absent.shape not in ((), (len(seen),)):
-            raise ConfigError("missing", f"of shape {absent.shape}", f"give one, or one for each of {len(seen)} rows")
-        absent = np.broadcast_to(absent, len(seen)).copy()
-        odd = ~np.isfinite(seen) & ~absent[:, None]
+        if absent.shape not in ((), (len(rows),)):
+            raise ConfigError("missing", f"of shape {absent.shape}", f"give one, or one for each of {len(rows)} rows")
+        absent = np.broadcast_to(absent, len(rows)).copy()
+        odd = ~np.isfinite(rows) & ~absent[:, None]
         if odd.any():
             if not self.header.agent.impute_missing:
-                places = [place if len(seen) == 1 else (row, place) for row, place in np.argwhere(odd).tolist()]
-                values = dict(zip(places, seen[odd].tolist(), strict=True))
+                places = [place if len(rows) == 1 else (row, place) for row, place in np.argwhere(odd).tolist()]
+                values = dict(zip(places, rows[odd].tolist(), strict=True))
                 raise ConfigError("observation", values, "give finite numbers, or missing=True where there is none")
             absent |= odd.any(1)
-        return seen, absent
+        return rows, absent
 
     def _rows(self, observation: ArrayLike) -> Floats:
         """(O,) or (N, O) -> (N, O). Raises ConfigError."""
         with np.errstate(over="ignore"):  # infinity, which is judged later
-            seen = np.asarray(observation, np.float32)
+            raw = np.asarray(observation, np.float32)
         size = self.header.obs_dim
-        if seen.ndim not in (1, 2) or seen.shape[-1] != size or not len(seen):
+        if raw.ndim not in (1, 2) or raw.shape[-1] != size or not len(raw):
             fix = f"the policy reads shape {(size,)}, or (N, {size}) of N episodes"
-            raise ConfigError("observation", f"of shape {seen.shape}", fix)
-        rows = seen.reshape(-1, size)
+            raise ConfigError("observation", f"of shape {raw.shape}", fix)
+        rows = raw.reshape(-1, size)
         if self._runner is not None and len(rows) != len(self._state):
             fix = f"the policy acts in {len(self._state)} episodes; reset() it before there are others"
-            raise ConfigError("observation", f"of shape {seen.shape}", fix)
+            raise ConfigError("observation", f"of shape {raw.shape}", fix)
         return rows

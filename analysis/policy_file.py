@@ -105,17 +105,17 @@ def _header(facts: Any) -> PolicyHeader:
     return header
 
 
-def _check_shapes(header: PolicyHeader, found: dict[str, tuple[int, ...]]) -> None:
+def _check_shapes(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> None:
     """Before any memory is taken for what a header says. Raises MessageError."""
     try:
         with torch.device("meta"):
-            wanted = Agent(header.obs_dim, header.action_dim, header.agent).policy_shapes()
+            expected = Agent(header.obs_dim, header.action_dim, header.agent).policy_shapes()
     except (RuntimeError, OverflowError, TypeError) as error:  # of torch, for sizes that nothing can have
         reason = str(error).splitlines()[0]
         raise MessageError("damaged header", f"no networks have its sizes ({reason}); copy it again") from None
-    for name in sorted(wanted.keys() | found.keys()):
-        if wanted.get(name) != found.get(name):
-            fault = f"{name} has shape {found.get(name)}, its header says {wanted.get(name)}; copy it again"
+    for name in sorted(expected.keys() | shapes.keys()):
+        if expected.get(name) != shapes.get(name):
+            fault = f"{name} has shape {shapes.get(name)}, its header says {expected.get(name)}; copy it again"
             raise MessageError("other sizes than its header's", fault)
 
 
@@ -149,10 +149,10 @@ def _of_older_run(folder: RunFolder, files: dict[str, bytes]) -> PolicyFile:
 def _evaluated(header: PolicyHeader, folder: RunFolder) -> PolicyHeader:
     """With how this checkpoint played: when the run ended, or while it trained."""
     result = folder.result()
-    found = [result] if result is not None and result["updates"] == header.updates else []
-    if not found:
-        found = [record for record in folder.records() if record.get("eval_update") == header.updates]
-    if not found or not all(is_finite(found[-1].get(f"eval_{name}")) for name in ("return_mean", "return_std")):
+    records = [result] if result is not None and result["updates"] == header.updates else []
+    if not records:
+        records = [record for record in folder.records() if record.get("eval_update") == header.updates]
+    if not records or not all(is_finite(records[-1].get(f"eval_{name}")) for name in ("return_mean", "return_std")):
         return header
-    mean, deviation, episodes = (found[-1][f"eval_{name}"] for name in ("return_mean", "return_std", "episodes"))
+    mean, deviation, episodes = (records[-1][f"eval_{name}"] for name in ("return_mean", "return_std", "episodes"))
     return replace(header, eval_return_mean=mean, eval_return_std=deviation, eval_episodes=episodes)

@@ -63,25 +63,25 @@ def write_report(runs: Sequence[ReportRun], out: Path, with_video: bool) -> None
         "differences": differences(runs),
     }
     template = files("rmc.analysis").joinpath("report.html").read_text(encoding="utf-8")
-    made = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(template)
-    write_whole(out, made.render(page).encode())
+    page_template = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(template)
+    write_whole(out, page_template.render(page).encode())
 
 
 def newest(runs: Sequence[ReportRun]) -> list[ReportRun]:
     """Of every agent in every environment the run that was trained last: its policy is played."""
-    found: dict[tuple[str, str], ReportRun] = {}
+    last: dict[tuple[str, str], ReportRun] = {}
     for run in sorted(runs, key=lambda run: run.records[-1]["time"] if run.records else 0.0):
-        found[run.about.env, run.about.agent] = run
-    return [run for run in runs if run in found.values()]
+        last[run.about.env, run.about.agent] = run
+    return [run for run in runs if run in last.values()]
 
 
 def _returns(histories: list[History]) -> list[dict[str, Any]]:
     from rmc.analysis.report_figures import COLOURS, returns
 
-    found = []
+    rows = []
     for env, agents in grouped(histories).items():
         colours = {agent: COLOURS[i % len(COLOURS)] for i, agent in enumerate(agents)}
-        found.append(
+        rows.append(
             {
                 "name": env,
                 "colours": colours,
@@ -90,7 +90,7 @@ def _returns(histories: list[History]) -> list[dict[str, Any]]:
                 "final": [final_row(agent, past) for agent, past in agents.items()],
             }
         )
-    return found
+    return rows
 
 
 def final_row(agent: str, past: list[History]) -> list[str]:
@@ -138,7 +138,7 @@ def differences(runs: Sequence[ReportRun]) -> dict[str, Any]:
         return {"columns": ["preset", runs[0].name], "rows": rows, "note": note}
     paths = list(dict.fromkeys(path for run in runs for path in run.options))
     values = {path: [run.options[path] for run in runs if path in run.options] for path in paths}
-    differing = [path for path, found in values.items() if any(one != found[0] for one in found)]
+    differing = [path for path, settings in values.items() if any(one != settings[0] for one in settings)]
     rows = [[path, *(_text(run.options[path]) if path in run.options else "-" for run in runs)] for path in differing]
     note = "Options that are not alike in all runs that have them." if rows else "All options are alike."
     return {"columns": [run.name for run in runs], "rows": rows, "note": note}

@@ -89,14 +89,14 @@ def _time_unit(seconds: Sequence[float]) -> tuple[float, str]:
 
 def over_time(lines: dict[str, Series], label: str) -> str | None:
     """Metrics over wall time, in bins; None where none was recorded."""
-    found = {name: series for name, series in lines.items() if series[0]}
-    if not found:
+    recorded = {name: series for name, series in lines.items() if series[0]}
+    if not recorded:
         return None
-    scale, unit = _time_unit([seconds for places, _ in found.values() for seconds in places])
+    scale, unit = _time_unit([seconds for places, _ in recorded.values() for seconds in places])
     with rc_context(STYLE):
         figure = Figure(figsize=SIZE, layout="constrained")
         panel = figure.subplots()
-        for (name, series), colour in zip(found.items(), COLOURS, strict=False):
+        for (name, series), colour in zip(recorded.items(), COLOURS, strict=False):
             places, values = _binned(*series)
             marker = "o" if len(values) == 1 else ""  # a line of one point is none
             panel.plot(places / scale, values, color=colour, linewidth=1.4, marker=marker, label=name)
@@ -121,8 +121,8 @@ def _binned(places: list[float], values: list[float]) -> tuple[NDArray[np.float6
 def _bins(x: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     """In which of so many stretches of equal length each lies."""
     width = (x.max() - x.min()) / count or 1.0
-    found: NDArray[np.int64] = np.minimum(((x - x.min()) / width).astype(np.int64), count - 1)
-    return found
+    bins: NDArray[np.int64] = np.minimum(((x - x.min()) / width).astype(np.int64), count - 1)
+    return bins
 
 
 def waits(run: ReportRun) -> str | None:
@@ -153,13 +153,13 @@ def _strips(stretches: list[tuple[float, Vitals]], kinds: list[str], reasons: li
         figure = Figure(figsize=(WIDE[0], 0.9 + 0.85 * len(kinds)), layout="constrained")
         panels = figure.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
         for panel, kind in zip(panels, kinds, strict=True):
-            said = [(wall / scale, v) for wall, v in stretches if v.busy(kind) is not None]
+            recorded = [(wall / scale, v) for wall, v in stretches if v.busy(kind) is not None]
             shares = [
-                [v.busy(kind) or 0.0 for _, v in said],
-                *([v.waits(kind).get(r, 0.0) for _, v in said] for r in reasons),
+                [v.busy(kind) or 0.0 for _, v in recorded],
+                *([v.waits(kind).get(r, 0.0) for _, v in recorded] for r in reasons),
             ]
             areas = panel.stackplot(
-                [wall for wall, _ in said], *shares, colors=[BUSY, *colours.values()], linewidth=0, step="mid"
+                [wall for wall, _ in recorded], *shares, colors=[BUSY, *colours.values()], linewidth=0, step="mid"
             )
             handles |= {
                 name: area

@@ -45,10 +45,10 @@ def rollouts(run: ReportRun) -> Medium:
         return Medium(run.name, note="A baseline has no world model.")
     picture = io.BytesIO()
     try:
-        seen = world_model_picture.inspect_to(run.folder, "latest", picture)
+        insight = world_model_picture.inspect_to(run.folder, "latest", picture)
     except RmcError as error:
         return Medium(run.name, note=f"No world-model rollouts: {_why(error)}.")
-    ahead = ", ".join(f"{share:.0%} at {horizon}" for horizon, share in seen.open_loop.items())
+    ahead = ", ".join(f"{share:.0%} at {horizon}" for horizon, share in insight.open_loop.items())
     note = f"unexplained of the observation's change, by steps ahead: {ahead} (100% is a guess of no change)"
     return Medium(run.name, data_uri(picture.getvalue(), "image/png"), note)
 

@@ -80,8 +80,8 @@ class ReportRun:
 
     def series(self, kind: str, name: str) -> Series:
         """A metric over wall time (s), the mean over the roles of a kind as each speaks; empty where nobody does."""
-        found = self._metric(kind, name)
-        return self.wall_seconds([time for time, _ in found]), [value for _, value in found]
+        series = self._metric(kind, name)
+        return self.wall_seconds([time for time, _ in series]), [value for _, value in series]
 
     def _metric(self, kind: str, name: str) -> list[tuple[float, float]]:
         return [
@@ -92,24 +92,24 @@ class ReportRun:
 
     def wall_seconds(self, times: list[float]) -> list[float]:
         """Seconds trained at these times, over all starts of the run."""
-        told = [
+        wall_times = [
             (record["time"], record["wall_s"])
             for record in self.records
             if record["role"] == "launcher" and is_finite(record.get("wall_s"))
         ]
-        if not told:
+        if not wall_times:
             return [0.0] * len(times)
-        began, wall = told[0]
-        found = np.interp(times, [at for at, _ in told], [seconds for _, seconds in told])
+        began, wall = wall_times[0]
+        seconds = np.interp(times, [at for at, _ in wall_times], [seconds for _, seconds in wall_times])
         return [
-            max(0.0, wall - (began - at)) if at < began else float(one) for at, one in zip(times, found, strict=True)
+            max(0.0, wall - (began - at)) if at < began else float(one) for at, one in zip(times, seconds, strict=True)
         ]
 
 
 def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """``config.json`` by dotted path."""
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for name, value in settings.items():
         nested = isinstance(value, dict) and name != "env_kwargs"
-        found |= _flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
-    return found
+        options |= _flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+    return options

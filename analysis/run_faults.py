@@ -30,20 +30,20 @@ def _still_seconds(vitals: Vitals) -> float:
     """Since when no counter has moved."""
     moved = []
     for role, name in [("learner", "updates"), *((role, "env_steps") for role in vitals.of("replay"))]:
-        found = vitals.series(role, name)
-        changes = [now[0] for before, now in pairwise(found) if now[1] != before[1]]
-        moved += changes[-1:] or [time for time, _ in found[:1]]
+        series = vitals.series(role, name)
+        changes = [now[0] for before, now in pairwise(series) if now[1] != before[1]]
+        moved += changes[-1:] or [time for time, _ in series[:1]]
     return vitals.end - max(moved, default=vitals.end)
 
 
 def silent(vitals: Vitals, _: RunConfig) -> Finding | None:
     """Roles that have stopped speaking while others go on."""
     ended = {role: vitals.end - vitals.series(role, "time")[-1][0] for role in vitals.roles if role != "launcher"}
-    found = [f"{role} for {seconds:.0f} s" for role, seconds in ended.items() if seconds > SILENT_SECONDS]
-    if not found or vitals.last("learner", "finished"):
+    silences = [f"{role} for {seconds:.0f} s" for role, seconds in ended.items() if seconds > SILENT_SECONDS]
+    if not silences or vitals.last("learner", "finished"):
         return None
-    log = f"logs/{found[0].split()[0]}.log"
-    return Finding("silent", f"{', '.join(found)} said nothing", f"it hangs, or its machine is away; see {log}")
+    log = f"logs/{silences[0].split()[0]}.log"
+    return Finding("silent", f"{', '.join(silences)} said nothing", f"it hangs, or its machine is away; see {log}")
 
 
 def long_warm_up(vitals: Vitals, config: RunConfig) -> Finding | None:
@@ -53,11 +53,11 @@ def long_warm_up(vitals: Vitals, config: RunConfig) -> Finding | None:
     missing = config.replay.warmup_steps - steps
     if vitals.last("learner", "updates") > 0 or missing <= 0 or sum(rates) <= 0.0:
         return None
-    left = missing / sum(rates)
-    if left < WARM_UP_SECONDS:
+    seconds = missing / sum(rates)
+    if seconds < WARM_UP_SECONDS:
         return None
     measured = (
-        f"{steps:,.0f} of {config.replay.warmup_steps:,} steps at {sum(rates):,.0f} a second, {left:,.0f} s to go"
+        f"{steps:,.0f} of {config.replay.warmup_steps:,} steps at {sum(rates):,.0f} a second, {seconds:,.0f} s to go"
     )
     return Finding(
         "long warm-up", measured, f"--warmup-steps {config.replay.warmup_steps // 4}, or more --actors, would help"
@@ -68,17 +68,18 @@ def evaluator_starved(vitals: Vitals, config: RunConfig) -> Finding | None:
     """Checkpoints come faster than the evaluator plays them; those in between are passed over."""
     if not config.evaluator.episodes:
         return None
-    made = {value for _, value in vitals.series("learner", "checkpoint_update") if value > 0}
+    checkpoints = {value for _, value in vitals.series("learner", "checkpoint_update") if value > 0}
     played = {value for _, value in vitals.series("evaluator", "eval_update")}
-    missed = len(made - played)
-    if len(made) - 1 <= 0 or len(made & played) >= PLAYED * (len(made) - 1):  # the newest may be on its way
+    missed = len(checkpoints - played)
+    due = len(checkpoints) - 1  # the newest may be on its way
+    if due <= 0 or len(checkpoints & played) >= PLAYED * due:
         return None
-    every = typed_number(config.learner.checkpoint_steps * len(made) / max(1, len(made) - missed))
-    fewer = max(1, config.evaluator.episodes * (len(made) - missed) // len(made))
+    every = typed_number(config.learner.checkpoint_steps * len(checkpoints) / max(1, len(checkpoints) - missed))
+    fewer = max(1, config.evaluator.episodes * (len(checkpoints) - missed) // len(checkpoints))
     advice = f"--checkpoint-steps {every} gives it the time"
     if fewer < config.evaluator.episodes:
         advice += f", --episodes {fewer} or a smaller --evaluation-seconds makes it faster"
-    return Finding("evaluator starved", f"{missed} of {len(made)} checkpoints were not evaluated", advice)
+    return Finding("evaluator starved", f"{missed} of {len(checkpoints)} checkpoints were not evaluated", advice)
 
 
 def stale_weights(vitals: Vitals, config: RunConfig) -> Finding | None:

@@ -42,10 +42,10 @@ def runs(folder: Path) -> list[RunSummary]:
     """All of them, by name. Raises ConfigError where the folder cannot be read, or holds none."""
     if not folder.is_dir():
         raise ConfigError("FOLDER", str(folder), "is no folder; give one that holds runs")
-    found = sorted(map(summary, run_folders(folder)), key=lambda one: one.run)
-    if not found:
+    summaries = sorted(map(summary, run_folders(folder)), key=lambda one: one.run)
+    if not summaries:
         raise ConfigError("FOLDER", str(folder), "holds no run; rmc train makes one, in runs/ unless told otherwise")
-    return found
+    return summaries
 
 
 def summary(path: Path) -> RunSummary:
@@ -71,14 +71,14 @@ def summary(path: Path) -> RunSummary:
     )
 
 
-def table(found: Sequence[RunSummary], folder: Path, width: int) -> Table:
+def table(summaries: Sequence[RunSummary], folder: Path, width: int) -> Table:
     """A row for each, with as many columns as there is room for; names are relative to ``folder``."""
     shown = [name for name, least in COLUMNS.items() if width >= least]
     drawn = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     for name in shown:
         right = name in ("steps", "return", "best", "done", "time")
         drawn.add_column(name, justify="right" if right else "left", no_wrap=right, overflow="fold")
-    for one in found:
+    for one in summaries:
         cells = _cells(one, folder)
         drawn.add_row(*(cells[name] for name in shown))
     return drawn

@@ -16,10 +16,10 @@ def expanded(path: Path) -> list[Path]:
     if (path / "config.json").exists():
         return [path]
     if path.is_dir():
-        found = sorted(run_folders(path))
-        if not found:
+        folders = sorted(run_folders(path))
+        if not folders:
             raise ConfigError("RUNS", str(path), "no run in there; give runs, or a folder that holds some")
-        return found
+        return folders
     if path.exists() or not glob.has_magic(str(path)):
         return [path]
     matched = sorted(map(Path, glob.glob(str(path), recursive=True)))

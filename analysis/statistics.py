@@ -27,8 +27,8 @@ def interval(
 ) -> tuple[float, float]:
     """Percentile bootstrap of a statistic of (R, E) matrices, runs drawn anew within each environment."""
     random = np.random.default_rng(seed)
-    found = [statistic(*(_resampled(matrix, random) for matrix in matrices)) for _ in range(resamples)]
-    low, high = np.quantile(found, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    estimates = [statistic(*(_resampled(matrix, random) for matrix in matrices)) for _ in range(resamples)]
+    low, high = np.quantile(estimates, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)
 
 

@@ -17,7 +17,7 @@ from rmc.actors.evaluator import LONGEST_EPISODE
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.faults import asked
+from rmc.common.env.faults import call_env
 from rmc.common.env.make import entry_point, find_spec, make_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError, EnvFault
@@ -46,13 +46,13 @@ def prepare(env: EnvConfig, out: Path) -> None:
 
 def _mode_fault(env: EnvConfig) -> str | None:
     """Why an environment has no pictures, as far as it can be told without making it."""
-    made_by = asked("entry point", lambda: entry_point(find_spec(env.id)))
-    metadata = getattr(made_by, "metadata", None)
+    factory = call_env("entry point", lambda: entry_point(find_spec(env.id)))
+    metadata = getattr(factory, "metadata", None)
     modes = metadata.get("render_modes") or [] if isinstance(metadata, dict) else []
-    if isinstance(made_by, type) and MODE not in modes:
+    if isinstance(factory, type) and MODE not in modes:
         return f'its metadata["render_modes"] is {modes}; give it "{MODE}", and a render() that returns {PICTURE}'
     try:
-        inspect.signature(made_by).bind_partial(render_mode=MODE)
+        inspect.signature(factory).bind_partial(render_mode=MODE)
     except TypeError:
         return f"it takes no render_mode; let its __init__ take and keep one, for a render() that returns {PICTURE}"
     except ValueError:  # of a class that is not written in Python
@@ -110,15 +110,15 @@ def _frame(env: Env, shape: tuple[int, ...] | None = None) -> NDArray[np.uint8]:
 def _working_backend(env: EnvConfig, out: Path) -> str:
     """The first backend that renders, tried in processes of their own: a failed one spoils a process for others."""
     chosen = os.environ.get("MUJOCO_GL")
-    said = {}
+    failures = {}
     for backend in (chosen,) if chosen else BACKENDS:
         status, words = _probed(backend, env)
         if status == 0:
             return backend
         if status == ENVS_FAULT:
             raise ConfigError("--video", str(out), f"{env.id} cannot be filmed: {words}")
-        said[backend] = words
-    reasons = "; ".join(f"{backend}: {reason}" for backend, reason in said.items())
+        failures[backend] = words
+    reasons = "; ".join(f"{backend}: {reason}" for backend, reason in failures.items())
     raise ConfigError("--video", str(out), f"nothing here can render ({reasons}); install libegl1 or libosmesa6")
 
 
@@ -141,9 +141,9 @@ def probe(env: str) -> None:
     Raises whatever else stands in the way: what draws for it does not work here.
     """
     try:
-        made = make_env(EnvConfig(**json.loads(env)), render=True)
-        made.reset(seed=0)
-        _frame(made)
+        environment = make_env(EnvConfig(**json.loads(env)), render=True)
+        environment.reset(seed=0)
+        _frame(environment)
     except EnvFault as fault:
         if fault.__cause__ is not None and _is_renderers(fault.__cause__):
             raise fault.__cause__ from None

@@ -35,12 +35,12 @@ class Vitals:
     @property
     def end(self) -> float:
         """Time of the newest record; 0 where there is none."""
-        return max((found[-1]["time"] for found in self._roles.values()), default=0.0)
+        return max((records[-1]["time"] for records in self._roles.values()), default=0.0)
 
     @property
     def seconds(self) -> float:
         """From the first record to the last."""
-        return self.end - min((found[0]["time"] for found in self._roles.values()), default=0.0)
+        return self.end - min((records[0]["time"] for records in self._roles.values()), default=0.0)
 
     def of(self, kind: str) -> list[str]:
         """The roles of a kind."""
@@ -48,18 +48,18 @@ class Vitals:
 
     def series(self, role: str, name: str) -> list[tuple[float, float]]:
         """(time, value) of a role's metric, where it is a number."""
-        found = self._roles.get(role, [])
-        return [(record["time"], float(record[name])) for record in found if is_finite(record.get(name))]
+        records = self._roles.get(role, [])
+        return [(record["time"], float(record[name])) for record in records if is_finite(record.get(name))]
 
     def last(self, role: str, name: str) -> float:
         """A role's newest number; 0 where it has said none."""
-        found = self.series(role, name)
-        return found[-1][1] if found else 0.0
+        series = self.series(role, name)
+        return series[-1][1] if series else 0.0
 
     def waiting_for(self, role: str) -> str:
         """What a role has waited for last; empty where it did not."""
-        said = (record["waiting_for"] for record in reversed(self._roles.get(role, [])) if "waiting_for" in record)
-        return str(next(said, ""))
+        reasons = (record["waiting_for"] for record in reversed(self._roles.get(role, [])) if "waiting_for" in record)
+        return str(next(reasons, ""))
 
     def values(self, kind: str, name: str) -> list[float]:
         """All that the roles of a kind have said."""
@@ -67,8 +67,8 @@ class Vitals:
 
     def mean(self, kind: str, name: str) -> float | None:
         """Over the roles of a kind and the span."""
-        found = self.values(kind, name)
-        return mean(found) if found else None
+        values = self.values(kind, name)
+        return mean(values) if values else None
 
     def busy(self, kind: str) -> float | None:
         """Mean share of time spent working, 0 to 1; the last seconds, when actors wait for the end, do not count."""
@@ -101,7 +101,7 @@ class Vitals:
         """The same from the learner's first update on."""
         updates = self.series("learner", "updates")
         began = next((time for time, value in updates if value > updates[0][1]), float("inf"))
-        return Vitals(one for found in self._roles.values() for one in found if one["time"] > began)
+        return Vitals(one for records in self._roles.values() for one in records if one["time"] > began)
 
 
 def _is_share(value: Any) -> TypeGuard[float]:
@@ -110,12 +110,12 @@ def _is_share(value: Any) -> TypeGuard[float]:
 
 def _newest(records: Iterable[Record], span: float) -> list[Record]:
     """Those of the newest span of the newest start."""
-    found: list[Record] = []
+    kept: list[Record] = []
     for record in records:
         if not is_finite(record.get("time")):
             continue
-        if found and record["time"] - found[-1]["time"] > NEW_START_SECONDS:
-            found.clear()
-        found.append(record)
-    end = max((record["time"] for record in found), default=0.0)
-    return [record for record in found if record["time"] >= end - span]
+        if kept and record["time"] - kept[-1]["time"] > NEW_START_SECONDS:
+            kept.clear()
+        kept.append(record)
+    end = max((record["time"] for record in kept), default=0.0)
+    return [record for record in kept if record["time"] >= end - span]

@@ -122,9 +122,9 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
         curiosity=model_error(prediction.hidden_change[0], latent_change, norm).numpy(),
         reward=episode.reward.numpy(),
         predicted_reward=prediction.reward[0].numpy(),
-        ahead={horizon: found.numpy() for horizon, found in ahead.items()},
+        ahead={horizon: predicted.numpy() for horizon, predicted in ahead.items()},
         unexplained=relative_l1_error(*_error(ahead[1], episode, 1)).numpy(),
-        open_loop={horizon: _overall(*_error(found, episode, horizon)) for horizon, found in ahead.items()},
+        open_loop={horizon: _overall(*_error(predicted, episode, horizon)) for horizon, predicted in ahead.items()},
     )
 
 
@@ -134,7 +134,7 @@ def _open_loop(agent: Agent, memory: MemoryOutput, observation: Tensor, action: 
     Observations (T, O) to start from, actions (T, A).
     """
     hidden, skip = memory.hidden[0, :-1], memory.skip[0, :-1]
-    steps, found = len(action), {}
+    steps, predicted = len(action), {}
     for ahead in range(1, min(max(HORIZONS), steps) + 1):
         count = steps - ahead + 1  # starts from which so many steps were played
         hidden, skip, observation, a = hidden[:count], skip[:count], observation[:count], action[ahead - 1 :]
@@ -142,8 +142,8 @@ def _open_loop(agent: Agent, memory: MemoryOutput, observation: Tensor, action: 
         hidden, observation = hidden + step.hidden_change, observation + step.observation_change
         skip = agent.memory.skip(observation, torch.zeros(count, dtype=torch.bool), a)
         if ahead in HORIZONS:
-            found[ahead] = observation
-    return found
+            predicted[ahead] = observation
+    return predicted
 
 
 def _overall(error: Tensor, size: Tensor) -> float:

@@ -85,7 +85,7 @@ def _stepped(actor: Actor, envs: int) -> int:
 
 
 def main() -> None:
-    parser = harness.parser(__doc__)
+    parser = harness.argument_parser(__doc__)
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--envs", type=int, nargs="+", default=[8, 32, 64, 128], help="environments of the actor")
     options = parser.parse_args()
@@ -94,9 +94,9 @@ def main() -> None:
     for envs in options.envs:
         with ExitStack() as stack:
             peers: dict[str, Measure | None] = {}
-            for theirs in (DEFAULT_ENVS, 1) if envs == DEFAULT_ENVS else ():
-                peer = stack.enter_context(Peer(python, "sb3_actor", options.env, str(theirs))) if python else None
-                name = f"stable-baselines3 SAC, {theirs} at a time"
+            for peer_envs in (DEFAULT_ENVS, 1) if envs == DEFAULT_ENVS else ():
+                peer = stack.enter_context(Peer(python, "sb3_actor", options.env, str(peer_envs))) if python else None
+                name = f"stable-baselines3 SAC, {peer_envs} at a time"
                 peers[name] = partial(peer.measure, options.seconds) if peer else None
             harness.save(measure(options.env, envs, peers, options.rounds, options.seconds))
 

@@ -7,7 +7,7 @@ Batches lie ready in pinned memory; both take priorities back to the host. Ends 
 
 import torch
 
-from benchmarks.harness import Row, compare, parser, random_rows, save, speed
+from benchmarks.harness import Row, argument_parser, compare, random_rows, save, speed
 from rmc.common.agent import Agent
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import RunConfig
@@ -58,10 +58,10 @@ def measure(run: RunConfig, batch_size: int, seconds: float, rounds: int) -> lis
 
 
 def main() -> None:
-    made = parser(__doc__)
-    made.add_argument("--env", default="HalfCheetah-v5")
-    made.add_argument("--batches", type=int, nargs="+", default=[64, 256])
-    options = made.parse_args()
+    parser = argument_parser(__doc__)
+    parser.add_argument("--env", default="HalfCheetah-v5")
+    parser.add_argument("--batches", type=int, nargs="+", default=[64, 256])
+    options = parser.parse_args()
     if not torch.cuda.is_available():
         print("PyTorch sees no CUDA device: nothing was measured")
         return

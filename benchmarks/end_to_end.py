@@ -24,7 +24,7 @@ from itertools import pairwise, product
 from pathlib import Path
 
 from benchmarks import PEER_ENVIRONMENT
-from benchmarks.harness import HERE, Row, command, parser, peer_python, save
+from benchmarks.harness import HERE, Row, argument_parser, command, peer_python, save
 
 CURVES = HERE / "results" / "end-to-end.jsonl"
 EPISODES = 5
@@ -47,9 +47,9 @@ def ours(env: str, seed: int, every: int) -> Iterator[Point]:
         process = _started([sys.executable, "-m", "rmc.cli.main", *words, "--checkpoint-steps", str(every)])
         try:
             for line in _lines(run / "metrics.jsonl", process):
-                found = json.loads(line)
-                if "eval_return_mean" in found:
-                    yield found["time"] - began, found["eval_return_mean"]
+                record = json.loads(line)
+                if "eval_return_mean" in record:
+                    yield record["time"] - began, record["eval_return_mean"]
         finally:
             _end(process)
 
@@ -104,21 +104,21 @@ def reached(points: list[Point], goal: float) -> float | None:
 
 def run(points: Iterator[Point], goals: list[float]) -> list[Point]:
     """Until the last goal is reached, or an hour has gone."""
-    seen: list[Point] = []
+    curve: list[Point] = []
     for point in points:
-        seen.append(point)
+        curve.append(point)
         print(f"  {point[0]:6.0f} s {point[1]:8.0f}", flush=True)
-        if reached(seen, max(goals)) is not None or point[0] > LIMIT_SECONDS:
+        if reached(curve, max(goals)) is not None or point[0] > LIMIT_SECONDS:
             break
     points.close()  # type: ignore[attr-defined]
-    return seen
+    return curve
 
 
-def _known(key: dict[str, object]) -> list[Point] | None:
+def _saved_curve(key: dict[str, object]) -> list[Point] | None:
     for line in CURVES.read_text().splitlines() if CURVES.exists() else []:
-        found = json.loads(line)
-        if all(found[name] == value for name, value in key.items()):
-            return [(seconds, value) for seconds, value in found["points"]]
+        row = json.loads(line)
+        if all(row[name] == value for name, value in key.items()):
+            return [(seconds, value) for seconds, value in row["points"]]
     return None
 
 
@@ -128,22 +128,22 @@ def _rows(env: str, goal: float, times: dict[str, list[float]], seeds: int) -> l
     range_ = {who: (min(all_), max(all_) if math.isfinite(max(all_)) else None) for who, all_ in times.items()}
     rows = []
     for peer in PEERS:
-        theirs = middle.get(peer)
-        ratio = None if theirs is None else theirs / middle["ours"]
+        peer_seconds = middle.get(peer)
+        ratio = None if peer_seconds is None else peer_seconds / middle["ours"]
         spread = {"ours": range_["ours"]} | ({"peer": range_[peer]} if peer in range_ else {})
         name = f"time to {goal:g}, {env}"
-        rows.append(Row(name, "s", middle["ours"], peer, theirs, ratio, None, "", spread, seeds, command()))
+        rows.append(Row(name, "s", middle["ours"], peer, peer_seconds, ratio, None, "", spread, seeds, command()))
     return rows
 
 
 def main() -> None:
-    made = parser(__doc__)
-    made.add_argument("--env", default="HalfCheetah-v5")
-    made.add_argument("--goals", type=float, nargs="+", default=[2000.0, 4000.0])
-    made.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    made.add_argument("--every", type=int, default=5000, help="environment steps between evaluations")
-    made.add_argument("--peers", nargs="*", choices=list(PEERS), default=list(PEERS), metavar="PEER")
-    options = made.parse_args()
+    parser = argument_parser(__doc__)
+    parser.add_argument("--env", default="HalfCheetah-v5")
+    parser.add_argument("--goals", type=float, nargs="+", default=[2000.0, 4000.0])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--every", type=int, default=5000, help="environment steps between evaluations")
+    parser.add_argument("--peers", nargs="*", choices=list(PEERS), default=list(PEERS), metavar="PEER")
+    options = parser.parse_args()
     python = peer_python("peers")
     runners: dict[str, Callable[[str, int, int], Iterator[Point]]] = {"ours": ours}
     if python:
@@ -151,7 +151,7 @@ def main() -> None:
     curves: dict[str, list[list[Point]]] = {who: [] for who in runners}
     for seed, who in product(options.seeds, runners):
         key = {"who": who, "env": options.env, "seed": seed, "every": options.every}
-        points = _known(key)
+        points = _saved_curve(key)
         if points is None:
             print(f"{who}, seed {seed}", flush=True)
             points = run(runners[who](options.env, seed, options.every), options.goals)

@@ -106,7 +106,7 @@ def _in_steps(row: Row, steps: int) -> Row:
 
 def slopes(of: str, table: Table) -> list[Row]:
     """Over all sizes, for each unit, and at which size the slope from one to the next bends most."""
-    found = []
+    fitted = []
     for series in zip(*(rows for _, rows in table), strict=True):
         points = [(math.log(size), math.log(row.ours)) for (size, _), row in zip(table, series, strict=True)]
         steps = [(v - y) / (u - x) for (x, y), (u, v) in pairwise(points)]
@@ -114,13 +114,13 @@ def slopes(of: str, table: Table) -> list[Row]:
         whole = (points[-1][1] - points[0][1]) / (points[-1][0] - points[0][0])
         name, bend = f"growth, slope of {series[0].unit} over {of}", float(table[1 + int(np.argmax(bends))][0])
         spread, rounds = {"ours": (min(steps), max(steps))}, series[0].rounds
-        found.append(Row(name, "", whole, "", None, None, bend, "bends most at", spread, rounds, harness.command()))
-    return found
+        fitted.append(Row(name, "", whole, "", None, None, bend, "bends most at", spread, rounds, harness.command()))
+    return fitted
 
 
 def main() -> None:
     tables = {"actors": actors, "batch": batch, "ring": ring, "window": window}
-    parser = harness.parser(__doc__)
+    parser = harness.argument_parser(__doc__)
     parser.add_argument("what", nargs="*", default=list(tables), help=", ".join(tables))
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -86,8 +86,8 @@ def compare(
     for peer in peers or {"": None}:
         pairs = list(zip(values["ours"], values.get(peer, []), strict=False))
         ratios = [b / a if less_is_better else a / b for a, b in pairs]
-        found = {"ours": values["ours"], "peer": values.get(peer, []), "limit": values.get("limit", [])}
-        medians = {key: statistics.median(seen) if seen else None for key, seen in found.items()}
+        times = {"ours": values["ours"], "peer": values.get(peer, []), "limit": values.get("limit", [])}
+        medians = {key: statistics.median(samples) if samples else None for key, samples in times.items()}
         assert medians["ours"] is not None
         rows.append(
             Row(
@@ -99,7 +99,7 @@ def compare(
                 statistics.median(ratios) if ratios else None,
                 medians["limit"],
                 limit[0] if limit else "",
-                {key: (min(seen), max(seen)) for key, seen in found.items() if seen},
+                {key: (min(samples), max(samples)) for key, samples in times.items() if samples},
                 rounds,
                 command(),
             )
@@ -123,12 +123,12 @@ def save(rows: list[Row]) -> None:
         print(row.show(), flush=True)
 
 
-def parser(doc: str | None) -> argparse.ArgumentParser:
+def argument_parser(doc: str | None) -> argparse.ArgumentParser:
     """With what every benchmark takes."""
-    made = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
-    made.add_argument("--rounds", type=int, default=5, help="in each of which ours and all peers take a turn")
-    made.add_argument("--seconds", type=float, default=4.0, help="of one turn")
-    return made
+    parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=5, help="in each of which ours and all peers take a turn")
+    parser.add_argument("--seconds", type=float, default=4.0, help="of one turn")
+    return parser
 
 
 def speed(work: Callable[[], int], seconds: float) -> float:

@@ -19,8 +19,8 @@ from benchmarks.harness import (
     Measure,
     Peer,
     Row,
+    argument_parser,
     compare,
-    parser,
     peer_python,
     random_rows,
     replay_process,
@@ -58,10 +58,10 @@ def ours(spec: WindowSpec, windows: int, seconds: float) -> Iterator[Measure]:
             first, start = sender.seq, time.perf_counter()
             speed(one, seconds)
             sender.wait()
-            found = (sender.seq - first) * CHUNK / (time.perf_counter() - start)
+            rate = (sender.seq - first) * CHUNK / (time.perf_counter() - start)
             for process in processes:
                 process.suspend()
-            return found
+            return rate
 
         yield measure
         for process in processes:
@@ -87,20 +87,20 @@ def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
     words = [str(word) for word in (cores[0], cores[-1], obs_dim, action_dim, HIDDEN, WINDOWS[env_id], CHUNK)]
     python, peers = peer_python("reverb"), dict[str, Measure | None]()
     with ExitStack() as stack:
-        found = stack.enter_context(ours(spec, WINDOWS[env_id], seconds))
+        own = stack.enter_context(ours(spec, WINDOWS[env_id], seconds))
         for name, layout in LAYOUTS.items():
             peers[name] = None
             if python is not None:
                 peer = stack.enter_context(Peer(python, "reverb_ingest", layout, *words))
                 peers[name] = lambda peer=peer: peer.measure(seconds)  # type: ignore[misc]
         limit = ("one copy in memory", copy(spec, seconds))
-        return compare(f"ingest, {CHUNK} windows an entry, {env_id}", "windows/s", found, peers, limit, rounds)
+        return compare(f"ingest, {CHUNK} windows an entry, {env_id}", "windows/s", own, peers, limit, rounds)
 
 
 def main() -> None:
-    made = parser(__doc__)
-    made.add_argument("--env", nargs="+", choices=list(WINDOWS), default=list(WINDOWS))
-    options = made.parse_args()
+    parser = argument_parser(__doc__)
+    parser.add_argument("--env", nargs="+", choices=list(WINDOWS), default=list(WINDOWS))
+    options = parser.parse_args()
     for env_id in options.env:
         save(measure(env_id, options.rounds, options.seconds))
 

@@ -23,9 +23,9 @@ from benchmarks.harness import (
     Measure,
     Peer,
     Row,
+    argument_parser,
     compare,
     on_cores,
-    parser,
     peer_python,
     random_rows,
     replay_process,
@@ -127,10 +127,10 @@ def _sac(stack: ExitStack, spec: WindowSpec, threads: int, seconds: float) -> Me
 
 
 def main() -> None:
-    made = parser(__doc__)
-    made.add_argument("--env", default="HalfCheetah-v5")
-    made.add_argument("--batches", type=int, nargs="+", default=[8, 32, 64, 256])
-    options = made.parse_args()
+    parser = argument_parser(__doc__)
+    parser.add_argument("--env", default="HalfCheetah-v5")
+    parser.add_argument("--batches", type=int, nargs="+", default=[8, 32, 64, 256])
+    options = parser.parse_args()
     run = robust(EnvConfig(options.env))
     torch.set_num_threads(1)
     rows: list[Row] = []

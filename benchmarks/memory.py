@@ -62,15 +62,15 @@ def resident(env_id: str, preset: str, total_steps: int) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         words = ["train", env_id, "--preset", preset, "--total-steps", str(total_steps), "--run-dir", f"{folder}/run"]
         process = subprocess.Popen([sys.executable, "-m", "rmc.cli.main", *words], stdout=subprocess.DEVNULL)
-        seen: dict[str, list[float]] = defaultdict(list)
+        readings: dict[str, list[float]] = defaultdict(list)
         while process.poll() is None:
-            _look(psutil.Process(process.pid), seen)
+            _look(psutil.Process(process.pid), readings)
             time.sleep(LOOK_SECONDS)
         assert process.returncode == 0
-    return [row for role in ROLES for row in _exact(f"memory, {role}, {env_id}, {preset}", "MB", max(seen[role]))]
+    return [row for role in ROLES for row in _exact(f"memory, {role}, {env_id}, {preset}", "MB", max(readings[role]))]
 
 
-def _look(launcher: psutil.Process, seen: dict[str, list[float]]) -> None:
+def _look(launcher: psutil.Process, readings: dict[str, list[float]]) -> None:
     """Note what each process of the run holds now."""
     for process in [launcher, *launcher.children(recursive=True)]:
         try:
@@ -78,11 +78,11 @@ def _look(launcher: psutil.Process, seen: dict[str, list[float]]) -> None:
         except psutil.Error:  # it has ended meanwhile
             continue
         role = next((role for role in ROLES if role in words), "redis")
-        seen["launcher" if process == launcher else role].append(held / 1e6)
+        readings["launcher" if process == launcher else role].append(held / 1e6)
 
 
 def main() -> None:
-    parser = harness.parser(__doc__)
+    parser = harness.argument_parser(__doc__)
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--preset", default="robust")
     parser.add_argument("--total-steps", type=int, default=6000)

@@ -23,8 +23,8 @@ from benchmarks.harness import (
     Measure,
     Peer,
     Row,
+    argument_parser,
     compare,
-    parser,
     peer_python,
     random_rows,
     replay_process,
@@ -115,12 +115,12 @@ def ours(spec: WindowSpec, windows: int, seconds: float) -> Iterator[Measure]:
             orders.send(seconds + 2 * SETTLE)
             speed(learner.step, SETTLE)
             before, start = learner.env_steps, time.perf_counter()
-            found = speed(learner.step, seconds)
+            rate = speed(learner.step, seconds)
             committed = (learner.env_steps - before) / spec.train / (time.perf_counter() - start)
             assert min(orders.recv(), committed) > KEPT_UP * RATE, committed
             for process in processes:
                 process.suspend()
-            return found
+            return rate
 
         yield measure
         for process in processes:
@@ -149,7 +149,7 @@ def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
     core = max(os.sched_getaffinity(0))
     sizes = [str(size) for size in (core, obs_dim, action_dim, HIDDEN, windows, BATCH, RATE, CHUNK)]
     with ExitStack() as stack:
-        found = stack.enter_context(ours(spec, windows, seconds))
+        own = stack.enter_context(ours(spec, windows, seconds))
         peers: dict[str, Measure | None] = {}
         for name, (place, layout) in REVERB.items():
             in_flight = IN_FLIGHT_OF.get((env_id, place, layout), IN_FLIGHT)
@@ -157,7 +157,7 @@ def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
             peers[name] = _peer(stack, "reverb", "reverb_replay", words, seconds)
         peers["cpprb, in the learner"] = _peer(stack, "peers", "cpprb_replay", sizes, seconds)
         limit = ("numpy gather in memory", gather(spec, windows, seconds))
-        return compare(f"replay, mixed load, batch {BATCH}, {env_id}", "batches/s", found, peers, limit, rounds)
+        return compare(f"replay, mixed load, batch {BATCH}, {env_id}", "batches/s", own, peers, limit, rounds)
 
 
 def _peer(stack: ExitStack, environment: str, script: str, words: list[str], seconds: float) -> Measure | None:
@@ -169,9 +169,9 @@ def _peer(stack: ExitStack, environment: str, script: str, words: list[str], sec
 
 
 def main() -> None:
-    made = parser(__doc__)
-    made.add_argument("--env", nargs="+", choices=list(WINDOWS), default=list(WINDOWS))
-    options = made.parse_args()
+    parser = argument_parser(__doc__)
+    parser.add_argument("--env", nargs="+", choices=list(WINDOWS), default=list(WINDOWS))
+    options = parser.parse_args()
     torch.set_num_threads(1)
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     for env_id in options.env:

@@ -136,8 +136,8 @@ def _committed(bus: RedisBus, actors: int) -> int:
 def _pin(numbers: dict[str, list[int]], alone: str) -> None:
     """The first core for one kind of process, the others for the rest."""
     first, *others = sorted(os.sched_getaffinity(0))
-    for kind, found in numbers.items():
-        for number in found:
+    for kind, pids in numbers.items():
+        for number in pids:
             for thread in psutil.Process(number).threads():
                 os.sched_setaffinity(thread.id, {first} if kind == alone else others)
 
@@ -150,15 +150,15 @@ def measure(spec: WindowSpec, shards: int, actors: int, alone: str, rate: float,
         while not all(_acknowledged(bus, actors)):
             time.sleep(0.05)
         time.sleep(2.0)
-        before = {kind: _cpu(found) for kind, found in numbers.items()}
+        before = {kind: _cpu(pids) for kind, pids in numbers.items()}
         unused = _unused()
         windows, start = _committed(bus, actors), time.perf_counter()
         time.sleep(seconds)
         windows, elapsed = _committed(bus, actors) - windows, time.perf_counter() - start
         idle, stolen = ((now - then) / elapsed for now, then in zip(_unused(), unused, strict=True))
         used = {
-            kind: [(after - at) / elapsed for after, at in zip(_cpu(found), before[kind], strict=True)]
-            for kind, found in numbers.items()
+            kind: [(after - at) / elapsed for after, at in zip(_cpu(pids), before[kind], strict=True)]
+            for kind, pids in numbers.items()
         }
     return Point(
         shards, actors, alone, rate, windows / elapsed,

@@ -41,8 +41,8 @@ def _receive(url: str, loaded: "Queue[Loaded]") -> None:
     bus, runner, held = RedisBus(url, RUN), PolicyRunner(OBS_DIM, ACTION_DIM, AGENT, envs=8), None
     while bus.stop_requested() is None:
         newest = bus.latest_version()
-        if newest is not None and newest != held and (found := bus.weights()) is not None:
-            held, blob = found
+        if newest is not None and newest != held and (weights := bus.weights()) is not None:
+            held, blob = weights
             runner.load(blob)
             loaded.put((held.update, time.monotonic()))
         time.sleep(POLL_SECONDS)
@@ -61,9 +61,9 @@ class Broadcast:
         self._update += 1
         start = time.monotonic()
         self._bus.publish_weights(Version(1, self._update), self.blob)
-        found = [self._loaded.get() for _ in range(self._actors)]
-        assert {update for update, _ in found} == {self._update}
-        return 1000.0 * (max(at for _, at in found) - start)
+        arrivals = [self._loaded.get() for _ in range(self._actors)]
+        assert {update for update, _ in arrivals} == {self._update}
+        return 1000.0 * (max(at for _, at in arrivals) - start)
 
     def median(self) -> float:
         """Of several, each at another moment of the actors' clocks."""
@@ -101,7 +101,7 @@ def broadcasting(actors: int) -> Iterator[Broadcast]:
 
 
 def main() -> None:
-    parser = harness.parser(__doc__)
+    parser = harness.argument_parser(__doc__)
     parser.add_argument("--actors", type=int, default=8)
     options = parser.parse_args()
     with broadcasting(options.actors) as broadcast:

@@ -264,15 +264,15 @@ class Agent(nn.Module):
         after the last. No gradient.
         """
         assert self.next_frame is not None
-        hidden, seen = state[:, : self.config.hidden], state[:, self.config.hidden :]
+        hidden, last_frame = state[:, : self.config.hidden], state[:, self.config.hidden :]
         frames = [observation[:, :0]]
         with torch.autocast(observation.device.type, enabled=False):  # at a step at a time the casts outweigh the rest
             for o, was_missing, a in zip(observation.unbind(1), missing.unbind(1), prev_action.unbind(1), strict=True):
-                expected = self.next_frame(hidden, seen, a).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
-                seen = torch.where(was_missing.unsqueeze(1), expected, o)
-                hidden = self.memory.step(seen, was_missing, a, hidden)
-                frames.append(seen.unsqueeze(1))
-        return torch.cat(frames, 1), torch.cat([hidden, seen], 1)
+                expected = self.next_frame(hidden, last_frame, a).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+                last_frame = torch.where(was_missing.unsqueeze(1), expected, o)
+                hidden = self.memory.step(last_frame, was_missing, a, hidden)
+                frames.append(last_frame.unsqueeze(1))
+        return torch.cat(frames, 1), torch.cat([hidden, last_frame], 1)
 
     def unroll(
         self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor
@@ -283,8 +283,8 @@ class Agent(nn.Module):
             seen, after = self.fill(observation, missing, prev_action, state)
         remembered: MemoryOutput = self.memory(seen, missing, prev_action, state)
         if seen is observation:
-            last_seen = seen[:, -1, : state.shape[1] - self.config.hidden]
-            after = torch.cat([remembered.hidden[:, -1], last_seen], 1)
+            last_frame = seen[:, -1, : state.shape[1] - self.config.hidden]
+            after = torch.cat([remembered.hidden[:, -1], last_frame], 1)
         return remembered, seen, after
 
     def fills(self, missing: Tensor) -> bool:
@@ -302,8 +302,8 @@ class Agent(nn.Module):
 
     def policy_shapes(self) -> dict[str, tuple[int, ...]]:
         """Of ``policy_weights``; also of an agent on the device ``meta``, which takes no memory."""
-        found = self.state_dict().items()
-        return {name: tuple(value.shape) for name, value in found if name.startswith(self._acting())}
+        state = self.state_dict().items()
+        return {name: tuple(value.shape) for name, value in state if name.startswith(self._acting())}
 
     def broadcast_weights(self) -> dict[str, Tensor]:
         """What actors are sent: the critics, too, where they rate their windows."""

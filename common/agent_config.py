@@ -35,12 +35,12 @@ class AgentConfig:
     missing_flag: bool = False
     """The memory has one more input, which says whether the observation is missing (flickered out)."""
     impute_missing: bool = False
-    """A missing observation is replaced, before the memory reads it, by what a small network predicts from the
-    observation before (filled itself if it was missing), the memory and the last action. The stored state then is h and
-    that observation. Needs normalized observations."""
+    """A small network fills a missing observation before the memory reads it. It predicts from the observation before
+    (filled itself if it was missing), the memory and the last action. The stored state then is h and that observation.
+    Needs normalized observations."""
     initial_priority: Literal["max", "actor"] = "max"
     """Priority that a window enters a prioritized replay with: the largest seen, or the TD error that its actor
-    computes, to which the critics are then sent, too."""
+    computes. For the latter, actors are sent the critics, too."""
 
     def state_size(self, obs_dim: int) -> int:
         """S, numbers that an actor carries from step to step, and stores: h, and what was last seen where it fills."""

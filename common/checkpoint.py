@@ -40,8 +40,8 @@ class CheckpointFolder:
         if self._lock is None:
             fix = "another process trains in this folder; stop it first"
             raise ConfigError("--run-dir", str(self.folder.parent), fix)
-        for left in self.folder.glob(".tmp-*"):
-            shutil.rmtree(left)
+        for leftover in self.folder.glob(".tmp-*"):
+            shutil.rmtree(leftover)
 
     def unlock(self) -> None:
         """Let another writer in."""

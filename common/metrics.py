@@ -30,15 +30,15 @@ class Rate:
     """How fast a counter moves, per second, over the last ten or so: actors step in bursts, as credit comes."""
 
     def __init__(self) -> None:
-        self._taken: deque[tuple[float, float]] = deque()
+        self._samples: deque[tuple[float, float]] = deque()
 
     def take(self, counter: float) -> float:
         """The rate up to now; 0 at the first call."""
         now = time.monotonic()
-        while len(self._taken) > 1 and self._taken[1][0] <= now - RATE_SECONDS:
-            self._taken.popleft()
-        self._taken.append((now, counter))
-        since, before = self._taken[0]
+        while len(self._samples) > 1 and self._samples[1][0] <= now - RATE_SECONDS:
+            self._samples.popleft()
+        self._samples.append((now, counter))
+        since, before = self._samples[0]
         return (counter - before) / (now - since) if now > since else 0.0
 
 

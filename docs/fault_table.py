@@ -26,7 +26,7 @@ def page() -> str:
 
 def _line(row: dict[str, Any]) -> str:
     counts = (row["tries"], row["acknowledged"], row["lost"], row["duplicated"], row["recovery_s_max"])
-    cells = [row["fault"], *map(_cell, counts), "yes" if row["passed"] else "**no**", _found(row["found"])]
+    cells = [row["fault"], *map(_cell, counts), "yes" if row["passed"] else "**no**", _measures(row["found"])]
     return f"| {' | '.join(cells)} | {row['date']}, {row['commit']} |"
 
 
@@ -34,9 +34,9 @@ def _cell(value: float | None) -> str:
     return NONE if value is None else f"{value:,}".replace(",", " ")
 
 
-def _found(found: dict[str, Any]) -> str:
+def _measures(measures: dict[str, Any]) -> str:
     """What else it measured, what came to nothing left out."""
-    return "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in found.items() if value) or NONE
+    return "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in measures.items() if value) or NONE
 
 
 if __name__ == "__main__":

@@ -129,10 +129,10 @@ def page() -> str:
         "",
         "Written by `make docs` from the code. Defaults are `robust`'s; what `paper` has otherwise is in brackets.",
     ]
-    ours, theirs = robust(EnvConfig("")), paper(EnvConfig(""))
+    defaults, paper_config = robust(EnvConfig("")), paper(EnvConfig(""))
     for part, title in TITLES.items():
         lines += ["", f"## {title}", "", HEAD, RULE]
-        configs = (ours, theirs) if part == "run" else (getattr(ours, part), getattr(theirs, part))
+        configs = (defaults, paper_config) if part == "run" else (getattr(defaults, part), getattr(paper_config, part))
         lines += _rows(*configs)
         if part == "run":
             lines += ["", "Which of them may change when a run goes on: [Resume a run](resume.md#what-may-change)."]
@@ -142,23 +142,24 @@ def page() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _rows(ours: Any, theirs: Any) -> list[str]:
-    said = _docstrings(type(ours))
+def _rows(defaults: Any, paper_config: Any) -> list[str]:
+    help_texts = _docstrings(type(defaults))
     rows = []
-    for item in dataclasses.fields(ours):
-        value, other = getattr(ours, item.name), getattr(theirs, item.name)
+    for item in dataclasses.fields(defaults):
+        value, other = getattr(defaults, item.name), getattr(paper_config, item.name)
         if dataclasses.is_dataclass(value) or item.name == "id":
             continue
         default = _text(value) if value == other or item.name == "preset" else f"{_text(value)} ({_text(other)})"
-        rows.append(f"| `{option(item.name)}` | {default} | {said[item.name]} | {WHEN[item.name]} |")
+        rows.append(f"| `{option(item.name)}` | {default} | {help_texts[item.name]} | {WHEN[item.name]} |")
     return rows
 
 
 def _launch_rows(names: list[str]) -> list[str]:
-    said = _docstrings(Train)
+    help_texts = _docstrings(Train)
     defaults = {item.name: item.default for item in dataclasses.fields(Train)}
     return [
-        f"| `--{name.replace('_', '-')}` | {_text(defaults[name])} | {said[name]} | {WHEN[name]} |" for name in names
+        f"| `--{name.replace('_', '-')}` | {_text(defaults[name])} | {help_texts[name]} | {WHEN[name]} |"
+        for name in names
     ]
 
 
@@ -166,12 +167,12 @@ def _docstrings(kind: type[Any]) -> dict[str, str]:
     """What stands under each field in the source."""
     tree = ast.parse(inspect.getsource(importlib.import_module(kind.__module__)))
     body = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind.__name__).body
-    found = {}
+    docstrings = {}
     for field, after in itertools.pairwise(body):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(after, ast.Expr):
             assert isinstance(after.value, ast.Constant)
-            found[field.target.id] = " ".join(str(after.value.value).split())
-    return found
+            docstrings[field.target.id] = " ".join(str(after.value.value).split())
+    return docstrings
 
 
 def _text(value: Any) -> str:

@@ -41,8 +41,8 @@ class UpdateConfig:
     """In schemes 4 to 6: the policy's loss also reaches the memory by the state that Q reads, not by the policy's
     own input alone."""
     update_order: Literal["joint", "alternate"] = "joint"
-    """All losses from the parameters as they stood, in one step; or one after the other, each from what the one
-    before left, with optimisers of their own (algorithm 1 as printed)."""
+    """All losses from the parameters as they stood, in one step; or one after the other. In turn, each starts from
+    what the one before left, with an optimiser of its own (algorithm 1 as printed)."""
     model_norm: Literal["l1", "l2"] = "l1"
     """How the world model's error is measured, as loss and as curiosity."""
     n_step: int = 1
@@ -81,5 +81,5 @@ class LearnerConfig:
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     """Matrix products in bfloat16 (auto: where this CPU or GPU has instructions for it) or float32."""
     threads: int = 0
-    """CPU threads of the learner. 0 takes all cores but one, and two of two: then memory and world model train in a
-    process of their own, where the scheme is 3. 1 keeps one process. On Ray and in lockstep 0 takes one."""
+    """CPU threads of the learner. 0 takes all cores but one, and two of two. With several and scheme 3, memory and
+    world model train in a process of their own. 1 keeps one process. On Ray and in lockstep 0 takes one."""

@@ -63,19 +63,19 @@ class CopiesAhead:
         self._places, self._device = places, places[0].device
         self._landed = [torch.empty_like(place) for place in places]
         self._stream = torch.cuda.Stream(self._device)  # type: ignore[no-untyped-call]
-        self._taken = torch.cuda.Event()  # type: ignore[no-untyped-call]
+        self._consumed = torch.cuda.Event()  # type: ignore[no-untyped-call]
 
     def __call__(self, tensors: list[Tensor]) -> None:
         """What is launched after this finds them there; what was launched before still finds the last."""
         current = torch.cuda.current_stream(self._device)
-        self._stream.wait_event(self._taken)
+        self._stream.wait_event(self._consumed)
         with torch.cuda.stream(self._stream):
             for landed, tensor in zip(self._landed, tensors, strict=True):
                 landed.copy_(tensor, non_blocking=True)
         current.wait_stream(self._stream)
         for place, landed in zip(self._places, self._landed, strict=True):
             place.copy_(landed)
-        self._taken.record(current)
+        self._consumed.record(current)
 
 
 class HostCopy:

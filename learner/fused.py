@@ -256,14 +256,14 @@ class _Heads(torch.autograd.Function):
         biases = [torch.zeros(w.shape[0], w.shape[2]) for w in (w1, w2, w3)]
         wants_features, wants_action, _, wants_weights, *_ = ctx.needs_input_grad
         # of the inputs only those asked for: where the policy climbs Q, that is the action alone
-        asked = slice(0 if wants_features else ctx.split, x.shape[1] if wants_action else ctx.split)
-        dx = torch.zeros_like(x[:, asked])
+        columns = slice(0 if wants_features else ctx.split, x.shape[1] if wants_action else ctx.split)
+        dx = torch.zeros_like(x[:, columns])
         for net, (first, second) in enumerate(zip(hidden[::2], hidden[1::2], strict=True)):
             d2 = _last_layer_back(grad[net], second, w3[net], weight_grads[2][net], biases[2][net], biases[1][net])
             d1 = torch.mm(d2, w2[net].t())
             kernels.relu_back(_bits(d1), _bits(first), biases[0][net].numpy())
             if dx.shape[1]:
-                dx.addmm_(d1, w1[net][asked].t())
+                dx.addmm_(d1, w1[net][columns].t())
             if wants_weights:
                 _product(first, d2, weight_grads[1][net])
                 _product(x, d1, weight_grads[0][net])

@@ -55,8 +55,8 @@ class ReplayConnection:
         if header.kind is Kind.ERROR:
             self._check_not_fenced(meta)
             raise AuthenticationError(f"it said {meta.get('error')!r:.200}")
-        known = _equal(meta.get("proof"), proof(secret, b"server", nonce, challenge))
-        if header.kind is not Kind.WELCOME or not known:
+        authentic = _equal(meta.get("proof"), proof(secret, b"server", nonce, challenge))
+        if header.kind is not Kind.WELCOME or not authentic:
             raise AuthenticationError("the replay server does not know this run's secret")
         if meta.get("fingerprint") != fingerprint:
             raise MessageError("fingerprint", f"{meta.get('fingerprint')}, this learner has {fingerprint}")
@@ -130,8 +130,8 @@ class ReplayConnection:
         self._socket.close()
 
 
-def _equal(given: Any, expected: bytes) -> bool:
-    return isinstance(given, bytes) and hmac.compare_digest(given, expected)
+def _equal(received: Any, expected: bytes) -> bool:
+    return isinstance(received, bytes) and hmac.compare_digest(received, expected)
 
 
 def _connect(address: str, tls: ssl.SSLContext | None) -> socket.socket:

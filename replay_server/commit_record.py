@@ -143,10 +143,10 @@ class RecordPair:
 
     def read(self) -> Progress | None:
         """The newest valid copy, or None where both are damaged."""
-        found = [(sequence, payload) for sequence, payload in map(_read_copy, self._copies) if payload is not None]
-        if not found:
+        copies = [(sequence, payload) for sequence, payload in map(_read_copy, self._copies) if payload is not None]
+        if not copies:
             return None
-        self._sequence, payload = max(found)
+        self._sequence, payload = max(copies)
         return decode_progress(payload, self._obs_dim)
 
 

@@ -57,8 +57,8 @@ class ClientConnection:
         """Take what has arrived, at most 64 KiB, and what of it is decrypted already."""
         try:
             received = self.socket.recv(RECEIVE_BYTES)
-            while received and isinstance(self.socket, ssl.SSLSocket) and (left := self.socket.pending()):
-                received += self.socket.recv(left)
+            while received and isinstance(self.socket, ssl.SSLSocket) and (pending := self.socket.pending()):
+                received += self.socket.recv(pending)
         except (BlockingIOError, ssl.SSLWantReadError):
             return
         if not received:

@@ -17,20 +17,20 @@ def find_episode(ring: Ring, serial: int, most: int) -> Slots | None:
     progress, rows = ring.progress, ring.rows
     if not (progress.valid_from <= serial < progress.next_serial and ring.holds(np.array([serial])).all()):
         return None
-    found = [serial % ring.capacity]
-    origin = {name: rows[name][found[0]] for name in ("actor", "epoch", "env")}
+    chain = [serial % ring.capacity]
+    origin = {name: rows[name][chain[0]] for name in ("actor", "epoch", "env")}
     oldest = max(progress.valid_from, serial - FARTHEST)
-    while rows["episode_step"][found[-1]] > 0 and serial > oldest:
+    while rows["episode_step"][chain[-1]] > 0 and serial > oldest:
         serials = np.arange(serial - 1, max(oldest, serial - CHUNK) - 1, -1)
         slots, serial = serials % ring.capacity, serial - len(serials)
         same = np.logical_and.reduce([ring.holds(serials), *(rows[name][slots] == origin[name] for name in origin)])
         for slot in slots[same].tolist():
-            if rows["episode_step"][found[-1]] == 0:
+            if rows["episode_step"][chain[-1]] == 0:
                 break
-            if len(found) == most or not _adjoins(ring, slot, found[-1]):
+            if len(chain) == most or not _adjoins(ring, slot, chain[-1]):
                 return None
-            found.append(slot)
-    return np.array(found[::-1]) if rows["episode_step"][found[-1]] == 0 else None
+            chain.append(slot)
+    return np.array(chain[::-1]) if rows["episode_step"][chain[-1]] == 0 else None
 
 
 def _adjoins(ring: Ring, earlier: int, later: int) -> bool:

@@ -82,16 +82,16 @@ class Ring:
 
     def holds(self, serials: Serials) -> NDArray[np.bool_]:
         """Which of (n,) windows are in the ring, whole as far as their serial tells."""
-        known = (serials >= self.progress.valid_from) & (serials < self.progress.next_serial)
-        found: NDArray[np.bool_] = known & (self.rows["serial"][serials % self.capacity] == serials)
-        return found
+        valid = (serials >= self.progress.valid_from) & (serials < self.progress.next_serial)
+        held: NDArray[np.bool_] = valid & (self.rows["serial"][serials % self.capacity] == serials)
+        return held
 
     def gather(self, slots: Slots, out: Rows) -> NDArray[np.bool_]:
         """Copy whole rows (B,) into ``out``; which of them are still windows, in their place."""
         np.take(self._blocks, slots, out=out.view(self._blocks.dtype), mode="clip")  # clip: unbuffered
         serials = out["serial"]
-        known = (serials >= self.progress.valid_from) & (serials < self.progress.next_serial)
-        sound: NDArray[np.bool_] = known & (serials % self.capacity == slots) & (row_faults(out, self.spec) == 0)
+        valid = (serials >= self.progress.valid_from) & (serials < self.progress.next_serial)
+        sound: NDArray[np.bool_] = valid & (serials % self.capacity == slots) & (row_faults(out, self.spec) == 0)
         return sound
 
     def forget(self, slots: Slots) -> None:
@@ -157,14 +157,14 @@ def _check_identity(path: Path, spec: WindowSpec, capacity: int) -> None:
         raw = file.read(_IDENTITY.size + 4)
     if len(raw) < _IDENTITY.size + 4 or zlib.crc32(raw[:-4]) != struct.unpack("<I", raw[-4:])[0]:
         raise _unusable(path, "not a replay ring, or a damaged one")
-    magic, fingerprint, found, _ = _IDENTITY.unpack(raw[:-4])
+    magic, fingerprint, stored, _ = _IDENTITY.unpack(raw[:-4])
     if magic != _MAGIC:
         raise _unusable(path, "made by another version")
     if fingerprint not in (spec.fingerprint.encode(), spec.former_fingerprint.encode()):
         fix = f"its windows are of layout {fingerprint.decode()}, this run's of {spec.fingerprint}; use a new folder"
         raise ConfigError("--run-dir", str(path), fix)
-    if found != capacity:
-        fix = f"the ring in {path.parent} has {found}; keep that or use a new --run-dir"
+    if stored != capacity:
+        fix = f"the ring in {path.parent} has {stored}; keep that or use a new --run-dir"
         raise ConfigError("--capacity", capacity, fix)
     if path.stat().st_size != file_bytes(spec, capacity):
         raise _unusable(path, "cut short")

@@ -142,21 +142,21 @@ class ReplayServer:
 
     def step(self) -> bool:
         """Take in one round of entries: ring, commit, acks. False where there was none."""
-        taken = self._reader.read(self._store.ring.progress.streams)
-        if taken is not None:
+        batch = self._reader.read(self._store.ring.progress.streams)
+        if batch is not None:
             self._owes_acks = True
-            self._insert(taken)
+            self._insert(batch)
         self._publish(at_once=self._owes_acks)
         self._owes_acks = False
-        if taken is None:
+        if batch is None:
             return False
-        for actor, before in taken.broken.items():
+        for actor, before in batch.broken.items():
             self.bus.drop_stream(self.owner, actor)
             self._reader.sends_again(actor, before)
         return True
 
-    def _insert(self, taken: IngestBatch) -> None:
-        ring, progress, rows = self._store.ring, self._store.ring.progress, taken.rows
+    def _insert(self, batch: IngestBatch) -> None:
+        ring, progress, rows = self._store.ring, self._store.ring.progress, batch.rows
         sums = observation_sums(rows, self.spec)
         slots = ring.write(rows)
         initial = rows["initial_priority"][-ring.capacity :]
@@ -167,7 +167,7 @@ class ReplayServer:
         progress.observations += sums.count
         progress.total += sums.total
         progress.total_square += sums.total_square
-        progress.streams = taken.positions
+        progress.streams = batch.positions
         ring.commit()
         self._measure_lag(rows)
 

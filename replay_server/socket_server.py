@@ -161,11 +161,11 @@ class SocketServer:
             self._selector.modify(connection.socket, events, connection)
 
     def _authenticate(self, connection: ClientConnection, frame: Frame) -> None:
-        nonce, given = frame.meta.get("nonce"), frame.meta.get("proof")
+        nonce, received = frame.meta.get("nonce"), frame.meta.get("proof")
         if frame.kind is not Kind.PROOF or not isinstance(nonce, bytes) or len(nonce) != NONCE_BYTES:
             raise AuthenticationError("no proof came")
         expected = proof(self._secret, b"client", connection.challenge, nonce)
-        if not isinstance(given, bytes) or not hmac.compare_digest(given, expected):
+        if not isinstance(received, bytes) or not hmac.compare_digest(received, expected):
             raise AuthenticationError("the client does not know this run's secret")
         connection.nonce = nonce
         self._introduce(connection, frame.meta.get("epoch"))

@@ -40,7 +40,7 @@ class StreamReader:
         self.spec, self.bus, self._shard = spec, bus, shard
         self.refused: Counter[str] = Counter()  # dead letters by reason
         self.gaps = 0  # entries whose number does not follow their predecessor's
-        self._asked: dict[int, EntryId] = {}  # past which entry an actor was asked to send again
+        self._resends: dict[int, EntryId] = {}  # past which entry an actor was asked to send again
         self._actors = {actor for actor in range(actors) if shard.owns(actor)}
         self._rounds = 0
         self._entry_bytes = ROUND_BYTES  # the largest entry of the last round that had any
@@ -58,7 +58,7 @@ class StreamReader:
 
     def sends_again(self, actor: int, before: EntryId) -> None:
         """An actor's stream was dropped, so that it sends again what came after that entry."""
-        self._asked[actor] = before
+        self._resends[actor] = before
         self.gaps += 1
 
     def _cursors(self, positions: Mapping[int, StreamPosition]) -> dict[int, EntryId]:
@@ -94,7 +94,7 @@ class StreamReader:
             for actor, epoch in newest.items()
             if epoch > last.get(actor, BEFORE_ALL).epoch
         }
-        taken: list[Entry] = []
+        accepted: list[Entry] = []
         broken: dict[int, EntryId] = {}
         for entry in entries:
             before = last.get(entry.actor, BEFORE_ALL)
@@ -110,8 +110,8 @@ class StreamReader:
                 broken[entry.actor] = before
                 continue
             last[entry.actor] = entry.id
-            taken.append(entry)
-        return taken, broken
+            accepted.append(entry)
+        return accepted, broken
 
     def _lacks_entries(self, before: EntryId, entry: Entry) -> bool:
         """Whether Redis has lost what comes between, and its actor may still have it.
@@ -119,10 +119,10 @@ class StreamReader:
         It has not where it was asked before, nor where the ring does not know this life at all: what is missing
         then was trimmed after another ring's commit.
         """
-        known = entry.id.epoch == before.epoch
-        if entry.id.seq == (before.seq + 1 if known else 0):
+        same_epoch = entry.id.epoch == before.epoch
+        if entry.id.seq == (before.seq + 1 if same_epoch else 0):
             return False
-        if known and self._asked.get(entry.actor) != before:
+        if same_epoch and self._resends.get(entry.actor) != before:
             return True
         self.gaps += 1
         return False
@@ -140,9 +140,9 @@ class StreamReader:
         """The bodies, but for those with a faulty row, which are refused."""
         ends = np.cumsum([0 if body is None else len(body) for body in bodies])
         kept = list(bodies)
-        for index, found in enumerate(np.split(faults, ends[:-1])):
-            if found.any():
-                self._refuse(entries[index], MessageError("window", FAULTS[found[found > 0][0]]))
+        for index, of_body in enumerate(np.split(faults, ends[:-1])):
+            if of_body.any():
+                self._refuse(entries[index], MessageError("window", FAULTS[of_body[of_body > 0][0]]))
                 kept[index] = None
         return kept
 
@@ -153,15 +153,15 @@ class StreamReader:
 
     def _stamped(self, entries: list[Entry], bodies: list[Rows | None]) -> Rows:
         """All bodies as one array; the origin comes from the entry ids, whatever the sender wrote."""
-        found = [(entry, body) for entry, body in zip(entries, bodies, strict=True) if body is not None and len(body)]
+        parts = [(entry, body) for entry, body in zip(entries, bodies, strict=True) if body is not None and len(body)]
         block = np.dtype((np.void, self.spec.dtype.itemsize))  # copies whole rows rather than fields
-        blocks = [np.empty(0, block), *(body.view(block) for _, body in found)]
+        blocks = [np.empty(0, block), *(body.view(block) for _, body in parts)]
         rows: Rows = np.concatenate(blocks).view(self.spec.dtype)
-        counts = [len(body) for _, body in found]
+        counts = [len(body) for _, body in parts]
         starts = np.cumsum([0, *counts[:-1]]) if counts else np.zeros(0, np.int64)
-        rows["actor"] = np.repeat([entry.actor for entry, _ in found], counts)
-        rows["epoch"] = np.repeat([entry.id.epoch for entry, _ in found], counts)
-        rows["seq"] = np.repeat([entry.id.seq for entry, _ in found], counts)
+        rows["actor"] = np.repeat([entry.actor for entry, _ in parts], counts)
+        rows["epoch"] = np.repeat([entry.id.epoch for entry, _ in parts], counts)
+        rows["seq"] = np.repeat([entry.id.seq for entry, _ in parts], counts)
         rows["k"] = np.arange(len(rows)) - np.repeat(starts, counts)
         return rows
 

@@ -31,9 +31,9 @@ def _find(nodes: Values, size: int, positions: Values, slots: Slots) -> None:
         node, position = 1, positions[i]
         while node < size:
             node *= 2
-            left = nodes[node]
-            if position >= left and nodes[node + 1] > 0.0:  # rounding never leads to an empty leaf
-                position -= left
+            left_mass = nodes[node]
+            if position >= left_mass and nodes[node + 1] > 0.0:  # rounding never leads to an empty leaf
+                position -= left_mass
                 node += 1
         slots[i] = node - size
 

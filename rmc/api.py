@@ -72,16 +72,16 @@ def resume(
     """
     folder = RunFolder(Path(run_dir))
     config, options = folder.config(), last_launch(folder, launcher)
-    said: dict[str, Any] = {"total_steps": total_steps, "actors": actors}
+    settings: dict[str, Any] = {"total_steps": total_steps, "actors": actors}
     how: dict[str, Any] = {"device": device, "redis_url": redis_url}
     if replay_ratio is not None:
-        said["replay"] = replace(config.replay, replay_ratio=replay_ratio)
+        settings["replay"] = replace(config.replay, replay_ratio=replay_ratio)
     if learning_rate is not None:
-        said["update"] = replace(config.update, learning_rate=learning_rate)
-    return _train(replace(config, **_given(said)), replace(options, **_given(how)))
+        settings["update"] = replace(config.update, learning_rate=learning_rate)
+    return _train(replace(config, **_not_none(settings)), replace(options, **_not_none(how)))
 
 
-def _given(values: dict[str, Any]) -> dict[str, Any]:
+def _not_none(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 

@@ -36,28 +36,28 @@ def play(job: Job, episodes: int = EPISODES) -> dict[str, Any]:
     folder = RunFolder(job.folder)
     config, steps, averaged, newest = folder.config(), [], [], []
     for number in CheckpointFolder(folder.checkpoints).numbers():
-        found = evaluate_policy(read_policy(folder.path, str(number)), episodes)
-        steps.append(found["env_steps"])
-        averaged.append(found["eval_return_mean"])
+        result = evaluate_policy(read_policy(folder.path, str(number)), episodes)
+        steps.append(result["env_steps"])
+        averaged.append(result["eval_return_mean"])
         blob = safetensors.torch.save(load_agent(folder, config, str(number)).policy_weights())
         newest.append(evaluate_blob(config.policy_header(), blob, episodes)["eval_return_mean"])
     about = {**job.values, "seed": job.seed}
     return about | {"env_steps": steps, "averaged": averaged, "newest": newest}
 
 
-def tell(path: Path) -> None:
+def report(path: Path) -> None:
     """The second half of each run."""
     for line in objects(path, "agent", "env", "seed", "env_steps", "averaged", "newest").values():
-        _tell_run(line)
+        _report_run(line)
 
 
-def _tell_run(line: dict[str, Any]) -> None:
+def _report_run(line: dict[str, Any]) -> None:
     half = np.array(line["env_steps"]) > max(line["env_steps"]) / 2
     for name in ("averaged", "newest"):
-        found = np.array(line[name])[half]
-        spread = f"mean {found.mean():,.0f}, worst {found.min():,.0f}, deviation {found.std():,.0f}"
-        print(f"{line['agent']}, {line['env']}, seed {line['seed']}, {name}: {spread} of {len(found)} checkpoints")
+        returns = np.array(line[name])[half]
+        spread = f"mean {returns.mean():,.0f}, worst {returns.min():,.0f}, deviation {returns.std():,.0f}"
+        print(f"{line['agent']}, {line['env']}, seed {line['seed']}, {name}: {spread} of {len(returns)} checkpoints")
 
 
 if __name__ == "__main__":
-    STUDY.main(Play("played", play, tell))
+    STUDY.main(Play("played", play, report))

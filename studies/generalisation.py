@@ -59,12 +59,12 @@ def area(returns: list[float]) -> float:
     return float(np.mean(returns[AREA]))
 
 
-def tell(path: Path) -> None:
+def report(path: Path) -> None:
     """The areas by environment and agent, with an interval where there are seeds enough."""
-    found: dict[tuple[str, str], list[float]] = {}
+    by_agent: dict[tuple[str, str], list[float]] = {}
     for line in objects(path, "agent", "env", "returns").values():
-        found.setdefault((line["env"], line["agent"]), []).append(area(line["returns"]))
-    for (env, agent), areas in found.items():
+        by_agent.setdefault((line["env"], line["agent"]), []).append(area(line["returns"]))
+    for (env, agent), areas in by_agent.items():
         scores = np.array(areas)[:, None]
         text = f"{env}, {agent}: {scores.mean():,.0f} ({', '.join(f'{one:,.0f}' for one in areas)})"
         if len(areas) >= ENOUGH_SEEDS:
@@ -96,7 +96,7 @@ def draw(out: Path, paths: list[Path]) -> None:
 def main() -> None:
     """Train, or play what was trained, or draw how it played."""
     if "--draw" not in sys.argv:
-        STUDY.main(Play("flicker", play, tell))
+        STUDY.main(Play("flicker", play, report))
         return
     parser = argparse.ArgumentParser()
     parser.add_argument("--draw", type=Path, nargs="+", metavar=("PICTURE", "FILE"))

@@ -75,7 +75,7 @@ def trained(task: str, seed: int, code: str) -> Line:
 
 
 def updates_per_s(run: RunFolder) -> float:
-    """The median of what its learner said a second."""
+    """The median of what its learner judgement a second."""
     speeds = [
         record["updates_per_s"]
         for record in run.records()
@@ -129,10 +129,10 @@ def main() -> None:
             line = trained(task, options.seed, code)
         except ConfigError as error:
             sys.exit(f"studies.guard: {error}")
-        said = verdict(line, before)
-        ok = ok and "below" not in said
+        judgement = verdict(line, before)
+        ok = ok and "below" not in judgement
         figures = f"{line.episode_return:9,.1f} {line.updates_per_s:10,.1f} {line.gflops:8,.1f} {line.speed:7,.1f}"
-        print(f"{task:15} {line.seed:4} {figures}  {said}", flush=True)
+        print(f"{task:15} {line.seed:4} {figures}  {judgement}", flush=True)
         if options.record:
             with LINES.open("a") as file:
                 file.write(json.dumps(asdict(line)) + "\n")

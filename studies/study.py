@@ -54,7 +54,7 @@ class Play:
 
     kind: str
     play: Callable[[Job], dict[str, Any]]
-    tell: Callable[[Path], None]
+    report: Callable[[Path], None]
 
 
 class Study:
@@ -75,8 +75,8 @@ class Study:
         if unknown := set(only or ()) - set(self.agents):
             raise ConfigError("--only", sorted(unknown), f"use some of {', '.join(map(repr, self.agents))}")
         size = self.scales[scale]
-        wanted = [agent for agent in self.agents if only is None or agent in only]
-        return [self._job(scale, *one) for one in product(seeds or size.seeds, envs or size.envs, wanted)]
+        agents = [agent for agent in self.agents if only is None or agent in only]
+        return [self._job(scale, *one) for one in product(seeds or size.seeds, envs or size.envs, agents)]
 
     def _job(self, scale: str, seed: int, env: str, agent: str) -> Job:
         words = [env if word == "ENV" else word for word in self.agents[agent]]
@@ -115,7 +115,7 @@ class Study:
         try:
             jobs = self.jobs(scale, options.seeds, options.env, options.only)
             if after is not None and options.play:
-                after.tell(self.played(scale, jobs, after))
+                after.report(self.played(scale, jobs, after))
             else:
                 self.run(scale, jobs, options.jobs)
         except ConfigError as error:
@@ -141,8 +141,8 @@ class Study:
         """Those that have no line yet, so many at once. Raises ConfigError for the first that fails, after the rest."""
         target = self.results(scale)
         target.parent.mkdir(parents=True, exist_ok=True)
-        found = history.read(target) if target.exists() else []
-        done = {(one.agent, one.env.partition(",")[0], one.seed) for one in found}
+        histories = history.read(target) if target.exists() else []
+        done = {(one.agent, one.env.partition(",")[0], one.seed) for one in histories}
         failures: list[ConfigError] = []
 
         def ended(job: Job, ending: Ending) -> None:
@@ -150,8 +150,8 @@ class Study:
                 with target.open("a") as file:
                     file.write(_line(job) + "\n")
             else:
-                said = f"{ending.state}: {ending.reason}"
-                failures.append(ConfigError(job.values["agent"], shlex.join(job.words), said))
+                reason = f"{ending.state}: {ending.reason}"
+                failures.append(ConfigError(job.values["agent"], shlex.join(job.words), reason))
 
         with signals_caught() as stop:
             conduct(Grid(job for job in jobs if _key(job) not in done), LocalRuns(at_once), stop, _begun, ended)
@@ -171,16 +171,16 @@ def _begun(job: Job) -> None:
 
 def _line(job: Job) -> str:
     """A finished run's, under the name that the study has for it."""
-    (found,) = history.read(job.folder)
-    return dataclasses.replace(found, agent=job.values["agent"], commit=commit()).to_line()
+    (past,) = history.read(job.folder)
+    return dataclasses.replace(past, agent=job.values["agent"], commit=commit()).to_line()
 
 
 def commit(studies: Path = RESULTS.parent) -> str:
     """Of the code that runs; with a + where it has changed since. Results are no code; "" outside a repository."""
 
     def git(*words: str) -> str:
-        found = subprocess.run(["git", "-C", str(studies), *words], capture_output=True, text=True, check=False)
-        return found.stdout.strip()
+        process = subprocess.run(["git", "-C", str(studies), *words], capture_output=True, text=True, check=False)
+        return process.stdout.strip()
 
     changed = git("diff", "--name-only", "HEAD", "--", ":(top)", f":(exclude){RESULTS.name}")
     return git("rev-parse", "--short=7", "HEAD") + "+" * bool(changed)

@@ -93,6 +93,17 @@ def pytest_unconfigure() -> None:
 
 
 @pytest.fixture
+def one_thread() -> Iterator[None]:
+    """PyTorch computes in one thread, so that the bits are the same everywhere."""
+    import torch  # slow, and most tests need none
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def run_name(request: pytest.FixtureRequest) -> str:
     """A run name that no other test has."""
     return f"{request.node.name}-{os.urandom(4).hex()}"
@@ -109,14 +120,14 @@ def _shared_memory() -> set[str]:
 
 
 def _running_children() -> list[psutil.Process]:
-    found = []
+    results = []
     for child in psutil.Process().children(recursive=True):
         try:
             if child.status() != psutil.STATUS_ZOMBIE and child.cmdline():
-                found.append(child)
+                results.append(child)
         except psutil.NoSuchProcess:
             continue
-    return found
+    return results
 
 
 @pytest.fixture(autouse=True)

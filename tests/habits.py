@@ -87,13 +87,13 @@ class Shaped(Slide):
         return super().step([float(np.ravel(part)[0]) for part in _parts(action)])
 
     def seen(self) -> Any:
-        place, *others = found = super().seen()
+        place, *others = numbers = super().seen()
         return {
-            "column": found.reshape(3, 1),
-            "row": found.reshape(1, 3),
+            "column": numbers.reshape(3, 1),
+            "row": numbers.reshape(1, 3),
             "nested": {"a": {"place": np.array(place)}, "b": np.array(others)},
-            "tuple": (found[:1], found[1:].reshape(2, 1)),
-        }.get(self.shape, found)
+            "tuple": (numbers[:1], numbers[1:].reshape(2, 1)),
+        }.get(self.shape, numbers)
 
 
 def _parts(action: Any) -> list[Any]:

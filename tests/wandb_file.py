@@ -31,8 +31,8 @@ def exit_codes(of: Iterable[Any]) -> list[int]:
     return [record.exit.exit_code for record in of if record.HasField("exit")]
 
 
-def items(found: Iterable[Any]) -> dict[str, Any]:
-    return {"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in found}
+def items(entries: Iterable[Any]) -> dict[str, Any]:
+    return {"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in entries}
 
 
 def _of(content: bytes) -> Iterator[Any]:

@@ -26,8 +26,8 @@ def main() -> None:
     rng = np.random.default_rng(0)
 
     def one() -> None:
-        found = buffer.sample(batch, beta=IMPORTANCE)
-        buffer.update_priorities(found["indexes"], rng.uniform(0.1, 1.0, batch).astype(np.float32))
+        sample = buffer.sample(batch, beta=IMPORTANCE)
+        buffer.update_priorities(sample["indexes"], rng.uniform(0.1, 1.0, batch).astype(np.float32))
 
     def measure(seconds: float) -> float:
         begin, done, added = time.perf_counter(), 0, 0

@@ -45,10 +45,10 @@ def read_client(port: int, batch: int, names: list[str]) -> Iterator[Batch]:
     """Batches stacked from the client's samples."""
     client = reverb.Client(f"localhost:{port}")
     while True:
-        found = list(client.sample(TABLE, batch, emit_timesteps=False))
-        columns = {name: np.stack([one.data[k] for one in found]) for k, name in enumerate(names)}
-        keys = np.array([one.info.key for one in found], np.uint64)
-        yield keys, np.array([one.info.probability for one in found]), found[0].info.table_size, columns
+        samples = list(client.sample(TABLE, batch, emit_timesteps=False))
+        columns = {name: np.stack([one.data[k] for one in samples]) for k, name in enumerate(names)}
+        keys = np.array([one.info.key for one in samples], np.uint64)
+        yield keys, np.array([one.info.probability for one in samples]), samples[0].info.table_size, columns
 
 
 def main() -> None:

@@ -43,9 +43,9 @@ def pack(columns: Columns) -> Columns:
 
 def unpack(rows: np.ndarray, like: Columns) -> Columns:
     """The fields of (B, bytes) packed rows, as views."""
-    found, start = {}, 0
+    columns, start = {}, 0
     for name, part in like.items():
         end = start + part[0].nbytes
-        found[name] = rows[:, start:end].view(part.dtype).reshape(len(rows), *part.shape[1:])
+        columns[name] = rows[:, start:end].view(part.dtype).reshape(len(rows), *part.shape[1:])
         start = end
-    return found
+    return columns

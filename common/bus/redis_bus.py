@@ -119,8 +119,8 @@ class RedisBus(RedisConnection):
         raise FencedError(f"actor {actor}: epoch {last.epoch} has replaced epoch {entry_id.epoch}")
 
     def actors(self) -> list[int]:
-        said = self.call(lambda: self.redis.smembers(self.key("actors")))
-        return sorted(int(actor) for actor in said if actor.isdigit() and len(actor) <= ACTOR_DIGITS)
+        members = self.call(lambda: self.redis.smembers(self.key("actors")))
+        return sorted(int(actor) for actor in members if actor.isdigit() and len(actor) <= ACTOR_DIGITS)
 
     def read(self, after: Mapping[int, EntryId], count: int) -> list[Entry]:
         if not after:
@@ -193,8 +193,8 @@ class RedisBus(RedisConnection):
 
     def ack(self, actor: int) -> Ack | None:
         raw = self.call(lambda: self.redis.hget(self.key("acks"), str(actor)))
-        found = self.integers(raw, 4)
-        return Ack(EntryId(found[0], found[1]), found[2], bool(found[3])) if found else None
+        numbers = self.integers(raw, 4)
+        return Ack(EntryId(numbers[0], numbers[1]), numbers[2], bool(numbers[3])) if numbers else None
 
     def dead_letter(self, entry: Entry, reason: str) -> None:
         fields = {
@@ -211,8 +211,8 @@ class RedisBus(RedisConnection):
     def replay_address(self, role: str) -> ReplayAddress | None:
         raw = self.call(lambda: self.redis.hget(self.key("replay"), role))
         epoch, _, address = (raw or b"").partition(b" ")
-        found = self.integers(epoch, 1)
-        return ReplayAddress(found[0], address.decode(errors="replace")) if found else None
+        numbers = self.integers(epoch, 1)
+        return ReplayAddress(numbers[0], address.decode(errors="replace")) if numbers else None
 
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
         self._weights.publish(version, blob, evaluate)
@@ -229,18 +229,18 @@ class RedisBus(RedisConnection):
 
     def records(self, after: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, str]]:
         cursors: dict[str, str] = dict(after)
-        found: list[dict[str, Any]] = []
+        records: list[dict[str, Any]] = []
         if not after:
-            return found, cursors
-        asked = {self.key("metrics", role): cursor for role, cursor in after.items()}
-        reply = self.call(lambda: self.redis.xread(asked, count=RECORDS_READ))
+            return records, cursors
+        streams = {self.key("metrics", role): cursor for role, cursor in after.items()}
+        reply = self.call(lambda: self.redis.xread(streams, count=RECORDS_READ))
         for name, entries in _stream_items(reply):
             role = name.decode().removeprefix(f"{self.key('metrics')}:")
             cursors[role] = entries[-1][0].decode()
-            found += [{**record, "role": role} for record in map(self._record, entries) if record is not None]
+            records += [{**record, "role": role} for record in map(self._record, entries) if record is not None]
             if len(entries) == RECORDS_READ:  # more than roles say: whoever does that shall not fill Redis
                 self.call(self.redis.xtrim, name, METRICS_KEPT)
-        return found, cursors
+        return records, cursors
 
     def _record(self, entry: tuple[bytes, dict[bytes, bytes]]) -> dict[str, Any] | None:
         try:

@@ -55,4 +55,4 @@ def has_password(url: str) -> bool:
 
 def without_passwords(word: str) -> str:
     """A word of a command line, the URL or the login that it may end with as it may be shown."""
-    return re.sub(r"[\w+.-]*://.*|[^=]*@.*", lambda found: shown(found[0]), word, flags=re.DOTALL)
+    return re.sub(r"[\w+.-]*://.*|[^=]*@.*", lambda match: shown(match[0]), word, flags=re.DOTALL)

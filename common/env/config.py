@@ -38,18 +38,18 @@ class EnvConfig:
 
 def read_kwargs(words: Sequence[str]) -> dict[str, Any]:
     """NAME=VALUE words as keywords, their values typed. Raises ConfigError."""
-    found: dict[str, Any] = {}
+    kwargs: dict[str, Any] = {}
     for word in words:
         name, equals, value = word.partition("=")
         if not (equals and name.isidentifier()):
             raise ConfigError("--env-kwargs", word, "write NAME=VALUE, like goal=1.5, and ENV before them")
-        if name in found:
+        if name in kwargs:
             raise ConfigError("--env-kwargs", word, f"{name} is there twice; give it once")
-        found[name] = _typed(value)
-        if found[name] == value and value.startswith(("[", "{")):
+        kwargs[name] = _typed(value)
+        if kwargs[name] == value and value.startswith(("[", "{")):
             raise ConfigError("--env-kwargs", word, 'no JSON; keep its quotes from the shell: \'names=["a", "b"]\'')
-    check_kwargs(found)
-    return found
+    check_kwargs(kwargs)
+    return kwargs
 
 
 def write_kwargs(kwargs: dict[str, Any]) -> list[str]:

@@ -24,35 +24,35 @@ def shown(env: gym.Env[Any, Any], hide: str) -> slice | None:
 
 def layout_of(env: Env, config: EnvConfig) -> EnvLayout:
     """Of an environment as ``make_env`` gives it."""
-    given, taken = env.get_wrapper_attr("given"), env.get_wrapper_attr("taken")
-    low, high = bounds(taken)
+    observations, actions = env.get_wrapper_attr("raw_observation_space"), env.get_wrapper_attr("raw_action_space")
+    low, high = bounds(actions)
     limit = env.spec.max_episode_steps if env.spec else None
     return EnvLayout(
-        _of_slice(_named(parts(given), structure(env)), shown(env, config.hide)),
+        _of_slice(_named(parts(observations), structure(env)), shown(env, config.hide)),
         config.frame_stack,
-        parts(taken),
+        parts(actions),
         tuple(low.tolist()),
         tuple(high.tolist()),
         None if limit is None else -(-limit // config.action_repeat),
     )
 
 
-def _named(found: tuple[Part, ...], names: dict[str, int]) -> tuple[Part, ...]:
+def _named(boxes: tuple[Part, ...], names: dict[str, int]) -> tuple[Part, ...]:
     """One box in the parts that the environment says it has."""
-    if len(found) != 1 or sum(names.values()) != found[0].stop:
-        return found
+    if len(boxes) != 1 or sum(names.values()) != boxes[0].stop:
+        return boxes
     named, at = [], 0
     for name, size in names.items():
         if size:
-            named.append(Part(name, at, at + size, (size,), found[0].dtype))
+            named.append(Part(name, at, at + size, (size,), boxes[0].dtype))
             at += size
     return tuple(named)
 
 
-def _of_slice(found: tuple[Part, ...], seen: slice | None) -> tuple[Part, ...]:
-    """Those that are shown; ``seen`` begins and ends with parts."""
-    if seen is None:
-        return found
-    first, last, _ = seen.indices(found[-1].stop)
-    kept = [part for part in found if first <= part.start and part.stop <= last]
+def _of_slice(all_parts: tuple[Part, ...], part_range: slice | None) -> tuple[Part, ...]:
+    """Those that are shown; ``part_range`` begins and ends with parts."""
+    if part_range is None:
+        return all_parts
+    first, last, _ = part_range.indices(all_parts[-1].stop)
+    kept = [part for part in all_parts if first <= part.start and part.stop <= last]
     return tuple(Part(part.name, part.start - first, part.stop - first, part.shape, part.dtype) for part in kept)

@@ -15,17 +15,17 @@ STANDARD_LIBRARY = sysconfig.get_path("stdlib")
 ResultT = TypeVar("ResultT")
 
 
-def asked(what: str, call: Callable[..., ResultT], *given: Any) -> ResultT:
+def call_env(what: str, call: Callable[..., ResultT], *arguments: Any) -> ResultT:
     """What a method of the environment's gives. Raises EnvFault with the error's place where it raises."""
     try:
-        return call(*given)
+        return call(*arguments)
     except RmcError:
         raise
     except RAISED as error:
-        raise EnvFault(f"the environment's {what} raises {told(error)}") from error
+        raise EnvFault(f"the environment's {what} raises {describe_error(error)}") from error
 
 
-def told(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """An error of a user's code in a line, with the innermost place in a file of theirs, if there is any."""
     while error.__cause__ is not None and not _users_places(error):  # gymnasium raises some errors anew
         error = error.__cause__
@@ -44,8 +44,8 @@ def one_line(error: BaseException) -> str:
 def _users_places(error: BaseException) -> list[str]:
     """File and line of each frame in a file of theirs, the innermost last; without any, in an installed package's."""
     frames = [(frame, line) for frame, line in traceback.walk_tb(error.__traceback__) if not _is_ours(frame)]
-    theirs = [(frame, line) for frame, line in frames if not _is_installed(frame)]
-    return [f"{Path(frame.f_code.co_filename).name}, line {line}" for frame, line in theirs or frames]
+    users = [(frame, line) for frame, line in frames if not _is_installed(frame)]
+    return [f"{Path(frame.f_code.co_filename).name}, line {line}" for frame, line in users or frames]
 
 
 def _is_ours(frame: FrameType) -> bool:

@@ -24,7 +24,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.env.describe import layout_of, shown, structure
-from rmc.common.env.faults import RAISED, asked, one_line, told
+from rmc.common.env.faults import RAISED, call_env, describe_error, one_line
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.process_state import ApartCall
 from rmc.common.env.spaces import space_fault
@@ -48,20 +48,20 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
     _redirect_mujoco_warnings()
     with ApartCall(config.id, "make", config.env_timeout):
         spec = find_spec(config.id)
-        made: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
-    fault = asked("spaces", lambda: space_fault(made.observation_space, made.action_space))
-    if fault is None and config.hide != "nothing" and not structure(made):
+        env: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
+    fault = call_env("spaces", lambda: space_fault(env.observation_space, env.action_space))
+    if fault is None and config.hide != "nothing" and not structure(env):
         fault = f"it does not say which observations are {config.hide}; --hide is for MuJoCo's bodies, like Ant-v5"
     if fault is not None:
         with suppress(*RAISED):
-            made.close()
+            env.close()
         raise ConfigError("ENV", config.id, fault)
-    return _as_seen(made, config, config.time_limit or spec.max_episode_steps)
+    return _as_seen(env, config, config.time_limit or spec.max_episode_steps)
 
 
-def _make(known: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
+def _make(registered: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
     """As gymnasium makes it, without a limit."""
-    spec = copy(known)
+    spec = copy(registered)
     spec.max_episode_steps = None
     spec.order_enforce = False  # roles reset and step in order; the check costs time at every step
     spec.kwargs = {**spec.kwargs, **config.env_kwargs, **({"render_mode": "rgb_array"} if render else {})}
@@ -73,7 +73,7 @@ def _make(known: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
         if isinstance(error, TypeError) and (fault := _keyword_fault(spec)) is not None:
             raise ConfigError("ENV", config.id, fault) from None
         if not config.id.startswith(DM_CONTROL):
-            raise EnvFault(f"the environment cannot be made: {told(error)}") from error
+            raise EnvFault(f"the environment cannot be made: {describe_error(error)}") from error
         fix = f"dm_control cannot make it ({one_line(error)}); it wants MuJoCo 3: {how_to_install('dm-control')}"
         raise ConfigError("ENV", config.id, fix) from None
 
@@ -93,26 +93,26 @@ def _keyword_fault(spec: EnvSpec) -> str | None:
 
 def entry_point(spec: EnvSpec) -> Callable[..., Any]:
     """What makes the environment: its class, or a function."""
-    made_by = spec.entry_point
-    assert made_by is not None
-    return gym.envs.registration.load_env_creator(made_by) if isinstance(made_by, str) else made_by
+    factory = spec.entry_point
+    assert factory is not None
+    return gym.envs.registration.load_env_creator(factory) if isinstance(factory, str) else factory
 
 
 def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> Env:
     """The environment as the agent sees it: each wrapper only where it does something."""
     seen_part = shown(env, config.hide)
-    seen: Env = RescaledEnv(env)  # the innermost: it judges what the user's own code gives
+    wrapped: Env = RescaledEnv(env)  # the innermost: it judges what the user's own code gives
     if limit:
-        seen = gym.wrappers.TimeLimit(seen, limit)
+        wrapped = gym.wrappers.TimeLimit(wrapped, limit)
     if config.action_repeat > 1:
-        seen = gym.wrappers.RepeatAction(seen, config.action_repeat)
+        wrapped = gym.wrappers.RepeatAction(wrapped, config.action_repeat)
     if seen_part is not None:
-        seen = ObservationSlice(seen, seen_part)
+        wrapped = ObservationSlice(wrapped, seen_part)
     if config.noise:
-        seen = Noise(seen, config.noise)
+        wrapped = Noise(wrapped, config.noise)
     if config.flicker:
-        seen = Flicker(seen, config.flicker)
-    return FrameStack(seen, config.frame_stack) if config.frame_stack > 1 else seen
+        wrapped = Flicker(wrapped, config.flicker)
+    return FrameStack(wrapped, config.frame_stack) if config.frame_stack > 1 else wrapped
 
 
 def checked_reset(env: Env, seed: int | None) -> tuple[Floats, dict[str, Any]]:
@@ -136,7 +136,7 @@ def further_env(make_env: Callable[[], Env], what: str) -> Env:
         return make_env()
     except Exception as error:
         fix = "where only one can exist, take --actors 1 --envs-per-actor 1 --episodes 0"
-        raise RmcError(f"{what} cannot be made beside the others ({told(error)}); {fix}") from error
+        raise RmcError(f"{what} cannot be made beside the others ({describe_error(error)}); {fix}") from error
 
 
 def first_env(config: EnvConfig) -> Env:
@@ -201,7 +201,7 @@ def _import_users_module(env_id: str, module: str) -> None:
         fix = f"start from the folder that holds {module}" if ours else f"{module} needs it; install it"
         raise ConfigError("ENV", env_id, f"{error}; {fix}") from None
     except RAISED as error:
-        raise ConfigError("ENV", env_id, f"{module} cannot be imported: {told(error)}") from None
+        raise ConfigError("ENV", env_id, f"{module} cannot be imported: {describe_error(error)}") from None
 
 
 def _import_dm_control(env_id: str) -> None:

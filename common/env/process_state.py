@@ -80,15 +80,15 @@ class ApartCall(EnvCall):
     A step is not looked at for changes of its own. Signals' handlers stay ours.
     """
 
-    theirs: ProcessState | None = None  # where it differs from ours
+    env_state: ProcessState | None = None  # where it differs from ours
     changed: dict[str, Any] = {}  # noqa: RUF012 - by any environment of this process: what, and into what
 
     def __enter__(self) -> "ApartCall":
         super().__enter__()
-        self._ours = ProcessState.read() if self.name != "step" or ApartCall.theirs is not None else None
+        self._ours = ProcessState.read() if self.name != "step" or ApartCall.env_state is not None else None
         self._random = _random_state() if self.name == "make" else None
-        if self._ours is not None and ApartCall.theirs is not None:
-            ApartCall.theirs._replace(handlers=self._ours.handlers).install(self._ours)
+        if self._ours is not None and ApartCall.env_state is not None:
+            ApartCall.env_state._replace(handlers=self._ours.handlers).install(self._ours)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -101,12 +101,12 @@ class ApartCall(EnvCall):
         if ours.dtype is None and now.dtype is not None:  # torch was imported meanwhile
             torch = sys.modules["torch"]
             ours = ours._replace(dtype=torch.float32, threads=now.threads, device=torch.device("cpu"))
-        found = {name: getattr(now, name) for name in sorted(ours.differences(now))}
+        changed = {name: getattr(now, name) for name in sorted(ours.differences(now))}
         if self._random is not None and self._random != _random_state():
-            found["random"] = None
-        ApartCall.changed |= found
+            changed["random"] = None
+        ApartCall.changed |= changed
         ours.install(now)
-        ApartCall.theirs = now if set(found) - {"handlers", "random"} else None
+        ApartCall.env_state = now if set(changed) - {"handlers", "random"} else None
 
 
 def _random_state() -> tuple[Any, ...]:
@@ -116,7 +116,7 @@ def _random_state() -> tuple[Any, ...]:
     return str(np.random.get_state()[1]), random.getstate()[1][:-1], seed  # type: ignore[index] # noqa: NPY002
 
 
-TOLD = {
+DESCRIPTIONS = {
     "folder": "its working folder ({})",
     "numpy_errors": "numpy's error state",
     "dtype": "torch's default dtype ({})",
@@ -130,4 +130,4 @@ TOLD = {
 
 def changes() -> list[str]:
     """What environments have changed of this process so far, in words."""
-    return [TOLD[name].format(value) for name, value in ApartCall.changed.items()]
+    return [DESCRIPTIONS[name].format(value) for name, value in ApartCall.changed.items()]

@@ -39,11 +39,11 @@ def bounds(action: gym.Space[Any]) -> tuple[NDArray[np.float64], NDArray[np.floa
 
 def parts(space: gym.Space[Any]) -> tuple[Part, ...]:
     """The boxes that a space is made of, in order."""
-    found: list[Part] = []
+    boxes: list[Part] = []
     for name, box in _leaves(space):
-        start, shape = found[-1].stop if found else 0, box.shape or ()
-        found.append(Part(name, start, start + math.prod(shape), shape, str(box.dtype)))
-    return tuple(found)
+        start, shape = boxes[-1].stop if boxes else 0, box.shape or ()
+        boxes.append(Part(name, start, start + math.prod(shape), shape, str(box.dtype)))
+    return tuple(boxes)
 
 
 def vector(space: gym.Space[Any], value: Any) -> NDArray[np.float32]:
@@ -54,21 +54,21 @@ def vector(space: gym.Space[Any], value: Any) -> NDArray[np.float32]:
 
 
 def _numbers(box: gym.Space[Any], value: Any) -> NDArray[np.float32]:
-    found = array("observation", value, "an array of numbers")
-    if found.shape != box.shape and _sides(found.shape) != _sides(box.shape or ()):
-        raise EnvFault(f"the environment's observation has shape {found.shape}, its space says {box.shape}")
-    return np.array(found, np.float32).ravel()  # a copy: some environments write into the same one again
+    numbers = array("observation", value, "an array of numbers")
+    if numbers.shape != box.shape and _sides(numbers.shape) != _sides(box.shape or ()):
+        raise EnvFault(f"the environment's observation has shape {numbers.shape}, its space says {box.shape}")
+    return np.array(numbers, np.float32).ravel()  # a copy: some environments write into the same one again
 
 
-def array(name: str, value: Any, wanted: str) -> NDArray[Any]:
-    """What is of numbers as an array; no copy. Raises EnvFault with what is ``wanted`` where it is none."""
+def array(name: str, value: Any, expected: str) -> NDArray[Any]:
+    """What is of numbers as an array; no copy. Raises EnvFault with what is ``expected`` where it is none."""
     try:
-        found = np.asarray(value)
+        numbers = np.asarray(value)
     except RAISED:  # a list whose rows differ, or a tensor on another device
-        found = np.empty(0, object)
-    if found.dtype.kind not in NUMBERS:
-        raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}; return {wanted}")
-    return found
+        numbers = np.empty(0, object)
+    if numbers.dtype.kind not in NUMBERS:
+        raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}; return {expected}")
+    return numbers
 
 
 def _sides(shape: tuple[int, ...]) -> list[int]:
@@ -113,9 +113,9 @@ def _image_fault(observation: gym.Space[Any]) -> str | None:
     images = {path: leaf.shape for path, leaf in _leaves(observation) if _is_image(leaf)}
     if not images:
         return None
-    found = f"its observations are images {images['']}" if "" in images else f"of its observations {images} are images"
+    reason = f"its observations are images {images['']}" if "" in images else f"of its observations {images} are images"
     fix = "give what an encoder or the simulator tells of them; what is no image, give in one dimension"
-    return f"{found}; only vectors are learnt from: {fix}"
+    return f"{reason}; only vectors are learnt from: {fix}"
 
 
 def _is_image(box: gym.Space[Any]) -> bool:

@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from rmc.common.env.faults import asked
+from rmc.common.env.faults import call_env
 from rmc.common.env.layout import ActionScale
 from rmc.common.env.spaces import array, bounds, vector
 from rmc.common.errors import EnvFault
@@ -35,7 +35,7 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
-        self.given, self.taken = env.observation_space, env.action_space
+        self.raw_observation_space, self.raw_action_space = env.observation_space, env.action_space
         low, high = bounds(env.action_space)
         self._scale = ActionScale(low, high)
         self._vectors = isinstance(env.action_space, gym.spaces.Box) and len(env.action_space.shape) == 1
@@ -43,23 +43,23 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
         self.observation_space = _box(gym.spaces.flatdim(env.observation_space))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        found = asked("reset", partial(self.env.reset, seed=seed, options=options))
-        observation, info = _values("reset", found, RESET)
-        return vector(self.given, observation), _own(info)
+        result = call_env("reset", partial(self.env.reset, seed=seed, options=options))
+        observation, info = _values("reset", result, RESET)
+        return vector(self.raw_observation_space, observation), _own(info)
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        found = asked("step", self.env.step, self._stretched(action))
-        observation, reward, terminated, truncated, info = _values("step", found, STEP)
+        result = call_env("step", self.env.step, self._stretched(action))
+        observation, reward, terminated, truncated, info = _values("step", result, STEP)
         ends = _bool("terminated", terminated), _bool("truncated", truncated)
-        return vector(self.given, observation), _number("reward", reward), *ends, _own(info)
+        return vector(self.raw_observation_space, observation), _number("reward", reward), *ends, _own(info)
 
     def render(self) -> Any:
-        return asked("render", self.env.render)
+        return call_env("render", self.env.render)
 
     def close(self) -> None:
         """What it raises is said once, and harms nobody."""
         try:
-            asked("close", self.env.close)
+            call_env("close", self.env.close)
         except EnvFault as fault:
             _warn_once(f"{fault}; it is left as it is")
 
@@ -67,25 +67,25 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
         """(A,) in [-1, 1] -> an action of the environment's own space, which it may change as it likes."""
         scaled = self._scale(action)
         if self._vectors:
-            return np.array(scaled, self.taken.dtype)
-        return gym.spaces.unflatten(self.taken, scaled.astype(np.float64))
+            return np.array(scaled, self.raw_action_space.dtype)
+        return gym.spaces.unflatten(self.raw_action_space, scaled.astype(np.float64))
 
 
-def _values(method: str, found: Any, wanted: tuple[str, ...]) -> Sequence[Any]:
-    if isinstance(found, tuple | list) and len(found) == len(wanted):
-        return found
-    given = f"{len(found)} values" if isinstance(found, tuple | list) else f"a {type(found).__name__}"
-    raise EnvFault(f"the environment's {method} gives {given}; return ({', '.join(wanted)})")
+def _values(method: str, result: Any, expected: tuple[str, ...]) -> Sequence[Any]:
+    if isinstance(result, tuple | list) and len(result) == len(expected):
+        return result
+    shape = f"{len(result)} values" if isinstance(result, tuple | list) else f"a {type(result).__name__}"
+    raise EnvFault(f"the environment's {method} gives {shape}; return ({', '.join(expected)})")
 
 
-def _number(name: str, value: Any, wanted: str = "a number") -> float:
+def _number(name: str, value: Any, expected: str = "a number") -> float:
     """A number, also as an array of one."""
     if isinstance(value, float):
         return float(value)
-    found = array(name, value, wanted)
-    if found.size != 1:
-        raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}; return {wanted}")
-    return float(found.item())
+    numbers = array(name, value, expected)
+    if numbers.size != 1:
+        raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}; return {expected}")
+    return float(numbers.item())
 
 
 def _bool(name: str, value: Any) -> bool:

@@ -15,19 +15,19 @@ def take_lock(path: Path, patience: float = LOCK_SECONDS) -> int | None:
     """A handle that holds the lock until it is closed; None where another process keeps it."""
     handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     began = time.monotonic()
-    said = False
-    while not _taken(handle):
+    warned = False
+    while not _try_lock(handle):
         if time.monotonic() >= began + patience:
             os.close(handle)
             return None
-        if not said:
+        if not warned:
             log.warning("waiting up to %g s for another process to let go of %s", patience, path)
-            said = True
+            warned = True
         time.sleep(LOOK_SECONDS)
     return handle
 
 
-def _taken(handle: int) -> bool:
+def _try_lock(handle: int) -> bool:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -39,7 +39,7 @@ class EnvCall:
     def __exit__(self, *_: object) -> None:
         EnvCall.current = self._outer
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """That it hangs, and where, in a line."""
         frame = sys._current_frames().get(self.thread)
         at = traceback.extract_stack(frame)[-1] if frame is not None else None
@@ -61,12 +61,12 @@ def start() -> None:
 
 def _watch() -> None:
     """Counts looks, not seconds: a process that was stopped for a while has not hung."""
-    seen, looks, arm_at = EnvCall.current, 0, float("-inf")
+    watched, looks, arm_at = EnvCall.current, 0, float("-inf")
     while True:
         time.sleep(LOOK_SECONDS)
         call = EnvCall.current
-        looks = looks + 1 if call is seen else 0
-        seen, seconds = call, EnvCall.armed if call is None else call.seconds
+        looks = looks + 1 if call is watched else 0
+        watched, seconds = call, EnvCall.armed if call is None else call.seconds
         over = looks * LOOK_SECONDS >= seconds
         if over and call is not None:
             _end(call)
@@ -85,7 +85,7 @@ def _arm(seconds: float) -> None:
 
 def _end(call: EnvCall) -> None:
     with suppress(OSError, ValueError):
-        os.write(STDERR, f"rmc: {call.told()}\n".encode())
+        os.write(STDERR, f"rmc: {call.describe()}\n".encode())
         sys.stdout.flush()
     descendants.end_children()  # a simulator that the environment has started
     os._exit(HUNG_STATUS)

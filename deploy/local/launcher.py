@@ -99,12 +99,12 @@ class LocalRun:
                 self._sockets.path / f"{shard.role}.sock",
                 time.monotonic(),
             )
-            pid, seen = self._listening.get(shard.role, (role.pid, now))
+            pid, since = self._listening.get(shard.role, (role.pid, now))
             if socket.exists():
                 self._listening[shard.role] = role.pid, now
             elif pid != role.pid:
                 self._listening.pop(shard.role)
-            elif now - seen > UNREACHABLE_SECONDS:
+            elif now - since > UNREACHABLE_SECONDS:
                 log.warning("%s was removed; starting %s again", socket, shard.role)
                 self._listening.pop(shard.role)
                 role.signal(signal.SIGKILL)

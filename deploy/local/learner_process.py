@@ -53,8 +53,8 @@ def replay_clients(
 
     def address_of(role: str) -> Callable[[], str | None]:
         def address() -> str | None:
-            found = bus.replay_address(role)
-            return found.address if found else None
+            location = bus.replay_address(role)
+            return location.address if location else None
 
         return address
 

@@ -71,7 +71,7 @@ class Lockstep:
         self.evaluator = (
             self._evaluator(config, clock=lambda: float(next(ticks))) if config.evaluator.episodes else None
         )
-        self._seen = self.learner.last_checkpoint
+        self._last_checkpoint = self.learner.last_checkpoint
         self._restart_due = False
 
     def _evaluator(self, config: RunConfig, clock: Callable[[], float]) -> Evaluator:
@@ -93,12 +93,12 @@ class Lockstep:
                 actor.step()
             while self.server.step():
                 pass
-        if self.learner.last_checkpoint != self._seen:
+        if self.learner.last_checkpoint != self._last_checkpoint:
             self._after_checkpoint()
 
     def _after_checkpoint(self) -> None:
         """Save the ring beside the learner; the actors begin anew in the next step, as those of a resumed run do."""
-        self._seen = self.learner.last_checkpoint
+        self._last_checkpoint = self.learner.last_checkpoint
         while self.evaluator is not None and self.evaluator.step():
             pass
         self.server.checkpoint()

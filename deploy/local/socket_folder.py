@@ -83,10 +83,10 @@ def _fits(place: Path) -> bool:
 
 def sweep(place: Path) -> None:
     """Remove what launchers killed by force have left; their processes died with them."""
-    for left in place.glob(f"{PREFIX}*"):
+    for leftover in place.glob(f"{PREFIX}*"):
         with suppress(OSError):  # another launcher sweeps, too; or it is somebody else's
-            if left.lstat().st_uid == os.getuid() and (lock := _locked(left)) is not None:
-                shutil.rmtree(left, ignore_errors=True)
+            if leftover.lstat().st_uid == os.getuid() and (lock := _locked(leftover)) is not None:
+                shutil.rmtree(leftover, ignore_errors=True)
                 os.close(lock)
 
 

@@ -43,12 +43,12 @@ class LauncherGone:
     """Whether no launcher has trained a run for long."""
 
     def __init__(self, folder: RunFolder) -> None:
-        self._folder, self._seen = folder, time.monotonic()
+        self._folder, self._seen_at = folder, time.monotonic()
 
     def __call__(self) -> bool:
         if self._folder.trainer() is not None:
-            self._seen = time.monotonic()
-        return time.monotonic() - self._seen > AWAY_SECONDS
+            self._seen_at = time.monotonic()
+        return time.monotonic() - self._seen_at > AWAY_SECONDS
 
 
 def launcher_pid(folder: RunFolder) -> int:

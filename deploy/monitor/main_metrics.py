@@ -18,14 +18,14 @@ def main_metrics(board: RunStatus) -> dict[str, float]:
         "waiting_share_actors": _actors_waiting(board),
     }
     losses = {name: value for name, value in learner.items() if name.endswith("_loss")}
-    found: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "env_steps_per_s": board.replay("env_steps_per_s", sum),
         "updates_per_s": learner.get("updates_per_s"),
         "episode_return": board.episode_return,
         **waits,
         **losses,
     }
-    return {MAIN + name: float(value) for name, value in found.items() if is_finite(value)}
+    return {MAIN + name: float(value) for name, value in metrics.items() if is_finite(value)}
 
 
 def evaluation_metrics(record: dict[str, Any]) -> dict[str, float]:

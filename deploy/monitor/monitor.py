@@ -84,8 +84,8 @@ class Monitor:
         self._folder.check_there()
         if self._folder.writable() != self._writable:
             self._writable = not self._writable
-            said = "can be written again" if self._writable else "is read-only: training goes on, its end waits"
-            log.warning("%s %s", self._folder.path, said)
+            change = "can be written again" if self._writable else "is read-only: training goes on, its end waits"
+            log.warning("%s %s", self._folder.path, change)
 
     def _take_in(self, bus: Bus) -> None:
         while records := self._read(bus):

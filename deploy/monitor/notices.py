@@ -15,7 +15,7 @@ def notices(board: RunStatus) -> dict[str, str]:
     """What is not as it should be, by its heading."""
     off = board.replay("replay_ratio_off", max)
     restarts, broken = board.get("launcher", "restarts"), board.broken_episodes
-    found = {
+    texts = {
         "not running": "" if board.is_over else board.get("launcher", "not_running"),
         "silent": _silent(board),
         "not saved": board.get("learner", "checkpoint_error"),
@@ -24,7 +24,7 @@ def notices(board: RunStatus) -> dict[str, str]:
         "restarts": f"{number(restarts, ',')} of roles that died" if restarts else "",
         "broken": f"{number(broken, ',')} episodes, by the environment's faults" if broken else "",
     }
-    return {name: str(text) for name, text in found.items() if text}
+    return {name: str(text) for name, text in texts.items() if text}
 
 
 def waits(board: RunStatus) -> str:
@@ -53,6 +53,6 @@ def _damaged(board: RunStatus) -> str:
 
 
 def _silent(board: RunStatus) -> str:
-    found = [f"{who} for {seconds:,.0f} s" for who, seconds in board.silent().items()]
-    more = len(found) - MOST_SILENT
-    return ", ".join(found[:MOST_SILENT]) + (f" and {more} more" if more > 0 else "")
+    roles = [f"{who} for {seconds:,.0f} s" for who, seconds in board.silent().items()]
+    more = len(roles) - MOST_SILENT
+    return ", ".join(roles[:MOST_SILENT]) + (f" and {more} more" if more > 0 else "")

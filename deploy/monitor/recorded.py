@@ -28,7 +28,7 @@ def recorded_status(folder: RunFolder, recent_bytes: int = RECENT_BYTES) -> RunS
 
 def status_json(folder: RunFolder, board: RunStatus) -> dict[str, Any]:
     """All of it as ``rmc stats --json`` prints it; a number that JSON has not, like infinity, is null."""
-    found = {
+    status = {
         "run": str(folder.path),
         "state": board.state,
         "env": board.env,
@@ -45,7 +45,7 @@ def status_json(folder: RunFolder, board: RunStatus) -> dict[str, Any]:
         "roles": board.roles,
         "result": folder.result(),
     }
-    plain: dict[str, Any] = json.loads(json.dumps(found), parse_constant=lambda _: None)
+    plain: dict[str, Any] = json.loads(json.dumps(status), parse_constant=lambda _: None)
     return plain
 
 
@@ -57,16 +57,17 @@ def catch_up(board: RunStatus, tail: MetricsTail) -> None:
 
 def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus:
     """By ``config.json`` alone. Raises ConfigError."""
-    said = folder.settings()
-    env = _part(said, "env").get("id")
-    preset = said.get("preset") or f"{said.get('algorithm')}-{said.get('settings')}"
-    seed, total, ratio = said.get("seed"), said.get("total_steps"), _part(said, "replay").get("replay_ratio", 0.0)
+    settings = folder.settings()
+    env = _part(settings, "env").get("id")
+    preset = settings.get("preset") or f"{settings.get('algorithm')}-{settings.get('settings')}"
+    seed, total = settings.get("seed"), settings.get("total_steps")
+    ratio = _part(settings, "replay").get("replay_ratio", 0.0)
     if not (isinstance(env, str) and isinstance(seed, int) and isinstance(total, int) and is_finite(ratio)):
         fix = "config.json has no env, seed or total_steps; restore it, or take another run"
         raise ConfigError("RUN", str(folder.path), fix)
     return RunStatus(env, str(preset), seed, total, ratio, expected)
 
 
-def _part(said: dict[str, Any], name: str) -> dict[str, Any]:
-    found = said.get(name, {})
-    return found if isinstance(found, dict) else {}
+def _part(settings: dict[str, Any], name: str) -> dict[str, Any]:
+    part = settings.get(name, {})
+    return part if isinstance(part, dict) else {}

@@ -58,13 +58,13 @@ class RunStatus:
     def take(self, record: dict[str, Any]) -> None:
         """Take in a record; what it does not name stays as it was, and of a role there are ``MOST_NAMES`` at most."""
         role = record["role"]
-        known = self.roles.get(role, {})
-        if role == "launcher" and _number(record.get("start_s")) < _number(known.get("start_s")):
+        current = self.roles.get(role, {})
+        if role == "launcher" and _number(record.get("start_s")) < _number(current.get("start_s")):
             self._pace.forget()  # of another start
-        room = MOST_NAMES - len(known)
-        new = record if len(record) <= room else {name: record[name] for name in record if name in known}
+        room = MOST_NAMES - len(current)
+        new = record if len(record) <= room else {name: record[name] for name in record if name in current}
         if role in self.roles:
-            self.roles[role] = known | new
+            self.roles[role] = current | new
         else:  # afresh: another thread may be going through the old one
             self.roles = {**self.roles, role: dict(new)}
         self.take_evaluation(record)
@@ -117,11 +117,11 @@ class RunStatus:
     @property
     def elapsed_s(self) -> float | None:
         """Seconds trained, over all starts of the run."""
-        said, spoke = self.get("launcher", "wall_s"), self.get("launcher", "time")
-        if not is_finite(said):
+        wall_s, spoke = self.get("launcher", "wall_s"), self.get("launcher", "time")
+        if not is_finite(wall_s):
             return None
         since = 0.0 if self.is_over or not is_finite(spoke) else max(0.0, time.time() - spoke)
-        return float(said) + since
+        return float(wall_s) + since
 
     @property
     def eta_s(self) -> float | None:
@@ -134,13 +134,13 @@ class RunStatus:
     def checkpoint_steps(self, update: int | None) -> int | None:
         """Environment steps at the checkpoint of that update, or None where the learner has said them of another."""
         steps = self.get("learner", "checkpoint_env_steps")
-        known = update is not None and update == self.get("learner", "checkpoint_update")
-        return _steps(steps) if known else None
+        saved = update is not None and update == self.get("learner", "checkpoint_update")
+        return _steps(steps) if saved else None
 
     def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:
         """The sum or mean ``over`` all replay servers, or None."""
-        found = [record[name] for role, record in self.roles.items() if role.startswith("replay") and name in record]
-        return over(found) if found else None
+        values = [record[name] for role, record in self.roles.items() if role.startswith("replay") and name in record]
+        return over(values) if values else None
 
     @property
     def episode_return(self) -> float | None:

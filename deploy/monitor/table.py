@@ -64,13 +64,13 @@ def _bar(board: RunStatus, width: int) -> RenderableType:
 
 def _lines(facts: list[Fact], width: int, most: int = 10**6) -> list[Text]:
     """The first of them that fit whole into so many rows."""
-    found: list[Text] = []
+    lines: list[Text] = []
     for name, text in facts:
         rows = _rows(name, text, width)
-        if len(found) + len(rows) > most:
+        if len(lines) + len(rows) > most:
             break
-        found += rows
-    return found
+        lines += rows
+    return lines
 
 
 def _rows(name: str, text: str, width: int, style: str = "bold") -> list[Text]:
@@ -90,11 +90,12 @@ def _essentials(board: RunStatus) -> list[Fact]:
     ]
 
 
-def _evaluation(found: Evaluation | None) -> str:
-    if found is None:
+def _evaluation(evaluation: Evaluation | None) -> str:
+    if evaluation is None:
         return number(None)
-    at = f"step {found.env_steps:,}" if found.env_steps is not None else f"update {number(found.update, ',')}"
-    return f"{number(found.return_mean, ',.1f')} ± {number(found.return_std, ',.1f')} at {at}"
+    steps = evaluation.env_steps
+    at = f"step {steps:,}" if steps is not None else f"update {number(evaluation.update, ',')}"
+    return f"{number(evaluation.return_mean, ',.1f')} ± {number(evaluation.return_std, ',.1f')} at {at}"
 
 
 def _details(board: RunStatus) -> list[Fact]:
@@ -161,9 +162,9 @@ def _share(group: dict[str, dict[str, Any]], name: str) -> str:
 def _reasons(group: dict[str, dict[str, Any]], silent: dict[str, float]) -> str:
     """What they wait for, and how many have said nothing for long."""
     speaking = [record for role, record in group.items() if role not in silent]
-    found = [str(one.get("waiting_for", "")) for one in speaking if one.get("waiting_share", 0.0) > 0.005]
+    reasons = [str(one.get("waiting_for", "")) for one in speaking if one.get("waiting_share", 0.0) > 0.005]
     quiet = [silent[role] for role in group if role in silent]
     if quiet:
         some = f"{len(quiet)} " if len(group) > 1 else ""
-        found.append(f"{some}silent for {max(quiet):.0f} s")
-    return ", ".join(dict.fromkeys(filter(None, found)))
+        reasons.append(f"{some}silent for {max(quiet):.0f} s")
+    return ", ".join(dict.fromkeys(filter(None, reasons)))

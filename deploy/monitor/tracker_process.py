@@ -24,7 +24,7 @@ from rmc.deploy.run.tracking import Tracking, kept_tracking
 
 ROW_SECONDS = 10.0  # between rows
 LOOK_SECONDS = 1.0
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 class TrackedRun(Protocol):
@@ -39,44 +39,44 @@ class TrackedRun(Protocol):
 
 def main() -> None:
     """The entry point: a run's folder, and from which byte of its metrics on."""
-    told = os.fdopen(os.dup(1), "w", buffering=1)
+    output = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     folder, read_from = RunFolder(Path(sys.argv[1])), int(sys.argv[2])
 
-    def tell(text: str) -> None:
+    def notify(text: str) -> None:
         with suppress(OSError):  # the launcher has died
-            told.write(" ".join(text.split()) + "\n")
+            output.write(" ".join(text.split()) + "\n")
 
-    _tell_first_warning(tell)
+    _notify_first_warning(notify)
     try:
         tracking = kept_tracking(folder.path)
         assert tracking is not None
-        _follow(folder, _begin(folder, tracking, tell), read_from)
+        _follow(folder, _begin(folder, tracking, notify), read_from)
     except Exception as error:
-        tell(f"{_first_line(error)}; the run goes on without it")
+        notify(f"{_first_line(error)}; the run goes on without it")
         raise
 
 
-def _begin(folder: RunFolder, tracking: Tracking, tell: Tell) -> TrackedRun:
+def _begin(folder: RunFolder, tracking: Tracking, notify: Notify) -> TrackedRun:
     if tracking.tracker == "wandb":
         from rmc.deploy.monitor import wandb_run  # extras, and slow to import
 
-        return wandb_run.WandbRun(folder, tracking, tell)
+        return wandb_run.WandbRun(folder, tracking, notify)
     from rmc.deploy.monitor import trackio_run
 
     return trackio_run.TrackioRun(folder, tracking)
 
 
-def _tell_first_warning(tell: Tell) -> None:
+def _notify_first_warning(notify: Notify) -> None:
     """Of a library's, like that of a full disk; all are in the log."""
     shown = warnings.showwarning
-    told: list[Warning | str] = []
+    notified: list[Warning | str] = []
 
     def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
         shown(message, category, *where)
-        if not told and issubclass(category, UserWarning):
-            told.append(message)
-            tell(str(message))
+        if not notified and issubclass(category, UserWarning):
+            notified.append(message)
+            notify(str(message))
 
     warnings.showwarning = show  # type: ignore[assignment]
 
@@ -107,8 +107,8 @@ def _end_of_run() -> dict[str, Any] | None:
     ready, _, _ = select.select([sys.stdin], [], [], LOOK_SECONDS)
     if not ready:
         return None
-    said = sys.stdin.read()
-    return dict(json.loads(said)) if said else {"state": "lost"}
+    ending = sys.stdin.read()
+    return dict(json.loads(ending)) if ending else {"state": "lost"}
 
 
 def _at(board: RunStatus, evaluation: dict[str, Any]) -> int:

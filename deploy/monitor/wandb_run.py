@@ -17,12 +17,12 @@ KILLED = 1
 class WandbRun:
     """Where the service cannot be reached it is recorded in the run's folder, as by ``WANDB_MODE=offline``."""
 
-    def __init__(self, folder: RunFolder, tracking: Tracking, tell: Callable[[str], None]) -> None:
+    def __init__(self, folder: RunFolder, tracking: Tracking, notify: Callable[[str], None]) -> None:
         try:
             self._run = _begin(folder, tracking, None)
         except wandb.Error as error:
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            tell(f"{reason.rstrip('.')}; recorded offline, and wandb sync {folder.path}/wandb/offline-run-* sends it")
+            notify(f"{reason.rstrip('.')}; recorded offline, and wandb sync {folder.path}/wandb/offline-run-* sends it")
             wandb.teardown()  # of the service that still holds the id
             self._run = _begin(folder, tracking, "offline")
         self._run.define_metric(STEPS)

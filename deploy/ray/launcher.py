@@ -40,8 +40,8 @@ def joined(address: str, cpus: int | None = None) -> Iterator[None]:
         else:
             ray.init(address=address, **quiet)
     except (ConnectionError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
-        said = (str(error).strip() or type(error).__name__).splitlines()[0]
-        fix = f"no Ray cluster answers ({said}); start one with ray start --head, or take local"
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        fix = f"no Ray cluster answers ({reason}); start one with ray start --head, or take local"
         raise ConfigError("--ray-address", address, fix) from None
     finally:
         os.umask(mask)

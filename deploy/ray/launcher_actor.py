@@ -38,14 +38,14 @@ class LauncherActor(RoleActor):
         """End all that the run still has on the cluster, whatever its launcher left, and this host."""
         run = actor_name(self._task.run, "")
         own = ray.get_runtime_context().current_actor
-        for found in ray.util.list_named_actors(all_namespaces=True):
+        for actor in ray.util.list_named_actors(all_namespaces=True):
             if (
-                found["namespace"] == NAMESPACE
-                and found["name"].startswith(run)
-                and not found["name"].endswith("launcher")
+                actor["namespace"] == NAMESPACE
+                and actor["name"].startswith(run)
+                and not actor["name"].endswith("launcher")
             ):
                 with suppress(ValueError):
-                    ray.kill(ray.get_actor(found["name"], NAMESPACE), no_restart=True)
+                    ray.kill(ray.get_actor(actor["name"], NAMESPACE), no_restart=True)
         for name in (f"{run}learner", f"{run}replay"):
             with suppress(ValueError):
                 remove_placement_group(ray.util.get_placement_group(name))
@@ -82,8 +82,8 @@ class LauncherActor(RoleActor):
 
     def newest(self, above: int) -> tuple[int, dict[str, bytes]] | None:
         """The newest whole checkpoint, if it is newer than that."""
-        found = self._checkpoints.latest() if max(self.numbers(), default=-1) > above else None
-        return found if found is not None and found[0] > above else None
+        checkpoint = self._checkpoints.latest() if max(self.numbers(), default=-1) > above else None
+        return checkpoint if checkpoint is not None and checkpoint[0] > above else None
 
     def numbers(self) -> list[int]:
         """Of the checkpoints that are kept here."""

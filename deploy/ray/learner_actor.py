@@ -29,8 +29,8 @@ class LearnerActor(RoleActor):
         launcher, was_here = self._claim(place)
         if not was_here:
             shutil.rmtree(folder, ignore_errors=True)  # of an earlier stay on this node: the run has gone on elsewhere
-        found = self._folder.latest()
-        newest = ray.get(launcher.newest.remote(found[0] if found is not None else -1))
+        local = self._folder.latest()
+        newest = ray.get(launcher.newest.remote(local[0] if local is not None else -1))
         if newest is not None:
             self._folder.save(*newest)
             self._folder.note_save(ray.get(launcher.last_save.remote()))

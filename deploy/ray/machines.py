@@ -49,14 +49,14 @@ def down(path: Path, console: Console) -> None:
     _ray("down", "-y", str(path))
     if config["provider"]["type"] != "local":
         return
-    left = {}
+    running = {}
     for address in [config["provider"]["head_ip"], *config["provider"]["worker_ips"]]:
         _ssh(config, address, _stop_command(config))
         count = _ssh(config, address, LEFT).strip().splitlines()[-1:]
         if count != ["0"]:
-            left[address] = " ".join(count) or "no answer"
-    if left:
-        raise RmcError(f"{path}: Ray still runs on {left}; ssh there and run ray stop --force")
+            running[address] = " ".join(count) or "no answer"
+    if running:
+        raise RmcError(f"{path}: Ray still runs on {running}; ssh there and run ray stop --force")
     console.print("no process of Ray is left on any node")
 
 
@@ -97,10 +97,10 @@ def secure_token() -> None:
 
 def _ray_program() -> str:
     beside = Path(sys.executable).with_name("ray")
-    found = str(beside) if beside.exists() else shutil.which("ray")
-    if found is None:
+    program = str(beside) if beside.exists() else shutil.which("ray")
+    if program is None:
         raise ConfigError("cluster", "ray", f"Ray is not installed; {how_to_install('ray')}")
-    return found
+    return program
 
 
 def _ray(*words: str, quiet: bool = False) -> str:
@@ -116,15 +116,15 @@ def _ray(*words: str, quiet: bool = False) -> str:
 
 
 def _alive(path: Path) -> int:
-    said = _ray("exec", str(path), f'PATH=~/rmc-env/bin:$PATH RAY_AUTH_MODE=token python3 -c "{COUNT}"', quiet=True)
-    counts = [line.split()[1] for line in said.splitlines() if line.startswith("alive ")]
+    output = _ray("exec", str(path), f'PATH=~/rmc-env/bin:$PATH RAY_AUTH_MODE=token python3 -c "{COUNT}"', quiet=True)
+    counts = [line.split()[1] for line in output.splitlines() if line.startswith("alive ")]
     return int(counts[-1]) if counts else 0
 
 
 def _stop_command(config: dict[str, Any]) -> str:
     """As the file itself stops Ray before it starts it."""
-    found = [line for line in config.get("worker_start_ray_commands", []) if "ray stop" in line]
-    return str(found[0]) if found else "ray stop --force"
+    commands = [line for line in config.get("worker_start_ray_commands", []) if "ray stop" in line]
+    return str(commands[0]) if commands else "ray stop --force"
 
 
 def _ssh(config: dict[str, Any], address: str, command: str) -> str:

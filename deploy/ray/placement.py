@@ -42,16 +42,18 @@ def reserved_cpus(config: RunConfig) -> float:
 
 def bundle(config: RunConfig, device: str) -> dict[str, float]:
     """What the node of the learner must hold."""
-    found = {"CPU": float(ceil(learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS))}
-    return found | {"GPU": 1.0} if device.startswith("cuda") else found
+    resources = {"CPU": float(ceil(learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS))}
+    return resources | {"GPU": 1.0} if device.startswith("cuda") else resources
 
 
 def check_room(config: RunConfig, device: str) -> None:
     """Raises ConfigError where no node can hold the learner."""
     need = bundle(config, device)
     if not any(node["Alive"] and holds(node, need) for node in ray.nodes()):
-        wanted = ", ".join(f"{amount:g} {name}" for name, amount in need.items())
-        fix = f"no node of the cluster has {wanted}, which the learner and what is beside it take; start one that has"
+        resources = ", ".join(f"{amount:g} {name}" for name, amount in need.items())
+        fix = (
+            f"no node of the cluster has {resources}, which the learner and what is beside it take; start one that has"
+        )
         raise ConfigError("--device", device, fix)
 
 
@@ -101,7 +103,7 @@ def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[st
     if encrypted and config.replay.replay_shards > 1:  # one alone has a unix socket
         secrets += ["--tls-folder", "{scratch}"]
     learner, gpus = learner_command(run, "{scratch}/checkpoints", device, secrets), float(device.startswith("cuda"))
-    found = [
+    placements = [
         *_replays(config, run, secrets),
         RolePlacement(LearnerActor, learner, learner_cpus(config), gpus, "learner"),
         *(
@@ -110,7 +112,7 @@ def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[st
         ),
         *(RolePlacement(RoleActor, command, 1.0) for command in actor_commands(config, run)),
     ]
-    return {place.command.name: place for place in found}
+    return {place.command.name: place for place in placements}
 
 
 def _replays(config: RunConfig, run: str, secrets: list[str]) -> list[RolePlacement]:

@@ -31,8 +31,8 @@ class RingLocations:
     def node(self, role: str) -> str | None:
         """Ray's id of the node that holds a ring, while that node is alive."""
         address = self._at.get(role)
-        found = [node["NodeID"] for node in ray.nodes() if node["Alive"] and node["NodeManagerAddress"] == address]
-        return found[0] if address and found else None
+        nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"] and node["NodeManagerAddress"] == address]
+        return nodes[0] if address and nodes else None
 
     def bundles(self, group: PlacementGroup, roles: list[str]) -> dict[str, int]:
         """A bundle of the group for each role: one on its ring's node where there is one, else any."""

@@ -70,8 +70,8 @@ def scratch_folder(run: str) -> Path:
     """
     folder = Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{run[-8:]}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    found = folder.lstat()
-    if found.st_uid != os.getuid() or found.st_mode & 0o077:
+    status = folder.lstat()
+    if status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise RuntimeError(f"{folder} is not private; remove it")
     return folder
 
@@ -100,10 +100,10 @@ class RoleActor:
         self.prepare()
         logs = self.log_folder()
         logs.mkdir(exist_ok=True)
-        self._role = RoleProcess(self._here(task.command), self._environment(), logs)
+        self._role = RoleProcess(self._on_this_node(task.command), self._environment(), logs)
         self._start()
 
-    def _here(self, command: RoleCommand) -> RoleCommand:
+    def _on_this_node(self, command: RoleCommand) -> RoleCommand:
         return replace(command, words=tuple(map(self._filled, command.words)))
 
     def _filled(self, text: str) -> str:

@@ -62,7 +62,7 @@ LOST_SECONDS = 120.0  # within which a role's host may be lost for good twice
 STOP_SECONDS = 20.0  # for all roles to end in order and for the last checkpoint to reach the head
 PATIENCE_SECONDS = 120.0  # of a role that starts while launcher and Redis are being started again
 FIRST_PORT, LAST_PORT = 6380, 6479  # for Redis; 6379 is Ray's
-TOLD_SECONDS = 2.0  # for hosts to hear that the run ends
+NOTICE_SECONDS = 2.0  # for hosts to hear that the run ends
 log = logging.getLogger(__name__)
 
 
@@ -234,8 +234,8 @@ class ClusterRun:
             for role_handle in actors
             if role_handle.running and role_handle.node == node["NodeManagerAddress"]
         ]
-        taken = sum(one.cpus for one in self._hosts.values() if one.running and one.node == node["NodeManagerAddress"])
-        short = need["CPU"] - (node["Resources"]["CPU"] - taken)
+        used = sum(one.cpus for one in self._hosts.values() if one.running and one.node == node["NodeManagerAddress"])
+        short = need["CPU"] - (node["Resources"]["CPU"] - used)
         going = [role_handle for role_handle in actors if not role_handle.running] + (
             there[-ceil(short) :] if short > 0 else []
         )
@@ -278,9 +278,11 @@ class ClusterRun:
 
     def stop(self, reason: str) -> None:
         """Ask every role to end, and wait until the learner's last checkpoint is on the head."""
-        told = [role_handle.handle.stopping.remote(True) for role_handle in self._hosts.values() if role_handle.running]
-        if told:
-            ray.wait(told, num_returns=len(told), timeout=TOLD_SECONDS)
+        replies = [
+            role_handle.handle.stopping.remote(True) for role_handle in self._hosts.values() if role_handle.running
+        ]
+        if replies:
+            ray.wait(replies, num_returns=len(replies), timeout=NOTICE_SECONDS)
         with suppress(BusUnavailable, BusFull):
             self.bus.request_stop(reason)
         deadline = time.monotonic() + STOP_SECONDS + self._saving()
@@ -358,8 +360,8 @@ def _port(folder: RunFolder, ip: str) -> tuple[int, bool]:
     had = int(note.read_text()) if note.exists() else None
     ports = list(range(FIRST_PORT, LAST_PORT + 1))
     own = zlib.crc32(folder.name.encode()) % len(ports)  # runs that begin together do not want the same
-    wanted = [*([had] if had else []), *ports[own:], *ports[:own]]
-    for port in wanted:
+    candidates = [*([had] if had else []), *ports[own:], *ports[:own]]
+    for port in candidates:
         with socket.socket() as probe, suppress(OSError):
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((ip, port))

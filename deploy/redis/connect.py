@@ -24,15 +24,15 @@ class Deadline:
     def __init__(self, seconds: float, stop: StopSignal) -> None:
         self._seconds, self._deadline = seconds, time.monotonic() + seconds
         self._stop = stop
-        self._said = False
+        self._warned = False
 
     def wait(self, awaited: str) -> bool:
         """Wait a moment; False once there is none left."""
         if self._stop.requested or time.monotonic() >= self._deadline:
             return False
-        if not self._said:
+        if not self._warned:
             log.warning("waiting up to %g s for %s", self._seconds, awaited)
-            self._said = True
+            self._warned = True
         time.sleep(RECONNECT_SLEEP)
         return True
 

@@ -31,9 +31,9 @@ class ProgressBackup:
             return
         self._keep_at = time.monotonic() + KEEP_SECONDS
         with suppress(BusUnavailable, BusFull, OSError):  # the disk is full: those before stay
-            found = {role: raw for role in self._roles if (raw := bus.progress(role)) is not None}
-            if found and all(map(is_whole, found.values())):
-                write_whole(self._path, msgpack.packb(found))
+            progress = {role: raw for role in self._roles if (raw := bus.progress(role)) is not None}
+            if progress and all(map(is_whole, progress.values())):
+                write_whole(self._path, msgpack.packb(progress))
 
     def restore(self, bus: Bus) -> None:
         """Say them where Redis has nothing; a replay server whose ring is older then goes on from them.
@@ -41,20 +41,20 @@ class ProgressBackup:
         A file that cannot be read is told, and does not keep the run from going on: most often the ring has them, too.
         """
         try:
-            found = self._kept()
+            progress = self._kept()
         except (OSError, ValueError) as error:
             log.warning("%s: cannot be read (%s); going on without what it counted", self._path, error)
             return
-        for role, raw in found.items():
+        for role, raw in progress.items():
             bus.set_progress(role, raw)
 
     def _kept(self) -> dict[str, bytes]:
         """By role. Raises OSError, ValueError."""
         if not self._path.exists():
             return {}
-        found = msgpack.unpackb(self._path.read_bytes())
-        if not isinstance(found, dict) or not all(
-            role in self._roles and isinstance(raw, bytes) and is_whole(raw) for role, raw in found.items()
+        progress = msgpack.unpackb(self._path.read_bytes())
+        if not isinstance(progress, dict) or not all(
+            role in self._roles and isinstance(raw, bytes) and is_whole(raw) for role, raw in progress.items()
         ):
             raise ValueError("damaged, or no counters of this run's replay servers")
-        return found
+        return progress

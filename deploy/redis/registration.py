@@ -22,7 +22,7 @@ class Registration:
         self._look_at = 0.0
         bus.expire(None)
         bus.clear_stop()  # before the config, which roles that are started by hand may wait for
-        self._tell()
+        self._publish()
 
     def change(self, config: RunConfig) -> None:
         """From now on roles begin with this config. Raises BusUnavailable, BusFull."""
@@ -36,7 +36,7 @@ class Registration:
             self._look_at = time.monotonic() + LOOK_SECONDS
             with suppress(BusUnavailable, BusFull):
                 if self._bus.config() is None:
-                    self._tell()
+                    self._publish()
         self._progress_backup.keep(self._bus)
 
     def keep(self) -> None:
@@ -44,7 +44,7 @@ class Registration:
         with suppress(RmcError):
             self._progress_backup.keep(self._bus, at_once=True)
 
-    def _tell(self) -> None:
+    def _publish(self) -> None:
         """The counters first: a replay server that finds the config goes on from them."""
         self._progress_backup.restore(self._bus)
         self._bus.set_config(self._config)

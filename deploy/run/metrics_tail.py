@@ -37,12 +37,12 @@ class MetricsTail:
 
 def _evaluations(file: BinaryIO, size: int) -> tuple[list[dict[str, Any]], int]:
     """The evaluations in the lines that are whole within the first ``size`` bytes, and where those lines end."""
-    found = []
+    records = []
     with mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ) as content:
         end = content.rfind(b"\n") + 1
         at = content.find(EVALUATION, 0, end)
         while at >= 0:
             stop = content.find(b"\n", at)
-            found.append(parse_record(content[content.rfind(b"\n", 0, at) + 1 : stop]))
+            records.append(parse_record(content[content.rfind(b"\n", 0, at) + 1 : stop]))
             at = content.find(EVALUATION, stop, end)
-    return [record for record in found if record is not None], end
+    return [record for record in records if record is not None], end

@@ -30,16 +30,16 @@ def migrated(raw: Any) -> Any:
     """
     if not isinstance(raw, dict):
         return raw
-    found = {name: dict(part) if isinstance(part, dict) else part for name, part in raw.items()}
-    was = found.pop("format", 1)
+    settings = {name: dict(part) if isinstance(part, dict) else part for name, part in raw.items()}
+    was = settings.pop("format", 1)
     if type(was) is not int or was < 1:
         raise ConfigError("config.json format", was, "must be a number from 1; restore the file or start a new run")
     if was > FORMAT:
         fix = f"written by a newer version of RMC, this one reads up to {FORMAT}; update RMC to use this run"
         raise ConfigError("config.json format", was, fix)
     for migrate in MIGRATIONS[was - 1 :]:
-        migrate(found)
-    return found
+        migrate(settings)
+    return settings
 
 
 def _add(raw: Raw, part: str, **options: Any) -> None:

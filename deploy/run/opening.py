@@ -120,11 +120,11 @@ def new_folder(path: Path) -> RunFolder:
                 folder.path.mkdir(0o700)
                 break
     except OSError as error:
-        raise _cannot_be_made(path, error) from None
+        raise _creation_error(path, error) from None
     return folder
 
 
-def _cannot_be_made(path: Path, error: OSError) -> ConfigError:
+def _creation_error(path: Path, error: OSError) -> ConfigError:
     return ConfigError("--run-dir", str(path), f"cannot be made ({error.strerror}); give another")
 
 
@@ -137,7 +137,7 @@ def make(folder: RunFolder) -> None:
         for path in (folder.checkpoints, folder.logs):
             path.mkdir(exist_ok=True)
     except OSError as error:
-        raise _cannot_be_made(folder.path, error) from None
+        raise _creation_error(folder.path, error) from None
 
 
 def _taken_up(folder: RunFolder, config: RunConfig, if_exists: IfExists, options: LaunchOptions) -> RunConfig:

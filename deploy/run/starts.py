@@ -52,9 +52,9 @@ def note_start(
 def _env_steps(folder: RunFolder) -> int:
     """That the run has, by its newest checkpoint and what its roles said last."""
     newest: dict[str, int] = {}
-    for found in folder.records():
-        if found["role"].startswith(("learner", "replay")) and is_finite(found.get("env_steps")):
-            newest[found["role"]] = int(found["env_steps"])
+    for record in folder.records():
+        if record["role"].startswith(("learner", "replay")) and is_finite(record.get("env_steps")):
+            newest[record["role"]] = int(record["env_steps"])
     learner, saved = newest.pop("learner", 0), 0
     for progress in sorted(folder.checkpoints.glob(f"[0-9]*/{PROGRESS}"))[-1:]:
         with suppress(OSError, ConfigError):  # damaged, it is as none
@@ -64,12 +64,12 @@ def _env_steps(folder: RunFolder) -> int:
 
 def starts(folder: RunFolder) -> list[Start]:
     """All that can be read, oldest first; an older version has kept none."""
-    found = []
+    all_starts = []
     with suppress(FileNotFoundError):
         for line in folder.history_file.read_bytes().splitlines():
             with suppress(ValueError, TypeError):
-                found.append(Start(**json.loads(line)))
-    return found
+                all_starts.append(Start(**json.loads(line)))
+    return all_starts
 
 
 def resume_command(folder: RunFolder) -> str:
@@ -79,8 +79,8 @@ def resume_command(folder: RunFolder) -> str:
 
 def last_launch(folder: RunFolder, launcher: Launcher | None = None) -> LaunchOptions:
     """How the run was started last; with another ``launcher`` only its device is taken. As by default if not known."""
-    known = starts(folder)
-    kept = {name: value for name, value in known[-1].launch.items() if name in KEPT} if known else {}
+    past_starts = starts(folder)
+    kept = {name: value for name, value in past_starts[-1].launch.items() if name in KEPT} if past_starts else {}
     last = dataclasses.replace(LaunchOptions(folder.path), **kept)
     if launcher in (None, last.launcher):
         return last
@@ -89,14 +89,14 @@ def last_launch(folder: RunFolder, launcher: Launcher | None = None) -> LaunchOp
 
 def format_starts(folder: RunFolder) -> str:
     """In a line; empty where nothing is known."""
-    known = starts(folder)
-    words = [f"{len(known)} starts" if len(known) != 1 else "1 start"] if known else []
-    for start in known:
+    all_starts = starts(folder)
+    words = [f"{len(all_starts)} starts" if len(all_starts) != 1 else "1 start"] if all_starts else []
+    for start in all_starts:
         if start.init_from is not None:
             words.append("began with {parts} of {run}, update {checkpoint}".format(**start.init_from))
-        told = [f"{option(path)} {_word(was)} to {_word(now)}" for path, (was, now) in start.changes.items()]
-        if told:
-            words.append(f"from step {start.env_steps:,} {', '.join(told)}")
+        changes = [f"{option(path)} {_word(was)} to {_word(now)}" for path, (was, now) in start.changes.items()]
+        if changes:
+            words.append(f"from step {start.env_steps:,} {', '.join(changes)}")
     return "; ".join(words)
 
 

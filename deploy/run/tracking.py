@@ -49,9 +49,9 @@ def choose_tracking(options: LaunchOptions) -> Tracking | None:
 
 
 def _refuse_without_tracker(options: LaunchOptions) -> None:
-    for name, given in (("--track-project", options.track_project), ("--track-tags", options.track_tags)):
-        if given:
-            raise ConfigError(name, given, "say which tracker: --track wandb or --track trackio")
+    for name, value in (("--track-project", options.track_project), ("--track-tags", options.track_tags)):
+        if value:
+            raise ConfigError(name, value, "say which tracker: --track wandb or --track trackio")
 
 
 def _check(tracker: str, project: str, tags: tuple[str, ...]) -> None:
@@ -80,19 +80,20 @@ def keep_tracking(folder: RunFolder, tracking: Tracking | None) -> None:
 def kept_tracking(path: Path) -> Tracking | None:
     """That of a run's folder, None where it has none. Raises ConfigError where the file is damaged."""
     try:
-        said = read_object(_file(path))
+        settings = read_object(_file(path))
     except FileNotFoundError:
         return None
     except ConfigError:
-        said = {}
-    if not _is_whole(said):
+        settings = {}
+    if not _is_whole(settings):
         raise ConfigError("tracking.json", str(_file(path)), "is damaged; remove it, and give --track again")
-    return Tracking(said["tracker"], said["project"], tuple(said["tags"]), said["id"])
+    return Tracking(settings["tracker"], settings["project"], tuple(settings["tags"]), settings["id"])
 
 
-def _is_whole(said: dict[str, Any]) -> bool:
-    texts = said.get("project"), said.get("id"), *(said["tags"] if isinstance(said.get("tags"), list) else [None])
-    return said.get("tracker") in get_args(Tracker) and all(isinstance(text, str) for text in texts)
+def _is_whole(settings: dict[str, Any]) -> bool:
+    tags = settings["tags"] if isinstance(settings.get("tags"), list) else [None]
+    texts = settings.get("project"), settings.get("id"), *tags
+    return settings.get("tracker") in get_args(Tracker) and all(isinstance(text, str) for text in texts)
 
 
 def _file(path: Path) -> Path:

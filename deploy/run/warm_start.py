@@ -72,9 +72,9 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
     torch.save(update.state_dict(), learnt)
     weights = {name: value.contiguous() for name, value in update.policy_weights().items()}
     policy = safetensors.torch.save(weights, config.policy_header().metadata())
-    made = {STATE: learnt.getvalue(), POLICY: policy, PROGRESS: json.dumps(progress).encode()}
+    checkpoint = {STATE: learnt.getvalue(), POLICY: policy, PROGRESS: json.dumps(progress).encode()}
     return InitialCheckpoint(
-        made, {"asked": [init_from, parts], "run": str(folder.path), "checkpoint": number, "parts": parts}
+        checkpoint, {"asked": [init_from, parts], "run": str(folder.path), "checkpoint": number, "parts": parts}
     )
 
 
@@ -90,12 +90,10 @@ def _split(init_from: str) -> tuple[RunFolder, str]:
 def _check_sizes(
     init_from: str, parts: InitParts, source: RunConfig, config: RunConfig, agent: dict[str, Tensor]
 ) -> None:
-    theirs = {"observations": len(agent["normalizer.mean"]), "actions": len(agent["policy.net.4.bias"]) // 2}
+    sizes = {"observations": len(agent["normalizer.mean"]), "actions": len(agent["policy.net.4.bias"]) // 2}
     for name, ours in config.sizes().items():
-        if theirs.get(name, ours) != ours:
-            raise ConfigError(
-                OPTION, init_from, f"that run has {theirs[name]} {name}, this one has {ours}; use another"
-            )
+        if sizes.get(name, ours) != ours:
+            raise ConfigError(OPTION, init_from, f"that run has {sizes[name]} {name}, this one has {ours}; use another")
     for item in fields(source.agent):
         was, now = getattr(source.agent, item.name), getattr(config.agent, item.name)
         if was != now and item.name not in NOT_IN[parts]:
@@ -105,17 +103,17 @@ def _check_sizes(
 
 def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages: bool) -> JointUpdate:
     """The run's own learner before its first update, with what is taken in its place."""
-    spec, taken = config.window_spec(), PARTS[parts]
+    spec, prefixes = config.window_spec(), PARTS[parts]
     torch.manual_seed(config.seed)  # the rest is as the learner would make it
     update = make_update(Agent(spec.obs_dim, spec.action_dim, config.agent), spec.burn_in, config.update, config.seed)
-    theirs = {name: value for name, value in state["agent"].items() if name.startswith(taken)}
-    update.agent.load_state_dict(update.agent.state_dict() | theirs)
+    weights = {name: value for name, value in state["agent"].items() if name.startswith(prefixes)}
+    update.agent.load_state_dict(update.agent.state_dict() | weights)
     update.target_memory.load_state_dict(update.agent.memory.state_dict())
     critic = state["target_critic"] if parts == "all" else update.agent.critic.state_dict()
     update.target_critic.load_state_dict(critic)
     acting = dict(update.agent.acting())
     for name, value in update.average.items():
-        value.copy_(state["average"][name] if averages and name in theirs else acting[name].detach())
+        value.copy_(state["average"][name] if averages and name in weights else acting[name].detach())
     return update
 
 

@@ -71,7 +71,7 @@ def _evaluate_baseline(command: run_options.Evaluate) -> int:
 
 
 def _say_played(command: run_options.Evaluate, played: dict[str, Any]) -> None:
-    terminal().print(json.dumps(played) if command.json else _said(played), soft_wrap=True)
+    terminal().print(json.dumps(played) if command.json else _result_line(played), soft_wrap=True)
 
 
 def _check_baselines(what: str) -> None:
@@ -80,10 +80,10 @@ def _check_baselines(what: str) -> None:
             raise ConfigError("baseline", what, f"{package} is missing; {how_to_install('baselines')}")
 
 
-def _said(played: dict[str, Any]) -> str:
+def _result_line(played: dict[str, Any]) -> str:
     mean, deviation, flicker = (played[f"eval_{name}"] for name in ("return_mean", "return_std", "flicker"))
-    seen = f" with {flicker:.0%} of the frames missing" if flicker else ""
-    text = f"{played['env']}{seen}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
+    missing = f" with {flicker:.0%} of the frames missing" if flicker else ""
+    text = f"{played['env']}{missing}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
     return f"{text}{cut_note(played)}, after {played['env_steps']:,} environment steps"
 
 
@@ -102,10 +102,10 @@ def export_policy(command: run_options.Export) -> int:
 
 def inspect(command: run_options.Inspect) -> int:
     """Write a picture of what the world model knows, and say it in numbers."""
-    found, console = world_model_picture.inspect(command.run, command.checkpoint, command.out), terminal()
-    ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in found.open_loop.items())
-    hardest = np.argsort(-found.unexplained)[: world_model_picture.SHOWN]
-    worst = ", ".join(f"{i} ({found.unexplained[i]:.0%})" for i in hardest)
+    insight, console = world_model_picture.inspect(command.run, command.checkpoint, command.out), terminal()
+    ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in insight.open_loop.items())
+    hardest = np.argsort(-insight.unexplained)[: world_model_picture.SHOWN]
+    worst = ", ".join(f"{i} ({insight.unexplained[i]:.0%})" for i in hardest)
     console.print(
         f"unexplained of the observation's change: {ahead} (100% is a guess of no change)",
         soft_wrap=True,
@@ -145,14 +145,14 @@ def plot(command: run_options.Plot) -> int:
 def _histories(paths: Sequence[Path]) -> list[history.History]:
     """Of all that can be read; the others are told. Raises ConfigError where that is none."""
     runs = list(dict.fromkeys(run for path in paths for run in expanded(path)))
-    found = []
+    histories = []
     for run in runs:
         try:
-            found += history.read(run)
+            histories += history.read(run)
         except ConfigError as error:
             if len(runs) == 1:
                 raise
             log.warning("%s (left out)", error)
-    if not found:
+    if not histories:
         raise ConfigError("RUNS", " ".join(map(str, paths)), "no history in there; give runs that were evaluated")
-    return found
+    return histories

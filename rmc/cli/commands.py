@@ -49,12 +49,12 @@ def stats(command: run_options.Stats) -> int:
 
 def list_runs(command: run_options.List) -> int:
     """Print a table of the runs in a folder."""
-    console, found = terminal(), run_list.runs(command.folder)
+    console, summaries = terminal(), run_list.runs(command.folder)
     if command.json:
-        console.print(json.dumps([dataclasses.asdict(one) for one in found]), soft_wrap=True)
+        console.print(json.dumps([dataclasses.asdict(one) for one in summaries]), soft_wrap=True)
         return 0
-    console.print(run_list.table(found, command.folder, console.width))
-    for one in found:
+    console.print(run_list.table(summaries, command.folder, console.width))
+    for one in summaries:
         if one.fault is not None:
             console.print(one.fault, soft_wrap=True)
     return 0

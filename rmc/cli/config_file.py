@@ -14,10 +14,10 @@ from rmc.deploy.run.config import option_words
 OPTION, KWARGS = "--config", "--env-kwargs"
 
 
-def with_file(words: list[str], known: Sequence[str]) -> tuple[list[str], str]:
+def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
     """The words with the options of the file that they name, if any, before their own; and the file's ENV.
 
-    ``known`` are the names of the options. Raises ConfigError.
+    ``names`` are those of all options. Raises ConfigError.
     """
     path = _named(words)
     if path is None:
@@ -29,13 +29,13 @@ def with_file(words: list[str], known: Sequence[str]) -> tuple[list[str], str]:
     if not isinstance(kwargs, dict):
         raise ConfigError(f"{OPTION} {path}: env_kwargs", kwargs, "write a table, like env_kwargs = { goal = 1.5 }")
     for name, value in options.items():
-        _check(path, name, value, known)
-    given = [word for name, value in options.items() for word in option_words(name, value)]
+        _check(path, name, value, names)
+    file_words = [word for name, value in options.items() for word in option_words(name, value)]
     check_kwargs(kwargs)
     if any(word.partition("=")[0].replace("_", "-") == KWARGS for word in words):
         kwargs = {}
     last = [KWARGS, *write_kwargs(kwargs)] if kwargs else []
-    return [words[0], *given, *words[1:], *last], env
+    return [words[0], *file_words, *words[1:], *last], env
 
 
 def _named(words: Sequence[str]) -> Path | None:
@@ -55,9 +55,9 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigError(OPTION, str(path), f"is not TOML ({error}); mend it") from None
 
 
-def _check(path: Path, name: str, value: Any, known: Sequence[str]) -> None:
-    if name not in known:
-        near = difflib.get_close_matches(name, known, 1)
+def _check(path: Path, name: str, value: Any, names: Sequence[str]) -> None:
+    if name not in names:
+        near = difflib.get_close_matches(name, names, 1)
         fix = f"did you mean {near[0]}?" if near else "rmc train --help-all lists them"
         raise ConfigError(f"{OPTION} {path}: {name}", value, f"is no option; {fix}")
     if not all(isinstance(one, str | bool | int | float) for one in (value if isinstance(value, list) else [value])):

@@ -74,8 +74,8 @@ def _import_all() -> None:
 
 def _status(pid: int, roles: set[int]) -> int | str:
     """Of a role; with one that has ended goes what its environments started, which has come to us."""
-    found, status = os.waitpid(pid, os.WNOHANG)
-    if not found:
+    ended, status = os.waitpid(pid, os.WNOHANG)
+    if not ended:
         return "running"
     roles.discard(pid)
     descendants.end_children(roles)

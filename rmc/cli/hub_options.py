@@ -7,6 +7,8 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from rmc.cli.run_options import Checkpoint
+
 
 @dataclass(frozen=True)
 class Push:
@@ -16,8 +18,7 @@ class Push:
     """The run's folder, or a policy file."""
     repo: Positional[str]
     """owner/name; made where it is not there."""
-    checkpoint: str = "latest"
-    """latest, best of those evaluated while it trained, or the number of a checkpoint."""
+    checkpoint: Checkpoint = "latest"
     license: str | None = None
     """What the model card says, like mit or cc-by-4.0; by default nothing."""
     private: bool = False

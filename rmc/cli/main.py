@@ -56,9 +56,9 @@ def run(words: list[str]) -> int:
     _choose_temporary_folder()
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
     try:
-        here = os.getcwd()
-        if here not in sys.path:  # a user's own environments, last, so that they cannot shadow ours
-            sys.path.append(here)
+        folder = os.getcwd()
+        if folder not in sys.path:  # a user's own environments, last, so that they cannot shadow ours
+            sys.path.append(folder)
     except FileNotFoundError:
         if parent is None:  # a role is given whole paths
             return _complain("the working folder is gone; cd to one that is there", CONFIG_STATUS)
@@ -119,9 +119,9 @@ def _complaint(words: list[str]) -> str:
     """What is wrong with words that cannot be parsed; it quotes them."""
     from rmc.cli import complaint, parser
 
-    with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.suppress(SystemExit):
+    with contextlib.redirect_stderr(io.StringIO()) as stderr, contextlib.suppress(SystemExit):
         parser.parse(words)
-    return f"{complaint.as_line(said.getvalue())} (see rmc --help)"
+    return f"{complaint.as_line(stderr.getvalue())} (see rmc --help)"
 
 
 def _complain(message: str, status: int) -> int:

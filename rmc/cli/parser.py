@@ -132,15 +132,15 @@ def _parsed(words: list[str], defaults: dict[str, Any]) -> Any:
 
 def renamed(words: list[str]) -> list[str]:
     """The words with the new names of options, each of whose old ones is warned of."""
-    found = []
+    new_words = []
     for word in words:
         flag, equals, value = word.partition("=")
         no = "no-" if flag.startswith("--no-") else ""
         new = RENAMED.get(flag.replace("_", "-").removeprefix(f"--{no}")) if flag.startswith("--") else None
         if new is not None:
             log.warning("%s is called --%s%s now; the old name goes in the next version", flag, no, new)
-        found.append(f"--{no}{new}{equals}{value}" if new is not None else word)
-    return found
+        new_words.append(f"--{no}{new}{equals}{value}" if new is not None else word)
+    return new_words
 
 
 def option_names(kind: type) -> list[str]:
@@ -153,15 +153,15 @@ def option_names(kind: type) -> list[str]:
 
 def _check_once(option: str, words: list[str]) -> None:
     """Of two, the parser would drop the first without a word."""
-    given = [word for word in words if word.partition("=")[0].replace("_", "-") == option]
-    if len(given) > 1:
-        raise ConfigError(option, " ".join(given), "is there twice; give all of NAME=VALUE after one")
+    uses = [word for word in words if word.partition("=")[0].replace("_", "-") == option]
+    if len(uses) > 1:
+        raise ConfigError(option, " ".join(uses), "is there twice; give all of NAME=VALUE after one")
 
 
 def _named_preset(words: list[str]) -> Preset:
     """The preset must be known before the options, whose defaults it gives; a wrong one is refused later."""
-    given = [word.partition("=")[2] for word in words if word.startswith("--preset=")]
-    given += [after for word, after in itertools.pairwise(words) if word == "--preset"]
-    if "paper" in given[-1:]:
+    presets = [word.partition("=")[2] for word in words if word.startswith("--preset=")]
+    presets += [after for word, after in itertools.pairwise(words) if word == "--preset"]
+    if "paper" in presets[-1:]:
         return "paper"
-    return "debug" if "debug" in given[-1:] else "robust"
+    return "debug" if "debug" in presets[-1:] else "robust"

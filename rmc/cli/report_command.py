@@ -27,14 +27,14 @@ def report(command: run_options.Report) -> int:
 
 def _read(paths: Sequence[Path]) -> list[ReportRun]:
     """Each once; those that are no runs are told. Raises ConfigError where none is."""
-    found = []
+    reports = []
     for path in dict.fromkeys(path.resolve() for path in paths):
         try:
-            found.append(ReportRun.read(path))
+            reports.append(ReportRun.read(path))
         except ConfigError as error:
             if len(paths) == 1:
                 raise
             log.warning("%s (left out)", error)
-    if not found:
+    if not reports:
         raise ConfigError("RUNS", " ".join(map(str, paths)), "none of them is a run's folder")
-    return found
+    return reports

@@ -25,17 +25,17 @@ class RoleSecrets:
 
 def run_role(command: Role) -> int:
     """Be one role of a run until it ends."""
-    role, given = command.role, RoleSecrets()
+    role, secrets = command.role, RoleSecrets()
     if isinstance(role, LauncherRole):
         return launch(role)
     warn_of_password(role.redis_url)
-    url = role.redis_url or given.redis_url
+    url = role.redis_url or secrets.redis_url
     if not url:
         raise ConfigError("--redis-url", url, f"say where the run's Redis is, or set {URL_VARIABLE}")
     if isinstance(role, ActorRole | EvaluatorRole):
         _play(role, RunConnection(role.run, url))
         return 0
-    place = RunConnection(role.run, url, given.secret, role.secret_file, role.tls_folder)
+    place = RunConnection(role.run, url, secrets.secret, role.secret_file, role.tls_folder)
     if isinstance(role, ReplayRole):
         from rmc.deploy.local import replay_process
 

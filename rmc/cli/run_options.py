@@ -1,18 +1,20 @@
 """The commands that look at a run or an environment, stop a run, or start a cluster, as dataclasses."""
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro import MISSING
 from tyro.conf import Positional, Suppress, arg
 
 from rmc.analysis import baseline_settings
 from rmc.analysis.baseline_settings import Algorithm, BaselineConfig
 from rmc.analysis.curves import Axis
-from rmc.cli.train_options import EnvOptions, KnownEnvOptions
+from rmc.cli.train_options import EnvOptions, KnownEnvOptions, KnownRunDir, known_run, values_of
 from rmc.deploy.run.folder import RunFolder
+
+Checkpoint = Annotated[
+    str, arg(help="latest, best of those evaluated while it trained, or the number of a checkpoint.")
+]
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,7 @@ class Evaluate:
     all."""
     flicker: tuple[float, ...] = ()
     """Probabilities of a missing observation, each of which is played; by default the run's own."""
-    checkpoint: str = "latest"
-    """latest, best of those evaluated while it trained, or the number of a checkpoint."""
+    checkpoint: Checkpoint = "latest"
     video: Path | None = None
     """Also write an episode to this file, like episode.mp4, with the first of the flicker probabilities."""
     json: bool = False
@@ -44,8 +45,7 @@ class Export:
     """The run's folder, or a policy file."""
     out: Path = Path("policy.onnx")
     """The file to write, which ends in .safetensors or .onnx."""
-    checkpoint: str = "latest"
-    """latest, best of those evaluated while it trained, or the number of a checkpoint."""
+    checkpoint: Checkpoint = "latest"
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,7 @@ class Inspect:
     """The run's folder."""
     out: Path = Path("inspect.png")
     """The picture to write."""
-    checkpoint: str = "latest"
-    """latest, best of those evaluated while it trained, or the number of a checkpoint."""
+    checkpoint: Checkpoint = "latest"
 
 
 @dataclass(frozen=True)
@@ -81,8 +80,7 @@ class Baseline(BaselineConfig):
 
     def config(self) -> BaselineConfig:
         """The run's config."""
-        own = {item.name: getattr(self, item.name) for item in dataclasses.fields(BaselineConfig)}
-        return BaselineConfig(**own | {"env": self.env.config()})
+        return BaselineConfig(**values_of(BaselineConfig, self) | {"env": self.env.config()})
 
 
 @dataclass(frozen=True)
@@ -91,16 +89,13 @@ class ResumeBaseline(Baseline):
 
     algorithm: Suppress[Algorithm]
     env: KnownEnvOptions
-    run_dir: Annotated[Path | None, Positional, arg(metavar="RUN")] = None
-    """The run's folder."""
+    run_dir: KnownRunDir = None
 
 
 def resuming_baseline(folder: RunFolder) -> ResumeBaseline:
     """The command that goes on with such a run, and changes nothing. Raises ConfigError."""
     config = baseline_settings.read(folder)
-    return ResumeBaseline(
-        **vars(config) | {"env": KnownEnvOptions(**dataclasses.asdict(config.env)), "run_dir": MISSING}
-    )
+    return ResumeBaseline(**vars(config) | known_run(config.env))
 
 
 @dataclass(frozen=True)

@@ -54,21 +54,21 @@ def check_values(spec: Spec, on_this_machine: bool) -> None:
 
 
 def _check(place: str, value: Any, spec: Spec, words: list[str]) -> None:
-    with contextlib.redirect_stderr(io.StringIO()) as said:
+    with contextlib.redirect_stderr(io.StringIO()) as output:
         try:
             parser.parse(["train", spec.env, *words])
         except SystemExit:
-            raise ConfigError(place, value, complaint.as_line(said.getvalue())) from None
+            raise ConfigError(place, value, complaint.as_line(output.getvalue())) from None
 
 
 def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:
     """All of them, if each can be started. Raises ConfigError. What differs in its seed alone is read once."""
-    known: dict[str, Checked] = {}
+    by_values: dict[str, Checked] = {}
     checked = []
     for job in jobs:
-        alike = known.get(repr(job.values))
+        alike = by_values.get(repr(job.values))
         if alike is None:
-            alike = known[repr(job.values)] = _checked(job, on_this_machine)
+            alike = by_values[repr(job.values)] = _checked(job, on_this_machine)
         config = dataclasses.replace(alike.config, seed=job.seed)
         validate(config)
         checked.append(Checked(with_length(job, config), config, alike.options))

@@ -149,16 +149,18 @@ def _conduct(command: Sweep, work: Work, checked: list[Checked], index: Index) -
     with signals_caught() as stop:
         if work.todo:
             with _place(command, work.todo, checked) as (place, about):
-                known = f"{work.total} runs in {folder}, {over} of them over; {about}"
-                console.print(known, soft_wrap=True)
+                summary = f"{work.total} runs in {folder}, {over} of them over; {about}"
+                console.print(summary, soft_wrap=True)
                 _warn_of_empty_rings(work.todo)
                 conduct(work.plan, place, stop, index.begin, ended)
     if work.jobs:
         console.print(result_table(work.jobs, index))
-    left = work.total - sum(index.state(job) in OVER for job in work.jobs)
-    if left:
-        console.print(f"{left} not over; the same command goes on; {folder / NAME} has their words", soft_wrap=True)
-    return STOPPED if stop.requested else int(left > 0)
+    remaining = work.total - sum(index.state(job) in OVER for job in work.jobs)
+    if remaining:
+        console.print(
+            f"{remaining} not over; the same command goes on; {folder / NAME} has their words", soft_wrap=True
+        )
+    return STOPPED if stop.requested else int(remaining > 0)
 
 
 def _warn_of_empty_rings(todo: list[Job]) -> None:

@@ -46,6 +46,14 @@ class KnownEnvOptions(EnvOptions):
     id: tyro.conf.Suppress[str]
 
 
+KnownRunDir = Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN", help="The run's folder.")]
+
+
+def known_run(env: EnvConfig) -> dict[str, Any]:
+    """The options that say which run goes on; its folder must be given."""
+    return {"env": KnownEnvOptions(**dataclasses.asdict(env)), "run_dir": tyro.MISSING}
+
+
 @dataclass(frozen=True)
 class Train:
     """Train an agent, or go on with a run. --help shows the basic options, --help-all all of them."""
@@ -103,19 +111,22 @@ class Train:
 
     def config(self) -> RunConfig:
         """The run's config."""
-        own = {item.name: getattr(self, item.name) for item in dataclasses.fields(RunConfig) if item.name != "env"}
-        return RunConfig(env=self.env.config(), **own)
+        return RunConfig(**values_of(RunConfig, self) | {"env": self.env.config()})
 
     def launch_options(self) -> LaunchOptions:
         """Where and on what it runs."""
-        return LaunchOptions(**{item.name: getattr(self, item.name) for item in dataclasses.fields(LaunchOptions)})
+        return LaunchOptions(**values_of(LaunchOptions, self))
+
+
+def values_of(kind: type[Any], source: Any) -> dict[str, Any]:
+    """What ``source`` has for each field of a dataclass."""
+    return {item.name: getattr(source, item.name) for item in dataclasses.fields(kind)}
 
 
 def from_config(config: RunConfig, launch: LaunchOptions) -> Train:
     """The command that would say all of this."""
-    own = {item.name: getattr(config, item.name) for item in dataclasses.fields(RunConfig)}
-    how = {item.name: getattr(launch, item.name) for item in dataclasses.fields(LaunchOptions)}
-    return Train(**own | how | {"env": EnvOptions(**dataclasses.asdict(config.env))})
+    options = values_of(RunConfig, config) | values_of(LaunchOptions, launch)
+    return Train(**options | {"env": EnvOptions(**dataclasses.asdict(config.env))})
 
 
 @dataclass(frozen=True)
@@ -124,8 +135,7 @@ class Resume(Train):
     options, --help-all all of them."""
 
     env: KnownEnvOptions
-    run_dir: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
-    """The run's folder."""
+    run_dir: KnownRunDir = None
     config_file: tyro.conf.Suppress[Path | None] = None
     if_exists: tyro.conf.Suppress[IfExists] = "resume"
     init_from: tyro.conf.Suppress[str | None] = None
@@ -134,5 +144,4 @@ class Resume(Train):
 
 def resuming(config: RunConfig, launch: LaunchOptions) -> Resume:
     """The command that goes on with such a run, and changes nothing."""
-    said = vars(from_config(config, launch))
-    return Resume(**said | {"env": KnownEnvOptions(**dataclasses.asdict(config.env)), "run_dir": tyro.MISSING})
+    return Resume(**vars(from_config(config, launch)) | known_run(config.env))

@@ -66,10 +66,10 @@ def spawn(words: list[str], log: Path) -> "subprocess.Popen[bytes]":
     """``rmc`` as a process that ends with this one, and that a terminal's Ctrl-C does not reach."""
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = os.environ | {PARENT_VARIABLE: str(os.getpid())}
-    with log.open("ab") as said:
+    with log.open("ab") as output:
         return subprocess.Popen(
             command_line(words),
-            stdin=subprocess.DEVNULL, stdout=said, stderr=said, env=environment, start_new_session=True,
+            stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=environment, start_new_session=True,
         )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rmc.common.process.file_lock import take_lock
 from rmc.sweep.local_runs import spawn
-from rmc.sweep.parcel import Known, Parcel, pack, unpack
+from rmc.sweep.parcel import Parcel, Stamps, pack, unpack
 
 BEGIN_SECONDS = 60.0
 
@@ -24,16 +24,16 @@ class NodeRun:
         if os.path.isdir(working_folder):  # where the user's own environments may lie
             os.chdir(working_folder)
         base = _private(Path(tempfile.gettempdir()) / f"rmc-sweep-{os.getuid()}")
-        for left in _left(base):
-            shutil.rmtree(left, ignore_errors=True)
+        for abandoned in _abandoned(base):
+            shutil.rmtree(abandoned, ignore_errors=True)
         self._place = Path(tempfile.mkdtemp(dir=base))
         self._lock = take_lock(self._place / "lock")
         self._folder, self._log = self._place / name, self._place / "log"
-        if brought.known:
+        if brought.stamps:
             unpack(brought, self._folder, {})
         self._process = spawn([*words, "--run-dir", str(self._folder)], self._log)
 
-    def look(self, known: Known, copy: bool) -> tuple[int | None, Parcel | None, bytes]:
+    def look(self, stamps: Stamps, copy: bool) -> tuple[int | None, Parcel | None, bytes]:
         """The run's exit status, if it has one; where that is so, or a ``copy`` is due, what has changed, and its log.
 
         After its end, nothing is kept here.
@@ -41,7 +41,7 @@ class NodeRun:
         status = self._process.poll()
         if status is None and not copy:
             return None, None, b""
-        parcel, log = pack(self._folder, known), self._log.read_bytes()
+        parcel, log = pack(self._folder, stamps), self._log.read_bytes()
         if status is not None:
             shutil.rmtree(self._place, ignore_errors=True)
         return status, parcel, log
@@ -60,7 +60,7 @@ def _private(folder: Path) -> Path:
     return folder
 
 
-def _left(base: Path) -> Iterator[Path]:
+def _abandoned(base: Path) -> Iterator[Path]:
     """What killed sweeps have left there."""
     for folder in base.iterdir():
         begins = time.time() - folder.stat().st_mtime < BEGIN_SECONDS  # another one's may not be locked yet

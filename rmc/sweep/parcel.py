@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-Known = dict[str, tuple[int, int]]  # a file's size and time of change in ns, by its path in the folder
+Stamps = dict[str, tuple[int, int]]  # a file's size and time of change in ns, by its path in the folder
 
 
 @dataclass(frozen=True)
@@ -14,13 +14,13 @@ class Parcel:
     """Changed files, and the names of all."""
 
     folders: list[str]
-    known: Known
+    stamps: Stamps
     tar: bytes = field(repr=False)
 
 
-def pack(folder: Path, known: Known) -> Parcel:
-    """All that is not as it is ``known``. Files that vanish meanwhile are left out."""
-    content, now, folders = io.BytesIO(), Known(), list[str]()
+def pack(folder: Path, stamps: Stamps) -> Parcel:
+    """All that is not as in ``stamps``. Files that vanish meanwhile are left out."""
+    content, now, folders = io.BytesIO(), Stamps(), list[str]()
     with tarfile.open(fileobj=content, mode="w") as tar:
         for path in sorted(folder.rglob("*")):
             name = path.relative_to(folder)
@@ -31,21 +31,21 @@ def pack(folder: Path, known: Known) -> Parcel:
                     folders.append(str(name))
                 elif path.is_file():
                     about = path.stat()
-                    seen = about.st_size, about.st_mtime_ns
-                    if known.get(str(name)) != seen:
+                    stamp = about.st_size, about.st_mtime_ns
+                    if stamps.get(str(name)) != stamp:
                         tar.add(path, str(name))
-                    now[str(name)] = seen
+                    now[str(name)] = stamp
     return Parcel(folders, now, content.getvalue())
 
 
-def unpack(parcel: Parcel, folder: Path, before: Known) -> None:
+def unpack(parcel: Parcel, folder: Path, before: Stamps) -> None:
     """Make a copy like the folder that was packed. Of what is not in that, only what came ``before`` is removed."""
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     with tarfile.open(fileobj=io.BytesIO(parcel.tar)) as tar:
         tar.extractall(folder, filter="data")
     for name in parcel.folders:
         (folder / name).mkdir(parents=True, exist_ok=True)
-    for name in before.keys() - parcel.known.keys():
+    for name in before.keys() - parcel.stamps.keys():
         (folder / name).unlink(missing_ok=True)
         with suppress(OSError):  # other files are in it
             (folder / name).parent.rmdir()

@@ -12,7 +12,7 @@ from rmc.deploy.ray.role_actor import last_line
 from rmc.sweep.job import Job
 from rmc.sweep.local_runs import last_line as last_log_line
 from rmc.sweep.node_run import NodeRun
-from rmc.sweep.parcel import Known, Parcel, pack, unpack
+from rmc.sweep.parcel import Parcel, Stamps, pack, unpack
 
 LOOK_SECONDS = 2.0
 BYTES_PER_SECOND = 1e6  # that copies of a run's files take at most, but for the last
@@ -63,31 +63,31 @@ class RayRun:
         self._log = job.log.read_bytes() if job.log.exists() else b""
         brought = pack(job.folder, {}) if job.folder.exists() else Parcel([], {}, b"")
         self._actor = ray.remote(NodeRun).options(**needs).remote(job.words, job.name, brought, os.getcwd())
-        self._known: Known = brought.known  # of its files, those that are here
-        self._asked: Any = self._actor.look.remote(self._known, True)
+        self._stamps: Stamps = brought.stamps  # of its files, those that are here
+        self._pending: Any = self._actor.look.remote(self._stamps, True)
         self._begun, self._look_at, self._copy_at = False, 0.0, 0.0
 
     def status(self) -> int | None:
         """Its exit status, once that and all that it left are here."""
         now = time.monotonic()
-        if self._asked is None and now >= self._look_at:
-            self._asked = self._actor.look.remote(self._known, now >= self._copy_at)
-        if self._asked is None or not ray.wait([self._asked], timeout=0.0)[0]:
+        if self._pending is None and now >= self._look_at:
+            self._pending = self._actor.look.remote(self._stamps, now >= self._copy_at)
+        if self._pending is None or not ray.wait([self._pending], timeout=0.0)[0]:
             return None
         try:
-            status, parcel, log = ray.get(self._asked)
+            status, parcel, log = ray.get(self._pending)
         except ray.exceptions.RayError as error:
             self._lost = f"its node was lost, or could not start it ({last_line(error)})"
             return self._end(LOST)
-        self._asked, self._begun, self._look_at = None, True, now + LOOK_SECONDS
+        self._pending, self._begun, self._look_at = None, True, now + LOOK_SECONDS
         if parcel is not None:
             self._take(parcel, log)
             self._copy_at = now + len(parcel.tar) / BYTES_PER_SECOND
         return None if status is None else self._end(status)
 
     def _take(self, parcel: Parcel, log: bytes) -> None:
-        unpack(parcel, self._job.folder, self._known)
-        self._known = parcel.known
+        unpack(parcel, self._job.folder, self._stamps)
+        self._stamps = parcel.stamps
         self._job.log.parent.mkdir(parents=True, exist_ok=True)
         self._job.log.write_bytes(self._log + log)
 

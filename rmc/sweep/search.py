@@ -62,10 +62,10 @@ class SearchPlan:
         self._at_work: dict[str, _Trial] = {}
         self.todo: list[Job] = []
         self._index = index
-        self.jobs = [self._known(line) for name, line in index.lines.items() if name.startswith(TRIAL)]
+        self.jobs = [self._earlier_job(line) for name, line in index.lines.items() if name.startswith(TRIAL)]
         self._names = self._all_names()
 
-    def _known(self, line: dict[str, Any]) -> Job:
+    def _earlier_job(self, line: dict[str, Any]) -> Job:
         """Tell Optuna of a trial of before, or take it up again."""
         name, values = str(line["run"]), values_of(line)
         job = self._make(name, values)
@@ -145,10 +145,10 @@ class SearchPlan:
     def _evaluations(self, job: Job) -> list[tuple[int, Evaluation]]:
         """By which evaluation of a run it is: the steps themselves differ a little from run to run."""
         try:
-            found = of_run(RunFolder(job.folder)).evaluations
+            evaluations = of_run(RunFolder(job.folder)).evaluations
         except ConfigError:  # none yet
             return []
-        by_step = {round(one.env_steps / self._checkpoint_steps): one for one in found}
+        by_step = {round(one.env_steps / self._checkpoint_steps): one for one in evaluations}
         return sorted(by_step.items(), key=lambda pair: pair[0])
 
     def end(self, job: Job, ending: Ending) -> None:

@@ -65,8 +65,8 @@ class Spec:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for names and lists that make no sense; values are judged by the parser of rmc train."""
-        for part, given in (("options", self.options), ("grid", self.grid)):
-            for name, value in given.items():
+        for part, table in (("options", self.options), ("grid", self.grid)):
+            for name, value in table.items():
                 check_name(f"{part}.{name}", name, value)
         for name, values in self.grid.items():
             if not isinstance(values, list) or not values:
@@ -130,11 +130,11 @@ def read_spec(path: Path, words: Sequence[str]) -> Spec:
     return Spec(raw["env"], seeds, options, grid, search, tuple(words))
 
 
-def _check_keys(place: str, raw: dict[str, Any], known: Sequence[str]) -> None:
+def _check_keys(place: str, raw: dict[str, Any], names: Sequence[str]) -> None:
     for name, value in raw.items():
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean {near[0]}?" if near else f"use {', '.join(known)}"
+        if name not in names:
+            near = difflib.get_close_matches(name, names, 1)
+            hint = f"did you mean {near[0]}?" if near else f"use {', '.join(names)}"
             raise ConfigError(f"{place}{name}", value, f"no such key; {hint}")
 
 
@@ -147,8 +147,8 @@ def _search(raw: dict[str, Any]) -> Search:
     kinds = {"trials": int, "sampler_seed": int, "prune": bool, "ranges": dict}
     for name, value in raw.items():
         if type(value) is not kinds[name]:
-            wanted = {int: "a whole number", bool: "true or false", dict: "a table, [search.ranges]"}[kinds[name]]
-            raise ConfigError(f"search.{name}", value, f"write {wanted}")
+            expected = {int: "a whole number", bool: "true or false", dict: "a table, [search.ranges]"}[kinds[name]]
+            raise ConfigError(f"search.{name}", value, f"write {expected}")
     ranges = {name: _range(f"search.{name}", value) for name, value in raw.get("ranges", {}).items()}
     return Search(**{**raw, "ranges": _plain_names(ranges)})
 
@@ -176,7 +176,7 @@ def read_seeds(raw: Any) -> tuple[int, ...]:
     """Of a list of whole numbers, of one, or of words like ``1-3,7``. Raises ConfigError."""
     if isinstance(raw, str):
         ends = [re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip()) for part in raw.split(",")]
-        pairs = [(int(found[1]), int(found[2] or found[1])) for found in ends if found]
+        pairs = [(int(match[1]), int(match[2] or match[1])) for match in ends if match]
         if len(pairs) < len(ends) or any(not 0 <= high - low < MOST for low, high in pairs):
             raise ConfigError("seeds", raw, SEEDS_FIX)
         seeds = [seed for low, high in pairs for seed in range(low, high + 1)]
@@ -189,23 +189,23 @@ def read_seeds(raw: Any) -> tuple[int, ...]:
 
 def read_grid(words: Sequence[str]) -> dict[str, list[Any]]:
     """Of ``NAME=VALUE,VALUE…`` words. Raises ConfigError."""
-    found: dict[str, list[Any]] = {}
+    grid: dict[str, list[Any]] = {}
     for name, text in _pairs("--grid", words):
-        found[name] = read_values(text)
-    return found
+        grid[name] = read_values(text)
+    return grid
 
 
 def read_ranges(words: Sequence[str]) -> dict[str, Range | list[Any]]:
     """Of ``NAME=LOW..HIGH``, ``NAME=LOW..HIGH:log`` or ``NAME=CHOICE,CHOICE…`` words. Raises ConfigError."""
-    found: dict[str, Range | list[Any]] = {}
+    ranges: dict[str, Range | list[Any]] = {}
     for name, text in _pairs("--search", words):
         ends = re.fullmatch(r"(.+?)\.\.(.+?)(:log)?", text)
         if ends is None:
-            found[name] = read_values(text)
+            ranges[name] = read_values(text)
         else:
             low, high = read_values(ends[1])[0], read_values(ends[2])[0]
-            found[name] = _checked_range(f"search.{name}", low, high, bool(ends[3]))
-    return found
+            ranges[name] = _checked_range(f"search.{name}", low, high, bool(ends[3]))
+    return ranges
 
 
 def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:

@@ -42,6 +42,6 @@ def run_line(job: Job, index: Index) -> str:
     """How one run ended, for a line."""
     line = index.lines[job.name]
     returned = "" if line["return"] is None else f"return {line['return']:,.1f} after {line['env_steps']:,} steps, "
-    said = "" if line["state"] == "finished" else f"{line['state']}: "
+    state = "" if line["state"] == "finished" else f"{line['state']}: "
     reason = f"; {line['reason']}" if line["reason"] else ""
-    return f"{job.title}: {said}{returned}{line['seconds']:,.0f} s{reason}"
+    return f"{job.title}: {state}{returned}{line['seconds']:,.0f} s{reason}"

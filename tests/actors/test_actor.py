@@ -92,11 +92,11 @@ def play(bus: Bus, actor: Actor, reader: Reader, steps: int, final: bool = True)
 
 def assert_each_step_once(rows: Rows, steps: int) -> None:
     """Every environment's steps from its first one on, without a gap, in order of arrival."""
-    found = audit(rows, SPEC)
-    assert set(found.trained.values()) == {1}
-    assert found.trained.total() == found.new_steps == steps
+    counts = audit(rows, SPEC)
+    assert set(counts.trained.values()) == {1}
+    assert counts.trained.total() == counts.new_steps == steps
     by_env: dict[int, list[Step]] = {}
-    for step in found.trained:  # a Counter keeps the order of arrival
+    for step in counts.trained:  # a Counter keeps the order of arrival
         by_env.setdefault(step.env, []).append(step)
     for names in by_env.values():
         assert names == sorted(names)
@@ -167,9 +167,9 @@ def test_final_credit_flushes_open_windows_and_more_credit_goes_on(bus: Bus) -> 
 
 def assert_each_step_once_with_cuts(rows: Rows, steps: int) -> None:
     """As above, but an episode may go no further after a cut."""
-    found = audit(rows, SPEC)
-    assert set(found.trained.values()) == {1}
-    assert found.trained.total() == found.new_steps == steps
+    counts = audit(rows, SPEC)
+    assert set(counts.trained.values()) == {1}
+    assert counts.trained.total() == counts.new_steps == steps
 
 
 def test_a_full_resend_buffer_makes_it_wait(bus: Bus) -> None:
@@ -432,8 +432,8 @@ def test_a_redis_that_is_back_as_it_was_ends_no_life(bus: Bus) -> None:
     reader.read(400)
     newest = bus.ack(0)
     assert newest is not None
-    for said in (old, newest, old):
-        bus.commit(reader.owner, {0: said})
+    for published in (old, newest, old):
+        bus.commit(reader.owner, {0: published})
         actor.step()
         assert actor.waiting_for() == "credit"
     assert bus.current_epoch("actor-0") == 1
@@ -456,13 +456,13 @@ def test_a_broken_episode_is_dropped_and_training_goes_on(fault: str) -> None:
     actor, reader = make_broken(bus, f"Broken-{fault}-v0"), Reader(bus)
     play(bus, actor, reader, 2000)
     rows = reader.rows()
-    found = audit(rows, SPEC)
-    assert set(found.trained.values()) == {1}
-    assert found.trained.total() == found.new_steps  # as many as were granted, broken ones not among them
-    assert 2000 <= found.new_steps < 2000 + CONFIG.envs_per_actor
+    counts = audit(rows, SPEC)
+    assert set(counts.trained.values()) == {1}
+    assert counts.trained.total() == counts.new_steps  # as many as were granted, broken ones not among them
+    assert 2000 <= counts.new_steps < 2000 + CONFIG.envs_per_actor
     assert np.isfinite(rows["observation"]).all()
     assert actor.metrics()["broken_episodes"] > 10
-    sent = {step.step for step in found.trained if step.episode % 3 == 2}
+    sent = {step.step for step in counts.trained if step.episode % 3 == 2}
     assert {0, SPEC.train - 1} <= sent
     actor.close()
 
@@ -473,11 +473,11 @@ def test_a_fault_is_logged_with_its_place_in_the_users_file(caplog: pytest.LogCa
     actor = make_broken(bus, "Broken-raise-v0")
     play(bus, actor, Reader(bus), 500)
     actor.close()
-    said = [record.getMessage() for record in caplog.records if "broke in step" in record.getMessage()]
-    assert said
+    messages = [record.getMessage() for record in caplog.records if "broke in step" in record.getMessage()]
+    assert messages
     fault = r"the environment's step raises RuntimeError: the simulation is unstable \(broken_env.py, line \d+\)$"
     assert all(
-        re.search(f"^actor-0: environment [0-9] broke in step [0-9]+ of an episode: {fault}", line) for line in said
+        re.search(f"^actor-0: environment [0-9] broke in step [0-9]+ of an episode: {fault}", line) for line in messages
     )
 
 

@@ -172,25 +172,25 @@ class Dead(gym.Wrapper[Any, Any, Any, Any]):
 def test_an_episode_that_breaks_is_left_out_and_its_environment_made_anew() -> None:
     runner = runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT))
     sound = play_episodes(runner, counting, 3, seed=4).returns
-    made = itertools.count()
-    some = play_episodes(runner, lambda: Dead(counting()) if next(made) == 0 else counting(), 3, seed=4)
+    counter = itertools.count()
+    some = play_episodes(runner, lambda: Dead(counting()) if next(counter) == 0 else counting(), 3, seed=4)
     assert (some.returns, some.broken) == (sound[1:], 1)
     with pytest.raises(RmcError, match="broke in each of 2 episodes"):
         play_episodes(runner, lambda: Dead(counting()), 2, seed=4)
 
 
 def test_the_evaluator_counts_them_and_makes_new_environments() -> None:
-    bus, made = MemoryBus(), itertools.count()
+    bus, counter = MemoryBus(), itertools.count()
 
     def breaking_once() -> Env:
-        return Dead(counting()) if next(made) == 0 else counting()
+        return Dead(counting()) if next(counter) == 0 else counting()
 
     config = EvaluatorConfig(episodes=3)
     evaluator = Evaluator(1, breaking_once, AGENT, config, bus, clock=itertools.count().__next__)
-    found = []
+    records = []
     for update in (1, 2):
         publish(bus, update, evaluate=True)
         step_until_idle(evaluator)
-        found.append(evaluator.metrics())
-    assert [(record["eval_broken_episodes"], record["eval_episodes"]) for record in found] == [(1, 2), (0, 3)]
+        records.append(evaluator.metrics())
+    assert [(record["eval_broken_episodes"], record["eval_episodes"]) for record in records] == [(1, 2), (0, 3)]
     evaluator.close()

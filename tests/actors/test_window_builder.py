@@ -145,12 +145,12 @@ def _assert_complete(play: Play, steps: int, trained: dict[tuple[int, int], Coun
     for env in range(len(play.lengths)):
         left, episode = steps, 0
         while left > 0:
-            made = min(left, play.length(env, episode))
+            count = min(left, play.length(env, episode))
             counts = trained[env, episode]
-            assert sorted(counts) == list(range(made))
+            assert sorted(counts) == list(range(count))
             if play.stride == play.spec.train:
                 assert set(counts.values()) == {1}
-            left, episode = left - made, episode + 1
+            left, episode = left - count, episode + 1
 
 
 @given(plays(), st.integers(1, 80))

@@ -36,8 +36,8 @@ def config(algorithm: Algorithm = "sac", settings: Settings = "paper", **other) 
     )
 
 
-def run(made: BaselineConfig, folder, stop: StopSignal | None = None) -> int:
-    return train(made, folder, Console(quiet=True), stop or StopSignal())
+def run(settings: BaselineConfig, folder, stop: StopSignal | None = None) -> int:
+    return train(settings, folder, Console(quiet=True), stop or StopSignal())
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -95,8 +95,8 @@ def test_rmc_resume_goes_on_with_it(tmp_path, capsys):
     """The command that a stopped one prints; what is not said is as it was, also of an older version's run."""
     folder, stop = tmp_path / "run", StopSignal()
     stop.requested = True
-    made = config("td3", env=EnvConfig("InvertedPendulum-v5", flicker=0.5), seed=3)
-    assert train(made, folder, Console(width=400), stop) == 130
+    settings = config("td3", env=EnvConfig("InvertedPendulum-v5", flicker=0.5), seed=3)
+    assert train(settings, folder, Console(width=400), stop) == 130
     (printed,) = re.findall(r"to go on:\n  rmc (.*)\n", capsys.readouterr().out)
     raw = json.loads((folder / "config.json").read_bytes())
     assert raw.pop("format") == 2
@@ -106,7 +106,7 @@ def test_rmc_resume_goes_on_with_it(tmp_path, capsys):
     assert rmc([*printed.split(), "--total-steps", "250", "--episodes", "2"]) == 0
     result = RunFolder(folder).result()
     assert (result["env_steps"], result["eval_flicker"]) == (250, 0.5)
-    assert read(RunFolder(folder)) == dataclasses.replace(made, total_steps=250, episodes=2)
+    assert read(RunFolder(folder)) == dataclasses.replace(settings, total_steps=250, episodes=2)
     (start,) = starts(RunFolder(folder))
     assert (start.env_steps, start.changes) == (1, {"total_steps": [300, 250], "episodes": [5, 2]})
     assert json.loads((folder / "config.json").read_bytes())["format"] == 2
@@ -128,12 +128,12 @@ def test_another_agent_is_not_gone_on_with(tmp_path):
 
 
 def test_a_stack_of_frames_belongs_to_the_agent(tmp_path):
-    made = config(env=EnvConfig("InvertedPendulum-v5", flicker=0.5, frame_stack=4), total_steps=100)
-    assert run(made, tmp_path / "run") == 0
-    found = of_run(RunFolder(tmp_path / "run"))
-    assert found.agent == "SAC 400-300 --frame-stack 4"
-    assert found.env == "InvertedPendulum-v5, flicker 0.5"
-    assert found.transitions == found.updates * 256
+    settings = config(env=EnvConfig("InvertedPendulum-v5", flicker=0.5, frame_stack=4), total_steps=100)
+    assert run(settings, tmp_path / "run") == 0
+    past = of_run(RunFolder(tmp_path / "run"))
+    assert past.agent == "SAC 400-300 --frame-stack 4"
+    assert past.env == "InvertedPendulum-v5, flicker 0.5"
+    assert past.transitions == past.updates * 256
 
 
 @pytest.mark.parametrize("body", ["HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Humanoid-v5", "Ant-v5", "mine:Own-v0"])
@@ -146,9 +146,9 @@ def test_the_zoos_numbers_are_of_the_right_kind(algorithm, body):
 
 def test_the_zoos_ppo_trains_and_keeps_its_scales(tmp_path):
     """With running statistics of observations, which a run that goes on has again."""
-    made = config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=600, checkpoint_steps=300)
+    settings = config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=600, checkpoint_steps=300)
     for total in (600, 1200):
-        assert run(dataclasses.replace(made, total_steps=total), tmp_path / "run") == 0
+        assert run(dataclasses.replace(settings, total_steps=total), tmp_path / "run") == 0
         (scales,) = (tmp_path / "run" / "checkpoints").glob("*/scales.pkl")
         with scales.open("rb") as file:
             count = pickle.load(file).obs_rms.count
@@ -160,16 +160,16 @@ def test_one_in_use_is_left_as_it_is_and_can_be_stopped(tmp_path, capsys):
     command = [sys.executable, "-m", "rmc.cli.main", *words, str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        while "environment step" not in (said := process.stdout.readline()):
-            assert said
+        while "environment step" not in (line := process.stdout.readline()):
+            assert line
         before = (tmp_path / "run" / "config.json").read_bytes()
         with pytest.raises(ConfigError, match="stop it first"):
             run(config(total_steps=2_000_000), tmp_path / "run")
         assert (tmp_path / "run" / "config.json").read_bytes() == before
         assert rmc(["stop", str(tmp_path / "run")]) == 0
     assert process.returncode == 130
-    said = capsys.readouterr()
-    assert (said.out, said.err) == (f"{tmp_path / 'run'} has ended\n", "")
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == (f"{tmp_path / 'run'} has ended\n", "")
 
 
 def test_files_that_are_cut_are_named(tmp_path):

@@ -16,7 +16,7 @@ from rmc.deploy.run.config import to_json
 from rmc.deploy.run.presets import robust
 
 
-def made(agent="RMC", env="HalfCheetah-v5", seed=0, last=100.0, initial: float | None = 0.0) -> History:
+def history_of(agent="RMC", env="HalfCheetah-v5", seed=0, last=100.0, initial: float | None = 0.0) -> History:
     evaluations = [Evaluation(1000 * i, 10 * i, 5.0 * i, last * i / 3, 1.0) for i in (1, 2, 3)]
     return History(agent, env, seed, 3000, 30, 14400, 15.0, initial, evaluations, True, "abc")
 
@@ -29,7 +29,7 @@ def shown(tables) -> str:
 
 
 def test_a_line_holds_a_history():
-    line = made().to_line()
+    line = history_of().to_line()
     assert history._of_line(json.loads(line), "file:1").to_line() == line
 
 
@@ -52,21 +52,21 @@ def test_a_run_is_read_from_its_folder(tmp_path):
         {"role": "launcher", "time": 910.0, "wall_s": 20.0},
     ]
     (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, records)) + '\n{"role": "evalu')
-    (found,) = history.read(tmp_path)
-    assert found.agent == "RMC --heads 5 6 --head-input hidden+embedding"
-    assert found.env == "Hopper-v5, flicker 0.5"
-    assert (found.seed, found.finished, found.initial_return) == (3, False, None)
-    assert found.evaluations == [Evaluation(500, 50, 5.0, 7.0, 1.0), Evaluation(900, 90, 15.0, 9.0, 1.0)]
-    assert found.transitions == 90 * 8 * 15
+    (past,) = history.read(tmp_path)
+    assert past.agent == "RMC --heads 5 6 --head-input hidden+embedding"
+    assert past.env == "Hopper-v5, flicker 0.5"
+    assert (past.seed, past.finished, past.initial_return) == (3, False, None)
+    assert past.evaluations == [Evaluation(500, 50, 5.0, 7.0, 1.0), Evaluation(900, 90, 15.0, 9.0, 1.0)]
+    assert past.transitions == 90 * 8 * 15
     result = {"updates": 100, "env_steps": 1000, "wall_s": 21.0, "eval_return_mean": 11.0, "eval_return_std": 2.0}
     result["eval_episodes"] = 10
     (tmp_path / "result.json").write_text(json.dumps({**result, "initial_return_mean": -1.0}))
-    (found,) = history.read(tmp_path)
-    assert found.evaluations[-1] == Evaluation(1000, 100, 21.0, 11.0, 2.0)
-    assert (found.finished, found.initial_return) == (True, -1.0)
+    (past,) = history.read(tmp_path)
+    assert past.evaluations[-1] == Evaluation(1000, 100, 21.0, 11.0, 2.0)
+    assert (past.finished, past.initial_return) == (True, -1.0)
     (tmp_path / "result.json").write_text(json.dumps({**result, "updates": 90, "initial_return_mean": -1.0}))
-    (found,) = history.read(tmp_path)  # the evaluator has played that checkpoint before
-    assert [one.env_steps for one in found.evaluations] == [500, 1000]
+    (past,) = history.read(tmp_path)  # the evaluator has played that checkpoint before
+    assert [one.env_steps for one in past.evaluations] == [500, 1000]
 
 
 def test_a_window_that_is_an_episode_counts_with_its_length(tmp_path):
@@ -77,7 +77,7 @@ def test_a_window_that_is_an_episode_counts_with_its_length(tmp_path):
 
 
 def odd(**fields) -> str:
-    return json.dumps(dataclasses.asdict(made()) | fields)
+    return json.dumps(dataclasses.asdict(history_of()) | fields)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def odd(**fields) -> str:
         "[1, 2]",
         "{}",
         "not json",
-        made().to_line()[:-9],
+        history_of().to_line()[:-9],
         b"\xff",
         odd(evaluations=[]),
         odd(evaluations=[dataclasses.asdict(Evaluation(1, 1, 1.0, 1.0, 1.0)) | {"return_mean": None}]),
@@ -99,7 +99,7 @@ def odd(**fields) -> str:
 )
 def test_what_is_no_history_is_refused_where_it_is(text, tmp_path):
     line = text if isinstance(text, bytes) else text.encode()
-    (tmp_path / "file.jsonl").write_bytes(made().to_line().encode() + b"\n\n" + line)
+    (tmp_path / "file.jsonl").write_bytes(history_of().to_line().encode() + b"\n\n" + line)
     with pytest.raises(ConfigError, match=r"RUNS='.*file\.jsonl:3'"):
         history.read(tmp_path / "file.jsonl")
 
@@ -108,7 +108,7 @@ def test_a_run_that_cannot_be_read_is_told_and_left_out(tmp_path, capsys):
     for name, text in {"foreign": "5", "new": to_json(robust(EnvConfig("Hopper-v5")))}.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").write_text(text)
-    (tmp_path / "lines").write_text(made().to_line())
+    (tmp_path / "lines").write_text(history_of().to_line())
     (tmp_path / "empty").touch()
     paths = {name: str(tmp_path / name) for name in ("foreign", "new", "empty", "lines")}
     assert run(["plot", *paths.values(), "--out", str(tmp_path / "out.png")]) == 0
@@ -119,20 +119,20 @@ def test_a_run_that_cannot_be_read_is_told_and_left_out(tmp_path, capsys):
     with pytest.raises(ConfigError, match=str(tmp_path / "foreign")):
         history.read(tmp_path / "foreign")
     assert run(["plot", paths["lines"], "--out", "/proc/out.png"]) == 2
-    said = capsys.readouterr()
-    assert "100 (100)" in said.out
-    assert "--out='/proc/out.png': cannot be written" in said.err
+    captured = capsys.readouterr()
+    assert "100 (100)" in captured.out
+    assert "--out='/proc/out.png': cannot be written" in captured.err
 
 
 def test_a_run_counts_once_and_what_differs_is_told_apart(tmp_path):
     """Length, an end that is missing, and a seed's second run each make a line of their own."""
-    runs = [made(seed=seed) for seed in (1, 2, 3, 4)]
+    runs = [history_of(seed=seed) for seed in (1, 2, 3, 4)]
     twice = [dataclasses.replace(run, commit="def") for run in runs]
-    again = made(seed=1, last=300.0)
-    late = [dataclasses.replace(made(seed=seed, last=500.0), env_steps=9000 + seed) for seed in (1, 2)]
-    cut = dataclasses.replace(made(seed=1, last=400.0), finished=False, env_steps=1000)
+    again = history_of(seed=1, last=300.0)
+    late = [dataclasses.replace(history_of(seed=seed, last=500.0), env_steps=9000 + seed) for seed in (1, 2)]
+    cut = dataclasses.replace(history_of(seed=1, last=400.0), finished=False, env_steps=1000)
     groups = curves.grouped([*runs, *twice, *late, again, cut, cut])
-    assert {name: [one.seed for one in found] for name, found in groups["HalfCheetah-v5"].items()} == {
+    assert {name: [one.seed for one in runs] for name, runs in groups["HalfCheetah-v5"].items()} == {
         "RMC, 3,000 steps": [1, 2, 3, 4],
         "RMC, 3,000 steps, run 2 of its seed": [1],
         "RMC, 9,001 steps": [1, 2],
@@ -145,9 +145,12 @@ def test_a_run_counts_once_and_what_differs_is_told_apart(tmp_path):
 
 
 def test_runs_that_are_all_alike_keep_their_name():
-    found = curves.grouped([made(seed=seed) for seed in (1, 2)])
-    assert list(found["HalfCheetah-v5"]) == ["RMC"]
-    late = [dataclasses.replace(made(seed=1), finished=False), dataclasses.replace(made(seed=2), finished=False)]
+    groups = curves.grouped([history_of(seed=seed) for seed in (1, 2)])
+    assert list(groups["HalfCheetah-v5"]) == ["RMC"]
+    late = [
+        dataclasses.replace(history_of(seed=1), finished=False),
+        dataclasses.replace(history_of(seed=2), finished=False),
+    ]
     assert list(curves.grouped(late)["HalfCheetah-v5"]) == ["RMC"]
 
 
@@ -170,9 +173,9 @@ def test_a_folder_of_runs_at_any_depth_and_a_pattern_can_be_plotted(tmp_path, ca
     assert "7 (7, 7)" in capsys.readouterr().out
     for words, fault in {"empty": "no run in there", "no*": "matches nothing"}.items():
         assert run(["plot", str(tmp_path / words), *out]) == 2
-        said = capsys.readouterr().err
-        assert fault in said
-        assert said.count("\n") == 1
+        errors = capsys.readouterr().err
+        assert fault in errors
+        assert errors.count("\n") == 1
 
 
 def test_a_run_without_an_evaluation_is_refused(tmp_path):
@@ -182,8 +185,10 @@ def test_a_run_without_an_evaluation_is_refused(tmp_path):
 
 
 def test_few_seeds_are_lines_and_many_a_band(tmp_path):
-    runs = [made(seed=seed, last=100.0 + seed) for seed in range(5)] + [made("SAC", seed=seed) for seed in (2, 1)]
-    groups = curves.grouped([*runs, made("SAC", "Hopper-v5")])
+    runs = [history_of(seed=seed, last=100.0 + seed) for seed in range(5)] + [
+        history_of("SAC", seed=seed) for seed in (2, 1)
+    ]
+    groups = curves.grouped([*runs, history_of("SAC", "Hopper-v5")])
     assert [one.seed for one in groups["HalfCheetah-v5"]["SAC"]] == [1, 2]
     from matplotlib.figure import Figure
 
@@ -204,12 +209,14 @@ def test_panels_without_an_environment_are_empty(tmp_path, monkeypatch):
 
     figures = []
     monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
-    curves.draw(curves.grouped([made(env=f"Env{i}-v0") for i in range(4)]), "env_steps", tmp_path / "out.png")
+    curves.draw(curves.grouped([history_of(env=f"Env{i}-v0") for i in range(4)]), "env_steps", tmp_path / "out.png")
     assert [panel.axison for panel in figures[0].axes] == [True] * 4 + [False] * 2
 
 
 def test_the_table_compares_with_a_reference():
-    runs = [made(seed=s, last=200.0) for s in range(5)] + [made("SAC", seed=s, last=100.0) for s in range(2)]
+    runs = [history_of(seed=s, last=200.0) for s in range(5)] + [
+        history_of("SAC", seed=s, last=100.0) for s in range(2)
+    ]
     text = shown(curves.tables(curves.grouped(runs), "SAC"))
     assert "200 [200, 200]" in text
     assert "100 (100, 100)" in text
@@ -221,11 +228,11 @@ def test_the_table_compares_with_a_reference():
 
 def test_the_command_draws_and_prints(tmp_path, capsys):
     lines = tmp_path / "study.jsonl"
-    lines.write_text("\n".join(made(seed=seed).to_line() for seed in range(2)) + "\n")
+    lines.write_text("\n".join(history_of(seed=seed).to_line() for seed in range(2)) + "\n")
     assert run(["plot", str(lines), "--out", str(tmp_path / "out.svg"), "--by", "wall_s"]) == 0
-    said = capsys.readouterr().out
-    assert "HalfCheetah-v5" in said
-    assert "100 (100, 100)" in said
+    output = capsys.readouterr().out
+    assert "HalfCheetah-v5" in output
+    assert "100 (100, 100)" in output
     assert (tmp_path / "out.svg").read_text().startswith("<?xml")
 
 
@@ -245,21 +252,21 @@ def test_the_command_draws_and_prints(tmp_path, capsys):
     ],
 )
 def test_bad_input_is_one_line_that_names_the_fault(words, fault, tmp_path, capsys):
-    (tmp_path / "lines").write_text(made().to_line())
+    (tmp_path / "lines").write_text(history_of().to_line())
     assert run([word.replace("LINES", str(tmp_path / "lines")) for word in words]) == 2
-    said = capsys.readouterr().err
-    assert fault in said
-    assert said.count("\n") == 1
+    errors = capsys.readouterr().err
+    assert fault in errors
+    assert errors.count("\n") == 1
 
 
 @pytest.mark.parametrize(
-    ("counts", "said"),
+    ("counts", "label"),
     [
         ((1,), "1 seed, each a line"),
         ((3, 1), "1 to 3 seeds, each a line"),
         ((5, 5), "5 seeds, interquartile mean, 95 %"),
     ],
 )
-def test_the_legend_says_how_many_seeds_its_panels_have(counts, said):
-    groups = {f"env {i}": {"RMC": [made(seed=seed) for seed in range(count)]} for i, count in enumerate(counts)}
-    assert curves._named("RMC", groups) == f"RMC ({said})"
+def test_the_legend_says_how_many_seeds_its_panels_have(counts, label):
+    groups = {f"env {i}": {"RMC": [history_of(seed=seed) for seed in range(count)]} for i, count in enumerate(counts)}
+    assert curves._named("RMC", groups) == f"RMC ({label})"

@@ -34,9 +34,9 @@ def records(seconds: int = 60, **roles: Record) -> list[Record]:
     return [
         {"role": role.replace("_", "-"), "time": 1000.0 + second}
         | ({"updates": 10 * second} if role == "learner" else {})
-        | {name: value(second) if callable(value) else value for name, value in said.items()}
+        | {name: value(second) if callable(value) else value for name, value in metrics.items()}
         for second in range(seconds)
-        for role, said in roles.items()
+        for role, metrics in roles.items()
     ]
 
 
@@ -48,10 +48,10 @@ HOST = {"host_cores": 4, "host_cpus": 4, "host_load": 2.0, "host_idle_share": 0.
 
 
 def test_the_learner_holds_the_actors_back() -> None:
-    found = bottleneck(
+    finding = bottleneck(
         vitals(learner=shares(0.99), actor_0=shares(0.03, "credit"), replay=shares(0.2, "draws")), CONFIG
     )
-    assert str(found) == (
+    assert str(finding) == (
         "learner-bound: actors waited 97% of the time for credit, the learner was busy 99%; more actors will not help; "
         "a GPU (--device cuda) or a faster one, or --replay-ratio 24, would: "
         "the latter takes half the updates for each step, 2.0 times the steps a second"
@@ -60,12 +60,12 @@ def test_the_learner_holds_the_actors_back() -> None:
 
 def test_the_actors_hold_the_learner_back() -> None:
     slow = {"learner": shares(0.5, "experience"), "actor_0": shares(0.97), "replay": shares(0.1, "windows")}
-    found = bottleneck(vitals(**slow, launcher=HOST), CONFIG)
-    assert found is not None
-    assert (found.name, found.advice) == (
+    finding = bottleneck(vitals(**slow, launcher=HOST), CONFIG)
+    assert finding is not None
+    assert (finding.name, finding.advice) == (
         "actor-bound", "--actors 2 would help; with what there is, --replay-ratio 96 would use the learner's idle time",
     )  # fmt: skip
-    assert "learner waited 50%" in found.measured
+    assert "learner waited 50%" in finding.measured
     full = bottleneck(vitals(**slow, launcher=HOST | {"host_idle_share": 0.02}), CONFIG)
     assert full is not None
     assert full.advice.startswith("all cores are taken: more machines (--launcher ray)")
@@ -75,12 +75,12 @@ def test_the_actors_hold_the_learner_back() -> None:
 
 
 def test_the_replay_server_holds_both_back() -> None:
-    found = bottleneck(
+    finding = bottleneck(
         vitals(learner=shares(0.4, "experience"), actor_0=shares(0.3, "acknowledgements"), replay=shares(0.95)), CONFIG
     )
-    assert found is not None
-    assert found.name == "replay-bound"
-    assert "--replay-shards 2 with --actors 2" in found.advice
+    assert finding is not None
+    assert finding.name == "replay-bound"
+    assert "--replay-shards 2 with --actors 2" in finding.advice
 
 
 @pytest.mark.parametrize(
@@ -92,9 +92,9 @@ def test_the_replay_server_holds_both_back() -> None:
     ],
 )
 def test_other_stages(learner: Record, actor: Record, name: str) -> None:
-    found = bottleneck(vitals(learner=learner, actor_0=actor, replay=shares(0.1, "windows")), CONFIG)
-    assert found is not None
-    assert found.name == name
+    finding = bottleneck(vitals(learner=learner, actor_0=actor, replay=shares(0.1, "windows")), CONFIG)
+    assert finding is not None
+    assert finding.name == name
 
 
 def test_a_lockstep_run_has_one_clock_and_no_bottleneck() -> None:
@@ -103,8 +103,8 @@ def test_a_lockstep_run_has_one_clock_and_no_bottleneck() -> None:
 
 
 def test_a_wait_that_is_not_named_counts_for_the_usual_one() -> None:
-    found = vitals(actor_0=shares(0.2) | {"waiting_for": lambda second: "credit" if second % 2 else ""})
-    assert found.waits("actor") == {"credit": pytest.approx(0.8)}
+    playing = vitals(actor_0=shares(0.2) | {"waiting_for": lambda second: "credit" if second % 2 else ""})
+    assert playing.waits("actor") == {"credit": pytest.approx(0.8)}
     ends = vitals(actor_0=shares(0.2, "the end"))
     assert ends.busy("actor") is None
 
@@ -121,9 +121,9 @@ def test_a_deadlock_is_named_with_its_waits() -> None:
         actor_0=shares(0.0, "credit"),
         replay=shares(0.0, "windows") | {"env_steps": lambda s: min(s, 30)},
     )
-    (found,) = examine(still, CONFIG)
-    assert found.name == "deadlock"
-    assert found.measured == (
+    (finding,) = examine(still, CONFIG)
+    assert finding.name == "deadlock"
+    assert finding.measured == (
         "no step and no update for 89 s (actor-0 for credit, learner for experience, replay for windows)"
     )
     still[-2]["finished"] = 1
@@ -132,30 +132,32 @@ def test_a_deadlock_is_named_with_its_waits() -> None:
 
 
 def test_a_role_that_fell_silent_is_named() -> None:
-    found = run_faults.silent(
+    finding = run_faults.silent(
         Vitals([one for one in records() if one["role"] != "actor-0" or one["time"] < 1010.0]), CONFIG
     )
-    assert str(found) == "silent: actor-0 for 50 s said nothing; it hangs, or its machine is away; see logs/actor-0.log"
+    assert (
+        str(finding) == "silent: actor-0 for 50 s said nothing; it hangs, or its machine is away; see logs/actor-0.log"
+    )
     assert run_faults.silent(vitals(), CONFIG) is None
 
 
 def test_a_warm_up_that_takes_long_is_told() -> None:
-    said: Record = {"learner": {"updates": 0}, "replay": {"env_steps": 1_000, "env_steps_per_s": 10.0}}
-    found = run_faults.long_warm_up(vitals(**said), CONFIG)
-    assert found is not None
-    assert "1,000 of 5,000 steps at 10 a second, 400 s to go" in found.measured
-    assert "--warmup-steps 1250" in found.advice
-    said["replay"]["env_steps_per_s"] = 100.0
-    assert run_faults.long_warm_up(vitals(**said), CONFIG) is None
+    metrics: Record = {"learner": {"updates": 0}, "replay": {"env_steps": 1_000, "env_steps_per_s": 10.0}}
+    finding = run_faults.long_warm_up(vitals(**metrics), CONFIG)
+    assert finding is not None
+    assert "1,000 of 5,000 steps at 10 a second, 400 s to go" in finding.measured
+    assert "--warmup-steps 1250" in finding.advice
+    metrics["replay"]["env_steps_per_s"] = 100.0
+    assert run_faults.long_warm_up(vitals(**metrics), CONFIG) is None
 
 
 def test_an_evaluator_that_cannot_keep_up() -> None:
     checkpoints = {"checkpoint_update": lambda s: s // 10 * 100}
     starving = vitals(learner=checkpoints, evaluator={"eval_update": lambda s: s // 30 * 300})
-    found = run_faults.evaluator_starved(starving, CONFIG)
-    assert found is not None
-    assert found.measured == "4 of 5 checkpoints were not evaluated"
-    assert found.advice.startswith("--checkpoint-steps 50000 gives it the time, --episodes 1")
+    finding = run_faults.evaluator_starved(starving, CONFIG)
+    assert finding is not None
+    assert finding.measured == "4 of 5 checkpoints were not evaluated"
+    assert finding.advice.startswith("--checkpoint-steps 50000 gives it the time, --episodes 1")
     sound = vitals(learner=checkpoints, evaluator={"eval_update": lambda s: max(0, s // 10 * 100 - 100)})
     assert run_faults.evaluator_starved(sound, CONFIG) is None
     none = dataclasses.replace(CONFIG, evaluator=dataclasses.replace(CONFIG.evaluator, episodes=0))
@@ -165,23 +167,23 @@ def test_an_evaluator_that_cannot_keep_up() -> None:
 def test_stale_weights_name_the_option_that_ages_them() -> None:
     old = vitals(replay={"policy_lag_mean": 4_000.0})
     refresh = dataclasses.replace(CONFIG, actor=dataclasses.replace(CONFIG.actor, refresh_steps=20_000))
-    found = run_faults.stale_weights(old, refresh)
-    assert str(found) == (
+    finding = run_faults.stale_weights(old, refresh)
+    assert str(finding) == (
         "stale weights: windows came from a policy 4,000 updates old on average; "
         "--refresh-steps 2500 in place of 20000 brings newer ones"
     )
     publish = dataclasses.replace(CONFIG, learner=dataclasses.replace(CONFIG.learner, publish_updates=8_000))
-    found = run_faults.stale_weights(old, publish)
-    assert found is not None
-    assert found.advice.startswith("--publish-updates 1000 ")
+    finding = run_faults.stale_weights(old, publish)
+    assert finding is not None
+    assert finding.advice.startswith("--publish-updates 1000 ")
     assert run_faults.stale_weights(vitals(replay={"policy_lag_mean": 160.0}), CONFIG) is None
 
 
 def test_a_ring_that_never_fills() -> None:
     short = dataclasses.replace(CONFIG, total_steps=100_000)
     little = vitals(replay={"env_steps": 50_000, "ring_fill": 0.05})
-    found = run_faults.oversized_ring(little, short)
-    assert str(found) == (
+    finding = run_faults.oversized_ring(little, short)
+    assert str(finding) == (
         "ring never fills: of 70,000 windows 10% will be used at the end of the run; "
         "--capacity 7800 holds the whole run"
     )
@@ -190,23 +192,23 @@ def test_a_ring_that_never_fills() -> None:
 
 def test_threads_that_fight() -> None:
     greedy = dataclasses.replace(CONFIG, learner=dataclasses.replace(CONFIG.learner, threads=8))
-    found = host_faults.threads_fight(vitals(launcher=HOST), greedy)
+    finding = host_faults.threads_fight(vitals(launcher=HOST), greedy)
     assert (
-        str(found) == "threads fight: the learner has 8 threads on 4 cores; --threads 3 leaves one to the other roles"
+        str(finding) == "threads fight: the learner has 8 threads on 4 cores; --threads 3 leaves one to the other roles"
     )
     full = HOST | {"host_idle_share": 0.01}
     busy = {"learner": shares(1.0), "actor_0": shares(0.9), "actor_1": shares(0.9), "replay": shares(0.5)}
-    found = host_faults.threads_fight(vitals(launcher=full, **busy), CONFIG)
-    assert found is not None
-    assert found.measured == "5.3 threads of the run are busy at a time, on 4 cores"
-    assert found.advice == "--threads 1 in place of 3 would fit"
+    finding = host_faults.threads_fight(vitals(launcher=full, **busy), CONFIG)
+    assert finding is not None
+    assert finding.measured == "5.3 threads of the run are busy at a time, on 4 cores"
+    assert finding.advice == "--threads 1 in place of 3 would fit"
     assert host_faults.threads_fight(vitals(launcher=HOST, **busy), CONFIG) is None  # they sleep: half is idle
 
 
 def test_a_machine_that_others_use() -> None:
-    found = host_faults.oversubscribed(vitals(launcher=HOST | {"host_load": 9.0}, learner=shares(0.5)), CONFIG)
-    assert found is not None
-    assert found.measured == "load 9.0 on 4 CPUs, of which this run is 1.5"
+    finding = host_faults.oversubscribed(vitals(launcher=HOST | {"host_load": 9.0}, learner=shares(0.5)), CONFIG)
+    assert finding is not None
+    assert finding.measured == "load 9.0 on 4 CPUs, of which this run is 1.5"
     assert host_faults.oversubscribed(vitals(launcher=HOST), CONFIG) is None
     stolen = host_faults.stolen(vitals(launcher=HOST | {"host_steal_share": 0.25}), CONFIG)
     assert stolen is not None
@@ -215,9 +217,9 @@ def test_a_machine_that_others_use() -> None:
 
 def test_memory_that_is_slow() -> None:
     copied = {"host_copy_bytes_per_s": lambda s: 12e9 if s < 10 else 3e9}
-    found = host_faults.slow_memory(vitals(launcher=copied), CONFIG)
-    assert found is not None
-    assert found.measured == "it was copied at 3.0 GB/s, at best at 12.0 GB/s"
+    finding = host_faults.slow_memory(vitals(launcher=copied), CONFIG)
+    assert finding is not None
+    assert finding.measured == "it was copied at 3.0 GB/s, at best at 12.0 GB/s"
     steady = {"host_copy_bytes_per_s": lambda s: 12e9 if s < 10 else 6e9}
     assert host_faults.slow_memory(vitals(launcher=steady), CONFIG) is None
 
@@ -225,29 +227,29 @@ def test_memory_that_is_slow() -> None:
 def test_memory_that_is_short() -> None:
     memory = {"host_memory_bytes": 16e9, "host_available_bytes": 8e9, "host_swap_bytes": 0.0}
     assert host_faults.little_memory(vitals(launcher=memory), CONFIG) is None
-    found = host_faults.little_memory(vitals(launcher=memory | {"host_available_bytes": 4e8}), CONFIG)
-    assert found is not None
-    assert found.measured == "400 of 16,000 MB were free, 0 MB were swapped"
+    finding = host_faults.little_memory(vitals(launcher=memory | {"host_available_bytes": 4e8}), CONFIG)
+    assert finding is not None
+    assert finding.measured == "400 of 16,000 MB were free, 0 MB were swapped"
     swaps = host_faults.little_memory(vitals(launcher=memory | {"host_swap_bytes": lambda s: 2e6 * s}), CONFIG)
     assert swaps is not None
     assert "118 MB were swapped" in swaps.measured
 
 
 def test_records_without_host_figures_are_judged_as_far_as_they_go() -> None:
-    found = examine(records(learner=shares(0.99), actor_0=shares(0.03, "credit")), CONFIG)
-    assert [one.name for one in found] == ["learner-bound"]
+    findings = examine(records(learner=shares(0.99), actor_0=shares(0.03, "credit")), CONFIG)
+    assert [one.name for one in findings] == ["learner-bound"]
 
 
-def made_run(path: Path, said: list[Record], config: RunConfig = CONFIG) -> Path:
+def recorded_run(path: Path, lines: list[Record], config: RunConfig = CONFIG) -> Path:
     path.mkdir()
     (path / "config.json").write_text(to_json(config))
-    (path / "metrics.jsonl").write_text("".join(f"{json.dumps(one)}\n" for one in said))
+    (path / "metrics.jsonl").write_text("".join(f"{json.dumps(one)}\n" for one in lines))
     return path
 
 
 def test_a_run_that_has_just_begun_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name, said in {"silent": [], "short": records(4)}.items():
-        path = made_run(tmp_path / name, said)
+    for name, lines in {"silent": [], "short": records(4)}.items():
+        path = recorded_run(tmp_path / name, lines)
         assert run(["doctor", str(path)]) == 2
         out, err = capsys.readouterr()
         assert out == ""
@@ -276,14 +278,14 @@ def test_a_real_run_that_its_learner_holds_back(tmp_path: Path) -> None:
 
 
 def test_a_real_run_that_its_environment_holds_back(tmp_path: Path) -> None:
-    said = trained(tmp_path / "run", "tests.slow_env:Slow-v0", "--total-steps", "1500")
-    assert "actor-bound: the learner waited " in said
+    output = trained(tmp_path / "run", "tests.slow_env:Slow-v0", "--total-steps", "1500")
+    assert "actor-bound: the learner waited " in output
 
 
 def test_a_real_run_whose_evaluator_starves(tmp_path: Path) -> None:
     words = "--total-steps 1800 --replay-ratio 4 --warmup-steps 200 --checkpoint-steps 100 --episodes 20".split()  # noqa: SIM905
-    said = trained(tmp_path / "run", "tests.slow_env:Slow-v0", *words)
-    assert "evaluator starved: " in said
+    output = trained(tmp_path / "run", "tests.slow_env:Slow-v0", *words)
+    assert "evaluator starved: " in output
 
 
 def test_a_real_run_records_its_host(tmp_path: Path) -> None:
@@ -313,7 +315,7 @@ def test_whatever_roles_say_the_doctor_does_not_fail() -> None:
     """.split()  # noqa: SIM905
     chance = random.Random(0)
     for _ in range(300):
-        said = records(30, learner=shares(0.5, "experience"), actor_0=shares(0.9), replay=shares(0.4), launcher=HOST)
-        for record in chance.sample(said, 40):
+        lines = records(30, learner=shares(0.5, "experience"), actor_0=shares(0.9), replay=shares(0.4), launcher=HOST)
+        for record in chance.sample(lines, 40):
             record[chance.choice(names)] = chance.choice(numbers)
-        examine(said, CONFIG)
+        examine(lines, CONFIG)

@@ -14,7 +14,7 @@ from rmc.deploy.run.presets import debug
 from rmc.deploy.run.validation import validate
 
 
-def said(env: str, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, str]:
+def checked(env: str, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, str]:
     status = main.run(["check-env", env, *options])
     return status, capsys.readouterr().out
 
@@ -63,7 +63,7 @@ gym.register("Unrewarded-v0", entry_point=Unrewarded)
 
 
 def test_a_sound_environment(capsys):
-    status, text = said("HalfCheetah-v5", capsys)
+    status, text = checked("HalfCheetah-v5", capsys)
     assert status == 0
     assert "observations 17, actions 6, time limit 1000" in text
     assert re.search(r"2,000 random steps, [\d,]+ a second; reward -?[\d.]+ ± [\d.]+", text)
@@ -73,12 +73,12 @@ def test_a_sound_environment(capsys):
 
 
 def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
-    status, text = said("Odd-v0", capsys, "--steps", "300")
+    status, text = checked("Odd-v0", capsys, "--steps", "300")
     assert status == 0
     for words in ("observations 1 never changed", "observations reach", "--reward-scale 0.001", "--time-limit"):
         assert words in text
     assert "the same seed and actions gave other observations" in text
-    assert "--curiosity" in said("Unrewarded-v0", capsys, "--steps", "100")[1]
+    assert "--curiosity" in checked("Unrewarded-v0", capsys, "--steps", "100")[1]
 
 
 @pytest.mark.parametrize(
@@ -91,8 +91,8 @@ def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
     ],
 )
 def test_a_reward_scale_is_proposed_that_train_takes(env, status, words, capsys):
-    found, text = said(f"{env}-v0", capsys, "--steps", "300")
-    assert found == status
+    exit_code, text = checked(f"{env}-v0", capsys, "--steps", "300")
+    assert exit_code == status
     assert words in text
     if status == 0:
         scale = float(text.partition("--reward-scale ")[2].split()[0])
@@ -101,7 +101,7 @@ def test_a_reward_scale_is_proposed_that_train_takes(env, status, words, capsys)
 
 
 def test_rewards_of_an_ordinary_size_need_no_scale(capsys):
-    assert "--reward-scale" not in said("Plain-v0", capsys, "--steps", "300")[1]
+    assert "--reward-scale" not in checked("Plain-v0", capsys, "--steps", "300")[1]
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_rewards_of_an_ordinary_size_need_no_scale(capsys):
     ],
 )
 def test_faults_are_named(fault, words, capsys):
-    status, text = said(f"tests.broken_env:Broken-{fault}-v0", capsys)
+    status, text = checked(f"tests.broken_env:Broken-{fault}-v0", capsys)
     assert status == 1
     assert words in text
     assert "mend the fault first" in text

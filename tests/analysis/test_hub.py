@@ -22,9 +22,9 @@ Call = Callable[..., subprocess.CompletedProcess[str]]
 
 @pytest.fixture(scope="module")
 def hub() -> Iterator[Hub]:
-    found = Hub()
-    yield found
-    found.close()
+    service = Hub()
+    yield service
+    service.close()
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +116,9 @@ def test_what_goes_wrong_is_one_line(hub: Hub, call: Call, tmp_path: Path) -> No
     cases = json.dumps([[words, token] for words, token, _ in WRONG])
     done = call("-c", MANY, cases, folder=tmp_path)
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
-    said = done.stderr.splitlines()
-    assert len(said) == 2 * len(WRONG), done.stderr
-    for (_, _, expected), line, status in zip(WRONG, said[::2], said[1::2], strict=True):
+    errors = done.stderr.splitlines()
+    assert len(errors) == 2 * len(WRONG), done.stderr
+    for (_, _, expected), line, status in zip(WRONG, errors[::2], errors[1::2], strict=True):
         assert line.startswith("rmc: ")
         assert expected in line
         assert status == "2"

@@ -81,23 +81,23 @@ def test_a_loop_of_ones_own_gives_what_an_evaluation_gives(run: RunFolder) -> No
             observation, reward, terminated, truncated, info = env.step(action)
             total, ended = total + float(reward), terminated or truncated
         returns.append(total)
-    found = evaluate_policy(read_policy(run.path), episodes=3)
-    assert np.mean(returns) == found["eval_return_mean"]
+    result = evaluate_policy(read_policy(run.path), episodes=3)
+    assert np.mean(returns) == result["eval_return_mean"]
 
 
 def test_an_evaluation_is_the_same_with_any_number_of_threads(tmp_path: Path) -> None:
     run = make_run(
         tmp_path / "run", AgentConfig(normalize_observations=True, impute_missing=True), "HalfCheetah-v5", 0.5
     )
-    before, found = torch.get_num_threads(), []
+    before, counts = torch.get_num_threads(), []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            found.append(evaluate_policy(read_policy(run.path), episodes=10))
+            counts.append(evaluate_policy(read_policy(run.path), episodes=10))
             assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
-    assert found[0] == found[1]
+    assert counts[0] == counts[1]
 
 
 @pytest.mark.parametrize("odd", [np.nan, np.inf, -np.inf, 1e300])
@@ -126,10 +126,10 @@ def test_an_observation_of_another_shape_is_refused(tmp_path: Path, observation:
 
 def test_exploring_actions_vary_and_are_seeded(run: RunFolder) -> None:
     observation = np.ones(3, np.float32)
-    found = [[load_policy(run.path).act(observation, explore=explore) for _ in range(2)] for explore in (False, True)]
-    assert found[0][0] == found[0][1]
-    assert found[1][0] == found[1][1]
-    assert found[0][0] != found[1][0]
+    actions = [[load_policy(run.path).act(observation, explore=explore) for _ in range(2)] for explore in (False, True)]
+    assert actions[0][0] == actions[0][1]
+    assert actions[1][0] == actions[1][1]
+    assert actions[0][0] != actions[1][0]
 
 
 def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -150,12 +150,12 @@ def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureF
         feed = {"previous_action": action, "state": state}
     if run.config().agent.impute_missing:
         observation[1, 2] = np.nan
-        found = [
+        actions = [
             session.run(None, {"observation": seen, "missing": np.array([False, missing, False]), **feed})
             for seen, missing in ((observation, False), (np.nan_to_num(observation), True))
         ]
-        np.testing.assert_array_equal(found[0][0], found[1][0])
-        np.testing.assert_array_equal(found[0][1], found[1][1])
+        np.testing.assert_array_equal(actions[0][0], actions[1][0])
+        np.testing.assert_array_equal(actions[0][1], actions[1][1])
 
 
 def test_export_says_what_is_wrong_in_one_line(

@@ -120,8 +120,8 @@ def test_the_return_is_that_of_the_checkpoint(tmp_path: Path, result: bool) -> N
         played = {"eval_return_mean": -4.0, "eval_return_std": 0.25, "eval_episodes": 10, "initial_return_mean": 0.0}
         run.write_result(played | {"env_steps": 70, "updates": 7, "wall_s": 1.0})
     header = read_policy(run.path).header
-    found = header.eval_return_mean, header.eval_return_std, header.eval_episodes
-    assert found == ((-4.0, 0.25, 10) if result else (-2.0, 0.5, 5))
+    evaluation = header.eval_return_mean, header.eval_return_std, header.eval_episodes
+    assert evaluation == ((-4.0, 0.25, 10) if result else (-2.0, 0.5, 5))
 
 
 def test_an_older_runs_policy_is_given_its_header(tmp_path: Path) -> None:
@@ -293,12 +293,12 @@ def test_weights_that_are_not_finite_are_refused(file: Path, capsys: pytest.Capt
 def test_a_file_is_played_and_exported_as_its_run_is(
     file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = []
+    errors = []
     for source in (file, tmp_path / "run"):
         assert main.run(["evaluate", str(source), "--episodes", "2", "--json"]) == 0
-        said.append(json.loads(capsys.readouterr().out.splitlines()[-1]))
+        errors.append(json.loads(capsys.readouterr().out.splitlines()[-1]))
         assert main.run(["export", str(source), "--out", str(tmp_path / f"{source.stem}.onnx")]) == 0
-    assert said[0] == said[1]
+    assert errors[0] == errors[1]
     capsys.readouterr()
     assert "--checkpoint='7': " in complaint(["evaluate", str(file), "--checkpoint", "7"], capsys)
     assert "cannot be read" in complaint(["evaluate", str(tmp_path / "none.safetensors")], capsys)

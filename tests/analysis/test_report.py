@@ -60,12 +60,14 @@ class Links(HTMLParser):
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.found: list[str] = []
+        self.targets: list[str] = []
         self.feed(text)
-        self.found += re.findall(r"url\(([^)]*)\)|@import", text)
+        self.targets += re.findall(r"url\(([^)]*)\)|@import", text)
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.found += [value or "" for name, value in attributes if name in ("src", "href", "srcset", "data", "poster")]
+        self.targets += [
+            value or "" for name, value in attributes if name in ("src", "href", "srcset", "data", "poster")
+        ]
 
 
 def written(out: Path, *words: str) -> str:
@@ -94,7 +96,7 @@ def opened(page: Path, width: int, tmp_path: Path) -> dict[str, int]:
 def test_a_browser_shows_it_without_a_network(trained: Path, other: Path, tmp_path: Path) -> None:
     page = tmp_path / "report.html"
     text = written(page, str(trained), str(other))
-    links = Links(text).found
+    links = Links(text).targets
     assert all(link.startswith("data:") for link in links)
     assert sum(link.startswith("data:image/svg+xml") for link in links) >= 2 + 2 * 4  # curves; each run's figures
     assert "Report of 2 runs" in text
@@ -110,7 +112,7 @@ def test_a_browser_shows_it_without_a_network(trained: Path, other: Path, tmp_pa
 
 def test_the_table_is_of_all_runs_of_an_agent(trained: Path, other: Path) -> None:
     evaluations = [[Evaluation(100, 10, 1.0, 5.0, 0.0), Evaluation(200, 20, 2.0, mean, 0.0)] for mean in (10.0, 20.0)]
-    past = [History("RMC", "E", seed, 200, 20, 1, 2.0, 0.0, found, True) for seed, found in enumerate(evaluations)]
+    past = [History("RMC", "E", seed, 200, 20, 1, 2.0, 0.0, scores, True) for seed, scores in enumerate(evaluations)]
     row = report.final_row("RMC", past)
     assert dict(zip(report.COLUMNS, row, strict=True)) == {
         "agent": "RMC", "runs": "2", "return": "15.0 ± 5.0", "each run": "10, 20", "worst of last 5": "5.0",
@@ -125,8 +127,8 @@ def test_wall_time_goes_over_all_starts(trained: Path, tmp_path: Path) -> None:
     path = tmp_path / "run"
     path.mkdir()
     shutil.copy(trained / "config.json", path)
-    said = [(100.0, 1.0), (110.0, 11.0), (500.0, 11.0), (510.0, 21.0)]
-    lines = [{"role": "launcher", "time": time, "wall_s": wall} for time, wall in said]
+    times = [(100.0, 1.0), (110.0, 11.0), (500.0, 11.0), (510.0, 21.0)]
+    lines = [{"role": "launcher", "time": time, "wall_s": wall} for time, wall in times]
     lines += [{"role": "learner", "time": time, "updates_per_s": 2.0} for time in (99.5, 105.0, 300.0, 505.0)]
     (path / "metrics.jsonl").write_text("".join(f"{json.dumps(one)}\n" for one in lines))
     places, values = ReportRun.read(path).series("learner", "updates_per_s")
@@ -193,7 +195,7 @@ def test_a_baseline_stands_beside_a_run(trained: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ([], "RUNS='': give folders of runs"),
         (["nowhere"], "no config.json there; give the folder of a run"),
@@ -203,13 +205,13 @@ def test_a_baseline_stands_beside_a_run(trained: Path, tmp_path: Path) -> None:
     ],
 )
 def test_what_it_cannot_do_is_one_line(
-    words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert run(["report", *words]) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert said in err.splitlines()[-1]
+    assert message in err.splitlines()[-1]
     assert not list(tmp_path.iterdir())
 
 
@@ -236,10 +238,10 @@ def test_differences_are_those_that_matter() -> None:
         def __init__(self, name: str, **options: Any) -> None:
             self.name, self.options = name, options
 
-    found = report.differences(
+    table = report.differences(
         [Run("a", seed=0, gamma=0.9, heads=[4, 2]), Run("b", seed=1, gamma=0.9), Run("c", seed=1)]
     )  # type: ignore[list-item]
-    assert found["columns"] == ["a", "b", "c"]
-    assert found["rows"] == [["seed", "0", "1", "1"]]
+    assert table["columns"] == ["a", "b", "c"]
+    assert table["rows"] == [["seed", "0", "1", "1"]]
     alike = report.differences([Run("a", seed=0), Run("b", seed=0)])  # type: ignore[list-item]
     assert (alike["rows"], alike["note"]) == ([], "All options are alike.")

@@ -21,7 +21,7 @@ RESULT = {
 }  # fmt: skip
 
 
-def made(path: Path, status: int | None, scores: tuple[float, ...] = ()) -> RunFolder:
+def run_in(path: Path, status: int | None, scores: tuple[float, ...] = ()) -> RunFolder:
     folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), path, "fail")
     records = [
         {"role": "replay", "time": time.time(), "env_steps": 700},
@@ -35,39 +35,39 @@ def made(path: Path, status: int | None, scores: tuple[float, ...] = ()) -> RunF
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    made(tmp_path / "finished", 0).write_result(RESULT)
-    made(tmp_path / "sweep" / "0001" / "stopped", 130, (20.0, 10.0))
-    made(tmp_path / "failed", 1)
+    run_in(tmp_path / "finished", 0).write_result(RESULT)
+    run_in(tmp_path / "sweep" / "0001" / "stopped", 130, (20.0, 10.0))
+    run_in(tmp_path / "failed", 1)
     baseline = tmp_path / "sac"
     (baseline / "checkpoints").mkdir(parents=True)
-    said = {"algorithm": "sac", "settings": "zoo", "env": {"id": "Hopper-v5"}, "seed": 3, "total_steps": 1000}
-    (baseline / "config.json").write_text(json.dumps(said))
+    settings = {"algorithm": "sac", "settings": "zoo", "env": {"id": "Hopper-v5"}, "seed": 3, "total_steps": 1000}
+    (baseline / "config.json").write_text(json.dumps(settings))
     lines = [{"role": "learner", "env_steps": 400, "updates": 300}, {"role": "launcher", "wall_s": 4.0}]
     (baseline / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    (made(tmp_path / "torn", 0).path / "config.json").write_text('{"env": {"id"')
-    (made(tmp_path / "without", 0).path / "config.json").unlink()
-    (made(tmp_path / "lock", 0).path / ".lock").write_text("ended perhaps")
-    made(tmp_path / "result", 0).result_file.write_text("[]")
+    (run_in(tmp_path / "torn", 0).path / "config.json").write_text('{"env": {"id"')
+    (run_in(tmp_path / "without", 0).path / "config.json").unlink()
+    (run_in(tmp_path / "lock", 0).path / ".lock").write_text("ended perhaps")
+    run_in(tmp_path / "result", 0).result_file.write_text("[]")
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "config.json").write_text("{}")  # of another program
     return tmp_path
 
 
 def test_every_run_is_found_with_what_became_of_it(root: Path) -> None:
-    found = {str(Path(one.run).relative_to(root)): one for one in runs(root)}
-    states = {name: one.state for name, one in found.items()}
+    by_name = {str(Path(one.run).relative_to(root)): one for one in runs(root)}
+    states = {name: one.state for name, one in by_name.items()}
     assert states == {
         "failed": "failed", "finished": "finished", "sac": "stopped", "sweep/0001/stopped": "stopped",
         "torn": "damaged", "without": "damaged", "lock": "damaged", "result": "damaged",
     }  # fmt: skip
-    stopped = found["sweep/0001/stopped"]
+    stopped = by_name["sweep/0001/stopped"]
     assert (stopped.env_steps, stopped.eval_return, stopped.best_return, stopped.elapsed_s) == (700, 10.0, 20.0, 9.0)
-    finished = found["finished"]
+    finished = by_name["finished"]
     assert (finished.env_steps, finished.eval_return, finished.elapsed_s) == (1500, 11.5, 21.0)
-    sac = found["sac"]
+    sac = by_name["sac"]
     assert (sac.agent, sac.env, sac.seed, sac.env_steps, sac.total_steps) == ("sac-zoo", "Hopper-v5", 3, 400, 1000)
     for name in ("torn", "without", "lock", "result"):
-        fault = found[name].fault
+        fault = by_name[name].fault
         assert fault is not None
         assert str(root / name) in fault
         assert "\n" not in fault
@@ -79,8 +79,8 @@ def test_the_table_fits_and_says_state_steps_and_return(root: Path, width: int) 
     console.print(table(runs(root), root, width))
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert max(map(len, text.splitlines())) <= width
-    for said in ("finished", "1,500", "11.5", "stopped", "700", "damaged", "sac"):
-        assert said in text
+    for shown in ("finished", "1,500", "11.5", "stopped", "700", "damaged", "sac"):
+        assert shown in text
     assert ("Hopper-v5" in text) is (width >= 110)
 
 

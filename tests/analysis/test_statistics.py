@@ -52,5 +52,5 @@ def test_environments_are_resampled_each_for_itself():
 
 
 def test_scores_are_scaled_by_environment():
-    found = normalised(np.array([[5.0, 0.0], [10.0, 50.0]]), np.array([0.0, -50.0]), np.array([10.0, 50.0]))
-    assert found.tolist() == [[0.5, 0.5], [1.0, 1.0]]
+    scores = normalised(np.array([[5.0, 0.0], [10.0, 50.0]]), np.array([0.0, -50.0]), np.array([10.0, 50.0]))
+    assert scores.tolist() == [[0.5, 0.5], [1.0, 1.0]]

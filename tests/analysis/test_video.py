@@ -56,10 +56,10 @@ def test_what_stands_in_the_way_is_one_line(tmp_path: Path, capsys: pytest.Captu
     assert "ends in .mp4" in capsys.readouterr().err
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
     assert main.run([*words, str(tmp_path / "episode.mp4")]) == 2
-    said = capsys.readouterr().err
-    assert "nothing here can render (nonsense: " in said
-    assert "libegl1 or libosmesa6" in said
-    assert len(said.splitlines()) == 1
+    errors = capsys.readouterr().err
+    assert "nothing here can render (nonsense: " in errors
+    assert "libegl1 or libosmesa6" in errors
+    assert len(errors.splitlines()) == 1
 
 
 def test_a_backend_that_hangs_is_passed_over_and_named(tmp_path: Path, capsys, monkeypatch) -> None:
@@ -69,10 +69,10 @@ def test_a_backend_that_hangs_is_passed_over_and_named(tmp_path: Path, capsys, m
     monkeypatch.setattr(video, "PROBE_SECONDS", 0.2)
     out = tmp_path / "episode.mp4"
     assert main.run(["evaluate", folder, "--episodes", "1", "--video", str(out)]) == 2
-    said = capsys.readouterr().err
-    assert f"--video={str(out)!r}: nothing here can render (egl: no frame in 0.2 s; osmesa: no frame in 0.2 s" in said
-    assert "libegl1 or libosmesa6" in said
-    assert len(said.splitlines()) == 1
+    errors = capsys.readouterr().err
+    assert f"--video={str(out)!r}: nothing here can render (egl: no frame in 0.2 s; osmesa: no frame in 0.2 s" in errors
+    assert "libegl1 or libosmesa6" in errors
+    assert len(errors.splitlines()) == 1
 
 
 def test_a_grid_of_flicker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -109,10 +109,10 @@ def test_an_environment_without_pictures_is_named_before_anything_is_played(
     folder = make_run(tmp_path / "run", AGENTS["robust"], f"tests.habits:{env}-v0", env_kwargs=kwargs).path
     monkeypatch.setenv("MUJOCO_GL", "egl")
     assert main.run(["evaluate", str(folder), "--video", str(tmp_path / "episode.mp4")]) == 2
-    said = capsys.readouterr()
-    assert says in said.err
-    assert "libegl1" not in said.err
-    assert (len(said.err.splitlines()), said.out) == (1, "")
+    captured = capsys.readouterr()
+    assert says in captured.err
+    assert "libegl1" not in captured.err
+    assert (len(captured.err.splitlines()), captured.out) == (1, "")
     assert not (tmp_path / "episode.mp4").exists()
 
 

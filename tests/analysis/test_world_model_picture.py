@@ -91,10 +91,10 @@ def test_the_command_writes_a_picture_and_says_it_in_numbers(
     folder = make_run(tmp_path / "run", config)
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 0
     assert (tmp_path / "seen.png").read_bytes().startswith(b"\x89PNG")
-    said = capsys.readouterr().out
-    assert "% 1 ahead" in said
-    assert "% 15 ahead (100% is a guess of no change)" in said
-    assert "worst dimensions" in said
+    output = capsys.readouterr().out
+    assert "% 1 ahead" in output
+    assert "% 15 ahead (100% is a guess of no change)" in output
+    assert "worst dimensions" in output
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "no" / "seen.png")]) == 2
     assert "its folder is not there" in capsys.readouterr().err
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.xyz")]) == 2

@@ -31,13 +31,13 @@ DISK_TOLERANCE = 0.05
 
 def records() -> list[dict[str, Any]]:
     """Ten seconds in which 80 batches of 16 windows of 15 steps are drawn: 600 environment steps at a ratio of 32."""
-    said = []
+    messages = []
     for second in range(12):
         of_replay = {"drawn_steps": 1920.0 * second, "windows": 5 * second, "env_steps": 60 * second}
-        said.append({"role": "replay", "time": 100.0 + second, "busy_share": 0.5, "waiting_share": 0.5} | of_replay)
+        messages.append({"role": "replay", "time": 100.0 + second, "busy_share": 0.5, "waiting_share": 0.5} | of_replay)
         of_learner = {"updates": 8 * second, "busy_share": 1.0, "waiting_share": 0.0}
-        said.append({"role": "learner", "time": 100.5 + second} | of_learner)
-    return said
+        messages.append({"role": "learner", "time": 100.5 + second} | of_learner)
+    return messages
 
 
 def rows(config=CONFIG, machine: Machine = MACHINE, **uses: RoleUse) -> dict[str, Need]:
@@ -46,27 +46,27 @@ def rows(config=CONFIG, machine: Machine = MACHINE, **uses: RoleUse) -> dict[str
 
 
 def test_the_speed_is_that_at_which_the_ratio_holds() -> None:
-    found = speed(CONFIG, records())
-    assert found.steps_per_s == pytest.approx(1920.0 / 32.0)
-    assert found.updates_per_s == pytest.approx(8.0)
-    assert found.windows_per_s == pytest.approx(5.0)
+    measured = speed(CONFIG, records())
+    assert measured.steps_per_s == pytest.approx(1920.0 / 32.0)
+    assert measured.updates_per_s == pytest.approx(8.0)
+    assert measured.windows_per_s == pytest.approx(5.0)
     with pytest.raises(ConfigError, match="--total-steps=4000: a trial of it is over too soon"):
         speed(CONFIG, [])
 
 
 def test_each_need_stands_beside_what_there_is() -> None:
-    found = rows(**{"actor-1": RoleUse(50 << 20, 10, 2)})
+    table = rows(**{"actor-1": RoleUse(50 << 20, 10, 2)})
     row = CONFIG.window_spec().dtype.itemsize
-    assert found["memory, actor (2)"].needs == megabytes(100 << 20)
-    assert found["memory, all"].needs == megabytes((400 << 20) + file_bytes(CONFIG.window_spec(), 2_000))
-    assert found["memory, all"].has == "8.6 GB free"
-    assert found["disk, 5 checkpoints"].needs == "10.0 MB"
-    assert found["bandwidth to replay"].needs == f"{megabytes(5 * row)}/s"
-    assert found["bandwidth from replay"].needs == f"{megabytes(8 * 16 * row)}/s"
-    assert found["file handles of a role"].needs == "20 (learner)"
-    assert found["threads"].needs == "3 learner + 3 others, 3.5 busy"  # the learner's, and half of the replay server
-    assert found["time to the end"].needs == "1 min 07 s at 60 steps/s, 8.0 updates/s"
-    assert all(one.fits is not False for one in found.values())
+    assert table["memory, actor (2)"].needs == megabytes(100 << 20)
+    assert table["memory, all"].needs == megabytes((400 << 20) + file_bytes(CONFIG.window_spec(), 2_000))
+    assert table["memory, all"].has == "8.6 GB free"
+    assert table["disk, 5 checkpoints"].needs == "10.0 MB"
+    assert table["bandwidth to replay"].needs == f"{megabytes(5 * row)}/s"
+    assert table["bandwidth from replay"].needs == f"{megabytes(8 * 16 * row)}/s"
+    assert table["file handles of a role"].needs == "20 (learner)"
+    assert table["threads"].needs == "3 learner + 3 others, 3.5 busy"  # the learner's, and half of the replay server
+    assert table["time to the end"].needs == "1 min 07 s at 60 steps/s, 8.0 updates/s"
+    assert all(one.fits is not False for one in table.values())
 
 
 @pytest.mark.parametrize(
@@ -81,8 +81,8 @@ def test_each_need_stands_beside_what_there_is() -> None:
 )
 def test_what_does_not_fit_is_marked(less: dict[str, Any], what: list[str], is_needed: bool) -> None:
     config = dataclasses.replace(CONFIG, learner=dataclasses.replace(CONFIG.learner, threads=3))
-    found = rows(config, dataclasses.replace(MACHINE, **less))
-    assert [(row.what, row.is_needed) for row in found.values() if row.fits is False] == [
+    table = rows(config, dataclasses.replace(MACHINE, **less))
+    assert [(row.what, row.is_needed) for row in table.values() if row.fits is False] == [
         (one, is_needed) for one in what
     ]
 
@@ -100,8 +100,8 @@ def test_a_trial_keeps_all_but_its_ring_and_warm_up() -> None:
 
 
 def test_this_machine_has_something(tmp_path: Path) -> None:
-    found = this_machine(tmp_path / "not" / "there")
-    assert min(dataclasses.astuple(found)) > 0
+    machine = this_machine(tmp_path / "not" / "there")
+    assert min(dataclasses.astuple(machine)) > 0
 
 
 def dry_run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
@@ -109,10 +109,10 @@ def dry_run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
                           capture_output=True, text=True, timeout=170)  # fmt: skip
 
 
-def bytes_of(said: str, what: str) -> float:
-    found = re.search(rf"^{re.escape(what)} +([\d.,]+) (kB|MB|GB)", said, re.MULTILINE)
-    assert found, said
-    return float(found[1].replace(",", "")) * {"kB": 1e3, "MB": 1e6, "GB": 1e9}[found[2]]
+def bytes_of(output: str, what: str) -> float:
+    match = re.search(rf"^{re.escape(what)} +([\d.,]+) (kB|MB|GB)", output, re.MULTILINE)
+    assert match, output
+    return float(match[1].replace(",", "")) * {"kB": 1e3, "MB": 1e6, "GB": 1e9}[match[2]]
 
 
 def seen_memory(run: Training) -> dict[str, int]:
@@ -131,34 +131,34 @@ def seen_memory(run: Training) -> dict[str, int]:
 
 @pytest.mark.timeout(400)
 def test_estimates_are_what_a_real_run_takes(tmp_path: Path) -> None:
-    told = dry_run(tmp_path / "planned")
-    assert (told.returncode, told.stderr) == (0, ""), told.stdout + told.stderr
-    assert told.stdout.splitlines()[-1] == "it fits"
+    output = dry_run(tmp_path / "planned")
+    assert (output.returncode, output.stderr) == (0, ""), output.stdout + output.stderr
+    assert output.stdout.splitlines()[-1] == "it fits"
     assert not (tmp_path / "planned").exists()
     run = Training(tmp_path / "real")
     held = seen_memory(run)
     assert run.process.returncode == 0, run.text()
     for role in ("learner", "replay", "actor", "evaluator"):
-        assert bytes_of(told.stdout, f"memory, {role}") == pytest.approx(held[role], rel=MEMORY_TOLERANCE), role
+        assert bytes_of(output.stdout, f"memory, {role}") == pytest.approx(held[role], rel=MEMORY_TOLERANCE), role
     ring = (tmp_path / "real" / "replay" / "ring").stat().st_size
-    assert bytes_of(told.stdout, "disk, ring") == pytest.approx(ring, rel=DISK_TOLERANCE)
+    assert bytes_of(output.stdout, "disk, ring") == pytest.approx(ring, rel=DISK_TOLERANCE)
     kept = [file for file in (tmp_path / "real" / "checkpoints").rglob("*") if file.is_file()]
     each = sum(file.stat().st_size for file in kept) / len(list((tmp_path / "real" / "checkpoints").glob("0*")))
-    assert bytes_of(told.stdout, "disk, 5 checkpoints") / 5 == pytest.approx(each, rel=DISK_TOLERANCE)
+    assert bytes_of(output.stdout, "disk, 5 checkpoints") / 5 == pytest.approx(each, rel=DISK_TOLERANCE)
 
 
 def test_a_ring_that_is_too_large_is_marked_and_the_status_is_1(tmp_path: Path) -> None:
-    told = dry_run(tmp_path / "run", "--capacity", "1000000000000")
-    assert (told.returncode, told.stderr) == (1, ""), told.stdout + told.stderr
-    assert re.search(r"^memory, all .* DOES NOT FIT$", told.stdout, re.MULTILINE)
-    assert told.stdout.splitlines()[-1] == "does not fit: memory, all, disk, all"
+    output = dry_run(tmp_path / "run", "--capacity", "1000000000000")
+    assert (output.returncode, output.stderr) == (1, ""), output.stdout + output.stderr
+    assert re.search(r"^memory, all .* DOES NOT FIT$", output.stdout, re.MULTILINE)
+    assert output.stdout.splitlines()[-1] == "does not fit: memory, all, disk, all"
     assert not (tmp_path / "run").exists()
 
 
 def test_a_trial_needs_processes(tmp_path: Path) -> None:
-    told = dry_run(tmp_path / "run", "--launcher", "lockstep")
-    assert (told.returncode, told.stdout) == (2, "")
-    assert told.stderr == "rmc: --dry-run=True: a trial needs --launcher local, not lockstep\n"
+    output = dry_run(tmp_path / "run", "--launcher", "lockstep")
+    assert (output.returncode, output.stdout) == (2, "")
+    assert output.stderr == "rmc: --dry-run=True: a trial needs --launcher local, not lockstep\n"
 
 
 def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
@@ -171,8 +171,8 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
             assert time.monotonic() < deadline
             time.sleep(0.1)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60.0)
+        _, output = process.communicate(timeout=60.0)
     finally:
         process.kill()
-    assert (process.returncode, said) == (130, "")
+    assert (process.returncode, output) == (130, "")
     assert not list(tmp_path.glob("r*"))  # torch keeps a cache of its own

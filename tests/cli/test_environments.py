@@ -121,7 +121,7 @@ def test_check_env_train_and_evaluate_say_the_same(
     ):
         caplog.clear()
         assert main.run(words) == 1
-        said = capsys.readouterr()
-        assert says in (said.err if words[0] != "check-env" else said.out)
-        assert len(said.err.splitlines()) <= 1
+        captured = capsys.readouterr()
+        assert says in (captured.err if words[0] != "check-env" else captured.out)
+        assert len(captured.err.splitlines()) <= 1
         assert len(caplog.records) <= 1

@@ -83,23 +83,23 @@ OTHER_FLAGS = {
 
 def flags(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
     assert main.run([*command.split(), "--help-all"]) == 0
-    found = re.findall(r"--[a-z][a-z-]*[a-z]", capsys.readouterr().out)
-    return set(found) - {"--help", "--help-all"}
+    options = re.findall(r"--[a-z][a-z-]*[a-z]", capsys.readouterr().out)
+    return set(options) - {"--help", "--help-all"}
 
 
 @pytest.mark.parametrize(("command", "expected"), [("train", TRAIN_FLAGS), *OTHER_FLAGS.items()])
 def test_the_flags_are_these(command: str, expected: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    found = flags(command, capsys)
-    assert {flag for flag in found if not flag.startswith("--no-")} == set(expected)
+    options = flags(command, capsys)
+    assert {flag for flag in options if not flag.startswith("--no-")} == set(expected)
 
 
 def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """The one line of a command that must end with status 2 and say nothing else."""
     assert main.run(words) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    lines = said.err.splitlines()
-    assert len(lines) == 1, said.err
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.splitlines()
+    assert len(lines) == 1, captured.err
     assert lines[0].startswith("rmc: ")
     return lines[0]
 
@@ -216,7 +216,7 @@ def test_without_a_temporary_folder_nothing_starts(
     assert not (tmp_path / "run").exists()
 
 
-def made_run(folder: Path) -> RunFolder:
+def opened_run(folder: Path) -> RunFolder:
     run = open_run(debug(EnvConfig(PENDULUM)), folder, "fail")
     run.unlock()
     return run
@@ -235,7 +235,7 @@ def made_run(folder: Path) -> RunFolder:
 def test_another_runs_folder_is_refused(
     words: list[str], named: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    made_run(tmp_path / "run")
+    opened_run(tmp_path / "run")
     assert named in complaint([*words, "--run-dir", str(tmp_path / "run")], capsys)
 
 
@@ -251,7 +251,7 @@ def test_a_folder_in_use_is_refused(capsys: pytest.CaptureFixture[str], tmp_path
 
 
 def test_a_corrupt_checkpoint_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    run = made_run(tmp_path / "run")
+    run = opened_run(tmp_path / "run")
     checkpoint = run.checkpoints / "000000010"
     checkpoint.mkdir()
     (checkpoint / "manifest.json").write_text('{"update": 10, "sha256": {"policy.safetensors": "00"}}')
@@ -263,7 +263,7 @@ def test_a_corrupt_checkpoint_is_named(capsys: pytest.CaptureFixture[str], tmp_p
 
 
 def test_runs_without_checkpoint_or_metrics_say_so(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    run = made_run(tmp_path / "run")
+    run = opened_run(tmp_path / "run")
     assert "no checkpoint yet" in complaint(["evaluate", str(run.path)], capsys)
     assert "no metrics yet" in complaint(["stats", str(run.path)], capsys)
     assert "--episodes=0" in complaint(["evaluate", str(run.path), "--episodes", "0"], capsys)
@@ -271,7 +271,7 @@ def test_runs_without_checkpoint_or_metrics_say_so(capsys: pytest.CaptureFixture
 
 
 def test_stats_and_list_as_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    run = made_run(tmp_path / "runs" / "run")
+    run = opened_run(tmp_path / "runs" / "run")
     records = [
         {"role": "replay", "time": 1.0, "env_steps": 700, "replay_ratio": math.inf},
         {"role": "launcher", "time": 1.0, "wall_s": 9.0},
@@ -279,25 +279,25 @@ def test_stats_and_list_as_json(capsys: pytest.CaptureFixture[str], tmp_path: Pa
     ]
     run.metrics.write_text("".join(json.dumps(record) + "\n" for record in records))
     assert main.run(["stats", str(run.path), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found["state"], found["env"], found["env_steps"], found["elapsed_s"]) == ("stopped", PENDULUM, 700, 9.0)
+    value = json.loads(capsys.readouterr().out)
+    assert (value["state"], value["env"], value["env_steps"], value["elapsed_s"]) == ("stopped", PENDULUM, 700, 9.0)
     evaluation = {"return_mean": 4.5, "return_std": 0.5, "update": 5, "env_steps": 600}
-    assert found["last_evaluation"] == found["best_evaluation"] == evaluation
-    assert found["roles"]["replay"] == records[0] | {"replay_ratio": None}  # which JSON cannot say
-    assert (found["eta_s"], found["result"]) == (None, None)
+    assert value["last_evaluation"] == value["best_evaluation"] == evaluation
+    assert value["roles"]["replay"] == records[0] | {"replay_ratio": None}  # which JSON cannot say
+    assert (value["eta_s"], value["result"]) == (None, None)
     assert main.run(["list", str(tmp_path / "runs"), "--json"]) == 0
     (listed,) = json.loads(capsys.readouterr().out)
     assert (listed["run"], listed["state"], listed["eval_return"]) == (str(run.path), "stopped", 4.5)
 
 
 def test_a_damaged_run_is_listed_and_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    made_run(tmp_path / "sound")
-    (made_run(tmp_path / "torn").path / "config.json").write_text("{")
+    opened_run(tmp_path / "sound")
+    (opened_run(tmp_path / "torn").path / "config.json").write_text("{")
     assert main.run(["list", str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    assert re.search(r"^sound +new ", said, re.MULTILINE)
-    assert re.search(r"^torn +damaged ", said, re.MULTILINE)
-    assert f"config.json='{tmp_path / 'torn' / 'config.json'}': not JSON" in said
+    output = capsys.readouterr().out
+    assert re.search(r"^sound +new ", output, re.MULTILINE)
+    assert re.search(r"^torn +damaged ", output, re.MULTILINE)
+    assert f"config.json='{tmp_path / 'torn' / 'config.json'}': not JSON" in output
 
 
 def test_a_role_needs_its_runs_secret(
@@ -314,7 +314,7 @@ def test_a_role_needs_its_runs_secret(
 
 def test_new_takes_a_folder_beside(tmp_path: Path) -> None:
     config = debug(EnvConfig(PENDULUM))
-    made_run(tmp_path / "run")
+    opened_run(tmp_path / "run")
     beside = open_run(config, tmp_path / "run", "new")
     beside.unlock()
     assert beside.path == tmp_path / "run-2"
@@ -322,7 +322,7 @@ def test_new_takes_a_folder_beside(tmp_path: Path) -> None:
 
 def test_a_run_may_be_made_longer(tmp_path: Path) -> None:
     config = debug(EnvConfig(PENDULUM))
-    made_run(tmp_path / "run")
+    opened_run(tmp_path / "run")
     longer = dataclasses.replace(config, total_steps=2 * config.total_steps)
     run = open_run(longer, tmp_path / "run", "resume")
     run.unlock()
@@ -331,7 +331,7 @@ def test_a_run_may_be_made_longer(tmp_path: Path) -> None:
 
 def test_a_runs_folder_is_its_owners_alone_until_they_open_it(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir(mode=0o755)
-    run = made_run(tmp_path / "run")
+    run = opened_run(tmp_path / "run")
     assert [stat.S_IMODE(path.stat().st_mode) for path in (run.path, run.secret_file)] == [0o700, 0o600]
     run.path.chmod(0o750)
     open_run(run.config(), run.path, "resume").unlock()

@@ -77,7 +77,7 @@ def test_a_new_folder_beside_it_begins_with_the_preset(run: RunFolder) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["--capacity", "30"], "--capacity=30: the run in {} has 2000, and its ring was made so; use that"),
         (["--seed", "4"], "--seed=4: the run in {} has 3, and its random numbers began with that"),
@@ -93,11 +93,11 @@ def test_a_new_folder_beside_it_begins_with_the_preset(run: RunFolder) -> None:
 )
 @pytest.mark.parametrize("command", [["resume"], ["train", "--run-dir"]])
 def test_what_may_not_change_is_one_line(
-    command: list[str], words: list[str], said: str, run: RunFolder, capsys: pytest.CaptureFixture[str]
+    command: list[str], words: list[str], message: str, run: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = run.history_file.read_bytes()
     line = complaint([*command, str(run.path), "--device", "cpu", *words], capsys)
-    assert said.format(run.path) in line
+    assert message.format(run.path) in line
     assert run.history_file.read_bytes() == before
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-TOLD = """
+PROGRAM = """
 import sys
 from rmc.cli import main
 
@@ -18,11 +18,11 @@ sys.exit(status)
 
 def rmc(at: Path, *words: str) -> tuple[subprocess.CompletedProcess[str], set[str]]:
     """A command, and which of the slow libraries it imported."""
-    command = [sys.executable, "-c", TOLD, *words]
+    command = [sys.executable, "-c", PROGRAM, *words]
     done = subprocess.run(command, cwd=at, capture_output=True, text=True, timeout=60, check=False)
-    said, told, imported = done.stdout.rpartition("IMPORTED")
-    assert told, done.stderr
-    done.stdout = said
+    output, marker, imported = done.stdout.rpartition("IMPORTED")
+    assert marker, done.stderr
+    done.stdout = output
     return done, set(imported.split())
 
 

@@ -63,8 +63,8 @@ def test_the_untrained_policy_is_played_once(tmp_path, monkeypatch):
     first = train()
     assert len(played) == 2
     kept = folder.initial_file.read_bytes()
-    said = {**json.loads(kept), "eval_return_mean": first + 1}  # told apart from one that is played
-    folder.initial_file.write_text(json.dumps(said))
+    changed = {**json.loads(kept), "eval_return_mean": first + 1}  # told apart from one that is played
+    folder.initial_file.write_text(json.dumps(changed))
     assert (train(), len(played)) == (first + 1, 1)
     for damaged in (b"", kept[:20], b"[]", b'{"eval_return_mean": "x"}', b"\xff"):
         folder.initial_file.write_bytes(damaged)
@@ -78,19 +78,19 @@ def test_an_evaluation_without_end_shows_that_it_goes_on_and_is_cut(tmp_path, mo
     folder = make_run(tmp_path / "run", AGENTS["robust"], "NeverEnding-v0")
     monkeypatch.setattr(training, "_launch", lambda *_: True)
     monkeypatch.setattr(evaluation, "SAY_SECONDS", 0.1)
-    config, said, began = folder.config(), io.StringIO(), time.monotonic()
+    config, output, began = folder.config(), io.StringIO(), time.monotonic()
     config = replace(config, evaluator=replace(config.evaluator, evaluation_seconds=0.5))
     folder.lock()
     placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
-    assert conduct(config, folder, placement, Console(file=said, width=200)) == 0
+    assert conduct(config, folder, placement, Console(file=output, width=200)) == 0
     assert 1.0 < time.monotonic() - began < 60
     for when in ("before training:", "after training:"):
-        assert f"{when} episode 1 of 10, " in said.getvalue()
-    assert said.getvalue().count("over 1 deterministic episodes, cut when its seconds were over") == 3
+        assert f"{when} episode 1 of 10, " in output.getvalue()
+    assert output.getvalue().count("over 1 deterministic episodes, cut when its seconds were over") == 3
     assert json.loads(folder.result_file.read_bytes())["eval_cut"] == 1
     assert main.run(["evaluate", str(folder.path), "--seconds", "0.5", "--json"]) == 0
-    told = capsys.readouterr()
-    assert json.loads(told.out)["eval_cut"] == 1
-    assert f"{folder.path}: episode 1 of 10, " in told.err.replace("\n", "")
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["eval_cut"] == 1
+    assert f"{folder.path}: episode 1 of 10, " in captured.err.replace("\n", "")
     assert main.run(["evaluate", str(folder.path), "--seconds", "nan"]) == 2
     assert "--seconds=nan: take 0 or more" in capsys.readouterr().err

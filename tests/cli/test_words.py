@@ -64,9 +64,9 @@ def test_a_wrong_file_is_refused(
     text: str, name: str, fix: str, file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file.write_text(text)
-    said = complaint(["train", *([PENDULUM] if "env =" not in text else []), "--config", str(file)], capsys)
-    assert name in said
-    assert fix in said
+    message = complaint(["train", *([PENDULUM] if "env =" not in text else []), "--config", str(file)], capsys)
+    assert name in message
+    assert fix in message
 
 
 def test_a_file_that_is_not_there_or_is_two(tmp_path: Path, file: Path) -> None:
@@ -87,9 +87,9 @@ def test_whole_numbers(word: str) -> None:
 
 @pytest.mark.parametrize("word", ["1.5", "1e-3", "inf", "nan", "", "a million", "0x10"])
 def test_what_is_no_whole_number(word: str, capsys: pytest.CaptureFixture[str]) -> None:
-    said = complaint(["train", PENDULUM, f"--total-steps={word}"], capsys)
-    assert "--total-steps" in said
-    assert "is no whole number" in said
+    message = complaint(["train", PENDULUM, f"--total-steps={word}"], capsys)
+    assert "--total-steps" in message
+    assert "is no whole number" in message
 
 
 def test_help_is_short_and_help_all_is_whole(capsys: pytest.CaptureFixture[str]) -> None:

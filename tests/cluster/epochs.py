@@ -33,16 +33,16 @@ def main(path: str, host: str) -> None:
     def bus_of(user: str) -> RedisBus:
         return RedisBus(f"redis://{users.login(user)}{host}:{port}", folder.name)
 
-    bus, found = bus_of(LAUNCHER), {}
+    bus, epochs = bus_of(LAUNCHER), {}
     for actor in bus.actors():
         epoch, ack = bus.current_epoch(f"actor-{actor}"), bus.ack(actor)
         acked = ack.id.epoch if ack else 0
-        found[actor] = {
+        epochs[actor] = {
             "epoch": epoch,
             "acked": acked,
             "refused": acked > 1 and is_refused(bus_of(f"actor-{actor}"), actor, acked - 1),
         }
-    print(json.dumps(found))
+    print(json.dumps(epochs))
 
 
 if __name__ == "__main__":

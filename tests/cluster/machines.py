@@ -131,8 +131,8 @@ class Machine:
 
     def processes(self, pattern: str) -> list[int]:
         """Its processes with such a command line."""
-        found = self.run(f"pgrep -f {shlex.quote(pattern)}", check=False).stdout.split()
-        return [int(word) for word in found]
+        pids = self.run(f"pgrep -f {shlex.quote(pattern)}", check=False).stdout.split()
+        return [int(word) for word in pids]
 
     def wait_until_gone(self, pattern: str, seconds: float) -> None:
         """Until no process has such a command line."""

@@ -85,8 +85,8 @@ class Site:
             "import ray; ray.init(address='auto', logging_level='ERROR', log_to_driver=False); "
             "print('alive', sum(n['Alive'] for n in ray.nodes()))"
         )
-        said = self.head.run(f'{PYTHON}/python -c "{code}"').stdout  # Ray's autoscaler may say something, too
-        return int(next(line for line in said.splitlines() if line.startswith("alive ")).split()[1])
+        output = self.head.run(f'{PYTHON}/python -c "{code}"').stdout  # Ray's autoscaler may say something, too
+        return int(next(line for line in output.splitlines() if line.startswith("alive ")).split()[1])
 
 
 def _replaced(before: dict[str, dict[str, Any]], now: dict[str, dict[str, Any]]) -> list[str]:
@@ -103,8 +103,8 @@ class Run:
 
     def records(self, role: str) -> list[dict[str, Any]]:
         text = self.site.head.run(f"cat {self.folder}/metrics.jsonl", check=False).stdout
-        found = [json.loads(line) for line in text.splitlines() if line.endswith("}")]
-        return [record for record in found if record["role"] == role]
+        records = [json.loads(line) for line in text.splitlines() if line.endswith("}")]
+        return [record for record in records if record["role"] == role]
 
     def newest(self, role: str, name: str, default: Any = 0) -> Any:
         values = [record[name] for record in self.records(role) if name in record]
@@ -113,8 +113,8 @@ class Run:
     def epochs(self) -> dict[str, dict[str, Any]]:
         """Of every actor, and whether Redis refuses an older one's entries (``epochs.py``)."""
         words = f"{PYTHON}/python -P -m tests.cluster.epochs {self.folder} {self.site.head.ip}"
-        found: dict[str, dict[str, Any]] = json.loads(self.site.head.run(words).stdout)
-        return found
+        epochs: dict[str, dict[str, Any]] = json.loads(self.site.head.run(words).stdout)
+        return epochs
 
     def all_have_sent(self) -> bool:
         """Whether of every actor something is acknowledged."""
@@ -168,11 +168,11 @@ class Run:
         assert self.newest("replay", "entry_gaps") == self.newest("replay", "dead_letters") == 0
 
     def stop(self) -> str:
-        said = self.site.head.run(f"{RMC} stop {self.folder}").stdout
+        output = self.site.head.run(f"{RMC} stop {self.folder}").stdout
         self.process.wait(60)
         assert self.process.stdout is not None
         self.process.stdout.close()
-        return said
+        return output
 
 
 @pytest.fixture(autouse=True)
@@ -182,16 +182,16 @@ def leaves_nothing_behind() -> None:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    made = Site(tmp_path_factory.mktemp("site"))
+    site_of_module = Site(tmp_path_factory.mktemp("site"))
     try:
         began = time.monotonic()
         environment = f"{RAY} HOME=/root"
-        up = made.head.run(f"{environment} {RMC} cluster up {made.config}", seconds=180)
+        up = site_of_module.head.run(f"{environment} {RMC} cluster up {site_of_module.config}", seconds=180)
         note(test="up", seconds=time.monotonic() - began)
         assert "3 nodes are up" in up.stdout
-        yield made
+        yield site_of_module
     finally:
-        made.machines.close()
+        site_of_module.machines.close()
 
 
 @pytest.fixture(scope="module")
@@ -205,9 +205,9 @@ def endless(site: Site) -> Run:
 
 def where(run: Run, role: str) -> Machine:
     """The machine whose processes a role's is one of."""
-    found = [machine for machine in run.site.machines.machines if machine.processes(f"rmc.cli.main role {role}")]
-    assert len(found) == 1, (role, [machine.name for machine in found])
-    return found[0]
+    hosts = [machine for machine in run.site.machines.machines if machine.processes(f"rmc.cli.main role {role}")]
+    assert len(hosts) == 1, (role, [machine.name for machine in hosts])
+    return hosts[0]
 
 
 def test_every_node_is_there(site: Site) -> None:
@@ -220,9 +220,9 @@ def test_a_sweeps_runs_are_spread_over_the_machines_and_come_to_the_head(site: S
         "sweep InvertedPendulum-v5 --preset debug --total-steps 1200 --seeds 1-2 --launcher ray --sweep-dir /root/sweep"
     )
     began = time.monotonic()
-    said = site.head.run(f"{RMC} {words}", seconds=400.0).stdout
+    output = site.head.run(f"{RMC} {words}", seconds=400.0).stdout
     note(test="sweep", seconds=time.monotonic() - began)
-    assert "2 of 2: seed " in said
+    assert "2 of 2: seed " in output
     index = [json.loads(line) for line in site.head.run("cat /root/sweep/sweep.jsonl").stdout.splitlines()]
     assert [(line["run"], line["state"], line["env_steps"]) for line in index] == [
         ("seed=1", "finished", 1200),

@@ -34,7 +34,7 @@ def leaves_nothing_behind() -> Iterator[None]:
 
 
 def _left() -> list[str]:
-    found = []
+    results = []
     for process in psutil.process_iter():
         try:
             words = " ".join(process.cmdline())
@@ -45,8 +45,8 @@ def _left() -> list[str]:
             or "gcs_server" in words
             or ("rmc.cli.main" in words and tempfile.gettempdir() in words)
         ):
-            found.append(f"{process.pid} {words[:150]}")
-    return found
+            results.append(f"{process.pid} {words[:150]}")
+    return results
 
 
 def _pids(words: str) -> list[int]:

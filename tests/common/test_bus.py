@@ -192,11 +192,11 @@ def test_a_replaced_learner_cannot_publish(bus):
 
 def piece_lives(bus: RedisBus, kind: str = "weights") -> dict[Version, list[int]]:
     """Seconds until each piece there expires, by version; -1 where it does not."""
-    found: dict[Version, list[int]] = {}
+    received: dict[Version, list[int]] = {}
     for key in bus.redis.scan_iter(match=bus.key(kind, "*")):
         epoch, update, _ = map(int, key.decode().rsplit(":", 3)[1:])
-        found.setdefault(Version(epoch, update), []).append(bus.redis.ttl(key))
-    return found
+        received.setdefault(Version(epoch, update), []).append(bus.redis.ttl(key))
+    return received
 
 
 def test_what_was_published_stays_and_what_was_fenced_expires(redis_url):

@@ -52,9 +52,9 @@ def test_damage_is_found_and_an_older_one_used(tmp_path, damage):
         target.write_bytes(content[:-1] if damage == "truncate" else content)
     with pytest.raises(CheckpointError, match="000000002"):
         folder.load(2)
-    found = folder.latest()
-    assert found is not None
-    assert found[0] == 1
+    checkpoint = folder.latest()
+    assert checkpoint is not None
+    assert checkpoint[0] == 1
 
 
 @pytest.mark.parametrize("next_number", [15, 20, 40])
@@ -65,9 +65,9 @@ def test_after_a_fall_back_damaged_ones_are_not_counted_among_the_kept(tmp_path,
     for number in (20, 30):
         (tmp_path / f"{number:09d}" / "state").write_bytes(b"damaged")
     folder = CheckpointFolder(tmp_path, keep=2)
-    found = folder.latest()
-    assert found is not None
-    assert found[0] == 10
+    checkpoint = folder.latest()
+    assert checkpoint is not None
+    assert checkpoint[0] == 10
     folder.save(next_number, FILES)
     assert folder.numbers() == [10, next_number]
     assert folder.load(next_number) == FILES

@@ -55,6 +55,6 @@ def test_check_train_and_evaluate(tmp_path: Path, capfd: pytest.CaptureFixture[s
     run = ["--preset", "debug", "--total-steps", "1200", "--launcher", "lockstep", "--checkpoint-steps", "1100"]
     assert main.run(["train", WALKER, *run, "--run-dir", str(tmp_path / "run")]) == 0
     assert main.run(["evaluate", str(tmp_path / "run"), "--episodes", "1"]) == 0
-    said = capfd.readouterr()
-    assert "it can be trained on" in said.out
-    assert "GLFW" not in said.err
+    captured = capfd.readouterr()
+    assert "it can be trained on" in captured.out
+    assert "GLFW" not in captured.err

@@ -108,8 +108,10 @@ def test_the_older_way_of_gym_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_close_that_raises_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
     for _ in range(3):
         make_env(habit("CannotClose")).close()
-    (said,) = [record for record in caplog.records if record.levelno == logging.WARNING]
-    assert said.getMessage().startswith("the environment's close raises RuntimeError: already closed (habits.py, line ")
+    (message,) = [record for record in caplog.records if record.levelno == logging.WARNING]
+    assert message.getMessage().startswith(
+        "the environment's close raises RuntimeError: already closed (habits.py, line "
+    )
 
 
 def test_the_innermost_place_in_the_users_file_is_named() -> None:
@@ -137,13 +139,13 @@ def test_keywords_are_typed_and_written_as_they_are_read() -> None:
         "empty=",
         "e=a=b",
     ]
-    found = read_kwargs(words)
-    assert found == {
+    kwargs = read_kwargs(words)
+    assert kwargs == {
         "goal": 1.5, "least": 0.5, "many": 1000, "most": -1000.0, "size": 3, "name": "maze", "at": [0, 1],
         "deep": True, "no": None, "text": "3", "empty": "",
         "e": "a=b",
     }  # fmt: skip
-    assert read_kwargs(write_kwargs(found)) == found
+    assert read_kwargs(write_kwargs(kwargs)) == kwargs
 
 
 @pytest.mark.parametrize(

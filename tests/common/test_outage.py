@@ -16,8 +16,8 @@ def test_once_each(caplog: pytest.LogCaptureFixture) -> None:
         outage.end()
         outage.end()
         outage.begin(OSError("again"))
-    said = [record.getMessage() for record in caplog.records]
-    assert len(said) == 3
-    assert said[0] == "actor-0: waiting for Redis: no answer"
-    assert said[1].startswith("actor-0: Redis is back after ")
-    assert said[2] == "actor-0: waiting for Redis: again"
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 3
+    assert messages[0] == "actor-0: waiting for Redis: no answer"
+    assert messages[1].startswith("actor-0: Redis is back after ")
+    assert messages[2] == "actor-0: waiting for Redis: again"

@@ -20,7 +20,7 @@ from tests.counting_env import CountingEnv
 
 @pytest.fixture(autouse=True)
 def nothing_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ApartCall, "theirs", None)
+    monkeypatch.setattr(ApartCall, "env_state", None)
     monkeypatch.setattr(ApartCall, "changed", {})
 
 
@@ -62,15 +62,15 @@ def test_a_folder_that_is_gone_harms_nobody() -> None:
 
 def test_check_env_names_what_is_changed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main.run(["check-env", "tests.meddling_env:Meddling-v0", "--steps", "50"]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     for words in (
         "note: it changes", "torch's default dtype (torch.float64)", "torch's grad mode (False)",
         "its working folder (/",
         "torch's threads (3)", "numpy's error state", "torch's default device (meta)", "the handlers of signals",
         "the random generators that all share",
     ):  # fmt: skip
-        assert words in said
-    ApartCall.changed, ApartCall.theirs = {}, None
+        assert words in output
+    ApartCall.changed, ApartCall.env_state = {}, None
     main.run(["check-env", "tests.counting_env:Counting-v0", "--steps", "50"])
     assert "it changes" not in capsys.readouterr().out
 

@@ -66,12 +66,12 @@ def server() -> Iterator[RedisServer]:
 
 @pytest.fixture
 def bus(server: RedisServer, run_name: str) -> RedisBus:
-    made = RedisBus(server.url(), re.sub(r"[^\w-]", "-", run_name))
-    made.set_config(b"{}")
-    made.append(0, EntryId(1, 0), b"hello")
-    made.publish_weights(Version(1, 1), b"weights")
-    made.emit("learner", {"updates": 0})
-    return made
+    redis_bus = RedisBus(server.url(), re.sub(r"[^\w-]", "-", run_name))
+    redis_bus.set_config(b"{}")
+    redis_bus.append(0, EntryId(1, 0), b"hello")
+    redis_bus.publish_weights(Version(1, 1), b"weights")
+    redis_bus.emit("learner", {"updates": 0})
+    return redis_bus
 
 
 @contextmanager

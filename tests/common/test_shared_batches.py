@@ -16,19 +16,19 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="Linux")
 
 @pytest.fixture
 def descriptor():
-    made = reserve_memory(shared_bytes(SPEC, BATCH))
-    assert made is not None
-    yield made
-    os.close(made)
+    memory = reserve_memory(shared_bytes(SPEC, BATCH))
+    assert memory is not None
+    yield memory
+    os.close(memory)
 
 
 def test_batches_take_turns_and_are_seen_by_the_other_side(descriptor):
     server, learner = SharedBatches(descriptor, SPEC, BATCH), SharedBatches(descriptor, SPEC, BATCH)
-    said = []
+    replies = []
     for number in range(TURNS):
         server.rows[server.turn]["serial"] = number
-        said.append(server.put(np.full(BATCH, float(number))))
-    for number, one in enumerate(said):
+        replies.append(server.put(np.full(BATCH, float(number))))
+    for number, one in enumerate(replies):
         rows, values = learner.take(one)
         assert (rows["serial"] == number).all()
         assert (values == number).all()
@@ -36,13 +36,13 @@ def test_batches_take_turns_and_are_seen_by_the_other_side(descriptor):
 
 def test_a_torn_batch_and_a_wrong_turn_are_refused(descriptor):
     server, learner = SharedBatches(descriptor, SPEC, BATCH), SharedBatches(descriptor, SPEC, BATCH)
-    said = server.put(np.ones(BATCH))
+    reply = server.put(np.ones(BATCH))
     server.rows[0]["reward"][3, 1] = 5.0
     with pytest.raises(MessageError, match="crc"):
-        learner.take(said)
+        learner.take(reply)
     for turn in (TURNS, -1, "0", None):
         with pytest.raises(MessageError, match="turn"):
-            learner.take({**said, "turn": turn})
+            learner.take({**reply, "turn": turn})
 
 
 def test_nobody_can_cut_it_short(descriptor):

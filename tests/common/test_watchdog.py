@@ -24,8 +24,8 @@ def run(code: str) -> tuple[int, str, float]:
 
 
 def test_a_hanging_call_is_named_and_ends_its_process() -> None:
-    status, said, seconds = run(WATCHED + "with call: time.sleep(50)")
-    assert (status, said) == (HUNG_STATUS, LINE)
+    status, output, seconds = run(WATCHED + "with call: time.sleep(50)")
+    assert (status, output) == (HUNG_STATUS, LINE)
     assert seconds < 30
 
 
@@ -41,10 +41,10 @@ def test_what_was_printed_before_is_not_lost() -> None:
 
 @pytest.mark.parametrize("before", ["", "with call: time.sleep(0.3)\ntime.sleep(0.3)\n"], ids=["at once", "later"])
 def test_one_that_hangs_in_c_with_pythons_lock_leaves_a_traceback(before: str) -> None:
-    status, said, seconds = run(WATCHED + before + STUCK)
+    status, output, seconds = run(WATCHED + before + STUCK)
     assert status == 1
-    assert "Timeout" in said
-    assert "in stuck" in said
+    assert "Timeout" in output
+    assert "in stuck" in output
     assert seconds < 30
 
 
@@ -73,5 +73,5 @@ def test_a_process_that_is_suspended_has_not_hung() -> None:
     assert os.WIFSTOPPED(os.waitpid(process.pid, os.WUNTRACED)[1])
     time.sleep(2.5)
     process.send_signal(signal.SIGCONT)
-    _, said = process.communicate(timeout=30)
-    assert (process.returncode, said) == (0, "")
+    _, output = process.communicate(timeout=30)
+    assert (process.returncode, output) == (0, "")

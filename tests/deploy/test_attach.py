@@ -35,9 +35,9 @@ folder.unlock(int(sys.argv[2]))
 
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
-    made = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
-    made.unlock()
-    return made
+    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    run.unlock()
+    return run
 
 
 def test_a_trainer_is_known_until_it_ends(folder: RunFolder) -> None:

@@ -55,7 +55,7 @@ def test_json_keeps_every_value(rate: float, steps: int, head_input: Any, memory
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "said"),
+    ("path", "value", "message"),
     [
         ("surprise", 1, "no such option"),
         ("agent.surprise", 1, "no such option"),
@@ -69,11 +69,11 @@ def test_json_keeps_every_value(rate: float, steps: int, head_input: Any, memory
         ("env", 5, "must be an object"),
     ],
 )
-def test_strange_json_is_refused(path: str, value: Any, said: str) -> None:
+def test_strange_json_is_refused(path: str, value: Any, message: str) -> None:
     raw = json.loads(to_json(robust(ENV)))
     parent, _, name = path.rpartition(".")
     (raw[parent] if parent else raw)[name] = value
-    with pytest.raises(ConfigError, match=said) as caught:
+    with pytest.raises(ConfigError, match=message) as caught:
         from_json(json.dumps(raw))
     assert path.split(".")[0] in str(caught.value)
 

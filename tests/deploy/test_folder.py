@@ -60,8 +60,8 @@ def test_it_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: p
         synchronised.append((Path(f"/proc/self/fd/{handle}").read_bytes(), (tmp_path / "secret").exists()))
 
     monkeypatch.setattr(os, "fsync", watched)
-    found = RunFolder(tmp_path).secret()
-    assert synchronised == [(found + b"\n", False)]
+    secret = RunFolder(tmp_path).secret()
+    assert synchronised == [(secret + b"\n", False)]
 
 
 def test_a_full_disk_leaves_none(tmp_path: Path) -> None:
@@ -155,8 +155,8 @@ def test_a_folder_that_turns_read_only_is_waited_for(
         written.result(5.0)
     monitor.watch(MemoryBus())
     assert folder.result_file.exists()
-    said = [message.partition("run ")[2] for message in caplog.messages]
-    assert said == ["is read-only: training goes on, its end waits", "can be written again"]
+    messages = [message.partition("run ")[2] for message in caplog.messages]
+    assert messages == ["is read-only: training goes on, its end waits", "can be written again"]
     monitor.close()
     folder.unlock()
 
@@ -220,10 +220,10 @@ def test_odd_files_are_named_in_one_line(
         (tmp_path / name).write_text(text)
     for command in commands:
         assert run([*command, str(tmp_path)]) == 2
-        said = capsys.readouterr()
-        assert (said.out, said.err.count("\n")) == ("", 1)
-        assert fault in said.err
-        assert str(tmp_path) in said.err
+        captured = capsys.readouterr()
+        assert (captured.out, captured.err.count("\n")) == ("", 1)
+        assert fault in captured.err
+        assert str(tmp_path) in captured.err
 
 
 def test_a_baseline_is_not_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -244,7 +244,9 @@ def test_a_newer_damaged_checkpoint_is_told_where_the_run_goes_on(
     for update in (20, 30):
         (checkpoints.path(update) / "state").write_bytes(b"y")
     open_run(config, tmp_path / "run", "resume").unlock()
-    said = [record.getMessage() for record in caplog.records]
-    assert len(said) == 2
-    assert all("does not match its manifest; the run goes on from the checkpoint of update 10" in text for text in said)
-    assert "000000030" in said[0]
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 2
+    assert all(
+        "does not match its manifest; the run goes on from the checkpoint of update 10" in text for text in messages
+    )
+    assert "000000030" in messages[0]

@@ -38,37 +38,19 @@ def fork(shared: ForkServer, log: Path, *words: str, **environment: str) -> Fork
         return shared.fork(words, environment, file.fileno())
 
 
+def fork_actor(shared: ForkServer, log: Path, index: str, **environment: str) -> ForkedProcess:
+    return fork(shared, log, "role", "actor", "--run", "x", "--index", index, **environment)
+
+
 def test_it_is_rmc_with_its_words(shared: ForkServer, tmp_path: Path) -> None:
-    role = fork(
-        shared,
-        tmp_path / "log",
-        "role",
-        "actor",
-        "--run",
-        "x",
-        "--index",
-        "0",
-        RMC_REDIS_URL="unix:///nowhere",
-        RMC_PATIENCE="0",
-    )
+    role = fork_actor(shared, tmp_path / "log", "0", RMC_REDIS_URL="unix:///nowhere", RMC_PATIENCE="0")
     assert role.wait(20) == 2
     assert "--redis-url='unix:///nowhere'" in (tmp_path / "log").read_text()
     assert role.poll() == 2  # it is still known
 
 
 def test_it_leads_a_group_has_its_title_and_dies_of_a_signal(shared: ForkServer, tmp_path: Path) -> None:
-    role = fork(
-        shared,
-        tmp_path / "log",
-        "role",
-        "actor",
-        "--run",
-        "x",
-        "--index",
-        "7",
-        RMC_REDIS_URL="unix:///a",
-        RMC_PATIENCE="99",
-    )
+    role = fork_actor(shared, tmp_path / "log", "7", RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99")
     assert os.getpgid(role.pid) == role.pid
     assert role.poll() is None
     with pytest.raises(subprocess.TimeoutExpired):
@@ -151,13 +133,13 @@ for _ in range(2):
 
 
 def test_forks_do_not_draw_the_same_numbers() -> None:
-    said = subprocess.run([sys.executable, "-c", FORKS_THAT_DRAW], capture_output=True, text=True, check=True).stdout
-    first, second = map(float, said.split())
+    output = subprocess.run([sys.executable, "-c", FORKS_THAT_DRAW], capture_output=True, text=True, check=True).stdout
+    first, second = map(float, output.split())
     assert first != second
 
 
 def test_what_its_roles_import_is_there_before_it_forks() -> None:
     """Else each role has a copy of its own: some 100 MB, and seconds at every start."""
     ask = "import sys; from rmc.cli import fork_server as one; one._import_all(); print(*sys.modules)"
-    said = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True).stdout
-    assert "rmc.actors.actor" in said.split()
+    output = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True).stdout
+    assert "rmc.actors.actor" in output.split()

@@ -26,17 +26,8 @@ from rmc.deploy.run.presets import debug
 @pytest.fixture
 def server() -> Iterator[RedisServer]:
     """A Redis of its own, in a short folder."""
-    with tempfile.TemporaryDirectory() as folder, RedisServer(Path(folder)) as made:
-        yield made
-
-
-@pytest.fixture
-def handlers() -> Iterator[None]:
-    """Those of this process are back afterwards."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+    with tempfile.TemporaryDirectory() as folder, RedisServer(Path(folder)) as redis_server:
+        yield redis_server
 
 
 @pytest.fixture
@@ -80,10 +71,10 @@ def test_that_it_has_finished_is_said_once_redis_is_back(
 @pytest.mark.usefixtures("handlers")
 def test_where_redis_stays_away_it_ends_when_it_is_told_to(place: RunConnection, tmp_path: Path) -> None:
     began = time.monotonic()
-    told = threading.Timer(2.0, signal.raise_signal, (signal.SIGTERM,))
-    told.start()
+    timer = threading.Timer(2.0, signal.raise_signal, (signal.SIGTERM,))
+    timer.start()
     try:
         run_learner(place, tmp_path / "checkpoints", "cpu")
     finally:
-        told.cancel()
+        timer.cancel()
     assert time.monotonic() - began > 1.9

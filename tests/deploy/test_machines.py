@@ -56,19 +56,19 @@ def test_every_cloud_machine_says_its_image(config: dict[str, Any]) -> None:
 
 
 def test_the_nodes_that_there_must_be() -> None:
-    found = {path.stem: machines.expected_nodes(machines.read(path)) for path in FILES}
-    assert found == {"aws": 3, "gcp": 3, "on-premise": 3}
+    nodes = {path.stem: machines.expected_nodes(machines.read(path)) for path in FILES}
+    assert nodes == {"aws": 3, "gcp": 3, "on-premise": 3}
 
 
 def test_a_file_that_is_none_is_named(tmp_path: Path) -> None:
     odd = tmp_path / "odd.yaml"
-    for text, said in [
+    for text, message in [
         ("[1, 2]", "is no Ray cluster's file"),
         ("a: [", "cannot be read"),
         ("provider: 3", "is no Ray"),
     ]:
         odd.write_text(text)
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=message):
             machines.read(odd)
     with pytest.raises(ConfigError, match="cannot be read"):
         machines.read(tmp_path / "absent.yaml")

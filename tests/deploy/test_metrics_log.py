@@ -22,9 +22,9 @@ from rmc.deploy.run.presets import debug
 
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
-    made = open_run(debug(EnvConfig("Pendulum-v1")), tmp_path / "run", "fail")
-    made.unlock()
-    return made
+    run = open_run(debug(EnvConfig("Pendulum-v1")), tmp_path / "run", "fail")
+    run.unlock()
+    return run
 
 
 def lines(folder: RunFolder) -> list[int]:
@@ -46,10 +46,10 @@ def test_a_full_disk_is_told_once_and_over_once(
         kept.write({"role": "learner", "x": 4}, 0, {})
     kept.close()
     assert lines(folder) == [1, 4]
-    said = [record.getMessage() for record in caplog.records]
-    assert len(said) == 2
-    assert "is not written" in said[0]
-    assert "is written again" in said[1]
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 2
+    assert "is not written" in messages[0]
+    assert "is written again" in messages[1]
     assert len(list(folder.path.glob("events.*"))) == 1  # which goes on, too
 
 
@@ -85,5 +85,5 @@ def test_a_torn_line_costs_no_record_after_it(folder: RunFolder, torn: str) -> N
     os.truncate(folder.metrics, folder.metrics.stat().st_size - 5)  # and while the run goes on
     kept.write({"role": "learner", "x": 4}, 0, {})
     kept.close()
-    assert [found["x"] for found in folder.records()] == [1, 2, 4][not torn.startswith('{"role": "learner"') :]
+    assert [record["x"] for record in folder.records()] == [1, 2, 4][not torn.startswith('{"role": "learner"') :]
     assert b"\n\n" not in folder.metrics.read_bytes()

@@ -64,10 +64,10 @@ def test_of_a_long_file_only_evaluations_and_its_end_are_parsed(
     evaluations, size = long_file(path, 211_000)
     assert size > 200e6
     tail = MetricsTail(path)
-    found = tail.take()
+    records = tail.take()
     assert sum(parsed) < metrics_tail.RECENT_BYTES + 100 * len(evaluations)
-    assert [record for record in found if record["role"] == "evaluator"] == evaluations
-    assert found[-1]["updates"] == 210_999
+    assert [record for record in records if record["role"] == "evaluator"] == evaluations
+    assert records[-1]["updates"] == 210_999
     assert tail.take() == []
 
 
@@ -81,5 +81,5 @@ def test_wherever_the_end_begins_each_evaluation_comes_once(tmp_path: Path) -> N
             evaluations.append({"role": "evaluator", "eval_return_mean": number})
             file.write(json.dumps(evaluations[-1]).encode() + b"\n")
     for recent in [*range(200), 10**9]:
-        found = MetricsTail(path, recent).take()
-        assert [record for record in found if record["role"] == "evaluator"] == evaluations, recent
+        records = MetricsTail(path, recent).take()
+        assert [record for record in records if record["role"] == "evaluator"] == evaluations, recent

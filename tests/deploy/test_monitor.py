@@ -71,18 +71,18 @@ def test_any_number_is_shown(monitor: Monitor, value: float) -> None:
     for role in ROLES:
         bus.emit(role, {"waiting_for": "credit", **dict.fromkeys(NAMES, value)})
     monitor.watch(bus)
-    assert any(said in line(monitor.board) for said in ("credit", "silent")) or not value > 0.5
+    assert any(text in line(monitor.board) for text in ("credit", "silent")) or not value > 0.5
     Console(quiet=True).print(table(monitor.board, 80))
     monitor.close()
 
 
 @pytest.mark.parametrize(
-    ("said", "shown"),
+    ("counter", "shown"),
     [(2**53, 2**53), (2**53 + 1, 2**53 + 1), (1e300, 2**63 - 1), (1.5, 1), (-1, 0), (math.nan, 0), (math.inf, 0)],
 )
-def test_steps_beyond_what_a_float_counts_are_shown(monitor: Monitor, said: float, shown: int) -> None:
-    monitor.take({"role": "replay", "env_steps": said})
-    monitor.take({"role": "learner", "checkpoint_update": 3, "checkpoint_env_steps": said})
+def test_steps_beyond_what_a_float_counts_are_shown(monitor: Monitor, counter: float, shown: int) -> None:
+    monitor.take({"role": "replay", "env_steps": counter})
+    monitor.take({"role": "learner", "checkpoint_update": 3, "checkpoint_env_steps": counter})
     assert monitor.board.env_steps == shown
     assert monitor.board.checkpoint_steps(3) == (shown or None)
     assert f"{shown:,} of " in line(monitor.board)
@@ -104,8 +104,8 @@ def test_whatever_a_role_leaves_out_the_run_goes_on(monitor: Monitor, tmp_path: 
     bus, chance = MemoryBus(), random.Random(seed)
     for count in (0, chance.randrange(len(NAMES))):
         for role in ROLES:
-            found = {name: chance.choice(NUMBERS) for name in [NAMES[seed], *chance.sample(NAMES, count)]}
-            bus.emit(role, decode_record(encode_record(found)))
+            record = {name: chance.choice(NUMBERS) for name in [NAMES[seed], *chance.sample(NAMES, count)]}
+            bus.emit(role, decode_record(encode_record(record)))
         monitor.watch(bus)
         assert line(monitor.board)
         Console(quiet=True).print(table(monitor.board, 80))
@@ -117,11 +117,11 @@ def test_whatever_a_role_leaves_out_the_run_goes_on(monitor: Monitor, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    "said", [{"eval_update": 3}, {"eval_return_mean": 1e9}, {"eval_update": 3, "eval_return_mean": math.inf}]
+    "record", [{"eval_update": 3}, {"eval_return_mean": 1e9}, {"eval_update": 3, "eval_return_mean": math.inf}]
 )
-def test_half_of_an_evaluation_is_none(monitor: Monitor, said: dict[str, float]) -> None:
+def test_half_of_an_evaluation_is_none(monitor: Monitor, record: dict[str, float]) -> None:
     monitor._checkpoints.save(3, {})
-    monitor.take({"role": "evaluator", **said})
+    monitor.take({"role": "evaluator", **record})
     assert monitor._checkpoints.best() is None
     monitor.take({"role": "evaluator", "eval_update": 3, "eval_return_mean": 1})
     assert monitor._checkpoints.best() == 3
@@ -141,8 +141,8 @@ def test_each_role_speaks_for_itself_only(monitor: Monitor, tmp_path: Path) -> N
 
 
 def test_an_evaluation_stands_where_its_checkpoint_was(monitor: Monitor, tmp_path: Path) -> None:
-    def says(role: str, **said: float) -> None:
-        bus.emit(role, {"time": 1.0, **said})
+    def says(role: str, **metrics: float) -> None:
+        bus.emit(role, {"time": 1.0, **metrics})
         monitor.watch(bus)
 
     bus = MemoryBus()
@@ -175,8 +175,8 @@ def test_tensorboard_has_the_main_metrics_and_the_options_under_the_runs_name(
         "waiting_share_learner": 0.25, "waiting_share_actors": 0.75, "q_loss": 0.5,
     }  # fmt: skip
     assert min(main).startswith("Main/")  # as TensorBoard sorts
-    told = shown.SummaryMetadata("run", "_hparams_/session_start_info").plugin_data.content
-    hparams = HParamsPluginData.FromString(told).session_start_info.hparams
+    content = shown.SummaryMetadata("run", "_hparams_/session_start_info").plugin_data.content
+    hparams = HParamsPluginData.FromString(content).session_start_info.hparams
     assert hparams["update.gamma"].number_value == config.update.gamma
     assert hparams["env.id"].string_value == "Pendulum-v1"
     experiment = HParamsPluginData.FromString(shown.SummaryMetadata("run", "_hparams_/experiment").plugin_data.content)
@@ -197,8 +197,8 @@ def test_evaluations_of_earlier_starts_are_known(config: RunConfig, tmp_path: Pa
     folder = open_run(config, tmp_path / "run", "fail")
     folder.unlock()
     scores = (3.0, 9.0, 5.0)
-    said = [{"role": "evaluator", "time": 1.0, "eval_return_mean": score, "eval_update": 3} for score in scores]
-    folder.metrics.write_text("".join(json.dumps(record) + "\n" for record in said))
+    evaluations = [{"role": "evaluator", "time": 1.0, "eval_return_mean": score, "eval_update": 3} for score in scores]
+    folder.metrics.write_text("".join(json.dumps(record) + "\n" for record in evaluations))
     monitor = Monitor(folder, config, Console(quiet=True))
     assert "eval 5 (best 9)" in line(monitor.board)
     assert "evaluator" not in monitor.board.roles  # it has not spoken in this start
@@ -224,7 +224,7 @@ def test_evaluations_that_found_no_room_are_marked_when_there_is_some(
     for update, score in ((10, 1.0), (20, 3.0), (30, 2.0)):
         monkeypatch.setattr(monitor._checkpoints, "mark_best", full)
         monitor.take({"role": "evaluator", "eval_update": update, "eval_return_mean": score})
-    monkeypatch.setattr(monitor._checkpoints, "mark_best", lambda *found: marked.append(found))
+    monkeypatch.setattr(monitor._checkpoints, "mark_best", lambda *arguments: marked.append(arguments))
     for _ in range(2):
         monitor.take({"role": "learner", "updates": 30})
     assert marked == [(10, 1.0), (20, 3.0), (30, 2.0)]
@@ -239,7 +239,7 @@ def shown(board: RunStatus) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("role", "said", "heading", "text"),
+    ("role", "metrics", "heading", "text"),
     [
         ("replay-0", {"damaged_windows": 8}, "damaged", "8 windows of the ring"),
         ("learner", {"damaged_checkpoints": 2}, "damaged", "2 newer checkpoints"),
@@ -251,10 +251,10 @@ def shown(board: RunStatus) -> list[str]:
     ],
 )
 def test_what_is_not_as_it_should_be_is_shown(
-    monitor: Monitor, role: str, said: dict[str, Any], heading: str, text: str
+    monitor: Monitor, role: str, metrics: dict[str, Any], heading: str, text: str
 ) -> None:
     for sound in (False, True):
-        record = dict.fromkeys(said, type(next(iter(said.values())))()) if sound else said
+        record = dict.fromkeys(metrics, type(next(iter(metrics.values())))()) if sound else metrics
         monitor.board.take({"role": role, **record})
         for text_of in shown(monitor.board):
             assert (heading in text_of and text in text_of) is not sound
@@ -335,5 +335,5 @@ def test_a_redis_that_stands_still_is_said_while_it_lasts_and_frames_go_on(
         time.sleep(0.3)
         assert "silent" not in printed.getvalue().splitlines()[-1]
         monitor.close()
-    away = [found["redis_away_s"] > 0 for found in folder.records() if "redis_away_s" in found]
+    away = [record["redis_away_s"] > 0 for record in folder.records() if "redis_away_s" in record]
     assert away == [False, True, False, False]  # each change is noted at once, for those who watch the file

@@ -48,8 +48,8 @@ def test_every_option_may_change_or_is_refused_with_the_reason(path: str, tmp_pa
         assert folder.config() == changed
         assert starts(folder)[-1].changes == {path: [was, flat(changed)[path]]}
     else:
-        said = r": the run in .*run has .*, and .+; use that, or another --run-dir"
-        with pytest.raises(ConfigError, match=said) as no:
+        message = r": the run in .*run has .*, and .+; use that, or another --run-dir"
+        with pytest.raises(ConfigError, match=message) as no:
             open_run(changed, folder.path, "resume")
         assert repr(flat(changed)[path]) in str(no.value)
         assert folder.config() == CONFIG

@@ -18,7 +18,7 @@ OTHERS = ([1], {"replay": 5}, {"replay": {}}, {"another": b"x"}, {None: b"x"})
 DAMAGED = {
     "two bits": WHOLE[:30] + bytes([WHOLE[30] ^ 0x40]) + WHOLE[31:-9] + bytes([WHOLE[-9] ^ 1]) + WHOLE[-8:],
     "empty": b"", "cut": WHOLE[:-3], "zeros": bytes(len(WHOLE)), "doubled": WHOLE * 2, "no msgpack": b"\xc1",
-    **{str(found): msgpack.packb(found) for found in OTHERS},
+    **{str(other): msgpack.packb(other) for other in OTHERS},
 }  # fmt: skip
 
 

@@ -216,8 +216,8 @@ def test_passwords_are_nowhere_to_be_read(tmp_path: Path) -> None:
     with tempfile.TemporaryDirectory() as name, RedisServer(folder := Path(name), port=port, users=USERS) as server:
         RedisBus(server.network_url("actor-0"), USERS.run).ping()
         assert server.process is not None
-        said = Path(f"/proc/{server.process.pid}/cmdline").read_text() + repr(USERS)
-        said += "".join(file.read_text() for file in folder.iterdir() if not file.is_socket())
+        visible = Path(f"/proc/{server.process.pid}/cmdline").read_text() + repr(USERS)
+        visible += "".join(file.read_text() for file in folder.iterdir() if not file.is_socket())
         assert stat.S_IMODE((folder / "users.acl").stat().st_mode) == 0o600
-        assert not [user for user in ROLES if USERS.password(user) in said]
-        assert SECRET.decode() not in said
+        assert not [user for user in ROLES if USERS.password(user) in visible]
+        assert SECRET.decode() not in visible

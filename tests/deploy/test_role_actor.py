@@ -28,10 +28,10 @@ def _own_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.fixture
 def ends(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """With what status hosts have ended themselves."""
-    found: list[int] = []
-    monkeypatch.setattr(role_actor.os, "_exit", found.append)
+    pids: list[int] = []
+    monkeypatch.setattr(role_actor.os, "_exit", pids.append)
     monkeypatch.setattr(role_actor, "LAST_WORDS_SECONDS", 0.0)
-    return found
+    return pids
 
 
 ENDS = "#!/bin/sh\ntrap 'exit 0' TERM\nwhile :; do sleep 0.05; done\n"
@@ -40,11 +40,11 @@ ENDS = "#!/bin/sh\ntrap 'exit 0' TERM\nwhile :; do sleep 0.05; done\n"
 @pytest.fixture
 def program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """In a role's place: it ends in order when it is told to."""
-    made = tmp_path / "program"
-    made.write_text(ENDS)
-    made.chmod(0o700)
-    monkeypatch.setattr(supervisor.sys, "executable", str(made))
-    return made
+    path = tmp_path / "program"
+    path.write_text(ENDS)
+    path.chmod(0o700)
+    monkeypatch.setattr(supervisor.sys, "executable", str(path))
+    return path
 
 
 @pytest.fixture
@@ -60,10 +60,10 @@ def host(program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
         return ended
 
     monkeypatch.setattr(supervisor.RoleProcess, "reap", slow_for_watchers)
-    made = RoleActor(Task("test-run", RoleCommand("replay", ("replay",)), {}, {}, str(tmp_path)))
-    yield made
-    made.close()
-    made.clear()
+    actor = RoleActor(Task("test-run", RoleCommand("replay", ("replay",)), {}, {}, str(tmp_path)))
+    yield actor
+    actor.close()
+    actor.clear()
 
 
 def wait_for(watched: list[int], seconds: float) -> list[int]:
@@ -103,11 +103,11 @@ class Learner(LearnerActor):
 def test_a_learner_that_saves_for_long_is_not_killed(
     program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    said = tmp_path / "said"
-    program.write_text(ENDS.replace("exit 0", f"sleep 1.5; echo saved >> {said}; exit 0"))
+    log = tmp_path / "said"
+    program.write_text(ENDS.replace("exit 0", f"sleep 1.5; echo saved >> {log}; exit 0"))
     monkeypatch.setattr(role_actor, "STOP_SECONDS", 0.5)
     host = Learner(Task("test-run", RoleCommand("learner", ("learner",)), {}, {}, str(tmp_path)))
     time.sleep(0.5)
     host.close()
     host.clear()
-    assert said.read_text() == "saved\n"
+    assert log.read_text() == "saved\n"

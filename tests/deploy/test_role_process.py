@@ -1,6 +1,5 @@
 """How a role finds its run, and waits for a Redis that is away or full."""
 
-import signal
 import subprocess
 import sys
 import tempfile
@@ -41,17 +40,8 @@ def test_a_role_waits_for_a_redis_that_is_coming_back(short: Path, caplog: pytes
         time.sleep(0.7)
         with server:
             waiting.result().ping()
-    (said,) = caplog.messages
-    assert said.startswith(f"waiting up to 20 s for the Redis at unix://{short}/redis.sock: ")
-
-
-@pytest.fixture
-def handlers() -> Iterator[None]:
-    """Those of this process are back afterwards."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+    (message,) = caplog.messages
+    assert message.startswith(f"waiting up to 20 s for the Redis at unix://{short}/redis.sock: ")
 
 
 @pytest.mark.usefixtures("handlers")

@@ -40,9 +40,9 @@ def test_a_run_with_a_result_is_finished(folder: RunFolder) -> None:
 
 def test_one_whose_launcher_was_killed_is_lost(folder: RunFolder) -> None:
     lock = folder.path / ".lock"
-    said = lock.read_text()
+    text = lock.read_text()
     folder.unlock()
-    lock.write_text(said)
+    lock.write_text(text)
     assert run_state(folder) == "lost"
 
 

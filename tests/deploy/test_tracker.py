@@ -35,9 +35,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
     monkeypatch.setenv("WANDB_BASE_URL", CLOSED)
     monkeypatch.setenv("HOME", str(tmp_path))  # where a login would be
     monkeypatch.delenv("WANDB_API_KEY", raising=False)
-    made = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "first", "fail")
-    made.unlock()
-    return made
+    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "first", "fail")
+    run.unlock()
+    return run
 
 
 def started(folder: RunFolder, name: Any) -> Tracker:
@@ -116,11 +116,11 @@ def test_trackio_has_the_run_over_its_starts(
     store.close()
     assert {row[0] for row in rows} == {"first-0123abcd"}
     assert len({row[1] for row in rows}) == 1
-    found = [(step, json.loads(metrics)) for *_, step, metrics in rows]
-    returns = [(step, one["Main/evaluation_return"]) for step, one in found if "Main/evaluation_return" in one]
+    logged = [(step, json.loads(metrics)) for *_, step, metrics in rows]
+    returns = [(step, one["Main/evaluation_return"]) for step, one in logged if "Main/evaluation_return" in one]
     assert returns == [(700, 7.0), (1500, 15.0)]
-    assert [one["Main/q_loss"] for _, one in found if "Main/q_loss" in one] == [0.5, 0.5]
-    step, last = found[-1]
+    assert [one["Main/q_loss"] for _, one in logged if "Main/q_loss" in one] == [0.5, 0.5]
+    step, last = logged[-1]
     assert (step, last["result/eval_return_mean"], last["video"]["_type"]) == (1500, 11.5, "trackio.video")
     assert (tmp_path / "trackio" / "media" / last["video"]["file_path"]).stat().st_size > 100
     about = json.loads(config)
@@ -137,9 +137,9 @@ def test_without_login_or_network_wandb_is_recorded_offline_and_that_is_said_onc
     tracker = started(folder, "wandb")
     trained(folder, 700, 7.0)
     tracker.close(RESULT)
-    (said,) = caplog.messages
-    assert said.startswith("wandb: ")
-    assert said.endswith(f"; recorded offline, and wandb sync {folder.path}/wandb/offline-run-* sends it")
+    (message,) = caplog.messages
+    assert message.startswith("wandb: ")
+    assert message.endswith(f"; recorded offline, and wandb sync {folder.path}/wandb/offline-run-* sends it")
     (records,) = wandb_file.records(folder.path)
     assert any(row.get("Main/evaluation_return") == 7.0 for row in wandb_file.rows(records))
 
@@ -152,7 +152,7 @@ def test_a_disk_that_takes_nothing_is_said_and_the_run_goes_on(
     trained(folder, 700, 7.0)
     tracker.close(RESULT)
     assert caplog.messages
-    assert all(said.startswith("trackio: ") for said in caplog.messages)
+    assert all(message.startswith("trackio: ") for message in caplog.messages)
     assert len(caplog.messages) == 1
 
 
@@ -163,8 +163,8 @@ def test_one_that_dies_is_said_once(folder: RunFolder, caplog: pytest.LogCapture
     for _ in range(3):
         tracker.look()
     tracker.close(RESULT)
-    (said,) = caplog.messages
-    assert "its process has ended; the run goes on without it" in said
+    (message,) = caplog.messages
+    assert "its process has ended; the run goes on without it" in message
 
 
 def test_one_that_hangs_is_not_waited_for(
@@ -180,8 +180,8 @@ def test_one_that_hangs_is_not_waited_for(
     tracker.close(RESULT)
     assert time.monotonic() - began < 5.0
     assert tracker._process.poll() is not None
-    (said,) = caplog.messages
-    assert "not all has arrived within" in said
+    (message,) = caplog.messages
+    assert "not all has arrived within" in message
 
 
 def test_one_whose_launcher_was_killed_ends_by_itself(folder: RunFolder) -> None:

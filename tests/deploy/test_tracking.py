@@ -18,9 +18,9 @@ from rmc.deploy.run.tracking import PROJECT, Tracking, choose_tracking, keep_tra
 
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
-    made = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
-    made.unlock()
-    return made
+    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    run.unlock()
+    return run
 
 
 def chosen(folder: RunFolder, **options: Any) -> Tracking | None:

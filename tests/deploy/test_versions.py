@@ -127,18 +127,18 @@ def test_it_goes_on_with_ring_checkpoint_and_counters(old: RunFolder, capsys: py
 
 
 @pytest.mark.parametrize(
-    ("format_", "said"),
+    ("format_", "message"),
     [(FORMAT + 1, f"newer version of RMC, this one reads up to {FORMAT}"), ("2", "a number from 1"), (0, "from 1")],
 )
 def test_a_format_that_is_none_of_ours_is_one_line(
-    format_: object, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    format_: object, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     raw = json.loads(to_json(debug(EnvConfig("InvertedPendulum-v5")))) | {"format": format_, "surprise": 1}
     (tmp_path / "config.json").write_text(json.dumps(raw))
     for words in (["stats"], ["evaluate"], ["plot"], ["resume"], ["train", "--run-dir"]):
         assert main.run([*words, str(tmp_path)]) == 2
         line = capsys.readouterr().err
-        assert said in line
+        assert message in line
         assert line.startswith(f"rmc: RUN='{tmp_path}': config.json format={format_!r}: ")
         assert line.count("\n") == 1
 

@@ -88,21 +88,21 @@ def test_the_first_published_weights_are_the_sources(parts: InitParts, source: R
 def test_what_is_not_taken_is_the_runs_own(parts: InitParts, source: RunFolder, tmp_path: Path) -> None:
     plain = Lockstep(OTHER, tmp_path / "plain")
     ours, theirs = plain.learner.update.state_dict(), state(source)
-    made = state(begin(OTHER, tmp_path / "run", source, parts))
+    begun = state(begin(OTHER, tmp_path / "run", source, parts))
     predicts = ("normalizer.", "memory.", "world_model.")
     taken = {"all": ("",), "policy": POLICY_PARTS, "memory+world-model": predicts}[parts]
-    for name, value in made["agent"].items():
+    for name, value in begun["agent"].items():
         expected = theirs if name.startswith(taken) else ours
         assert torch.equal(value, expected["agent"][name]), name
     for part, module in (("target_critic", "critic"), ("target_memory", "memory")):
-        for name, value in made[part].items():
+        for name, value in begun[part].items():
             from_source = parts == "all" and part == "target_critic"  # not all runs move a target memory
-            told = theirs[part][name] if from_source else made["agent"][f"{module}.{name}"]
-            assert torch.equal(value, told), name
-    for name, value in made["average"].items():
-        expected = theirs["average"] if name.startswith(taken) else made["agent"]
+            expected_value = theirs[part][name] if from_source else begun["agent"][f"{module}.{name}"]
+            assert torch.equal(value, expected_value), name
+    for name, value in begun["average"].items():
+        expected = theirs["average"] if name.startswith(taken) else begun["agent"]
         assert torch.equal(value, expected[name]), name
-    assert all(not optimizer["state"] for optimizer in made["optimizers"])  # they begin anew
+    assert all(not optimizer["state"] for optimizer in begun["optimizers"])  # they begin anew
     plain.close()
 
 
@@ -135,7 +135,7 @@ def test_a_numbered_checkpoint_and_the_history(source: RunFolder, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("config", "which", "said"),
+    ("config", "which", "message"),
     [
         (with_value(OTHER, "agent.hidden", 16), "", "that run has --hidden 8, this one has 16; use the same"),
         (with_value(OTHER, "agent.heads", (8, 9)), "", r"that run has --heads \(8, 8\), this one has \(8, 9\)"),
@@ -146,9 +146,9 @@ def test_a_numbered_checkpoint_and_the_history(source: RunFolder, tmp_path: Path
     ],
 )
 def test_what_does_not_fit_is_one_line_and_leaves_no_folder(
-    config: RunConfig, which: str, said: str, source: RunFolder, tmp_path: Path
+    config: RunConfig, which: str, message: str, source: RunFolder, tmp_path: Path
 ) -> None:
-    with pytest.raises(ConfigError, match=rf"^--init-from='{source.path}{which}': .*{said}") as no:
+    with pytest.raises(ConfigError, match=rf"^--init-from='{source.path}{which}': .*{message}") as no:
         begin(config, tmp_path / "run", source, which=which)
     assert "\n" not in str(no.value)
     assert not (tmp_path / "run").exists()
@@ -163,8 +163,8 @@ def test_a_state_that_is_cut_is_one_line(source: RunFolder, tmp_path: Path) -> N
     copied.unlock()
     progress = json.dumps({"updates": 5, "env_steps": 50}).encode()
     CheckpointFolder(copied.checkpoints).save(5, {"learner.pt": b"PK", "progress.json": progress})
-    said = r"--init-from='.*copied': its checkpoint 5 cannot be used \(.+\); use another"
-    with pytest.raises(ConfigError, match=said):
+    message = r"--init-from='.*copied': its checkpoint 5 cannot be used \(.+\); use another"
+    with pytest.raises(ConfigError, match=message):
         begin(OTHER, tmp_path / "run", copied)
     assert not (tmp_path / "run").exists()
 

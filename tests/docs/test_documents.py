@@ -48,16 +48,16 @@ def test_every_equation_leads_to_its_code_and_back() -> None:
     for row in table.splitlines()[2:]:
         equations, _, code, *_ = (cell for cell in re.split(r"(?<!\\)\|", row)[1:])
         numbers = re.findall(r"\d+", equations) if "eq" in equations else []
-        module, said = losses, []
+        module, docstrings = losses, []
         for name in re.findall(r"`([\w.]+)`", code):
             if "." in name and name.split(".")[0] in modules:
                 module, name = modules[name.split(".")[0]], name.split(".")[1]
             if numbers:
-                said.append(getattr(module, name).__doc__)
+                docstrings.append(getattr(module, name).__doc__)
             elif "/" not in name and "." not in name:
                 assert hasattr(module, name), name
-        assert all(any(f"Eq. {number}:" in text for text in said) for number in numbers), row
-        assert all(any(f"Eq. {number}:" in text for number in numbers) for text in said), row
+        assert all(any(f"Eq. {number}:" in text for text in docstrings) for number in numbers), row
+        assert all(any(f"Eq. {number}:" in text for number in numbers) for text in docstrings), row
         seen.update(map(int, numbers))
     assert seen == {6, 7, 8, 9, 10, 11, 12}
 
@@ -106,17 +106,17 @@ def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Pat
     (tmp_path / "shuttle.py").write_text(code)
     commands = re.findall(r"^rmc .*$", page, re.MULTILINE)
     assert [command.split()[1] for command in commands] == ["check-env", "train", "evaluate"]
-    said = []
+    names = []
     for command in commands:
         shorter = ["--preset", "debug", "--total-steps", "1500"] * command.startswith("rmc train")
         words = [sys.executable, "-m", "rmc.cli.main", *command.split()[1:], *shorter]
         done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=280)
         assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
-        said.append(done.stdout)
-    assert "time limit 100" in said[0]
-    assert said[0].endswith("it can be trained on\n")
-    assert "note" not in said[0]
-    assert "shuttle.mp4: an episode with return" in said[2]
+        names.append(done.stdout)
+    assert "time limit 100" in names[0]
+    assert names[0].endswith("it can be trained on\n")
+    assert "note" not in names[0]
+    assert "shuttle.mp4: an episode with return" in names[2]
     assert (tmp_path / "shuttle.mp4").stat().st_size > 1000
 
 

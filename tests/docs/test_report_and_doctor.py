@@ -28,13 +28,13 @@ def test_their_commands_run(tmp_path: Path) -> None:
     shutil.copytree(tmp_path / "runs" / "first", tmp_path / "runs" / "second")
     commands = [command for page in (REPORT, DOCTOR) for command in re.findall(r"```sh\n(rmc .*)\n```", page)]
     assert [command.split()[1] for command in commands] == ["report", "report", "doctor", "train"]
-    said = [ran(command, tmp_path) for command in commands]
-    assert said[0].startswith("report.html: 1 run, ")
-    assert said[1].startswith("both.html: 2 runs, ")
-    assert "learner-bound: actors waited " in said[2]
-    assert said[3].splitlines()[-1] == "it fits"
+    outputs = [ran(command, tmp_path) for command in commands]
+    assert outputs[0].startswith("report.html: 1 run, ")
+    assert outputs[1].startswith("both.html: 2 runs, ")
+    assert "learner-bound: actors waited " in outputs[2]
+    assert outputs[3].splitlines()[-1] == "it fits"
     for row in re.findall(r"^\| (memory|disk|bandwidth|file handles|threads|time to the end)\b", DOCTOR, re.MULTILINE):
-        assert row in said[3]
+        assert row in outputs[3]
 
 
 def test_every_finding_is_on_its_page_with_its_limits() -> None:

@@ -23,15 +23,15 @@ RESUME, WARM = ((DOCS / name).read_text() for name in ("resume.md", "warm-start.
 
 def execute(page: str, folder: Path) -> list[str]:
     """Its commands, in order; what each printed."""
-    said = []
+    outputs = []
     for command in re.findall(r"```sh\n(rmc .*?)\n```", page, re.DOTALL):
         words = shlex.split(command.replace("\\\n", ""))[1:]
         done = subprocess.run(
             [sys.executable, "-m", "rmc.cli.main", *words], cwd=folder, capture_output=True, text=True, timeout=150
         )
         assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
-        said.append(done.stdout)
-    return said
+        outputs.append(done.stdout)
+    return outputs
 
 
 @pytest.mark.timeout(500)
@@ -42,9 +42,9 @@ def test_a_run_is_resumed(tmp_path: Path) -> None:
     assert result is not None
     assert result["env_steps"] >= 2_000
     assert [list(start.changes) for start in starts(run)] == [[], [], ["total_steps", "replay.replay_ratio"]]
-    told = re.search(r"```\n(3 starts; .*)\n```", RESUME)
-    assert told is not None
-    assert re.sub(r"1,5\d\d", "1,500", format_starts(run)) == told[1]
+    match = re.search(r"```\n(3 starts; .*)\n```", RESUME)
+    assert match is not None
+    assert re.sub(r"1,5\d\d", "1,500", format_starts(run)) == match[1]
 
 
 def test_the_options_that_may_change_are_in_the_table() -> None:

@@ -63,6 +63,6 @@ def results(file: Path, name: str) -> list[int]:
     store = sqlite3.connect(file)
     rows = store.execute("select metrics from metrics where run_name like ?", (f"{name}%",)).fetchall()
     store.close()
-    found = [json.loads(metrics) for (metrics,) in rows]
-    assert all("video" in one for one in found if "result/env_steps" in one)
-    return [one["result/env_steps"] for one in found if "result/env_steps" in one]
+    logged = [json.loads(metrics) for (metrics,) in rows]
+    assert all("video" in one for one in logged if "result/env_steps" in one)
+    return [one["result/env_steps"] for one in logged if "result/env_steps" in one]

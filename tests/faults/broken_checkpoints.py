@@ -22,26 +22,26 @@ def break_checkpoints(tries: int, folder: Path) -> Iterator[Row]:
 
 def spoil_each(tries: int, place: CheckpointFolder, copy: Path) -> Row:
     """The newest of those, which lies in ``copy`` meanwhile."""
-    chance, said = random.Random(0), Said()
-    logging.getLogger("rmc.common.checkpoint").addHandler(said)
+    chance, warnings = random.Random(0), Said()
+    logging.getLogger("rmc.common.checkpoint").addHandler(warnings)
     older, newest = place.numbers()[-2:]
-    found = {"flipped": 0, "cut": 0, "older_used": 0, "said": 0}
+    counts = {"flipped": 0, "cut": 0, "older_used": 0, "said": 0}
     shutil.copytree(place.path(newest), copy)
     cuts = tries // CUT_SHARE
     for number in range(tries + cuts):
         how = "flipped" if number < tries else "cut"
         _spoil(chance.choice(sorted(place.path(newest).iterdir())), how, chance)
-        lines = len(said.lines)
+        lines = len(warnings.lines)
         used = place.latest()
-        found[how] += used is None or used[0] != newest
-        found["older_used"] += used is not None and used[0] == older
-        found["said"] += len(said.lines) > lines
+        counts[how] += used is None or used[0] != newest
+        counts["older_used"] += used is not None and used[0] == older
+        counts["said"] += len(warnings.lines) > lines
         shutil.rmtree(place.path(newest))
         shutil.copytree(copy, place.path(newest))
-    logging.getLogger("rmc.common.checkpoint").removeHandler(said)
+    logging.getLogger("rmc.common.checkpoint").removeHandler(warnings)
     whole = place.latest()
-    passed = set(found.values()) == {tries, cuts, tries + cuts} and whole is not None and whole[0] == newest
-    return Row("checkpoints with a flipped bit, or cut short", tries + cuts, passed, found={**found})
+    passed = set(counts.values()) == {tries, cuts, tries + cuts} and whole is not None and whole[0] == newest
+    return Row("checkpoints with a flipped bit, or cut short", tries + cuts, passed, found={**counts})
 
 
 def _spoil(path: Path, how: str, chance: random.Random) -> None:

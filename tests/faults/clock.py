@@ -28,16 +28,16 @@ def move_clock(tries: int, folder: Path) -> Iterator[Row]:
                 time.sleep(SECONDS)
                 hours.append(hours_away(run))
         restarts = run.newest("launcher", "restarts")
-        found = run.end()
+        verdict = run.end()
     facts = {
         "moves_seen_by_the_roles": sum(hour != 0 for hour in hours),
         "restarts": restarts,
         "weights_went_back": went_back(run.versions),
     }
-    passed = not (found.lost or found.duplicated or restarts or facts["weights_went_back"])
+    passed = not (verdict.lost or verdict.duplicated or restarts or facts["weights_went_back"])
     passed = passed and hours == [*HOURS] * tries
     yield Row(
-        "clock moved by an hour, both ways", 2 * tries, passed, found.acknowledged, found.lost, found.duplicated,
+        "clock moved by an hour, both ways", 2 * tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated,
         round(slowest, 2), facts,
     )  # fmt: skip
 

@@ -60,9 +60,9 @@ def _ring(folder: Path) -> Row:
         small_disk(folder / "small", 20) as disk,
         Training(disk / "run", "--capacity", "1000000", "--total-steps", "1000") as run,
     ):
-        status, said = run.finish(60), run.text().strip()
-    passed = status == 2 and len(said.splitlines()) == 1 and said.startswith("rmc: --capacity=1000000: ")
-    return Row("disk full: no room for the ring", 1, passed, found={"said": said.replace(str(folder), "")})
+        status, message = run.finish(60), run.text().strip()
+    passed = status == 2 and len(message.splitlines()) == 1 and message.startswith("rmc: --capacity=1000000: ")
+    return Row("disk full: no room for the ring", 1, passed, found={"said": message.replace(str(folder), "")})
 
 
 def _checkpoint(tries: int, folder: Path) -> Row:
@@ -82,11 +82,11 @@ def _checkpoint(tries: int, folder: Path) -> Row:
                     halves += checkpoints.numbers()[-1] != before[-1]
                 slowest = max(slowest, run.until(lambda last=before[-1]: checkpoints.numbers()[-1] > last))
             torn = sum(not line.endswith("}") for line in (run.folder / "metrics.jsonl").read_text().splitlines())
-            found = run.end()
+            verdict = run.end()
         broken = sum(_broken(checkpoints, number) for number in checkpoints.numbers())
-    passed = not (found.lost or found.duplicated or torn or broken or halves) and run.process.returncode == 130
+    passed = not (verdict.lost or verdict.duplicated or torn or broken or halves) and run.process.returncode == 130
     return Row(
-        "disk full: no room for a checkpoint", tries, passed, found.acknowledged, found.lost, found.duplicated,
+        "disk full: no room for a checkpoint", tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated,
         round(slowest, 2), {"torn_lines": torn, "broken_checkpoints": broken, "saved_without_room": halves},
     )  # fmt: skip
 
@@ -120,18 +120,18 @@ def _log_of_redis(tries: int, folder: Path) -> Row:
                 cannot_log(run, server)
                 time.sleep(FULL_SECONDS)
             slowest = max(slowest, run.until_all_go_on())
-        found = run.end()
-    passed = not (found.lost or found.duplicated) and run.process.returncode == 130
+        verdict = run.end()
+    passed = not (verdict.lost or verdict.duplicated) and run.process.returncode == 130
     return Row(
-        "disk full: no room for the log of Redis", tries, passed, found.acknowledged, found.lost, found.duplicated,
-        round(slowest, 2),
+        "disk full: no room for the log of Redis", tries, passed, verdict.acknowledged, verdict.lost,
+        verdict.duplicated, round(slowest, 2),
     )  # fmt: skip
 
 
 def cannot_log(run: Loaded, server: LoggedRedis) -> None:
     """Wait until it says so."""
     server.forget()
-    run.until(lambda: "Short write while writing to the AOF file" in server.said())
+    run.until(lambda: "Short write while writing to the AOF file" in server.log_text())
 
 
 if __name__ == "__main__":

@@ -31,15 +31,15 @@ def freeze_all(tries: int, folder: Path, seconds: float = 90.0) -> Iterator[Row]
         with Loaded(folder / role, *ROOMY, *PATIENT) as run:
             run.begin()
             row = freeze(run, role, tries, seconds)
-            found = run.end()
-        passed = row.passed and not (found.lost or found.duplicated)
-        counts = {"acknowledged": found.acknowledged, "lost": found.lost, "duplicated": found.duplicated}
+            verdict = run.end()
+        passed = row.passed and not (verdict.lost or verdict.duplicated)
+        counts = {"acknowledged": verdict.acknowledged, "lost": verdict.lost, "duplicated": verdict.duplicated}
         yield dataclasses.replace(row, passed=passed, **counts)
 
 
 def freeze(run: Loaded, role: str, tries: int, seconds: float) -> Row:
     """So often, each time for so long."""
-    slowest, accepted, said = 0.0, 0, _says_replaced(run, role)
+    slowest, accepted, replaced = 0.0, 0, _says_replaced(run, role)
     for _ in range(tries):
         old, epoch = run.process_of(role), run.bus.current_epoch(role)
         old.suspend()
@@ -53,7 +53,7 @@ def freeze(run: Loaded, role: str, tries: int, seconds: float) -> Row:
             accepted += run.acks.get((0, epoch), 0) - before if role == "actor-0" else 0
             run.until(lambda epoch=epoch: run.bus.current_epoch(role) > epoch + 1)  # the supervisor's next
         run.until_all_go_on()
-    silent = tries - (_says_replaced(run, role) - said)
+    silent = tries - (_says_replaced(run, role) - replaced)
     facts = {
         "ended_for_another_cause": silent,
         "entries_accepted": accepted,

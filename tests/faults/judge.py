@@ -49,8 +49,8 @@ def _lives(rows: Rows) -> set[tuple[int, int]]:
 def _of(rows: Rows, actor: int, epoch: int) -> Rows:
     """A life's windows, as they were sent."""
     own = rows[(rows["actor"] == actor) & (rows["epoch"] == epoch)]
-    found: Rows = own[np.lexsort((own["k"], own["seq"]))]
-    return found
+    ordered: Rows = own[np.lexsort((own["k"], own["seq"]))]
+    return ordered
 
 
 def _lost(own: Rows, acked: int, full: bool) -> int:

@@ -24,11 +24,11 @@ def kill_actors(tries: int, folder: Path) -> Iterator[Row]:
             time.sleep(chance.uniform(0.2, 1.5))
             slowest = max(slowest, run.kill(f"actor-{chance.randrange(ACTORS)}"))
         run.until_all_go_on()
-        found = run.end()
+        verdict = run.end()
     repeated = _repeated_starts(folder / "run")
-    passed = not (found.lost or found.duplicated or repeated) and slowest < RECOVERY_S
+    passed = not (verdict.lost or verdict.duplicated or repeated) and slowest < RECOVERY_S
     yield Row(
-        "kill -9 of an actor", tries, passed, found.acknowledged, found.lost, found.duplicated, round(slowest, 2),
+        "kill -9 of an actor", tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated, round(slowest, 2),
         {"repeated_episodes": repeated},
     )  # fmt: skip
 

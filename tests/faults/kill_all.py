@@ -24,7 +24,7 @@ def kill_everything(tries: int, folder: Path) -> Iterator[Row]:
     """So often, each time going on in the same folder."""
     chance, slowest, less = random.Random(0), 0.0, 0
     place, acks, versions = folder / "run", Acks(), []
-    said: Kept = {}
+    reported: Kept = {}
     left: Kept = {}
     for _ in range(tries + 1):
         began = time.monotonic()
@@ -35,17 +35,19 @@ def kill_everything(tries: int, folder: Path) -> Iterator[Row]:
             slowest = max(slowest, time.monotonic() - began)
             run.until(lambda run=run: CheckpointFolder(run.folder / "checkpoints").numbers())
             time.sleep(chance.uniform(1.0, 3.0))
-            said = {name: run.newest("replay", name) for name in COUNTED}
+            reported = {name: run.newest("replay", name) for name in COUNTED}
             run.kill_all()
         versions += run.versions
         before, left = left, on_disk(place)
-        less += sum(left[name] < said[name] for name in said) + sum(left[name] < before[name] for name in before)
-    found = judge(place, acks)
-    differs = sum(not one["same"] for one in run.said("resumed"))
-    table = {name: f"{said.get(name, '-')} said last, {left[name]} on disk" for name in left}
-    passed = not (found.lost or found.duplicated or less or differs or went_back(versions)) and slowest < RECOVERY_S
+        less += sum(left[name] < reported[name] for name in reported) + sum(
+            left[name] < before[name] for name in before
+        )
+    verdict = judge(place, acks)
+    differs = sum(not one["same"] for one in run.events("resumed"))
+    table = {name: f"{reported.get(name, '-')} said last, {left[name]} on disk" for name in left}
+    passed = not (verdict.lost or verdict.duplicated or less or differs or went_back(versions)) and slowest < RECOVERY_S
     yield Row(
-        "kill -9 of every process at once", tries, passed, found.acknowledged, found.lost, found.duplicated,
+        "kill -9 of every process at once", tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated,
         round(slowest, 2), {"learner_state_differs": differs, "counters_fell": less, **table},
     )  # fmt: skip
 
@@ -56,7 +58,7 @@ def on_disk(place: Path) -> Kept:
     config = run.config()
     store = open_store(run.replay, config.window_spec(), config.replay.capacity, config.replay.priority_exponent)
     store.close()
-    progress, found = store.ring.progress, CheckpointFolder(run.checkpoints).latest()
+    progress, checkpoint = store.ring.progress, CheckpointFolder(run.checkpoints).latest()
     learnt = store.priorities[: progress.next_serial] != 1.0
     return {
         "env_steps": progress.env_steps,
@@ -65,7 +67,7 @@ def on_disk(place: Path) -> Kept:
         "draws": progress.draws,
         "normaliser's observations": progress.observations,
         "priorities learnt": int(np.count_nonzero(learnt)),
-        "learner's update": found[0] if found is not None else 0,
+        "learner's update": checkpoint[0] if checkpoint is not None else 0,
     }
 
 

@@ -25,18 +25,18 @@ def kill_learners(tries: int, folder: Path) -> Iterator[Row]:
             point = POINTS[number // 3 % len(POINTS)]
             slowest = max(slowest, run.strike(point, "learner") if number % 3 == 0 else run.kill("learner"))
             run.until_all_go_on()
-        resumed = run.said("resumed")
-        found = run.end()
+        resumed = run.events("resumed")
+        verdict = run.end()
     facts = {
         "resumed": len(resumed),
         "state_differs": sum(not one["same"] for one in resumed),
         "weights_went_back": went_back(run.versions),
     }
-    passed = not (found.lost or found.duplicated or facts["state_differs"] or facts["weights_went_back"])
+    passed = not (verdict.lost or verdict.duplicated or facts["state_differs"] or facts["weights_went_back"])
     passed = passed and len(resumed) >= tries and slowest < RECOVERY_S
     yield Row(
-        "kill -9 of the learner", tries, passed, found.acknowledged, found.lost, found.duplicated, round(slowest, 2),
-        facts,
+        "kill -9 of the learner", tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated,
+        round(slowest, 2), facts,
     )  # fmt: skip
 
 

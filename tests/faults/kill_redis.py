@@ -20,15 +20,15 @@ RECOVERY_S = 5.0
 class LoggedRedis:
     """A user's own, on a unix socket, with an append-only file that is written every second."""
 
-    def __init__(self, folder: Path, said: Path) -> None:
-        """Its append-only file lies in ``folder``; ``said`` is where it tells what it does."""
+    def __init__(self, folder: Path, log: Path) -> None:
+        """Its append-only file lies in ``folder``; ``log`` is where it tells what it does."""
         folder.mkdir(parents=True, exist_ok=True)
         self.url = f"unix://{folder}/own.sock"
         self._words = [
             server_binary(), "--port", "0", "--unixsocket", f"{folder}/own.sock", "--dir", str(folder), "--save", "",
             "--appendonly", "yes", "--appendfsync", "everysec",
         ]  # fmt: skip
-        self._log = said
+        self._log = log
         self.start()
 
     def start(self) -> None:
@@ -46,7 +46,7 @@ class LoggedRedis:
                 assert time.monotonic() < deadline, self._log.read_text()
                 time.sleep(0.01)
 
-    def said(self) -> str:
+    def log_text(self) -> str:
         """What it told."""
         return self._log.read_text()
 
@@ -61,9 +61,9 @@ class LoggedRedis:
 
 
 @contextmanager
-def logged_redis(folder: Path, said: Path) -> Iterator[LoggedRedis]:
+def logged_redis(folder: Path, log: Path) -> Iterator[LoggedRedis]:
     """Killed at the end."""
-    server = LoggedRedis(folder, said)
+    server = LoggedRedis(folder, log)
     try:
         yield server
     finally:
@@ -100,10 +100,10 @@ def kill_embedded(tries: int, folder: Path) -> Iterator[Row]:
 
 
 def _row(fault: str, run: Loaded, tries: int, slowest: float) -> Row:
-    found = run.end()
-    passed = not (found.lost or found.duplicated or found.acted_on_older) and slowest < RECOVERY_S
-    facts = {"acted_on_older_weights": found.acted_on_older, "its_log_lacked_weights": went_back(run.versions)}
-    return Row(fault, tries, passed, found.acknowledged, found.lost, found.duplicated, round(slowest, 2), facts)
+    verdict = run.end()
+    passed = not (verdict.lost or verdict.duplicated or verdict.acted_on_older) and slowest < RECOVERY_S
+    facts = {"acted_on_older_weights": verdict.acted_on_older, "its_log_lacked_weights": went_back(run.versions)}
+    return Row(fault, tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated, round(slowest, 2), facts)
 
 
 def both(tries: int, folder: Path) -> Iterator[Row]:

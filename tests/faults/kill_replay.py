@@ -48,10 +48,10 @@ def strike_everywhere(run: Loaded) -> float:
 
 def tree_is_its_rebuild(run: Loaded) -> bool:
     """Of the replay server that runs, and of all that were looked at before."""
-    looks = len(run.said("tree"))
+    looks = len(run.events("tree"))
     run.arm("compare-tree")
-    run.until(lambda: len(run.said("tree")) > looks)
-    return all(look["same"] for look in run.said("tree"))
+    run.until(lambda: len(run.events("tree")) > looks)
+    return all(look["same"] for look in run.events("tree"))
 
 
 def kill_large(tries: int, folder: Path) -> Iterator[Row]:
@@ -68,11 +68,11 @@ def kill_large(tries: int, folder: Path) -> Iterator[Row]:
 
 def _row(fault: str, run: Loaded, tries: int, slowest: float) -> Row:
     recreate_env = tree_is_its_rebuild(run)
-    found = run.end()
-    facts = {"entries_missed": len(run.said("gap")), "acks_went_back": run.acks_went_back}
-    passed = not (found.lost or found.duplicated or any(facts.values())) and recreate_env and slowest < RECOVERY_S
-    facts |= {"trees_are_their_rebuild": len(run.said("tree")) if recreate_env else 0}
-    return Row(fault, tries, passed, found.acknowledged, found.lost, found.duplicated, round(slowest, 2), facts)
+    verdict = run.end()
+    facts = {"entries_missed": len(run.events("gap")), "acks_went_back": run.acks_went_back}
+    passed = not (verdict.lost or verdict.duplicated or any(facts.values())) and recreate_env and slowest < RECOVERY_S
+    facts |= {"trees_are_their_rebuild": len(run.events("tree")) if recreate_env else 0}
+    return Row(fault, tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated, round(slowest, 2), facts)
 
 
 def all_of_them(tries: int, folder: Path) -> Iterator[Row]:

@@ -104,14 +104,14 @@ class Loaded(Training):
         word, _, index = role.partition("-")
         others = {"redis": "unixsocket", "fork server": r"rmc\.cli\.fork_server"}
         pattern = others.get(role, rf"rmc\.cli\.main role {word} .*{f'--index {index}' if index else ''}")
-        found: list[psutil.Process] = []
+        processes: list[psutil.Process] = []
 
         def there() -> bool:
-            found[:] = [one for one in self.launcher.children(recursive=True) if _matches(one, pattern)]
-            return bool(found)
+            processes[:] = [one for one in self.launcher.children(recursive=True) if _matches(one, pattern)]
+            return bool(processes)
 
         self.wait_for(there)
-        return found[0]
+        return processes[0]
 
     def kill(self, role: str) -> float:
         """kill -9; how long it takes until it is back in a new epoch."""
@@ -129,16 +129,16 @@ class Loaded(Training):
         new.write_text(str(times))
         new.replace(self.armed / "slower")
 
-    def said(self, name: str) -> list[dict[str, Any]]:
+    def events(self, name: str) -> list[dict[str, Any]]:
         """What the hooks have written down."""
         path = self.armed / f"said-{name}"
         return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
     def strike(self, fault: str, role: str) -> float:
         """Arm a fault that kills the role; how long it takes from its death until it is back in a new epoch."""
-        epoch, deaths = self.bus.current_epoch(role), len(self.said("died"))
+        epoch, deaths = self.bus.current_epoch(role), len(self.events("died"))
         self.arm(fault)
-        self.until(lambda: len(self.said("died")) > deaths)
+        self.until(lambda: len(self.events("died")) > deaths)
         return self.until(lambda: self.bus.current_epoch(role) > epoch)
 
     def until(self, condition: Callable[[], object], seconds: float = START_SECONDS) -> float:

@@ -33,12 +33,16 @@ def force_nan(tries: int, folder: Path) -> Iterator[Row]:
             run.arm("nan")
             status = run.process.wait(60)
             text = run.text()
-        found = judge(run.folder, run.acks)
+        verdict = judge(run.folder, run.acks)
         log = (run.folder / "logs" / "learner.log").read_text()
         facts["causes_said"] += log.count(CAUSE) // QUICK_DEATHS + (status == 1 and CAUSE in text)
         facts["checkpoints_spoilt"] += sum(not _sound(checkpoints.load(one)) for one in checkpoints.numbers())
         facts["weights_went_back"] += went_back(run.versions)
-        acknowledged, lost, doubled = acknowledged + found.acknowledged, lost + found.lost, doubled + found.duplicated
+        acknowledged, lost, doubled = (
+            acknowledged + verdict.acknowledged,
+            lost + verdict.lost,
+            doubled + verdict.duplicated,
+        )
     passed = facts == {"causes_said": 2 * tries, "checkpoints_spoilt": 0, "weights_went_back": 0}
     passed = passed and not (lost or doubled) and slowest < RECOVERY_S
     yield Row(

@@ -32,19 +32,19 @@ class Row:
         rows = json.loads(RESULTS.read_text()) if RESULTS.exists() else []
         kept = [row for row in rows if row["fault"] != self.fault]
         words = [Path(sys.argv[0]).stem, *sys.argv[1:]]
-        made = {
+        about = {
             "command": f"python -m tests.faults.{' '.join(words)}",
             "date": time.strftime("%Y-%m-%d"),
             "commit": _commit(),
         }
-        rows = sorted([*kept, dataclasses.asdict(self) | made], key=lambda row: str(row["fault"]))
+        rows = sorted([*kept, dataclasses.asdict(self) | about], key=lambda row: str(row["fault"]))
         RESULTS.write_text(json.dumps(rows, indent=1) + "\n")
         print(json.dumps(dataclasses.asdict(self)), flush=True)
 
 
-def at_length(said: str | None, tries: int, fault: Callable[[int, Path], Iterator[Row]]) -> None:
+def at_length(doc: str | None, tries: int, fault: Callable[[int, Path], Iterator[Row]]) -> None:
     """A script: ``fault`` with so many tries, or ``--tries``, in a folder of its own; ends with 1 if a row failed."""
-    parser = argparse.ArgumentParser(description=said)
+    parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("--tries", type=int, default=tries)
     options, passed = parser.parse_args(), True
     with tempfile.TemporaryDirectory(prefix="rmc-fault-") as place:

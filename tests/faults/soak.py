@@ -20,9 +20,9 @@ def soak(tries: int, folder: Path, minutes: float = MINUTES, settled: float = SE
         with Loaded(folder / f"run-{number}", *WRAPPING) as run:
             run.begin()
             row = soaked(run, 60 * minutes, 60 * settled)
-            found = run.end()
-        passed = row.passed and not (found.lost or found.duplicated)
-        counts = {"acknowledged": found.acknowledged, "lost": found.lost, "duplicated": found.duplicated}
+            verdict = run.end()
+        passed = row.passed and not (verdict.lost or verdict.duplicated)
+        counts = {"acknowledged": verdict.acknowledged, "lost": verdict.lost, "duplicated": verdict.duplicated}
         yield dataclasses.replace(row, passed=passed, **counts)
 
 

@@ -94,7 +94,7 @@ def test_the_learner_is_killed_also_amid_saving(run: Loaded) -> None:
     run.kill("learner")
     run.strike("half-a-checkpoint", "learner")
     run.until_all_go_on()
-    assert [one["same"] for one in run.said("resumed")] == [True, True]
+    assert [one["same"] for one in run.events("resumed")] == [True, True]
 
 
 def test_a_loss_is_no_number(run: Loaded) -> None:
@@ -164,18 +164,18 @@ def test_the_learner_stands_still_and_is_replaced(run: Loaded) -> None:
 
 def test_all_are_killed_at_once_and_nothing_was_ever_lost(place: RunConnection, run: Loaded) -> None:
     run.kill_all()
-    said = {name: run.newest("replay", name) for name in ("env_steps", "windows", "drawn_steps", "draws")}
+    reported = {name: run.newest("replay", name) for name in ("env_steps", "windows", "drawn_steps", "draws")}
     with place.start() as again:
         again.acks = run.acks
         again.begin()
         again.until_all_go_on()
-        assert all(again.newest("replay", name) >= value for name, value in said.items())
-        found = again.end()
+        assert all(again.newest("replay", name) >= value for name, value in reported.items())
+        verdict = again.end()
     assert again.process.returncode == 130
-    assert all(one["same"] for one in again.said("resumed"))
+    assert all(one["same"] for one in again.events("resumed"))
     assert went_back(run.versions + again.versions) == run.acks_went_back == 0
-    assert (found.lost, found.duplicated) == (0, 0)
-    assert found.acknowledged > 300
+    assert (verdict.lost, verdict.duplicated) == (0, 0)
+    assert verdict.acknowledged > 300
 
 
 def test_a_bit_of_a_checkpoint_is_flipped(run: Loaded, tmp_path: Path) -> None:
@@ -216,6 +216,6 @@ def test_the_replay_server_stands_still_and_is_replaced(full: Loaded) -> None:
 
 def test_of_a_full_ring_nothing_was_lost_but_by_age(full: Loaded) -> None:
     full.until(lambda: full.newest("replay", "ring_fill") == 1.0)
-    found = full.end()
-    assert (found.lost, found.duplicated, full.acks_went_back) == (0, 0, 0)
-    assert found.acknowledged > 600  # it went round
+    verdict = full.end()
+    assert (verdict.lost, verdict.duplicated, full.acks_went_back) == (0, 0, 0)
+    assert verdict.acknowledged > 600  # it went round

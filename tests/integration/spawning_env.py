@@ -25,8 +25,8 @@ class Spawning(InvertedPendulumEnv):
             subprocess.Popen(SIMULATE, start_new_session=True).pid,
             _daemon(),
         ]
-        with (Path(os.environ[SPAWNED]) / str(os.getpid())).open("a") as told:
-            told.write("".join(f"{pid}\n" for pid in self.simulators))
+        with (Path(os.environ[SPAWNED]) / str(os.getpid())).open("a") as file:
+            file.write("".join(f"{pid}\n" for pid in self.simulators))
 
     def step(self, action: Any) -> Any:
         while (Path(os.environ[SPAWNED]) / f"hang-{os.getpid()}").exists():

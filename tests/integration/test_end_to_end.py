@@ -65,8 +65,8 @@ def test_train_evaluate_stats_and_resume(tmp_path: Path) -> None:
     assert longer["wall_s"] > result["wall_s"]
 
 
-@pytest.mark.parametrize("told", ["words", "environment"])
-def test_roles_by_hand_over_tcp(told: str, redis_url: str, run_name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("passed_by", ["words", "environment"])
+def test_roles_by_hand_over_tcp(passed_by: str, redis_url: str, run_name: str, tmp_path: Path) -> None:
     """As docs/manual.md says it, from files that the command lines name or from the environment."""
     folder = tmp_path / run_name
     (tmp_path / "redis-url").write_text(redis_url + "\n")
@@ -74,18 +74,18 @@ def test_roles_by_hand_over_tcp(told: str, redis_url: str, run_name: str, tmp_pa
     options = ("--launcher", "manual", "--redis-url", f"file:{tmp_path}/redis-url")
     assert " ".join(options[:3]) in begin
     assert [command.split()[1] for command in commands] == ["replay", "learner", "actor", "evaluator"]
-    environment, said = dict(os.environ), r"$^"
+    environment, hidden = dict(os.environ), r"$^"
     with ExitStack() as stack:
         training = stack.enter_context(Training(folder, "--total-steps", "1200", "--checkpoint-steps", "600", *options))
         training.wait_for(lambda: "start the roles with" in training.text())
         name = training.text().partition("--run ")[2].split()[0]
-        if told == "environment":
+        if passed_by == "environment":
             environment |= {"RMC_SECRET": (folder / "secret").read_text().strip(), "RMC_REDIS_URL": redis_url}
-            said = r" --(secret-file|redis-url) \S+"
+            hidden = r" --(secret-file|redis-url) \S+"
         places = {"NAME": name, "file:redis-url": options[-1], "runs/by-hand": str(folder)}
         roles = []
         for command in commands:
-            words = re.sub(said, "", command)
+            words = re.sub(hidden, "", command)
             for word, place in places.items():
                 words = words.replace(word, place)
             log = stack.enter_context((tmp_path / f"{words.split()[1]}.log").open("wb"))
@@ -117,6 +117,6 @@ def test_every_metric_is_in_the_glossary(tmp_path: Path) -> None:
     glossary = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text()
     explained = set(re.findall(r"`([a-z_]+)`", glossary))
     records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    said = {name for record in records for name in record} - {"role", "time"}
-    unexplained = {name for name in said - explained if not name.startswith(("restarts_", "dead_letters_"))}
+    names = {name for record in records for name in record} - {"role", "time"}
+    unexplained = {name for name in names - explained if not name.startswith(("restarts_", "dead_letters_"))}
     assert not unexplained

@@ -41,10 +41,10 @@ CONFIG = dataclasses.replace(
 
 @pytest.fixture
 def bus(redis_url: str, run_name: str) -> RedisBus:
-    made = RedisBus(redis_url, run_name)
-    made.set_config(to_registration(CONFIG))
-    made.publish_weights(Version(made.take_epoch("learner"), 1), initial_policy(CONFIG))
-    return made
+    redis_bus = RedisBus(redis_url, run_name)
+    redis_bus.set_config(to_registration(CONFIG))
+    redis_bus.publish_weights(Version(redis_bus.take_epoch("learner"), 1), initial_policy(CONFIG))
+    return redis_bus
 
 
 @pytest.fixture
@@ -64,10 +64,10 @@ def client(bus: RedisBus, redis_url: str, run_name: str, tmp_path: Path) -> Iter
         *(["role", "actor", *place, "--index", str(index)] for index in range(CONFIG.actors)),
     ]
     processes = [subprocess.Popen([sys.executable, "-m", "rmc.cli.main", *words], env=os.environ) for words in roles]
-    found = ReplayClient(lambda: f"unix:{tmp_path}/s", b"every hop", CONFIG.window_spec(), BATCH)
-    found.register_learner(bus.current_epoch("learner"))  # only the newest learner is served
-    yield found
-    found.close()
+    replay = ReplayClient(lambda: f"unix:{tmp_path}/s", b"every hop", CONFIG.window_spec(), BATCH)
+    replay.register_learner(bus.current_epoch("learner"))  # only the newest learner is served
+    yield replay
+    replay.close()
     bus.request_stop("the test is over")
     assert [process.wait(30) for process in processes] == [0, 0, 0]
 
@@ -91,11 +91,11 @@ def draw_everything(client: ReplayClient, steps: int) -> np.ndarray:
 
 def test_each_step_is_trained_once(client: ReplayClient) -> None:
     rows = draw_everything(client, ENOUGH_STEPS)
-    found = audit(rows, CONFIG.window_spec())
-    assert set(found.trained.values()) == {1}, "a step was doubled"
-    assert len(found.trained) == found.new_steps >= ENOUGH_STEPS, "a step was lost"
-    assert len({name.env for name in found.trained}) == CONFIG.actors * CONFIG.actor.envs_per_actor
-    assert_whole_episodes(set(found.trained))
+    counts = audit(rows, CONFIG.window_spec())
+    assert set(counts.trained.values()) == {1}, "a step was doubled"
+    assert len(counts.trained) == counts.new_steps >= ENOUGH_STEPS, "a step was lost"
+    assert len({name.env for name in counts.trained}) == CONFIG.actors * CONFIG.actor.envs_per_actor
+    assert_whole_episodes(set(counts.trained))
     assert rows["serial"].tolist() == list(range(len(rows)))
     assert len({(row["actor"], row["epoch"], row["seq"], row["k"]) for row in rows}) == len(rows)
 

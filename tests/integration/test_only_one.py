@@ -65,8 +65,8 @@ def test_who_makes_a_second_one_says_what_to_do(tmp_path: Path, left_out: int, w
 
 def test_check_env_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     assert main.run(["check-env", ENV, "--steps", "100"]) == 0
-    said = capsys.readouterr().out
-    assert "note: no second one can be beside it (BlockingIOError: " in said
-    assert "take --actors 1 --envs-per-actor 1 --episodes 0" in said
+    output = capsys.readouterr().out
+    assert "note: no second one can be beside it (BlockingIOError: " in output
+    assert "take --actors 1 --envs-per-actor 1 --episodes 0" in output
     assert main.run(["check-env", "tests.counting_env:Counting-v0", "--steps", "100"]) == 0
     assert "no second one" not in capsys.readouterr().out

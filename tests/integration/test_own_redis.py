@@ -56,9 +56,9 @@ def test_answers_that_pass_are_waited_out_and_one_that_does_not_names_its_key(tm
         (acks,) = client.keys("rmc:*:acks")
         client.pipeline().delete(acks).rpush(acks, "a list").execute()
         training.finish(30)
-        told = training.text().splitlines()[-1]
-        assert "WRONGTYPE" in told, training.text()
-        assert acks.decode() in told
+        line = training.text().splitlines()[-1]
+        assert "WRONGTYPE" in line, training.text()
+        assert acks.decode() in line
         assert "Traceback" not in training.text()
 
 

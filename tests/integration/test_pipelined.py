@@ -17,14 +17,14 @@ pytestmark = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one co
 
 def halves(training: Training) -> list[psutil.Process]:
     """The processes of the model's half."""
-    found = []
+    metrics = []
     for process in training.launcher.children(recursive=True):
         try:
             if MODEL_PROCESS in " ".join(process.cmdline()):
-                found.append(process)
+                metrics.append(process)
         except psutil.NoSuchProcess:
             continue
-    return found
+    return metrics
 
 
 def test_it_survives_the_death_of_each_half_and_goes_on(tmp_path: Path) -> None:

@@ -82,7 +82,7 @@ def test_a_changed_ratio_and_rate_count_from_there(tmp_path):
     state = torch.load(folder / "state", weights_only=True)
     rates = [group["lr"] for optimizer in state["optimizers"] for group in optimizer["param_groups"]]
     assert rates == [1e-5, 1e-5, 1e-5, 3e-4]  # memory, world model; critics and policy, temperature
-    told = rmc(f"rmc stats {folder}", tmp_path).stdout
-    assert "4 starts; from step 1,5" in told
-    assert "--replay-ratio 32 to 4, --learning-rate 0.0003 to 1e-05" in told
+    output = rmc(f"rmc stats {folder}", tmp_path).stdout
+    assert "4 starts; from step 1,5" in output
+    assert "--replay-ratio 32 to 4, --learning-rate 0.0003 to 1e-05" in output
     assert json.loads((folder / "config.json").read_text())["format"] == 2

@@ -112,18 +112,18 @@ def own_redis() -> Iterator[str]:
 
 def test_the_password_of_the_users_own_redis_is_nowhere(tmp_path: Path) -> None:
     """It stands in a file that the command line names. What was exported is neither passed on nor inherited."""
-    told = tmp_path / "told"
-    told.mkdir()
+    log = tmp_path / "told"
+    log.mkdir()
     with own_redis() as url:
         (tmp_path / "redis-url").write_text(f"{url}\n")
         options = (*ENDLESS, "--redis-url", f"file:{tmp_path}/redis-url")
-        exported = {"RMC_SECRET": PASSWORD, "RMC_REDIS_URL": f"redis://:{PASSWORD}@localhost:1", TELLS: str(told)}
+        exported = {"RMC_SECRET": PASSWORD, "RMC_REDIS_URL": f"redis://:{PASSWORD}@localhost:1", TELLS: str(log)}
         with Watched(tmp_path / "run", *options, env=TELLING, environment=exported) as training:
             training.go_on(1)
             players = {str(role.pid) for name in PLAYERS if (role := training.role(name)) is not None}
             passed_on = [child.environ() for child in training.launcher.children(recursive=True)]
             training.interrupt()
-    inherited = {path.name: path.read_text() for path in told.iterdir()}
+    inherited = {path.name: path.read_text() for path in log.iterdir()}
     assert len(players) == len(PLAYERS)
     assert inherited.keys() >= {str(training.process.pid), *players}
     assert not any("RMC_SECRET" in words or "RMC_REDIS_URL" in words for words in inherited.values())

@@ -51,9 +51,9 @@ class Whole:
 
 @pytest.fixture
 def wholes(tmp_path: Path) -> Iterator[list[Whole]]:
-    made = [Whole(tmp_path / f"of-{count}", count) for count in (1, 2, 4)]
-    yield made
-    for whole in made:
+    systems = [Whole(tmp_path / f"of-{count}", count) for count in (1, 2, 4)]
+    yield systems
+    for whole in systems:
         for server in whole.servers:
             server.close()
 
@@ -73,8 +73,8 @@ def give_priorities(whole: Whole) -> None:
     while left:
         sample = whole.replay.sample(BATCH)
         assert sample.rows is not None
-        found = np.array([priority(*name(row)) for row in sample.rows], np.float32)
-        whole.replay.update_priorities(sample.rows["serial"].copy(), found)
+        priorities = np.array([priority(*name(row)) for row in sample.rows], np.float32)
+        whole.replay.update_priorities(sample.rows["serial"].copy(), priorities)
         left -= {name(row) for row in sample.rows}
 
 
@@ -99,9 +99,9 @@ def test_any_number_of_shards_samples_with_the_same_distribution(wholes: list[Wh
             np.testing.assert_allclose(weights, truth / truth.max(), rtol=1e-5)
             assert sample.windows == len(names)
             assert sample.total_weight == pytest.approx(expected.sum())
-        found = np.array(list(counts.values()))
-        assert found.sum() == draws * BATCH
-        p_value = stats.chisquare(found, draws * BATCH * expected / expected.sum()).pvalue
+        drawn = np.array(list(counts.values()))
+        assert drawn.sum() == draws * BATCH
+        p_value = stats.chisquare(drawn, draws * BATCH * expected / expected.sum()).pvalue
         assert p_value > 1e-3, (len(whole.servers), p_value)
 
 
@@ -137,8 +137,8 @@ def test_priorities_find_their_windows_in_rings_that_wrap(count: int, tmp_path: 
     for _ in range(60):
         sample = whole.replay.sample(BATCH)
         assert sample.rows is not None
-        found = np.array([priority(*name(row)) for row in sample.rows], np.float32)
-        whole.replay.update_priorities(sample.rows["serial"].copy(), found)
+        priorities = np.array([priority(*name(row)) for row in sample.rows], np.float32)
+        whole.replay.update_priorities(sample.rows["serial"].copy(), priorities)
     assert sample.rows is not None
     assert sample.weights is not None
     truth = np.array([priority(*name(row)) for row in sample.rows]) ** FREE_AND_SMALL.priority_exponent

@@ -27,17 +27,17 @@ class Spawner(Training):
 
     def simulators(self, pid: int | None = None) -> list[psutil.Process]:
         """Those that run, of one process or of all."""
-        told = self.told.iterdir() if pid is None else [self.told / str(pid)]
-        pids = [int(word) for path in told if not path.name.startswith("hang") for word in path.read_text().split()]
+        notes = self.notes.iterdir() if pid is None else [self.notes / str(pid)]
+        pids = [int(word) for path in notes if not path.name.startswith("hang") for word in path.read_text().split()]
         return alive([psutil.Process(one) for one in pids if psutil.pid_exists(one)])
 
     @property
-    def told(self) -> Path:
+    def notes(self) -> Path:
         return self.folder.parent / "told"
 
     def pid_of(self, name: str) -> int:
         """Of a role that plays."""
-        self.wait_for(lambda: (role := self.role(name)) is not None and (self.told / str(role.pid)).exists())
+        self.wait_for(lambda: (role := self.role(name)) is not None and (self.notes / str(role.pid)).exists())
         role = self.role(name)
         assert role is not None
         return role.pid
@@ -79,7 +79,7 @@ def test_they_end_with_a_role_that_is_killed_or_hangs_and_with_the_run(training:
 
     training.wait_for(lambda: (role := training.role("actor")) is not None and role.pid != actor)
     again = training.pid_of("actor")
-    (training.told / f"hang-{again}").touch()
+    (training.notes / f"hang-{again}").touch()
     training.wait_for(lambda: not psutil.pid_exists(again), 20.0)
     training.wait_for(lambda: not training.simulators(again), 5.0)
 
@@ -113,11 +113,11 @@ def test_those_of_a_group_end_where_the_fork_server_is_killed(training: Spawner)
 def test_they_end_with_a_command_in_which_a_call_hangs(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "rmc.cli.main", "check-env", SPAWNING, "--steps", "1000000", "--env-timeout", "1"]
     process = subprocess.Popen(words, env={**os.environ, SPAWNED: str(tmp_path)}, stderr=subprocess.DEVNULL)
-    told = tmp_path / str(process.pid)
-    while not told.exists():
+    note = tmp_path / str(process.pid)
+    while not note.exists():
         assert process.poll() is None
         time.sleep(0.05)
-    theirs = alive([psutil.Process(int(pid)) for pid in told.read_text().split()])
+    theirs = alive([psutil.Process(int(pid)) for pid in note.read_text().split()])
     assert len(theirs) == 3
     (tmp_path / f"hang-{process.pid}").touch()
     assert process.wait(60.0) == HUNG_STATUS

@@ -109,11 +109,11 @@ def test_actors_rate_their_windows_once_there_is_something_to_rate_them_by(tmp_p
 def test_staleness_is_measured(strategy: str, stages: set[str], tmp_path: Path) -> None:
     run = config(env="Reacher-v5", state_strategy=strategy, batch_size=16, replay_ratio=64.0)
     metrics = train(run, tmp_path).learner.metrics()
-    found = {name: value for name, value in metrics.items() if name.startswith("stale_")}
-    assert set(found) == {f"stale_{what}_{stage}" for what in ("state", "q_first", "q_last") for stage in stages}
-    assert all(0.0 <= value < 10.0 for value in found.values())
+    stale = {name: value for name, value in metrics.items() if name.startswith("stale_")}
+    assert set(stale) == {f"stale_{what}_{stage}" for what in ("state", "q_first", "q_last") for stage in stages}
+    assert all(0.0 <= value < 10.0 for value in stale.values())
     if strategy == "zero":
-        assert found["stale_state_stored"] == pytest.approx(1.0)
+        assert stale["stale_state_stored"] == pytest.approx(1.0)
     assert metrics["sample_age_max"] >= metrics["sample_age_mean"] >= 0.0
 
 

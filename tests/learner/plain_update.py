@@ -59,7 +59,7 @@ class PlainUpdate:
     def __call__(self, rows: np.ndarray, importance: np.ndarray, beta: float) -> tuple[dict[str, float], list[float]]:
         """One update; the losses as they were before it, and the windows' priorities."""
         wholes = ["MGFVPT"] if self.c.update_order == "joint" else self.stages
-        found: dict[str, float] = {}
+        values: dict[str, float] = {}
         priorities: list[float] = []
         for names, optimizer in zip(wholes, self.optimizers, strict=True):
             losses, new_priorities, variance = self.losses(rows, importance, beta)
@@ -68,7 +68,7 @@ class PlainUpdate:
             if self.c.clip_norm:
                 torch.nn.utils.clip_grad_norm_(self.agent.parameters(), self.c.clip_norm)
             optimizer.step()
-            found |= {name: losses[name].item() for name in names}
+            values |= {name: losses[name].item() for name in names}
             if "V" in names:
                 priorities, moved = new_priorities, variance
         if self.c.curiosity_scale == "std":
@@ -77,7 +77,7 @@ class PlainUpdate:
             for target, source in ((self.target_critic, self.agent.critic), (self.target_memory, self.agent.memory)):
                 for old, new in zip(target.parameters(), source.parameters(), strict=True):
                     old.copy_(self.c.polyak * old + (1.0 - self.c.polyak) * new)
-        return found, priorities
+        return values, priorities
 
     def unroll(self, memory: Memory, row: np.void) -> dict[int, Known]:
         """By observation, from the first trained one on; the burn-in without gradient."""
@@ -98,17 +98,17 @@ class PlainUpdate:
     @torch.no_grad()
     def impute(self, row: np.void) -> dict[int, Tensor]:
         """By observation, what the memory is given: for a blank one what the model expects, where it is asked."""
-        memory, found = self.agent.memory, {}
+        memory, numbers = self.agent.memory, {}
         h, last = torch.tensor(row["state"]).tensor_split([self.agent.config.hidden])
         for t in range(int(row["first"]), int(row["last"]) + 1):
             previous = torch.tensor(row["prev_action"] if t == row["first"] else row["action"][t - 1])
-            found[t] = self.seen(row, t)
+            numbers[t] = self.seen(row, t)
             if self.agent.config.impute_missing and row["missing"][t]:
-                found[t] = self.agent.next_frame(h, last, previous).clamp(-10, 10)
-            last = found[t]
+                numbers[t] = self.agent.next_frame(h, last, previous).clamp(-10, 10)
+            last = numbers[t]
             without = self.agent.config.head_input == "observation"
-            h = 0 * h if without else gru(memory, self.embedded(memory, row, t, found[t], previous), h)
-        return found
+            h = 0 * h if without else gru(memory, self.embedded(memory, row, t, numbers[t], previous), h)
+        return numbers
 
     def seen(self, row: np.void, t: int) -> Tensor:
         """The observation as the networks see it."""

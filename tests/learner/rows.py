@@ -21,6 +21,15 @@ def step_valid(rows: Rows, spec: WindowSpec = SPEC) -> np.ndarray:
     return (rows["first"][:, None] <= t) & (t < rows["last"][:, None])
 
 
+def spoil_padding(rows: Rows) -> None:
+    """Write what no number is wherever a row holds nothing."""
+    observed, stepped = observation_valid(rows), step_valid(rows)
+    rows["observation"][~observed] = np.nan
+    rows["missing"][~observed] = 1
+    rows["action"][~stepped] = np.inf
+    rows["reward"][~stepped] = np.nan
+
+
 def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC) -> Rows:
     """Rows of every shape: padded and real burn-in, full and partial, terminated and not."""
     rng = np.random.default_rng(seed)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from rmc.learner.batch import clear_padding, importance_weights
-from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
+from tests.learner.rows import SPEC, random_rows, spoil_padding, to_batch
 
 
 def test_fields_match_the_rows():
@@ -49,18 +49,15 @@ def test_importance_weights_against_the_formula():
     values = np.random.default_rng(0).exponential(size=20)
     mass, windows = 3.0 * values.sum(), 60
     expected = np.array([(windows * value / mass) ** -0.4 for value in values])
-    found = importance_weights(values, mass, windows, 0.4)
-    np.testing.assert_allclose(found, expected / expected.max(), rtol=1e-5)
-    assert found.dtype == np.float32
+    weights = importance_weights(values, mass, windows, 0.4)
+    np.testing.assert_allclose(weights, expected / expected.max(), rtol=1e-5)
+    assert weights.dtype == np.float32
     assert (importance_weights(values, mass, windows, 0.0) == 1).all()
 
 
 def test_padding_is_cleared_and_nothing_else_touched():
     rows = random_rows(16)
     clean = rows.copy()
-    observed, stepped = observation_valid(rows), step_valid(rows)
-    rows["observation"][~observed] = np.nan
-    rows["missing"][~observed] = 1
-    rows["action"][~stepped] = rows["reward"][~stepped] = np.inf
+    spoil_padding(rows)
     clear_padding(rows, SPEC)
     assert (rows == clean).all()

@@ -13,21 +13,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from rmc.common.agent import Agent
-from rmc.common.agent_config import AgentConfig
 from rmc.learner.batch import clear_padding, view_batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.device_update import WARM_UP, CopiesAhead, CudaGraph, DeviceUpdate, HostCopy
 from rmc.learner.update import JointUpdate, make_update
+from tests.learner.agents import ROBUST
 from tests.learner.rows import SPEC, random_rows
 
-EVERYTHING = AgentConfig(
-    hidden=SPEC.state,
-    embedding=7,
-    heads=(10, 9),
-    layer_norm=True,
-    head_input="hidden+embedding",
-    normalize_observations=True,
-)
 BATCH = 8
 
 
@@ -36,7 +28,7 @@ def make(order: str = "joint", device: str = "cpu", bf16: bool = False) -> Joint
     config = UpdateConfig(
         update_order=order, latent_target="ema", target_memory="ema", curiosity=0.1, curiosity_scale="std", n_step=2
     )  # type: ignore[arg-type]
-    agent = Agent(SPEC.obs_dim, SPEC.action_dim, EVERYTHING).to(device)
+    agent = Agent(SPEC.obs_dim, SPEC.action_dim, ROBUST).to(device)
     return make_update(agent, SPEC.burn_in, config, 3, bf16)
 
 
@@ -56,9 +48,9 @@ def test_it_is_the_same_update(order):
     for step in range(20):
         raw, importance = host_batch(step)
         expected = plain(view_batch(raw, importance, SPEC), torch.tensor(0.1 * step))
-        (found,) = static(raw, importance, 0.1 * step, step + 1)
-        assert torch.equal(found.priorities, expected.priorities)
-        assert all(torch.equal(found.metrics[name], value) for name, value in expected.metrics.items())
+        (result,) = static(raw, importance, 0.1 * step, step + 1)
+        assert torch.equal(result.priorities, expected.priorities)
+        assert all(torch.equal(result.metrics[name], value) for name, value in expected.metrics.items())
     assert all(map(torch.equal, update.agent.state_dict().values(), plain.agent.state_dict().values()))
 
 
@@ -100,9 +92,9 @@ def cuda(monkeypatch):
     """Streams, events and graphs that only remember what they were asked."""
     calls = MagicMock()
     for name in ("Stream", "Event", "CUDAGraph"):
-        made = create_autospec(getattr(torch.cuda, name), instance=True, spec_set=name != "CUDAGraph")
-        calls.attach_mock(made, name)
-        monkeypatch.setattr(torch.cuda, name, lambda *_, made=made: made)
+        double = create_autospec(getattr(torch.cuda, name), instance=True, spec_set=name != "CUDAGraph")
+        calls.attach_mock(double, name)
+        monkeypatch.setattr(torch.cuda, name, lambda *_, double=double: double)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda _: calls.current)
     monkeypatch.setattr(torch.cuda, "stream", lambda _: nullcontext())
     monkeypatch.setattr(torch.cuda, "graph", lambda graph, stream: nullcontext(calls.recording(graph, stream)))
@@ -170,7 +162,7 @@ def test_a_graph_trains_as_the_updates_one_by_one(order, bf16):
     for step in range(100):
         raw, importance = host_batch(step, pinned=True)
         expected = plain(view_batch(raw.cuda(), importance.cuda(), SPEC), torch.tensor(0.1, device="cuda"))
-        (found,) = static(raw, importance, 0.1, 1)
-        torch.testing.assert_close(found.metrics, expected.metrics, rtol=1e-3, atol=1e-3)
-        priorities = HostCopy(found.priorities).wait()
+        (result,) = static(raw, importance, 0.1, 1)
+        torch.testing.assert_close(result.metrics, expected.metrics, rtol=1e-3, atol=1e-3)
+        priorities = HostCopy(result.priorities).wait()
         torch.testing.assert_close(priorities, expected.priorities.cpu(), rtol=1e-3, atol=1e-3)

@@ -28,7 +28,7 @@ def make_agent(seed: int, config: AgentConfig = AGENT) -> Agent:
 @torch.no_grad()
 def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray, start: int, stop: int) -> list:
     """(state, Q of the action taken) of every step from ``start`` on, one at a time, from the state before it."""
-    found, (state, last) = [], torch.from_numpy(hidden).reshape(1, -1).tensor_split([AGENT.hidden], dim=1)
+    states, (state, last) = [], torch.from_numpy(hidden).reshape(1, -1).tensor_split([AGENT.hidden], dim=1)
     for k in range(start, stop):
         before = episode["action"][k - 1] if k else np.zeros(SPEC.action_dim, np.float32)
         o, missing, a, previous = (
@@ -41,8 +41,8 @@ def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray,
         step = agent.memory(seen, missing, previous, state)
         state, last = step.hidden[:, 0], seen[:, 0] if agent.config.impute_missing else last
         carried = torch.cat([state, last], 1)[0].numpy()
-        found.append((carried, float(agent.critic(agent.features(step), a).mean())))
-    return found
+        states.append((carried, float(agent.critic(agent.features(step), a).mean())))
+    return states
 
 
 def with_state(spec: WindowSpec, config: AgentConfig) -> WindowSpec:
@@ -81,9 +81,9 @@ def test_todays_weights_find_nothing_stale(spec: WindowSpec, config: AgentConfig
     chosen = np.flatnonzero(measurable(rows, spec))
     assert chosen.tolist() == [1, 2, 3, 4, 5]  # not the first, not the short
     for window in chosen:
-        found = staleness(agent, spec, rows[: window + 1])
-        assert len(found) == (6 if spec.burn_in else 3)
-        assert max(found.values()) < 1e-5
+        measured = staleness(agent, spec, rows[: window + 1])
+        assert len(measured) == (6 if spec.burn_in else 3)
+        assert max(measured.values()) < 1e-5
 
 
 def test_where_nothing_is_blank_the_state_is_that_of_the_step_by_step_way():
@@ -117,9 +117,9 @@ def test_as_a_plain_loop_has_it(window: int, config: AgentConfig) -> None:
         "stale_q_first_burned": gap[SPEC.burn_in],
         "stale_q_last_burned": gap[-1],
     }
-    found = staleness(today, spec, rows[: window + 1])
-    assert found == pytest.approx(expected, abs=1e-5)
-    assert found["stale_state_stored"] > found["stale_state_burned"] > 0.0
+    measured = staleness(today, spec, rows[: window + 1])
+    assert measured == pytest.approx(expected, abs=1e-5)
+    assert measured["stale_state_stored"] > measured["stale_state_burned"] > 0.0
 
 
 def test_a_state_of_zeros_is_wholly_stale() -> None:

@@ -59,8 +59,8 @@ def run_next_frame(agent, low, x, o, action):
 
 def run_model(agent, low, x, action):
     with torch.autocast("cpu", torch.bfloat16, enabled=low):
-        found = agent.world_model(x, action)
-        return torch.cat([found.hidden_change, found.observation_change, found.reward.unsqueeze(-1)], -1)
+        output = agent.world_model(x, action)
+        return torch.cat([output.hidden_change, output.observation_change, output.reward.unsqueeze(-1)], -1)
 
 
 CASES = {
@@ -86,29 +86,29 @@ def everything(agent, part, low):
     return {"out": out.detach(), **{f"input {k}": x.grad for k, x in enumerate(inputs)}, **named}
 
 
-def distance(found, expected):
-    return {name: float((found[name] - value).norm() / value.norm()) for name, value in expected.items()}
+def distance(actual, expected):
+    return {name: float((actual[name] - value).norm() / value.norm()) for name, value in expected.items()}
 
 
 @pytest.mark.parametrize("part", CASES)
 def test_values_and_gradients_are_as_near_to_float32_as_plain_bfloat16(pair, part):
     plain, fused = pair
     exact = everything(plain, part, low=False)
-    found, usual = (
+    actual, usual = (
         distance(everything(fused, part, low=True), exact),
         distance(everything(plain, part, low=True), exact),
     )
-    assert len(found) > 4
-    for name, far in found.items():
+    assert len(actual) > 4
+    for name, far in actual.items():
         assert far < 1.5 * usual[name] + 2e-3, (name, far, usual[name])
-    assert max(found.values()) > 1e-5  # it is bfloat16
+    assert max(actual.values()) > 1e-5  # it is bfloat16
 
 
 @pytest.mark.parametrize("part", CASES)
 def test_without_autocast_they_are_the_plain_ones_to_the_bit(pair, part):
     plain, fused = pair
-    expected, found = everything(plain, part, low=False), everything(fused, part, low=False)
-    assert all(torch.equal(found[name], value) for name, value in expected.items())
+    expected, actual = everything(plain, part, low=False), everything(fused, part, low=False)
+    assert all(torch.equal(actual[name], value) for name, value in expected.items())
 
 
 def test_parameters_keep_their_names_and_values(pair):
@@ -138,8 +138,8 @@ def impute(config, low, scale=1.0):
     missing = torch.rand(B, T, generator=generator) < 0.5
     o[missing] = 0.0
     with torch.autocast("cpu", torch.bfloat16, enabled=low):
-        found = [agent.fill(o, missing, action, state) for agent in (plain, fused)]
-    return *found, o, missing
+        filled = [agent.fill(o, missing, action, state) for agent in (plain, fused)]
+    return *filled, o, missing
 
 
 @pytest.mark.parametrize("flag", [False, True])
@@ -153,8 +153,8 @@ def test_blanks_are_filled_to_the_precision_of_bfloat16_and_nothing_else_is_touc
 
 
 def test_what_fills_a_blank_stays_where_observations_are():
-    for found, _ in impute(FILLING, low=True, scale=1e6)[:2]:
-        assert found.abs().max() == 10.0
+    for output, _ in impute(FILLING, low=True, scale=1e6)[:2]:
+        assert output.abs().max() == 10.0
 
 
 @pytest.mark.parametrize("changed", [{"embedding": 0}, {"layer_norm": True}, {"head_input": "observation"}, {}])
@@ -175,10 +175,10 @@ def test_the_way_back_through_the_critics_gives_what_is_asked_for(pair, asked):
         agent.critic.requires_grad_(asked == "neither")
         run_critic(agent, agent is fused, x, a).sum().backward()
         grads.append((x.grad, a.grad, agent.critic.layers[0].weight.grad))
-    for exact, found in zip(*grads, strict=True):
-        assert (exact is None) == (found is None)
+    for exact, actual in zip(*grads, strict=True):
+        assert (exact is None) == (actual is None)
         if exact is not None:
-            assert float((found - exact).norm() / exact.norm()) < 0.1  # a ReLU near 0 may open or close by rounding
+            assert float((actual - exact).norm() / exact.norm()) < 0.1  # a ReLU near 0 may open or close by rounding
 
 
 def test_an_update_in_bfloat16_is_fused_and_one_in_float32_is_not():

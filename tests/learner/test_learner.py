@@ -59,10 +59,10 @@ class Setting:
 
 @pytest.fixture
 def setting(tmp_path):
-    made = Setting(tmp_path)
-    yield made
-    made.learner.close()
-    made.server.close()
+    fresh = Setting(tmp_path)
+    yield fresh
+    fresh.learner.close()
+    fresh.server.close()
 
 
 def test_first_weights_are_out_before_any_experience(setting):

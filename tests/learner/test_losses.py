@@ -50,8 +50,8 @@ def test_model_error_and_loss(rng, m, d, norm):
             expected += mean if norm == "l1" else math.sqrt(sum(x * x for x in differences) / H)
             count += 1
     ft, ct, mt, dt = tensors(f, change, m, d)
-    found = losses.model_loss(losses.model_error(ft, ct, norm), dt, mt)
-    assert found.item() == pytest.approx(expected / count, rel=1e-5)
+    loss = losses.model_loss(losses.model_error(ft, ct, norm), dt, mt)
+    assert loss.item() == pytest.approx(expected / count, rel=1e-5)
 
 
 @pytest.mark.parametrize("norm", ["l1", "l2"])
@@ -146,16 +146,16 @@ def test_grounding_loss(rng, m):
     visible = [(b, t) for b, t in real_steps(m) if seen[b, t]]
     o_part = sum(np.abs(f[b, t] - change[b, t]).mean() for b, t in visible) / len(visible)
     r_part = sum(abs(fr[b, t] - r[b, t]) for b, t in real_steps(m)) / len(real_steps(m))
-    found = losses.grounding_loss(*tensors(f, change, fr, r, seen, m)).item()
-    assert found == pytest.approx(o_part + r_part, rel=1e-5)
+    loss = losses.grounding_loss(*tensors(f, change, fr, r, seen, m)).item()
+    assert loss == pytest.approx(o_part + r_part, rel=1e-5)
 
 
 def test_priority(rng, m):
     td = rng.normal(size=(B, T))
-    found = losses.priority(*tensors(td)[:1], 0.9, *tensors(m))
+    priorities = losses.priority(*tensors(td)[:1], 0.9, *tensors(m))
     for b in range(B):
         sizes = [abs(td[b, t]) for t in range(T) if m[b, t]]
-        assert found[b].item() == pytest.approx(0.9 * max(sizes) + 0.1 * sum(sizes) / len(sizes), rel=1e-5)
+        assert priorities[b].item() == pytest.approx(0.9 * max(sizes) + 0.1 * sum(sizes) / len(sizes), rel=1e-5)
 
 
 def test_masked_mean_of_nothing_is_zero():

@@ -33,9 +33,9 @@ def give_gradients(values: list[nn.Parameter], step: int) -> None:
 
 def agent() -> Agent:
     torch.manual_seed(0)
-    made = Agent(3, 2, AgentConfig(hidden=24, embedding=20, heads=(40, 28), impute_missing=True))
-    fuse(made)
-    return made
+    network = Agent(3, 2, AgentConfig(hidden=24, embedding=20, heads=(40, 28), impute_missing=True))
+    fuse(network)
+    return network
 
 
 def test_it_is_torchs_adam():

@@ -29,12 +29,7 @@ AGENTS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def make(agent: str, bf16: bool) -> JointUpdate:
@@ -47,19 +42,19 @@ def make(agent: str, bf16: bool) -> JointUpdate:
 def test_it_is_the_same_update(agent, bf16):
     plain, update = make(agent, bf16), make(agent, bf16)
     in_turn, apart = DeviceUpdate(plain, SPEC, BATCH), PipelinedUpdate(update, SPEC, BATCH)
-    expected, found = [], []
+    expected, actual = [], []
     for step in range(1, 41):
         raw, importance = host_batch(step, missing=step > 20)  # what imputes is trained at some updates, then at all
-        for updated, results in ((in_turn, expected), (apart, found)):
+        for updated, results in ((in_turn, expected), (apart, actual)):
             results += copy.deepcopy(updated(raw, importance, 0.1 * step, step))
         if step % 15 == 0:  # as before weights are read
-            found += copy.deepcopy(apart.drain())
+            actual += copy.deepcopy(apart.drain())
             assert apart.pending == 0
             assert_same(update.agent.state_dict(), plain.agent.state_dict())
-    found += copy.deepcopy(apart.drain())
+    actual += copy.deepcopy(apart.drain())
     apart.close()
-    assert len(found) == len(expected) == 40
-    for one, other in zip(found, expected, strict=True):
+    assert len(actual) == len(expected) == 40
+    for one, other in zip(actual, expected, strict=True):
         assert torch.equal(one.priorities, other.priorities)
         assert torch.equal(one.hidden, other.hidden)
         norm, of_both = one.metrics.pop("grad_norm"), other.metrics.pop("grad_norm")
@@ -68,22 +63,22 @@ def test_it_is_the_same_update(agent, bf16):
     assert_same(update.state_dict(), plain.state_dict())
 
 
-def assert_same(found: object, expected: object) -> None:
+def assert_same(actual: object, expected: object) -> None:
     """Bit for bit, however they are nested."""
     if isinstance(expected, torch.Tensor):
-        assert isinstance(found, torch.Tensor)
-        assert torch.equal(found, expected)
+        assert isinstance(actual, torch.Tensor)
+        assert torch.equal(actual, expected)
     elif isinstance(expected, dict):
-        assert isinstance(found, dict)
-        assert found.keys() == expected.keys()
+        assert isinstance(actual, dict)
+        assert actual.keys() == expected.keys()
         for name, value in expected.items():
-            assert_same(found[name], value)
+            assert_same(actual[name], value)
     elif isinstance(expected, list):
-        assert isinstance(found, list)
-        for one, other in zip(found, expected, strict=True):
+        assert isinstance(actual, list)
+        for one, other in zip(actual, expected, strict=True):
             assert_same(one, other)
     else:
-        assert found == expected
+        assert actual == expected
 
 
 def test_it_goes_on_from_a_checkpoint_of_the_other_kind():

@@ -4,7 +4,6 @@ import copy
 import dataclasses
 import io
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -15,17 +14,9 @@ from rmc.learner import losses
 from rmc.learner.config import UpdateConfig
 from rmc.learner.unroll import unroll
 from rmc.learner.update import TRAINS_MEMORY, JointUpdate, make_update
-from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid, to_batch
+from tests.learner.agents import PAPER, ROBUST
+from tests.learner.rows import SPEC, observation_valid, random_rows, spoil_padding, to_batch
 
-ROBUST = AgentConfig(
-    hidden=SPEC.state,
-    embedding=7,
-    heads=(10, 9),
-    layer_norm=True,
-    head_input="hidden+embedding",
-    normalize_observations=True,
-)
-PAPER = AgentConfig(hidden=SPEC.state, embedding=0, heads=(10, 9), grounding=False)
 BETA = torch.tensor(0.5)
 
 
@@ -123,8 +114,8 @@ def test_what_fills_blanks_trains_itself_alone():
     parts, *_ = update.forward(to_batch(random_rows(8, spec=spec), spec), BETA)
     named = dict(update.agent.named_parameters())
     for loss in parts:
-        found = torch.autograd.grad(parts[loss], list(named.values()), retain_graph=True, allow_unused=True)
-        reached = {name for name, grad in zip(named, found, strict=True) if grad is not None and grad.abs().sum() > 0}
+        grads = torch.autograd.grad(parts[loss], list(named.values()), retain_graph=True, allow_unused=True)
+        reached = {name for name, grad in zip(named, grads, strict=True) if grad is not None and grad.abs().sum() > 0}
         assert reached
         own = part(update, "next_frame.")
         assert reached == own if loss == "fill_loss" else not reached & own, loss
@@ -133,15 +124,11 @@ def test_what_fills_blanks_trains_itself_alone():
 def test_garbage_in_padding_changes_nothing():
     rows = random_rows(12)
     dirty = rows.copy()
-    observed, stepped = observation_valid(rows), step_valid(rows)
-    dirty["observation"][~observed] = np.nan
-    dirty["missing"][~observed] = 1
-    dirty["action"][~stepped] = np.inf
-    dirty["reward"][~stepped] = np.nan
+    spoil_padding(dirty)
     clean_update, dirty_update = make(ROBUST, latent_target="ema"), make(ROBUST, latent_target="ema")
     clean, dirtied = clean_update(to_batch(rows), BETA), dirty_update(to_batch(dirty), BETA)
     assert torch.equal(clean.priorities, dirtied.priorities)
-    assert torch.equal(clean.observed, torch.from_numpy(observed[:, SPEC.burn_in :]))
+    assert torch.equal(clean.observed, torch.from_numpy(observation_valid(rows)[:, SPEC.burn_in :]))
     assert torch.equal(clean.hidden[clean.observed], dirtied.hidden[dirtied.observed])
     for name, value in clean.metrics.items():
         assert torch.equal(value, dirtied.metrics[name]), name
@@ -154,11 +141,11 @@ def test_padded_burn_in_starts_from_the_stored_state():
     rows["first"] = SPEC.burn_in
     rows["observation"][:, : SPEC.burn_in] = 0.0
     batch, update = to_batch(rows), make(PAPER)
-    found = unroll(update.agent.memory, batch.observation, batch, SPEC.burn_in).hidden
+    hidden = unroll(update.agent.memory, batch.observation, batch, SPEC.burn_in).hidden
     n = SPEC.burn_in
     o, missing, previous = batch.observation[:, n:], batch.missing[:, n:], batch.prev_action[:, n:]
     alone = update.agent.memory(o, missing, previous, batch.state).hidden
-    assert torch.equal(found, alone)
+    assert torch.equal(hidden, alone)
 
 
 def test_burn_in_gets_no_gradient():

@@ -11,10 +11,10 @@ from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.learner.config import UpdateConfig
 from rmc.learner.update import make_update
+from tests.learner.agents import PAPER
 from tests.learner.plain_update import PlainUpdate
 from tests.learner.rows import SPEC, random_rows, to_batch
 
-PAPER = AgentConfig(hidden=SPEC.state, embedding=0, heads=(10, 9), grounding=False)
 ROBUST = AgentConfig(
     hidden=SPEC.state,
     embedding=7,
@@ -74,10 +74,10 @@ def test_three_updates_are_those_of_the_equations(agent: AgentConfig, options: d
     for turn in range(3):
         rows, importance = random_rows(4, turn, spec), np.linspace(0.3, 1.0, 4).astype(np.float32)
         expected, priorities = plain(rows, importance, BETA)
-        found = update(to_batch(rows, spec, importance), torch.tensor(BETA))
+        result = update(to_batch(rows, spec, importance), torch.tensor(BETA))
         for name, value in expected.items():
-            if NAMES[name] in found.metrics:
-                assert found.metrics[NAMES[name]].item() == pytest.approx(value, rel=2e-3, abs=1e-4), (turn, name)
-        np.testing.assert_allclose(found.priorities, priorities, rtol=2e-3)
+            if NAMES[name] in result.metrics:
+                assert result.metrics[NAMES[name]].item() == pytest.approx(value, rel=2e-3, abs=1e-4), (turn, name)
+        np.testing.assert_allclose(result.priorities, priorities, rtol=2e-3)
     for (name, value), other in zip(network.named_parameters(), plain.agent.parameters(), strict=True):
         torch.testing.assert_close(value, other, atol=3e-4, rtol=2e-3, msg=lambda text, name=name: f"{name}: {text}")

@@ -41,10 +41,10 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Image:
     pip = {name: value for name, value in os.environ.items() if name.startswith(("PIP_", "SSL_CERT"))}
     wheels = [Path(word) for word in pip.get("PIP_FIND_LINKS", "").split() if Path(word).is_dir()]
     torch = {"TORCH_INDEX": os.environ["RMC_TORCH_INDEX"]} if "RMC_TORCH_INDEX" in os.environ else {}
-    made = Image(root, ROOT, bound=wheels)
-    made.build(DOCKERFILE, torch, pip)
-    made.bound = []
-    return made
+    built = Image(root, ROOT, bound=wheels)
+    built.build(DOCKERFILE, torch, pip)
+    built.bound = []
+    return built
 
 
 @pytest.fixture
@@ -66,10 +66,10 @@ def test_it_holds_torch_for_the_cpu_and_no_sources(image: Image, work: Path) -> 
     assert rmc(image, work, "--version").startswith("rmc ")
     assert not (image.root / "src").exists()
     image.entrypoint = ["python3"]
-    found = rmc(image, work, "-c", "import sys, torch; print(torch.version.cuda, *sys.version_info[:2])")
+    versions = rmc(image, work, "-c", "import sys, torch; print(torch.version.cuda, *sys.version_info[:2])")
     image.entrypoint = ["rmc"]
     (python,) = re.findall(r"FROM python:([\d.]+)-slim", DOCKERFILE)
-    assert found == f"None {python.replace('.', ' ')}\n"
+    assert versions == f"None {python.replace('.', ' ')}\n"
 
 
 def test_a_run_from_its_start_to_its_policy(image: Image, work: Path) -> None:
@@ -93,6 +93,6 @@ def test_the_pages_commands_run_for_a_user_whom_the_image_does_not_know(image: I
     for words in [*commands, own]:
         shorter = ["--total-steps", "1000"] * (words[0] == "train")
         assert "return" in rmc(image, work, *words, *shorter, uid=STRANGER)
-    made = [path for path in work.rglob("*") if path.name != "swing.py"]
-    assert {path.stat().st_uid for path in made} == {STRANGER}
+    files = [path for path in work.rglob("*") if path.name != "swing.py"]
+    assert {path.stat().st_uid for path in files} == {STRANGER}
     assert sum(path.stat().st_size for path in (work / ".cache").rglob("*")) < 1 << 20

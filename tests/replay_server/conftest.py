@@ -20,13 +20,13 @@ def bus() -> MemoryBus:
 @pytest.fixture
 def make(tmp_path: Path, bus: MemoryBus) -> Iterator[Make]:
     """Servers in one folder unless another is named, closed at the end."""
-    made: list[ReplayServer] = []
+    servers: list[ReplayServer] = []
 
     def build(config: ReplayConfig = OPEN, folder: str = "replay", actors: int = 2, total: int = 10**6,
               slack: int = 16, seed: int = 7, on: Bus | None = None) -> ReplayServer:  # fmt: skip
-        made.append(ReplayServer(SPEC, config, tmp_path / folder, seed, total, actors, slack, on or bus))
-        return made[-1]
+        servers.append(ReplayServer(SPEC, config, tmp_path / folder, seed, total, actors, slack, on or bus))
+        return servers[-1]
 
     yield build
-    for server in made:
+    for server in servers:
         server._store.lock >= 0 and close(server)

@@ -92,7 +92,7 @@ def test_draws_of_sound_rows_are_as_they_were(make: Make, bus: MemoryBus) -> Non
 
 def slow_faults(rows: Rows) -> list[str]:
     """The same judgement, row by row and as it is said."""
-    found = []
+    refused = []
     for row in rows:
         first, last, new, seen = (int(row[name]) for name in ("first", "last", "new_steps", "new_observations"))
         faults = {
@@ -106,8 +106,8 @@ def slow_faults(rows: Rows) -> list[str]:
             FAULTS[8]: row["initial_priority"] < 0,
             **{f"{name} is not finite": not np.isfinite(row[name]).all() for name in FLOATS},
         }
-        found.append(next((fault for fault, is_so in faults.items() if is_so), ""))
-    return found
+        refused.append(next((fault for fault, is_so in faults.items() if is_so), ""))
+    return refused
 
 
 def test_flipped_bits_are_judged_as_a_loop_judges_them() -> None:
@@ -121,11 +121,11 @@ def test_flipped_bits_are_judged_as_a_loop_judges_them() -> None:
     assert 100 < np.count_nonzero(row_faults(rows, SPEC)) < 3000
 
 
-@pytest.mark.parametrize(("name", "value", "fault"), [(name, *found) for name, found in WORDS.items()])
+@pytest.mark.parametrize(("name", "value", "fault"), [(name, *values) for name, values in WORDS.items()])
 def test_a_fault_has_its_name(name: str, value: float, fault: str) -> None:
     rows = make_rows(5)
     rows[name][2] = value
-    assert [FAULTS[found] for found in row_faults(rows, SPEC)] == ["", "", fault, "", ""]
+    assert [FAULTS[code] for code in row_faults(rows, SPEC)] == ["", "", fault, "", ""]
 
 
 @pytest.mark.parametrize("value", [3e38, np.nan, np.inf, -1.0, 0.0, 9.0])

@@ -91,5 +91,5 @@ def test_it_does_not_look_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(episode, "FARTHEST", 2)
     ring = ring_of(tmp_path, [0, 4, 8, 12])
     assert find_episode(ring, 3, most=5) is None
-    found = find_episode(ring, 2, most=5)
-    assert np.array_equal(found, [0, 1, 2])
+    slots = find_episode(ring, 2, most=5)
+    assert np.array_equal(slots, [0, 1, 2])

@@ -104,9 +104,9 @@ def test_most_streams_and_the_ratio_fit_into_a_record(obs_dim: int) -> None:
     progress.streams = {actor: StreamPosition(EntryId(1, 0), 0) for actor in range(4096)}
     records = RecordPair(np.zeros(2 * record_bytes(obs_dim), np.uint8), obs_dim)
     records.write(progress)
-    found = records.read()
-    assert found is not None
-    assert (len(found.streams), found.replay_ratio) == (4096, 4.0)
+    read = records.read()
+    assert read is not None
+    assert (len(read.streams), read.replay_ratio) == (4096, 4.0)
 
 
 def test_too_many_streams() -> None:

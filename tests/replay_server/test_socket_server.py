@@ -16,7 +16,6 @@ import numpy as np
 import psutil
 import pytest
 
-from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.errors import AuthenticationError, ConfigError, FencedError, MessageError, RmcError
 from rmc.common.replay import Sample, SampleStatus
 from rmc.common.shared_batches import TURNS
@@ -25,66 +24,9 @@ from rmc.learner.replay_client import ReplayClient
 from rmc.learner.replay_connection import ReplayConnection
 from rmc.replay_server import socket_server
 from rmc.replay_server.config import ReplayConfig
-from rmc.replay_server.server import ReplayServer
 from rmc.replay_server.socket_server import SocketServer
-from tests.replay_server.support import SPEC, Sender, make_rows
-
-SECRET = b"a secret of the run"
-MAX_BATCH = 4096
-BIG = MAX_BATCH * (SPEC.dtype.itemsize + 8)
-
-
-class Served:
-    """A replay server with its socket, polled by a thread."""
-
-    def __init__(self, folder: Path, address: str, config: ReplayConfig, windows: int, total: int = 10**9) -> None:
-        bus = MemoryBus()
-        self.replay = ReplayServer(SPEC, config, folder, 3, total, 1, 64, bus)
-        self.sender = Sender(bus)
-        self.sender.send(windows)
-        while self.replay.step():
-            pass
-        self.sockets = SocketServer(self.replay, SPEC, address, SECRET, MAX_BATCH)
-        self.address = self.sockets.address
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._loop)
-        self._thread.start()
-
-    def _loop(self) -> None:
-        while not self._stop.is_set():
-            self.sockets.wait(0.01)
-            self.sockets.poll()
-
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join()
-        self.sockets.close()
-        self.replay.close()
-
-    def connect(self, secret: bytes = SECRET, epoch: int = 0) -> ReplayConnection:
-        return ReplayConnection(self.address, secret, SPEC.fingerprint, BIG, epoch=epoch)
-
-    def client(self, epoch: int) -> ReplayClient:
-        """A learner's end."""
-        client = ReplayClient(lambda: self.address, SECRET, SPEC, 8)
-        client.register_learner(epoch)
-        return client
-
-    def stranger(self) -> socket.socket:
-        """A raw connection that has got its challenge and said nothing."""
-        raw = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        raw.settimeout(5.0)
-        raw.connect(self.address.removeprefix("unix:"))
-        raw.recv(4096)
-        return raw
-
-    def refused(self, reason: str) -> None:
-        """Wait until a client was sent away for this reason."""
-        end = time.monotonic() + 5.0
-        while self.sockets.refused[reason] == 0:
-            assert time.monotonic() < end, f"nobody was refused for {reason}, but for {dict(self.sockets.refused)}"
-            time.sleep(0.005)
-
+from tests.replay_server.served import BIG, MAX_BATCH, SECRET, Served
+from tests.replay_server.support import SPEC, make_rows
 
 Serve = Callable[..., Served]
 Frame = Callable[[bytes], tuple[Kind, dict[str, Any]]]  # of a client's nonce
@@ -93,15 +35,15 @@ FREE = ReplayConfig(capacity=5000, replay_ratio=1e9, warmup_steps=0)
 
 @pytest.fixture
 def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serve]:
-    made: list[Served] = []
+    started: list[Served] = []
 
     def build(config: ReplayConfig = FREE, address: str = "", windows: int = 200, total: int = 10**9) -> Served:
         folder = tmp_path_factory.mktemp("s")
-        made.append(Served(folder / "replay", address or f"unix:{folder}/r.sock", config, windows, total))
-        return made[-1]
+        started.append(Served(folder / "replay", address or f"unix:{folder}/r.sock", config, windows, total))
+        return started[-1]
 
     yield build
-    for served in made:
+    for served in started:
         served.close()
 
 
@@ -313,8 +255,8 @@ def away_for(served: Served, sample: Sample, reason: str, caplog: pytest.LogCapt
     lawful, client = served.replay.sample, served.client(0)
     served.replay.sample = lambda *_: sample  # type: ignore[method-assign]
     assert [client.sample(8).draw for _ in range(3)] == [SampleStatus.WAIT] * 3
-    (said,) = [record.message for record in caplog.records if "is away" in record.message]
-    assert f"is away: {reason}: " in said
+    (message,) = [record.message for record in caplog.records if "is away" in record.message]
+    assert f"is away: {reason}: " in message
     served.replay.sample = lawful  # type: ignore[method-assign]
     assert client.sample(8).draw is SampleStatus.BATCH
     client.close()
@@ -518,9 +460,9 @@ def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> Non
         assert draws[-1].env_steps == 200 * SPEC.train
         client.update_priorities(np.arange(16), np.full(16, 3.0, np.float32))
         assert client.statistics().count == 200 * SPEC.train
-        found = client.episode(7)  # every window here is an episode of its own
-        assert found is not None
-        assert found["serial"].tolist() == [7]
+        episode = client.episode(7)  # every window here is an episode of its own
+        assert episode is not None
+        assert episode["serial"].tolist() == [7]
         assert client.episode(999) is None
         served.close()
         served.close = lambda: None  # type: ignore[method-assign]
@@ -531,7 +473,12 @@ def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> Non
 def test_it_listens_on_the_interface_named_alone(serve: Serve) -> None:
     served = serve(address="tcp:127.0.0.1:0")
     port = int(served.address.rpartition(":")[2])
-    own = [found.address for each in psutil.net_if_addrs().values() for found in each if found.family == socket.AF_INET]
+    own = [
+        address.address
+        for each in psutil.net_if_addrs().values()
+        for address in each
+        if address.family == socket.AF_INET
+    ]
     for other in {"127.0.0.2", *own} - {"127.0.0.1"}:
         with pytest.raises(OSError, match=r"refused|assign"), socket.create_connection((other, port), 5.0):
             pass

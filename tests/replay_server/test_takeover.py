@@ -194,9 +194,9 @@ def test_what_another_redis_held_is_read_once_the_older_server_is_fenced(
 
     def progress(role: str) -> bytes | None:
         looks.append(role)
-        found = bus._progress[role] if len(looks) > 1 else published
+        progress = bus._progress[role] if len(looks) > 1 else published
         drain(old) if len(looks) == 1 else None  # which knows of no newer server yet
-        return found
+        return progress
 
     monkeypatch.setattr(bus, "progress", progress)
     new = make(folder="new")

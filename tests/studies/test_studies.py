@@ -29,9 +29,9 @@ NAMES = sorted({path.stem for path in Path(studies.__file__).parent.glob("*.py")
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("scale", ["smoke", "small", "full"])
 def test_every_run_is_one_that_rmc_takes(name, scale):
-    found: Study = importlib.import_module(f"studies.{name}").STUDY
-    assert found.name == name
-    jobs = found.jobs(scale)
+    imported: Study = importlib.import_module(f"studies.{name}").STUDY
+    assert imported.name == name
+    jobs = imported.jobs(scale)
     assert len({job.folder for job in jobs}) == len(jobs)
     seen = set()
     for job in jobs:
@@ -56,18 +56,18 @@ def test_a_study_runs_once_and_its_lines_can_be_plotted(tmp_path, monkeypatch):
     assert [job.values["agent"] for job in jobs] == ["ours", "theirs"]
     tiny.run("smoke", jobs, at_once=2)
     lines = tmp_path / "tiny-smoke.jsonl"
-    found = history.read(lines)
-    assert {one.agent for one in found} == {"ours", "theirs"}
-    assert {one.env for one in found} == {"InvertedPendulum-v5, flicker 0.1"}
-    assert all(one.finished and one.env_steps >= 1200 and one.commit for one in found)
+    histories = history.read(lines)
+    assert {one.agent for one in histories} == {"ours", "theirs"}
+    assert {one.env for one in histories} == {"InvertedPendulum-v5, flicker 0.1"}
+    assert all(one.finished and one.env_steps >= 1200 and one.commit for one in histories)
     before = lines.read_bytes()
     tiny.run("smoke", jobs)
     assert lines.read_bytes() == before
     played = averaging.play(jobs[0], episodes=1)
     plays = iter([{**one.values, "seed": one.seed} for one in jobs])
     for _ in range(2):  # the second time nothing is left to play
-        told = tiny.played("smoke", jobs, Play("played", lambda _: next(plays), print)).read_text().splitlines()
-        assert [json.loads(line)["agent"] for line in told] == ["ours", "theirs"]
+        written = tiny.played("smoke", jobs, Play("played", lambda _: next(plays), print)).read_text().splitlines()
+        assert [json.loads(line)["agent"] for line in written] == ["ours", "theirs"]
     assert played["env_steps"] == sorted(played["env_steps"]) != []
     assert len(played["averaged"]) == len(played["newest"]) == len(played["env_steps"])
     assert np.isfinite([played["averaged"], played["newest"]]).all()
@@ -143,8 +143,8 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, monkeypatch):
     tiny = Study("tiny", agents, small=Scale(1000, (1,), ("InvertedPendulum-v5",)))
     with pytest.raises(ConfigError, match="gamma"):
         tiny.run("smoke", tiny.jobs("smoke"))
-    (found,) = (json.loads(line) for line in (tmp_path / "tiny-smoke.jsonl").read_text().splitlines())
-    assert found["agent"] == "sound"
+    (kept,) = (json.loads(line) for line in (tmp_path / "tiny-smoke.jsonl").read_text().splitlines())
+    assert kept["agent"] == "sound"
 
 
 def test_ctrl_c_starts_no_other_run(tmp_path, monkeypatch, capsys):
@@ -193,7 +193,7 @@ def test_an_area_is_over_partial_views_only(tmp_path, capsys):
     lines = [{"agent": "RMC", "env": "Hopper-v5", "seed": seed, "returns": returns} for seed in (1, 2)]
     (tmp_path / "lines").write_text("\n".join(map(json.dumps, lines)))
     assert generalisation.area(returns) == 20.0
-    generalisation.tell(tmp_path / "lines")
+    generalisation.report(tmp_path / "lines")
     assert capsys.readouterr().out == "Hopper-v5, RMC: 20 (20, 20)\n"
 
 
@@ -201,7 +201,7 @@ def test_averages_are_judged_by_a_runs_second_half(tmp_path, capsys):
     both = {"averaged": [9, 2, 4, 6], "newest": [9, 1, 3, 8]}
     line = {"agent": "RMC", "env": "Hopper-v5", "seed": 1, "env_steps": [10, 20, 30, 40]} | both
     (tmp_path / "lines").write_text(json.dumps(line))
-    averaging.tell(tmp_path / "lines")
+    averaging.report(tmp_path / "lines")
     assert capsys.readouterr().out.splitlines() == [
         "RMC, Hopper-v5, seed 1, averaged: mean 5, worst 4, deviation 1 of 2 checkpoints",
         "RMC, Hopper-v5, seed 1, newest: mean 6, worst 3, deviation 2 of 2 checkpoints",

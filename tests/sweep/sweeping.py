@@ -44,8 +44,8 @@ class Sweeping:
     def lines(self) -> dict[str, dict[str, Any]]:
         """Of its index, by run."""
         path = self.folder / "sweep.jsonl"
-        found = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-        return {line["run"]: line for line in found}
+        lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        return {line["run"]: line for line in lines}
 
     def states(self) -> dict[str, str]:
         """Of its runs."""

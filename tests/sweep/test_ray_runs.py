@@ -109,13 +109,13 @@ def test_a_copy_is_like_the_folder_and_only_what_changed_is_sent(tmp_path: Path)
         file.write("second\n")
     (source / "checkpoints" / "1").rename(source / "checkpoints" / "2")
     (source / "events").mkdir()
-    later = pack(source, parcel.known)
-    unpack(later, copy, parcel.known)
+    later = pack(source, parcel.stamps)
+    unpack(later, copy, parcel.stamps)
     assert _content(copy) == {"checkpoints/2/policy": "one", "metrics.jsonl": "first\nsecond\n", "secret": "s"}
     assert (copy / "events").is_dir()
     with tarfile.open(fileobj=io.BytesIO(later.tar)) as tar:
         assert sorted(tar.getnames()) == ["checkpoints/2/policy", "metrics.jsonl"]
-    with tarfile.open(fileobj=io.BytesIO(pack(source, later.known).tar)) as tar:
+    with tarfile.open(fileobj=io.BytesIO(pack(source, later.stamps).tar)) as tar:
         assert tar.getnames() == []
 
 

@@ -179,6 +179,6 @@ def test_without_optuna_it_is_said_how_to_install_it(
     monkeypatch.setitem(sys.modules, "optuna", None)
     monkeypatch.delitem(sys.modules, "rmc.sweep.search", raising=False)
     assert run(["sweep", str(write_spec(tmp_path, TABLE)), "--sweep-dir", str(tmp_path / "sweep")]) == 2
-    said = capsys.readouterr().err
-    assert "Optuna is not installed; pip install" in said
-    assert said.count("\n") == 1
+    errors = capsys.readouterr().err
+    assert "Optuna is not installed; pip install" in errors
+    assert errors.count("\n") == 1

@@ -123,19 +123,19 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize(("text", "said"), FILES.items())
+@pytest.mark.parametrize(("text", "message"), FILES.items())
 def test_a_bad_file_is_one_line_and_nothing_is_written(
-    text: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("spec.toml").write_text(f'env = "{PENDULUM}"\n{text}\n')
     assert main.run(["sweep", "spec.toml"]) == 2
-    _one_line(capsys, said)
+    _one_line(capsys, message)
     assert os.listdir() == ["spec.toml"]
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ([], "ENV|SPEC.toml"),
         (["nowhere.toml"], "SPEC='nowhere.toml': No such file"),
@@ -158,16 +158,16 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(
     ],
 )
 def test_bad_words_are_one_line(
-    words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main.run(["sweep", *words]) == 2
-    _one_line(capsys, said)
+    _one_line(capsys, message)
     assert os.listdir() == []
 
 
-def _one_line(capsys: pytest.CaptureFixture[str], said: str) -> None:
-    found = capsys.readouterr()
-    assert found.out == ""
-    assert found.err.count("\n") == 1
-    assert said in found.err
+def _one_line(capsys: pytest.CaptureFixture[str], message: str) -> None:
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert message in captured.err

@@ -28,10 +28,10 @@ def test_a_grid_is_run_once_and_told(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert sweep.finish() == 0, sweep.text()
         lines, text = sweep.lines(), sweep.text()
     assert text.startswith(f"2 runs in {folder}, 0 of them over; {min(2, room.cores())} at a time")
-    told = re.findall(
+    events = re.findall(
         r"^([12] of 2): learning_rate \S+, seed 0: return \S+ after 70[01] steps, \d+ s$", text, re.MULTILINE
     )
-    assert told == ["1 of 2", "2 of 2"]
+    assert events == ["1 of 2", "2 of 2"]
     assert {name: line["values"] for name, line in lines.items()} == {
         name: {"learning_rate": rate} for name, rate in runs.items()
     }
@@ -57,9 +57,9 @@ def test_a_grid_is_run_once_and_told(tmp_path: Path, capsys: pytest.CaptureFixtu
     one = str(folder / next(iter(runs)))
     assert run(["evaluate", one, "--episodes", "1"]) == 0
     assert run(["plot", str(folder), "--out", str(tmp_path / "out.png")]) == 0
-    said = capsys.readouterr().out
-    assert "RMC debug" in said
-    assert "--learning-rate 0.001" in said
+    output = capsys.readouterr().out
+    assert "RMC debug" in output
+    assert "--learning-rate 0.001" in output
 
 
 def test_a_killed_run_is_told_the_other_goes_on_and_the_same_command_resumes(tmp_path: Path) -> None:
@@ -167,9 +167,9 @@ def test_a_sweep_in_a_runs_folder_or_with_a_damaged_index_is_refused(
     (tmp_path / "file").touch()
     for name, fault in {"run": "is a run's folder", "torn": "sweep.jsonl:1", "file": "cannot be used"}.items():
         assert run(["sweep", spec, "--sweep-dir", str(tmp_path / name)]) == 2
-        said = capsys.readouterr().err
-        assert fault in said
-        assert said.count("\n") == 1
+        errors = capsys.readouterr().err
+        assert fault in errors
+        assert errors.count("\n") == 1
 
 
 def test_a_stop_signal_before_a_run_trains_ends_it_too(tmp_path: Path) -> None:

@@ -100,10 +100,10 @@ def replay_server() -> None:
             die()
 
     def all_there(self: Any, positions: Any) -> Any:
-        found = read(self, positions)
+        batch = read(self, positions)
         if self.gaps:
             say("gap", gaps=self.gaps)
-        return found
+        return batch
 
     def compared(self: Any) -> bool:
         if strikes("compare-tree"):
@@ -140,11 +140,11 @@ def learner() -> None:
 
     def compared(self: Any) -> int:
         epoch = resume(self)
-        found = self.checkpoints.latest()
-        if found is not None:
-            said = torch.load(self.checkpoints.path(found[0]) / STATE, weights_only=True)
-            newest = found[0] == max(self.checkpoints.numbers())  # which no kill has cut short
-            say("resumed", number=found[0], same=newest and _same(said, self.update.state_dict()))
+        checkpoint = self.checkpoints.latest()
+        if checkpoint is not None:
+            state = torch.load(self.checkpoints.path(checkpoint[0]) / STATE, weights_only=True)
+            newest = checkpoint[0] == max(self.checkpoints.numbers())  # which no kill has cut short
+            say("resumed", number=checkpoint[0], same=newest and _same(state, self.update.state_dict()))
         return epoch
 
     def slower(self: Any, raw: Any, importance: Any, beta: float, number: int) -> Any:

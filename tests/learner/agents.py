@@ -1,0 +1,14 @@
+"""Small agents for the learner's tests."""
+
+from rmc.common.agent_config import AgentConfig
+from tests.learner.rows import SPEC
+
+PAPER = AgentConfig(hidden=SPEC.state, embedding=0, heads=(10, 9), grounding=False)
+ROBUST = AgentConfig(
+    hidden=SPEC.state,
+    embedding=7,
+    heads=(10, 9),
+    layer_norm=True,
+    head_input="hidden+embedding",
+    normalize_observations=True,
+)
