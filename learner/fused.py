@@ -92,7 +92,8 @@ class FusedGRU(Rounded, nn.GRU):
     """One layer, batch first."""
 
     def weights(self) -> list[Tensor]:
-        return [self.weight_ih_l0, self.weight_hh_l0]
+        input_weight, recurrent_weight = self.all_weights[0][:2]
+        return [input_weight, recurrent_weight]
 
     def forward(self, x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         """(B, T, E), (1, B, H) -> (B, T, H) and (1, B, H)."""
