@@ -105,6 +105,22 @@ def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 @pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("train X --totl-steps 5", "Unrecognized options: --totl-steps, 5; did you mean --total-steps?"),
+        ("evaluate x --episods 3", "Unrecognized options: --episods, 3; did you mean --episodes?"),
+        ("train X --zzzz", "Unrecognized options: --zzzz"),
+        (
+            "resume x --if-exists new",
+            "Unrecognized or misplaced options: --if-exists new; --if-exists is an option of rmc train",
+        ),
+    ],
+)
+def test_a_wrong_option_is_one_short_line(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert complaint(words.split(), capsys) == f"rmc: {said} (see rmc --help)"
+
+
+@pytest.mark.parametrize(
     ("words", "named"),
     [
         (["train", "Nope-v0"], "Nope-v0"),
