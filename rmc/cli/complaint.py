@@ -28,7 +28,7 @@ def _near(boxed: str, command: str) -> str:
             found[option[1]] = []
         elif found and (where := WHERE.match(row)):
             found[list(found)[-1]].append(where[1])
-    for option, commands in found.items():
+    for name, commands in found.items():
         if command in commands:
-            return f"; did you mean {option}?"
-    return "".join(f"; {option} is an option of {commands[0]}" for option, commands in found.items() if commands)
+            return f"; did you mean {name}?"
+    return "".join(f"; {name} is an option of {commands[0]}" for name, commands in found.items() if commands)
