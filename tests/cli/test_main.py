@@ -32,7 +32,7 @@ TRAIN_FLAGS = """
     --init-from --init-parts
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
     --env-timeout --env-kwargs --config --run-dir --if-exists --launcher --device --redis-url
-    --ray-address --all-cpus --tls --track --track-project --track-tags --dry-run
+    --ray-address --all-cpus --tls --track --track-project --track-tags --track-video-every --dry-run
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
     --missing-flag --impute-missing --initial-priority
