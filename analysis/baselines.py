@@ -39,7 +39,7 @@ from rmc.deploy.run.config import flat, option
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.migrations import FORMAT
-from rmc.deploy.run.opening import make, new_folder
+from rmc.deploy.run.opening import forget_start, has_more_than_a_start, make, new_folder
 from rmc.deploy.run.starts import note_start, resume_command
 from rmc.deploy.run.state import STOPPED
 
@@ -105,10 +105,12 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
         raise ConfigError("ENV" if refused == "env.id" else option(refused), now[refused], fix)
     if there:
         folder.check_sizes(config.env.id, sizes)
-    elif folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
+    elif has_more_than_a_start(folder):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no baseline's; give another one")
     make(folder)
     folder.lock()
+    if not there:
+        forget_start(folder)
     folder.reopen(config.total_steps)
     note_start(folder, changes, LaunchOptions(folder.path), None)
     written = json.dumps({"format": FORMAT} | asdict(config), indent=2)

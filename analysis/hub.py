@@ -12,6 +12,7 @@ from rmc.common.extra import how_to_install
 
 SCHEME = "hf:/"  # before a repository's name, where a path is asked for; a Path keeps but one of its slashes
 CARD = "README.md"
+UNREACHED = (ConnectionError, TimeoutError, RuntimeError)  # of hf-xet, through which large files go
 
 
 def check_installed(repo: str) -> None:
@@ -68,7 +69,7 @@ def _in_one_line(repo: str, revision: str | None = None) -> Iterator[None]:
         status = error.response.status_code
         fix = "use a token that may" if status in (401, 403) else "try again"
         raise ConfigError("REPO", repo, f"the hub refuses it (HTTP {status}); {fix}") from None
-    except (errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError, errors.HTTPError) as error:  # type: ignore[attr-defined]
+    except (*UNREACHED, errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError, errors.HTTPError) as error:  # type: ignore[attr-defined]
         cause = error.__cause__ if isinstance(error, errors.LocalEntryNotFoundError) and error.__cause__ else error
         reason = (str(cause).splitlines() or [type(cause).__name__])[0]
         fix = f"cannot be reached ({reason}); try again with a network"

@@ -17,6 +17,7 @@ from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import option
+from rmc.deploy.run.starts import format_starts
 
 PAGES = (".html", ".htm")
 COLUMNS = ("agent", "runs", "return", "each run", f"worst of last {LAST}", "steps", "updates", "wall s")
@@ -123,6 +124,7 @@ def _course(run: ReportRun) -> dict[str, Any]:
     return {
         "name": run.name,
         "is_baseline": baseline,
+        "starts": format_starts(run.folder),
         "findings": run.findings,
         "waits": waits(run),
         "figures": figures,

@@ -27,7 +27,7 @@ TITLES = {
 }
 HEAD, RULE = "| option | default | what it is | when to touch it |", "|---|---|---|---|"
 PLACEMENT = ["run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls", "dry_run"]
-TRACKING = ["track", "track_project", "track_tags"]
+TRACKING = ["track", "track_project", "track_tags", "track_video_every"]
 BEGINNING = ["init_from", "init_parts"]
 # When a user should touch an option; what it does is said where it is defined.
 WHEN = {
@@ -48,6 +48,7 @@ WHEN = {
     "track": "to compare runs in a web service, or to keep their videos",
     "track_project": "to keep kinds of runs apart",
     "track_tags": "to find runs again",
+    "track_video_every": "to see how the policy changes; each film takes a core for some seconds, at low priority",
     "dry_run": "before a long run, or on a machine that is new to it",
     "flicker": "for trials of partial observation",
     "hide": "for trials of partial observation",

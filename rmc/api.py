@@ -30,6 +30,7 @@ def train(
     track: Tracker | Literal["off"] | None = None,
     track_project: str | None = None,
     track_tags: Sequence[str] = (),
+    track_video_every: int | None = None,
 ) -> dict[str, Any]:
     """Train a run to its ``total_steps``, or go on with the one in ``run_dir``; its ``result.json``.
 
@@ -51,6 +52,7 @@ def train(
         track=track,
         track_project=track_project,
         track_tags=tuple(track_tags),
+        track_video_every=track_video_every,
     )
     return _train(config, options)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rmc.common.bus.metrics_record import is_finite
+from rmc.deploy.monitor.films import Films
 from rmc.deploy.monitor.main_metrics import evaluation_metrics, main_metrics
 from rmc.deploy.monitor.recorded import empty_status
 from rmc.deploy.monitor.run_status import RunStatus
@@ -33,8 +34,11 @@ class TrackedRun(Protocol):
     def log(self, values: dict[str, Any], env_steps: int) -> None:
         """A row of numbers at an environment step."""
 
-    def finish(self, summary: dict[str, Any], video: Path | None, env_steps: int) -> None:
-        """Log the end, and return when all has arrived."""
+    def log_video(self, video: Path, env_steps: int) -> None:
+        """An episode of the policy as it was at an environment step."""
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """Log the end, with ``env_steps``, and return when all has arrived."""
 
 
 def main() -> None:
@@ -51,7 +55,7 @@ def main() -> None:
     try:
         tracking = kept_tracking(folder.path)
         assert tracking is not None
-        _follow(folder, _begin(folder, tracking, notify), read_from)
+        _follow(folder, _begin(folder, tracking, notify), read_from, Films(folder, tracking.video_every), notify)
     except Exception as error:
         notify(f"{_first_line(error)}; the run goes on without it")
         raise
@@ -85,8 +89,8 @@ def _first_line(error: BaseException) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
-def _follow(folder: RunFolder, run: TrackedRun, read_from: int) -> None:
-    """A row now and then, one for each evaluation, and the end."""
+def _follow(folder: RunFolder, run: TrackedRun, read_from: int, films: Films, notify: Notify) -> None:
+    """A row now and then, one for each evaluation, films, and the end."""
     board, tail = empty_status(folder), MetricsTail(folder.metrics, read_from=read_from)
     due, end = time.monotonic() + ROW_SECONDS, None
     while end is None:
@@ -95,11 +99,23 @@ def _follow(folder: RunFolder, run: TrackedRun, read_from: int) -> None:
             board.take(record)
             if values := evaluation_metrics(record):
                 run.log(values, _at(board, record))
+                films.take(record, _at(board, record))
+        _log_film(films, run, notify)
         if time.monotonic() >= due or end is not None:
             due = time.monotonic() + ROW_SECONDS
             run.log(row(board), board.env_steps)
-    video = end.pop("video", None)
-    run.finish(end, Path(video) if video else None, end.get("env_steps", board.env_steps))
+    films.close()
+    if video := end.pop("video", None):
+        run.log_video(Path(video), end.get("env_steps", board.env_steps))
+    run.finish({"env_steps": board.env_steps} | end)
+
+
+def _log_film(films: Films, run: TrackedRun, notify: Notify) -> None:
+    film = films.finished()
+    if film is not None and film.fault:
+        notify(f"no {film.path.name}: {film.fault.removeprefix('rmc: ')}")
+    elif film is not None:
+        run.log_video(film.path, film.env_steps)
 
 
 def _end_of_run() -> dict[str, Any] | None:

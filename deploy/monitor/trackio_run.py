@@ -27,11 +27,12 @@ class TrackioRun:
         """A row of numbers at an environment step."""
         self._run.log(values, step=env_steps)
 
-    def finish(self, summary: dict[str, Any], video: Path | None, env_steps: int) -> None:
+    def log_video(self, video: Path, env_steps: int) -> None:
+        """An episode of the policy as it was at an environment step."""
+        self._run.log({"video": trackio.Video(video)}, step=env_steps)
+
+    def finish(self, summary: dict[str, Any]) -> None:
         """Log the end, and return when all has arrived."""
         numbers = {name: value for name, value in summary.items() if isinstance(value, int | float)}
-        end: dict[str, Any] = {f"result/{name}": value for name, value in numbers.items()}
-        if video is not None:
-            end["video"] = trackio.Video(video)
-        self._run.log(end, step=env_steps)
+        self._run.log({f"result/{name}": value for name, value in numbers.items()}, step=summary["env_steps"])
         self._run.finish()  # type: ignore[no-untyped-call]

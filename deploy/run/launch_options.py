@@ -27,3 +27,4 @@ class LaunchOptions:
     track: Tracker | Literal["off"] | None = None
     track_project: str | None = None
     track_tags: tuple[str, ...] = ()
+    track_video_every: int | None = None

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 import time
 from contextlib import suppress
 from itertools import count
@@ -49,6 +50,7 @@ MAY_CHANGE = SAME_AGENT | {  # that, and what is read afresh at every start: no 
     "learner.publish_updates",
     "learner.precision",
 }
+LEFT = {".lock", "checkpoints", "logs", "history.jsonl", ".config.json"}  # by a start that is killed before its config
 WHY_NOT = {  # by the part of the config, and then by the option
     "env": "its experience is from that environment",
     "window": "its ring holds windows of that length",
@@ -85,10 +87,12 @@ def open_run(
         initial = warm_start.prepare(config, options.init_from, options.init_parts)
     if run_dir is None or if_exists == "new":
         folder = new_folder(folder.path)
-    elif not there and folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
+    elif not there and has_more_than_a_start(folder):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
     make(folder)
     folder.lock()
+    if not there:
+        forget_start(folder)
     if initial is not None:  # before there is a config, without which it is no run
         CheckpointFolder(folder.checkpoints).save(0, initial.files)
     folder.reopen(config.total_steps)
@@ -138,6 +142,26 @@ def make(folder: RunFolder) -> None:
             path.mkdir(exist_ok=True)
     except OSError as error:
         raise _creation_error(folder.path, error) from None
+
+
+def has_more_than_a_start(folder: RunFolder) -> bool:
+    """Whether something is at its path that a start without a config does not leave, one that was killed early on."""
+    if not folder.path.is_dir():
+        return folder.path.exists()
+    left = {path.name for path in folder.path.iterdir()}
+    if not left <= LEFT:
+        return True
+    kept = (folder.checkpoints / name for name in ("000000000", ".tmp-000000000"))
+    initial = {file for path in kept for file in path.glob("*")}
+    files = {path for path in folder.path.rglob("*") if path.is_symlink() or not path.is_dir()}
+    return not files <= initial | {folder.path / name for name in LEFT}
+
+
+def forget_start(folder: RunFolder) -> None:
+    """Remove what one has left that came to no config. The folder is locked, and has nothing else."""
+    for path in folder.checkpoints.iterdir():
+        shutil.rmtree(path)
+    folder.history_file.unlink(missing_ok=True)
 
 
 def _taken_up(folder: RunFolder, config: RunConfig, if_exists: IfExists, options: LaunchOptions) -> RunConfig:

@@ -13,6 +13,7 @@ from typing import Any, get_args
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
 from rmc.common.whole_file import write_whole
+from rmc.deploy.run.config import option
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions, Tracker
 
@@ -29,6 +30,7 @@ class Tracking:
     project: str
     tags: tuple[str, ...]
     id: str
+    video_every: int = 0  # evaluations; 0 films the final policy alone
 
 
 def choose_tracking(options: LaunchOptions) -> Tracking | None:
@@ -43,18 +45,19 @@ def choose_tracking(options: LaunchOptions) -> Tracking | None:
         return None
     project = options.track_project or (before.project if before else PROJECT)
     tags = options.track_tags or (before.tags if before else ())
-    _check(tracker, project, tags)
+    every = options.track_video_every if options.track_video_every is not None else before.video_every if before else 0
+    _check(tracker, project, tags, every)
     same = before is not None and (before.tracker, before.project) == (tracker, project)
-    return Tracking(tracker, project, tags, before.id if same and before else secrets.token_hex(4))
+    return Tracking(tracker, project, tags, before.id if same and before else secrets.token_hex(4), every)
 
 
 def _refuse_without_tracker(options: LaunchOptions) -> None:
-    for name, value in (("--track-project", options.track_project), ("--track-tags", options.track_tags)):
-        if value:
-            raise ConfigError(name, value, "say which tracker: --track wandb or --track trackio")
+    for name in ("track_project", "track_tags", "track_video_every"):
+        if value := getattr(options, name):
+            raise ConfigError(option(name), value, "say which tracker: --track wandb or --track trackio")
 
 
-def _check(tracker: str, project: str, tags: tuple[str, ...]) -> None:
+def _check(tracker: str, project: str, tags: tuple[str, ...], video_every: int) -> None:
     if importlib.util.find_spec(tracker) is None:
         raise ConfigError("--track", tracker, f"{tracker} is not installed; {_how_to_install(tracker)}")
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", project):
@@ -63,6 +66,10 @@ def _check(tracker: str, project: str, tags: tuple[str, ...]) -> None:
     for tag in tags:
         if not (tag.isprintable() and 1 <= len(tag) <= LONGEST_TAG):
             raise ConfigError("--track-tags", tag, f"take tags of 1 to {LONGEST_TAG} characters")
+    if video_every < 0:
+        raise ConfigError(
+            "--track-video-every", video_every, "take 1 or more evaluations, or 0 for the final one alone"
+        )
 
 
 def _how_to_install(tracker: str) -> str:
@@ -87,13 +94,15 @@ def kept_tracking(path: Path) -> Tracking | None:
         settings = {}
     if not _is_whole(settings):
         raise ConfigError("tracking.json", str(_file(path)), "is damaged; remove it, and give --track again")
-    return Tracking(settings["tracker"], settings["project"], tuple(settings["tags"]), settings["id"])
+    every = settings.get("video_every", 0)  # a version before had none
+    return Tracking(settings["tracker"], settings["project"], tuple(settings["tags"]), settings["id"], every)
 
 
 def _is_whole(settings: dict[str, Any]) -> bool:
-    tags = settings["tags"] if isinstance(settings.get("tags"), list) else [None]
+    tags, every = settings["tags"] if isinstance(settings.get("tags"), list) else [None], settings.get("video_every", 0)
     texts = settings.get("project"), settings.get("id"), *tags
-    return settings.get("tracker") in get_args(Tracker) and all(isinstance(text, str) for text in texts)
+    whole = isinstance(every, int) and every >= 0 and all(isinstance(text, str) for text in texts)
+    return whole and settings.get("tracker") in get_args(Tracker)
 
 
 def _file(path: Path) -> Path:

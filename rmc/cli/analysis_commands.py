@@ -96,7 +96,8 @@ def export_policy(command: run_options.Export) -> int:
         console.print(f"{command.out}: {policy.header.summary()}", soft_wrap=True)
         return 0
     export.export(policy, command.out)
-    console.print(f"{command.out}: inputs {', '.join(export.INPUTS)}; outputs {', '.join(export.OUTPUTS)}")
+    summary = f"{command.out}: inputs {', '.join(export.INPUTS)}; outputs {', '.join(export.OUTPUTS)}"
+    console.print(summary, soft_wrap=True)
     return 0
 
 

@@ -121,7 +121,8 @@ def _complaint(words: list[str]) -> str:
 
     with contextlib.redirect_stderr(io.StringIO()) as stderr, contextlib.suppress(SystemExit):
         parser.parse(words)
-    return f"{complaint.as_line(stderr.getvalue())} (see rmc --help)"
+    command = " ".join(["rmc", *words[:1]])
+    return f"{complaint.as_line(stderr.getvalue(), command)} (see rmc --help)"
 
 
 def _complain(message: str, status: int) -> int:

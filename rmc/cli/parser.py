@@ -7,6 +7,7 @@ import itertools
 import logging
 import operator
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, cast, get_type_hints
 
@@ -26,6 +27,7 @@ from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.starts import last_launch
 
 log = logging.getLogger(__name__)
+HELP = {"-h", "--help", ALL_OPTIONS}
 FLAT = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 
 
@@ -74,19 +76,33 @@ def parse(words: list[str]) -> Any:
     """
     words, env = with_file(words, option_names(train_options.Train)) if words[:1] == ["train"] else (words, "")
     _check_once(KWARGS, words)
-    command = _parsed(words, _defaults(preset_config(_named_preset(words), EnvConfig(env)), LaunchOptions(None)))
-    folder = _known_run(command)
-    if folder is not None and isinstance(command, train_options.Resume) and folder.is_baseline():
-        return _parsed(words, {"resume": run_options.resuming_baseline(folder)})
-    if folder is not None:
-        config = folder.config()
-        named = dataclasses.replace(config.env, id=env or config.env.id)
-        config = dataclasses.replace(config, env=named)
-        as_before = _parsed(words, _defaults(config, last_launch(folder)))
-        return _parsed(words, _defaults(config, last_launch(folder, as_before.launcher)))
+    defaults = _defaults(preset_config(_named_preset(words), EnvConfig(env)), LaunchOptions(None))
+    without_help = [word for word in words if word not in HELP]
+    if without_help != words and words[0] in defaults:
+        with suppress(ConfigError, SystemExit):  # with the preset's, where nothing else can be found out
+            defaults = _defaults_of_run(without_help, env, _parsed(without_help, defaults)) or defaults
+        return _parsed(words, defaults)
+    command = _parsed(words, defaults)
+    of_run = _defaults_of_run(words, env, command)
+    if of_run is not None:
+        return _parsed(words, of_run)
     if isinstance(command, train_options.Train) and not command.env.id:
         raise ConfigError("ENV", "", "rmc train takes an environment, like HalfCheetah-v5, or --run-dir with a run")
     return command
+
+
+def _defaults_of_run(words: list[str], env: str, command: Any) -> dict[str, Any] | None:
+    """Those of the run that the command goes on with, None where it begins one. Raises ConfigError, SystemExit."""
+    folder = _known_run(command)
+    if folder is None:
+        return None
+    if isinstance(command, train_options.Resume) and folder.is_baseline():
+        return {"resume": run_options.resuming_baseline(folder)}
+    config = folder.config()
+    named = dataclasses.replace(config.env, id=env or config.env.id)
+    config = dataclasses.replace(config, env=named)
+    as_before = _parsed(words, _defaults(config, last_launch(folder)))
+    return _defaults(config, last_launch(folder, as_before.launcher))
 
 
 def _defaults(config: RunConfig, launch: LaunchOptions) -> dict[str, Any]:
@@ -109,7 +125,7 @@ def _known_run(command: Any) -> RunFolder | None:
 
 def _parsed(words: list[str], defaults: dict[str, Any]) -> Any:
     """The command, which is as by default where nothing is said."""
-    if {"-h", "--help"}.intersection(words):
+    if HELP.difference({ALL_OPTIONS}).intersection(words):
         fixed = {
             path.rpartition(".")[2] for path in flat(preset_config("robust", EnvConfig(""))) if path not in MAY_CHANGE
         }

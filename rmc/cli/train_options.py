@@ -105,6 +105,8 @@ class Train:
     """The tracker's project, by default rmc."""
     track_tags: tuple[str, ...] = ()
     """The run's tags in the tracker."""
+    track_video_every: int | None = None
+    """Film every so-manieth evaluated checkpoint for the tracker; 0, the default, films the final policy alone."""
     dry_run: bool = False
     """Train for some seconds in a temporary folder, and tell what the run needs beside what this machine has: memory,
     disk, bandwidth, handles, threads, time. Exit status 1 where it does not fit."""
@@ -131,8 +133,8 @@ def from_config(config: RunConfig, launch: LaunchOptions) -> Train:
 
 @dataclass(frozen=True)
 class Resume(Train):
-    """Go on with a run: what is not said is as it was, whatever is called a default here. --help shows the basic
-    options, --help-all all of them."""
+    """Go on with a run: what is not said is as it was. --help shows the basic options, --help-all all of them; behind
+    RUN they show the run's own values as defaults."""
 
     env: KnownEnvOptions
     run_dir: KnownRunDir = None

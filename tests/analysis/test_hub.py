@@ -11,8 +11,10 @@ import pytest
 import yaml
 from safetensors.numpy import save
 
+from rmc.analysis.hub import push
 from rmc.analysis.policy_file import decode
 from rmc.cli import main
+from rmc.common.errors import ConfigError
 from tests.analysis.hub_stub import TOKEN, Hub
 from tests.analysis.test_policy import AGENTS, make_run
 from tests.cli.test_main import complaint
@@ -136,6 +138,20 @@ def test_without_a_network_one_line_says_what_was_tried(
     done = call(*RMC, *words.split(), folder=tmp_path, HF_ENDPOINT="http://127.0.0.1:9", **more)
     (line,) = done.stderr.splitlines()
     assert line.startswith("rmc: HF_ENDPOINT='http://127.0.0.1:9': cannot be reached ("), line
+
+
+@pytest.mark.parametrize("error", [ConnectionError, TimeoutError, RuntimeError])
+def test_where_the_store_of_large_files_fails_one_line_says_so(error: type[Exception]) -> None:
+    """That is hf-xet, which raises these."""
+
+    def upload(*_: object, **__: object) -> None:
+        raise error("Network error: error sending request\nat once")
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("huggingface_hub.get_token", lambda: TOKEN)
+        patched.setattr("huggingface_hub.HfApi.create_repo", upload)
+        with pytest.raises(ConfigError, match=r"cannot be reached \(Network error: error sending request\); try again"):
+            push("me/x", {}, False)
 
 
 def test_without_the_extra_one_line_says_how_to_get_it(

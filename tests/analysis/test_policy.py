@@ -135,7 +135,8 @@ def test_exploring_actions_vary_and_are_seeded(run: RunFolder) -> None:
 def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "policy.onnx"
     assert main.run(["export", str(run.path), "--out", str(file)]) == 0
-    assert "inputs observation, previous_action, missing, state" in capsys.readouterr().out
+    (line,) = capsys.readouterr().out.splitlines()
+    assert "inputs observation, previous_action, missing, state; outputs action, next_state" in line
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     rng, policy = np.random.default_rng(0), load_policy(run.path)
     assert session.get_modelmeta().custom_metadata_map == policy.header.metadata()

@@ -157,6 +157,18 @@ def test_a_run_that_trains_and_was_never_evaluated(trained: Path, tmp_path: Path
     assert "<td>stopped</td>" in written(tmp_path / "report.html", str(path), "--no-video")
 
 
+def test_what_a_run_began_with_and_what_changed_is_said(trained: Path, tmp_path: Path) -> None:
+    path = tmp_path / "warm"
+    shutil.copytree(trained, path)
+    start = json.loads((path / "history.jsonl").read_text().splitlines()[0])
+    start["init_from"] = {"asked": ["source", "all"], "run": "/old/source", "checkpoint": 7, "parts": "all"}
+    again = start | {"init_from": None, "env_steps": 1500, "changes": {"total_steps": [1500, 2000]}}
+    (path / "history.jsonl").write_text(f"{json.dumps(start)}\n{json.dumps(again)}\n")
+    text = written(tmp_path / "report.html", str(path), "--no-video")
+    note = "2 starts; began with all of /old/source, update 7; from step 1,500 --total-steps 1500 to 2000"
+    assert f'<p class="note">{note}</p>' in text
+
+
 def test_of_a_run_without_a_record_there_is_still_a_page(trained: Path, tmp_path: Path) -> None:
     path = tmp_path / "<b>new & empty"
     path.mkdir()

@@ -14,7 +14,8 @@ from rmc.cli import main
 
 BIN = Path(sys.executable).parent
 START = {
-    "bash": (["bash", "--norc", "-i"], "source rmc.script"),
+    "bash": (["bash", "--norc", "-i"], "source rmc.script; rm rmc.script"),
+    "fish": (["fish", "--no-config", "-i"], "source rmc.script; rm rmc.script"),
     "zsh": (["zsh", "-f", "-i"], "autoload -U compinit; compinit -u; fpath=($PWD $fpath); compinit -u"),
 }
 
@@ -29,7 +30,7 @@ class Shell:
             os.chdir(folder)
             os.environ.update(TERM="dumb", HOME=str(folder), PATH=f"{BIN}:{os.environ['PATH']}")
             os.execvp(words[0], words)
-        self.type(f"{self._begin}; echo rea''dy\n", "ready")
+        self.type(f"{self._begin}; echo rea''dy\r", "ready")
 
     def type(self, text: str, wanted: str, seconds: float = 20.0) -> str:
         """What it shows after some keys, once ``wanted`` is in there."""
@@ -46,7 +47,7 @@ class Shell:
         os.waitpid(self._pid, 0)
 
 
-@pytest.mark.parametrize("name", ["bash", "zsh"])
+@pytest.mark.parametrize("name", ["bash", "fish", "zsh"])
 def test_a_shell_completes(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if shutil.which(name) is None:
         pytest.skip(f"no {name} here")
@@ -61,6 +62,7 @@ def test_a_shell_completes(name: str, tmp_path: Path, capsys: pytest.CaptureFixt
             ("rmc train X --preset de\t", "--preset debug"),
             ("rmc train X --run-dir runs/f\t", "runs/first"),
             ("rmc evaluate runs/f\t", "runs/first"),
+            ("rmc evaluate \t", "runs/"),
             ("rmc role act\t", "role actor"),
         ]:
             shell.type(typed, completed)

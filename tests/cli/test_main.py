@@ -32,7 +32,7 @@ TRAIN_FLAGS = """
     --init-from --init-parts
     --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
     --env-timeout --env-kwargs --config --run-dir --if-exists --launcher --device --redis-url
-    --ray-address --all-cpus --tls --track --track-project --track-tags --dry-run
+    --ray-address --all-cpus --tls --track --track-project --track-tags --track-video-every --dry-run
     --burn-in --trained-steps
     --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
     --missing-flag --impute-missing --initial-priority
@@ -102,6 +102,22 @@ def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     assert len(lines) == 1, captured.err
     assert lines[0].startswith("rmc: ")
     return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("train X --totl-steps 5", "Unrecognized options: --totl-steps, 5; did you mean --total-steps?"),
+        ("evaluate x --episods 3", "Unrecognized options: --episods, 3; did you mean --episodes?"),
+        ("train X --zzzz", "Unrecognized options: --zzzz"),
+        (
+            "resume x --if-exists new",
+            "Unrecognized or misplaced options: --if-exists new; --if-exists is an option of rmc train",
+        ),
+    ],
+)
+def test_a_wrong_option_is_one_short_line(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert complaint(words.split(), capsys) == f"rmc: {said} (see rmc --help)"
 
 
 @pytest.mark.parametrize(

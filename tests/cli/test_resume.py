@@ -101,6 +101,24 @@ def test_what_may_not_change_is_one_line(
     assert run.history_file.read_bytes() == before
 
 
+@pytest.mark.parametrize("command", [["resume"], ["train", "--run-dir"]])
+def test_help_shows_the_runs_own_defaults(
+    command: list[str], run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for flag in ("--help", "--help-all"):
+        assert main.run([*command, str(run.path), flag]) == 0
+        shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        assert "(default: 12345)" in shown  # --total-steps
+        assert "(default: 0.30000000000000004)" in shown  # --learning-rate
+    assert "(default: cuda)" in shown
+
+
+def test_help_of_no_run_is_the_presets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["resume"], ["resume", str(tmp_path)], ["train", "--run-dir", str(tmp_path)], ["train"]):
+        assert main.run([*words, "--help"]) == 0
+        assert "(default: 1000000)" in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_baseline_takes_its_own_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from rmc.analysis import baselines
 
@@ -113,6 +131,8 @@ def test_a_baseline_takes_its_own_options(tmp_path: Path, capsys: pytest.Capture
         assert (command.config(), command.run_dir) == (expected, folder.path)
     assert "--flicker=0.1: the run in" in complaint(["resume", str(folder.path), "--flicker", "0.1"], capsys)
     assert "--gamma" in complaint(["resume", str(folder.path), "--gamma", "0.9"], capsys)
+    assert main.run(["resume", str(folder.path), "--help"]) == 0
+    assert "(default: 700)" in " ".join(capsys.readouterr().out.split())
     assert "rmc resume goes on with it" in complaint(["train", "--run-dir", str(folder.path)], capsys)
 
 

@@ -15,6 +15,8 @@ import psutil
 import pytest
 from imageio_ffmpeg import write_frames
 
+from rmc.analysis.evaluation import initial_policy
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.monitor import tracker as tracker_module
 from rmc.deploy.monitor.tracker import Tracker, start_tracker
@@ -58,6 +60,13 @@ def trained(folder: RunFolder, env_steps: int, score: float) -> None:
     ]
     with folder.metrics.open("a") as file:
         file.writelines(json.dumps(record) + "\n" for record in records)
+
+
+def saved(folder: RunFolder) -> None:
+    """The checkpoint that is evaluated."""
+    progress = json.dumps({"updates": 3, "env_steps": 700}).encode()
+    policy = initial_policy(folder.config())
+    CheckpointFolder(folder.checkpoints).save(3, {"policy.safetensors": policy, "progress.json": progress})
 
 
 def video(path: Path) -> str:
@@ -120,11 +129,67 @@ def test_trackio_has_the_run_over_its_starts(
     returns = [(step, one["Main/evaluation_return"]) for step, one in logged if "Main/evaluation_return" in one]
     assert returns == [(700, 7.0), (1500, 15.0)]
     assert [one["Main/q_loss"] for _, one in logged if "Main/q_loss" in one] == [0.5, 0.5]
-    step, last = logged[-1]
-    assert (step, last["result/eval_return_mean"], last["video"]["_type"]) == (1500, 11.5, "trackio.video")
-    assert (tmp_path / "trackio" / "media" / last["video"]["file_path"]).stat().st_size > 100
+    (step, last), (film_step, film) = logged[-1], logged[-2]
+    assert (step, last["result/eval_return_mean"]) == (1500, 11.5)
+    assert (film_step, film["video"]["_type"]) == (1500, "trackio.video")
+    assert (tmp_path / "trackio" / "media" / film["video"]["file_path"]).stat().st_size > 100
     about = json.loads(config)
     assert (about["env"]["id"], about["tags"]) == ("InvertedPendulum-v5", ["a", "b"])
+
+
+@pytest.mark.parametrize("name", ["wandb", "trackio"])
+def test_every_second_evaluated_checkpoint_is_filmed(
+    name: Any, folder: RunFolder, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    saved(folder)
+    keep_tracking(folder, Tracking(name, "my-project", (), "0123abcd", 2))
+    tracker = start_tracker(folder)
+    assert tracker is not None
+    for env_steps in (700, 1500):
+        assert not (folder.path / "videos").exists()
+        trained(folder, env_steps, 1.0)
+        time.sleep(3.0)
+    films = "wandb/offline-run-*/files/media/videos/*.mp4" if name == "wandb" else "../trackio/media/**/*.mp4"
+    deadline = time.monotonic() + 60.0
+    while not (arrived := list(folder.path.glob(films))):
+        assert time.monotonic() < deadline, (folder.logs / "tracker.log").read_text()
+        time.sleep(0.2)
+    tracker.close({"state": "stopped"})
+    assert [path.name for path in (folder.path / "videos").iterdir()] == ["000000003.mp4"]
+    assert len(arrived) == 1
+    assert arrived[0].stat().st_size > 1_000
+    assert not caplog.messages
+
+
+def test_a_checkpoint_that_is_gone_is_one_warning(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
+    keep_tracking(folder, Tracking("trackio", "my-project", (), "0123abcd", 1))
+    tracker = start_tracker(folder)
+    assert tracker is not None
+    trained(folder, 700, 1.0)
+    deadline = time.monotonic() + 60.0
+    while not caplog.messages:
+        assert time.monotonic() < deadline
+        tracker.look()
+        time.sleep(0.2)
+    tracker.close({"state": "stopped"})
+    (message,) = caplog.messages
+    assert message.startswith("trackio: no 000000003.mp4: ")
+
+
+def test_a_film_that_is_being_made_ends_with_the_tracker(folder: RunFolder) -> None:
+    saved(folder)
+    keep_tracking(folder, Tracking("trackio", "my-project", (), "0123abcd", 1))
+    tracker = start_tracker(folder)
+    assert tracker is not None
+    trained(folder, 700, 1.0)
+    deadline = time.monotonic() + 60.0
+    while not (films := [p for p in psutil.Process().children(recursive=True) if "evaluate" in p.cmdline()]):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert films[0].nice() == 19
+    tracker.close({"state": "stopped"})
+    assert not any(one.is_running() for one in films)
+    assert not list((folder.path / "videos").iterdir())
 
 
 @pytest.mark.parametrize("key", [None, "a" * 40])

@@ -15,6 +15,8 @@ from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.tracking import PROJECT, Tracking, choose_tracking, keep_tracking, kept_tracking
 
+NEGATIVE = '{"tracker": "wandb", "project": "x", "tags": [], "id": "y", "video_every": -1}'
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
@@ -32,6 +34,24 @@ def test_a_new_run_is_in_no_tracker_unless_asked(folder: RunFolder) -> None:
     tracking = chosen(folder, track="wandb", track_tags=("a", "b"))
     assert tracking is not None
     assert (tracking.tracker, tracking.project, tracking.tags) == ("wandb", PROJECT, ("a", "b"))
+
+
+def test_how_often_it_is_filmed_goes_on_with_the_run(folder: RunFolder) -> None:
+    keep_tracking(folder, chosen(folder, track="wandb", track_video_every=3))
+    for words, every in (({}, 3), ({"track_video_every": 0}, 0), ({"track": "trackio"}, 3)):
+        tracking = chosen(folder, **words)
+        assert tracking is not None
+        assert tracking.video_every == every
+    with pytest.raises(ConfigError, match=r"^--track-video-every=-1: take 1 or more evaluations, or 0"):
+        chosen(folder, track_video_every=-1)
+    keep_tracking(folder, None)
+    with pytest.raises(ConfigError, match=r"^--track-video-every=2: say which tracker: --track wandb or"):
+        chosen(folder, track_video_every=2)
+
+
+def test_what_a_version_before_has_kept_is_read(folder: RunFolder) -> None:
+    (folder.path / "tracking.json").write_text('{"tracker": "wandb", "project": "x", "tags": [], "id": "y"}')
+    assert kept_tracking(folder.path) == Tracking("wandb", "x", (), "y", 0)
 
 
 def test_a_run_that_goes_on_stays_the_same_in_its_tracker(folder: RunFolder) -> None:
@@ -55,7 +75,9 @@ def test_it_can_be_left(folder: RunFolder) -> None:
     keep_tracking(folder, None)  # once more
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"tracker": "mlflow", "project": "x", "tags": [], "id": "y"}'])
+@pytest.mark.parametrize(
+    "text", ["{", "[]", "{}", '{"tracker": "mlflow", "project": "x", "tags": [], "id": "y"}', NEGATIVE]
+)
 def test_a_damaged_note_is_named(folder: RunFolder, text: str) -> None:
     (folder.path / "tracking.json").write_text(text)
     with pytest.raises(ConfigError, match=r"^tracking\.json='.*': is damaged; remove it, and give --track again$"):

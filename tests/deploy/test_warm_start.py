@@ -134,6 +134,42 @@ def test_a_numbered_checkpoint_and_the_history(source: RunFolder, tmp_path: Path
     assert format_starts(folder).startswith("2 starts; began with policy of ")
 
 
+class Killed(Exception):
+    """The start."""
+
+
+@pytest.mark.parametrize("before", ["lock", "reopen", "write_config", "write_sizes"])
+def test_a_start_that_is_killed_is_made_again_by_the_same_words(
+    before: str, source: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed: list[RunFolder] = []
+
+    def kill(folder: RunFolder, *_: object) -> None:
+        killed.append(folder)
+        raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr(RunFolder, before, kill)
+        with pytest.raises(Killed):
+            begin(OTHER, tmp_path / "run", source)
+    killed[0].unlock()
+    folder = begin(OTHER, tmp_path / "run", source)
+    assert read_policy(folder.path, "0").header == OTHER.policy_header()
+    assert format_starts(folder) == ("2 starts" if before == "write_sizes" else "1 start") + (
+        f"; began with all of {source.path}, update {CheckpointFolder(source.checkpoints).numbers()[-1]}"
+    )
+
+
+@pytest.mark.parametrize("kept", ["notes.txt", "logs/x.log", "checkpoints/000000007/learner.pt", "checkpoints/x.pt"])
+def test_a_folder_with_anything_else_is_left_alone(kept: str, source: RunFolder, tmp_path: Path) -> None:
+    file = tmp_path / "run" / kept
+    file.parent.mkdir(parents=True)
+    file.write_text("of value")
+    with pytest.raises(ConfigError, match="is there and is no run's folder"):
+        begin(OTHER, tmp_path / "run", source)
+    assert file.read_text() == "of value"
+
+
 @pytest.mark.parametrize(
     ("config", "which", "message"),
     [
