@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo wheel site guard test test-faults test-cluster test-container test-dm-control test-newest lint docs bench peers clean
+.PHONY: env demo wheel site guard test test-faults test-learning test-cluster test-container test-dm-control test-newest lint docs bench peers clean
 
 env: $(STAMP)
 
@@ -51,6 +51,10 @@ test-faults: $(addprefix test-faults-,$(FAULTS)) docs
 
 test-faults-%: $(STAMP)
 	$(BIN)/python -m tests.faults.$*
+
+# Two tasks learnt to their goals, some minutes; make test has the shorter one.
+test-learning: $(STAMP)
+	$(BIN)/python -m pytest -x tests/integration/test_learning.py tests/integration/balance.py
 
 # Real ray up on three machines that are namespaces of this one: Linux, root, openssh-server, rsync, iproute2.
 ROUNDS ?= 5
@@ -97,7 +101,7 @@ docs: $(STAMP)
 
 # Short trainings beside the committed lines of earlier ones, for every change of a default: some 20 minutes, two quiet cores.
 guard: $(STAMP)
-	$(BIN)/python -m studies.guard
+	$(BIN)/python -m benchmarks.guard
 
 # Each beside what a user would pick instead, where make peers has installed that. Results: docs/performance.md.
 BENCHMARKS := replay ingest learner actor weights growth memory cuda end-to-end

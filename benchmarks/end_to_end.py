@@ -5,7 +5,7 @@
 A goal is reached at the second of two consecutive evaluations above it, each of 5 deterministic episodes, every 5 000
 environment steps; the clock starts with the process. Ours is ``rmc train`` as it comes. SAC of stable-baselines3 has
 its defaults, or what rl-baselines3-zoo found best for this environment: 10 000 random steps before the first update.
-SBX's has that too, an update a step, in calls of one or eight. Each has all cores for itself, one run after another.
+SBX's has that too, an update a step, in calls of 8 or 32. Each has all cores for itself, one run after another.
 What results/end-to-end.jsonl has already is not run again: an interrupted benchmark goes on where it was.
 """
 
@@ -32,9 +32,8 @@ LIMIT_SECONDS = 3600.0
 PEERS = {  # script, and its arguments after the shared ones
     "stable-baselines3 SAC, defaults": ("sb3_end_to_end", 100),
     "stable-baselines3 SAC, rl-zoo": ("sb3_end_to_end", 10_000),
-    "SBX SAC, 1 update a call": ("sbx_end_to_end", 1, 2),
     "SBX SAC, 8 updates a call": ("sbx_end_to_end", 8, 2),
-    "SBX SAC, 8 updates a call, 1 thread": ("sbx_end_to_end", 8, 1),
+    "SBX SAC, 32 updates a call": ("sbx_end_to_end", 32, 2),
 }
 Point = tuple[float, float]  # seconds since the command, return
 

@@ -1,10 +1,10 @@
 """Whether a change cost return or speed: three short trainings, beside the committed lines of earlier ones.
 
     make guard
-    python -m studies.guard [--only HalfCheetah-v5 Walker2d-v5 cue] [--seed 1] [--record]
+    python -m benchmarks.guard [--only HalfCheetah-v5 Walker2d-v5 cue] [--seed 1] [--record]
 
 Takes about 20 minutes on two quiet cores, and goes on where it was interrupted. --record adds its lines to
-studies/results/guard.jsonl. The return is the mean of a run's last three evaluations. Speed is updates a second over
+benchmarks/results/guard.jsonl. The return is the mean of a run's last three evaluations. Speed is updates a second over
 GFLOP/s of the update's own products, timed before and after the run in the same process: a slow hour slows both.
 """
 
@@ -17,15 +17,17 @@ import sys
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import torch
 
+from benchmarks.harness import HERE
 from rmc.analysis.history import of_run
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
-from studies.study import RESULTS, RUNS, commit
+from studies.study import commit
 
-LINES = RESULTS / "guard.jsonl"
+LINES, RUNS = HERE / "results" / "guard.jsonl", Path("runs") / "guard"
 CUE = (
     "--hidden 64 --embedding 64 --heads 128 128 --head-input hidden+embedding --normalize-observations "
     "--learning-rate 5e-4 --polyak 0.99 --target-memory ema --batch-size 16 --capacity 5000 --warmup-steps 1000 "
@@ -63,7 +65,7 @@ class Line:
 
 def trained(task: str, seed: int, code: str) -> Line:
     """Train it. Raises ConfigError where that fails."""
-    folder = RUNS / "guard" / f"{code.rstrip('+')}-{task}-{seed}"
+    folder = RUNS / f"{code.rstrip('+')}-{task}-{seed}"
     words = ["train", *shlex.split(TASKS[task]), "--seed", str(seed), "--run-dir", str(folder)]
     before = gflops()
     ended = subprocess.run([sys.executable, "-m", "rmc.cli.main", *words], check=False, stdout=subprocess.DEVNULL)
@@ -84,12 +86,12 @@ def updates_per_s(run: RunFolder) -> float:
     return statistics.median(speeds)
 
 
-def gflops() -> float:
+def gflops(least_seconds: float = PRODUCT_SECONDS) -> float:
     """Of a product like those of an update, on one core, in bfloat16."""
     rows, inputs, outputs = PRODUCT
     x, w = torch.randn(rows, inputs).bfloat16(), torch.randn(inputs, outputs).bfloat16()
     products, start = 0, time.perf_counter()
-    while (seconds := time.perf_counter() - start) < PRODUCT_SECONDS:
+    while (seconds := time.perf_counter() - start) < least_seconds:
         for _ in range(100):
             torch.mm(x, w)
         products += 100
@@ -119,7 +121,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--only", nargs="+", choices=list(TASKS), default=list(TASKS))
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--record", action="store_true", help=f"add the lines to studies/results/{LINES.name}")
+    parser.add_argument("--record", action="store_true", help=f"add the lines to benchmarks/results/{LINES.name}")
     options = parser.parse_args()
     torch.set_num_threads(1)
     before, code, ok = committed(), commit(), True
@@ -128,7 +130,7 @@ def main() -> None:
         try:
             line = trained(task, options.seed, code)
         except ConfigError as error:
-            sys.exit(f"studies.guard: {error}")
+            sys.exit(f"benchmarks.guard: {error}")
         judgement = verdict(line, before)
         ok = ok and "below" not in judgement
         figures = f"{line.episode_return:9,.1f} {line.updates_per_s:10,.1f} {line.gflops:8,.1f} {line.speed:7,.1f}"
