@@ -26,7 +26,7 @@ from rmc.learner.unroll import impute, unroll
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 MODEL_PARTS = ("memory", "world_model", "next_frame")
 VALUE_PARTS = ("critic", "policy", "log_alpha")
-IMPUTER_UPDATES = 8  # between those of what imputes, as long as no frame was ever missing: nothing reads it then
+IMPUTER_UPDATES = 8  # updates for one of the imputer's until a frame is missing: no loss reads it before
 AVERAGE_UPDATES = 10  # updates between moves of the policy's average, which reads and writes all that acts
 TRAINS_MEMORY = {  # the paper's table 1
     1: {"model", "value"},
