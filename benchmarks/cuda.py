@@ -15,7 +15,8 @@ from rmc.deploy.run.presets import robust
 from rmc.learner.batch import view_batch
 from rmc.learner.device_update import DeviceUpdate, HostCopy
 from rmc.learner.learner import bf16_is_native
-from rmc.learner.update import JointUpdate, make_update
+from rmc.learner.update import JointUpdate
+from rmc.learner.update_order import make_update
 
 CHUNK = 10  # updates between looks at the clock
 

@@ -4,8 +4,8 @@
 
 A goal is reached at the second of two consecutive evaluations above it, each of 5 deterministic episodes, every 5 000
 environment steps; the clock starts with the process. Ours is ``rmc train`` as it comes. SAC of stable-baselines3 has
-its defaults, or what rl-baselines3-zoo found best for this environment: 10 000 random steps before the first update.
-SBX's has that too, an update a step, in calls of 8 or 32. Each has all cores for itself, one run after another.
+its defaults, or rl-baselines3-zoo's settings: 10 000 random steps before the first update. SBX's starts likewise, and
+makes 8 or 32 updates after as many steps. Each has all cores for itself, one run after another.
 What results/end-to-end.jsonl has already is not run again: an interrupted benchmark goes on where it was.
 """
 
@@ -63,6 +63,7 @@ def sac(python: Path, peer: str, env: str, seed: int, every: int) -> Iterator[Po
         for line in process.stdout:
             if line.startswith("{"):
                 yield time.time() - began, json.loads(line)["return"]
+        sys.exit(f"{peer}: it ended by itself, with status {process.wait()}; make peers installs what it needs")
     finally:
         _end(process)
 
@@ -126,7 +127,7 @@ def _rows(env: str, goal: float, times: dict[str, list[float]], seeds: int) -> l
     middle = {who: statistics.median(all_) for who, all_ in times.items()}
     range_ = {who: (min(all_), max(all_) if math.isfinite(max(all_)) else None) for who, all_ in times.items()}
     rows = []
-    for peer in PEERS:
+    for peer in [who for who in times if who != "ours"] or PEERS:
         peer_seconds = middle.get(peer)
         ratio = None if peer_seconds is None else peer_seconds / middle["ours"]
         spread = {"ours": range_["ours"]} | ({"peer": range_[peer]} if peer in range_ else {})

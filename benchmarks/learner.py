@@ -43,7 +43,7 @@ from rmc.deploy.run.presets import robust
 from rmc.learner.batch import view_batch
 from rmc.learner.learner import Learner
 from rmc.learner.replay_client import ReplayClient
-from rmc.learner.update import make_update
+from rmc.learner.update_order import make_update
 from rmc.replay_server.config import ReplayConfig
 
 Precision = Literal["auto", "bf16", "fp32"]

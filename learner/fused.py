@@ -48,7 +48,7 @@ def _applies(x: Tensor) -> bool:
 class Rounded(nn.Module):
     """A module that keeps its weights in bfloat16, too, rounded again where one was written since.
 
-    What writes a weight without torch's knowledge rounds it itself: see ``learner/optimizers.py``.
+    That is seen by torch's version of it, which neither ``.data`` nor numba raises: ``CompiledAdam`` rounds itself.
     """
 
     def weights(self) -> list[Tensor]:
@@ -56,7 +56,7 @@ class Rounded(nn.Module):
         raise NotImplementedError
 
     def bf16(self) -> list[Tensor]:
-        """They in bfloat16, always in the same memory."""
+        """The bfloat16 copies, always in the same memory."""
         weights, state = self.weights(), self.__dict__
         versions = [weight._version for weight in weights]
         if "_rounded" not in state:
@@ -70,7 +70,7 @@ class Rounded(nn.Module):
 
 
 def rounded_weights(modules: Iterable[nn.Module]) -> dict[Tensor, Tensor]:
-    """Every weight of theirs that is kept in bfloat16, too, and that."""
+    """By weight, its bfloat16 copy, of all modules that have some."""
     parts = [part for module in modules for part in module.modules() if isinstance(part, Rounded)]
     return {weight: low for part in parts for weight, low in zip(part.weights(), part.bf16(), strict=True)}
 

@@ -29,7 +29,8 @@ from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.learner.device_update import DeviceUpdate, HostCopy
 from rmc.learner.learner_metrics import Drawn, LearnerMetrics, needs_weights
 from rmc.learner.pipelined_update import PipelinedUpdate
-from rmc.learner.update import UpdateResult, make_update
+from rmc.learner.update import UpdateResult
+from rmc.learner.update_order import make_update
 
 log = logging.getLogger(__name__)
 NOT_OURS = (pickle.UnpicklingError, EOFError, RuntimeError, LookupError, ValueError, TypeError, AttributeError)

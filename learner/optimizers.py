@@ -20,7 +20,7 @@ class CompiledAdam(torch.optim.Adam):
     """torch's Adam by ``learner/kernels.py``, which rounds weights for the next products in the same pass."""
 
     def __init__(self, groups: list[dict[str, Any]], rounded: Mapping[Tensor, Tensor]) -> None:
-        """``rounded`` has the weights that are kept in bfloat16, too."""
+        """``rounded`` has, by weight, its bfloat16 copy, which a step writes, too."""
         super().__init__(groups, fused=True)
         self._rounded = rounded
 
@@ -40,6 +40,7 @@ class CompiledAdam(torch.optim.Adam):
         assert gradient is not None
         moments = _flat(state["exp_avg"]), _flat(state["exp_avg_sq"])
         low, step = _low(self._rounded, parameter), state["step"].view(1).numpy()
+        assert all(moment.size == parameter.numel() for moment in moments)  # the kernel does not look
         kernels.adam(_flat(parameter), _flat(gradient), *moments, low, step, *rates)
 
 
@@ -90,6 +91,8 @@ def by_optimizer(saved: list[dict[str, Any]], optimizers: list[torch.optim.Adam]
     """The states of the optimizers; version 0.1.0 saved one for all parts, in the same order."""
     if len(saved) == len(optimizers):
         return saved
+    if len(saved) != 1:
+        raise ValueError(f"{len(saved)} optimizers where this order of updates has {len(optimizers)}")
     states, begin = [], 0
     for optimizer in optimizers:
         groups = optimizer.state_dict()["param_groups"]

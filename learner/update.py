@@ -1,4 +1,4 @@
-"""The joint update: all losses from the parameters as they stood, one backward, one step; or one after the other.
+"""The joint update: all losses from the parameters as they stood, one backward, one step.
 
 Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, H hidden, S state, Z head input.
 Nothing here waits for the host: no ``.item()``, no branch on a tensor, static shapes.
@@ -26,7 +26,7 @@ from rmc.learner.unroll import impute, unroll
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 MODEL_PARTS = ("memory", "world_model", "next_frame")
 VALUE_PARTS = ("critic", "policy", "log_alpha")
-IMPUTER_UPDATES = 8  # between those of what imputes, as long as no frame was ever missing: nothing reads it then
+IMPUTER_UPDATES = 8  # updates for one of the imputer's until a frame is missing: no loss reads it before
 AVERAGE_UPDATES = 10  # updates between moves of the policy's average, which reads and writes all that acts
 TRAINS_MEMORY = {  # the paper's table 1
     1: {"model", "value"},
@@ -74,7 +74,7 @@ Losses = dict[str, Tensor]
 class JointUpdate:
     """Agent, targets and optimiser, and the update that moves them together."""
 
-    _imputer_updates = IMPUTER_UPDATES
+    imputer_updates = IMPUTER_UPDATES
 
     def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> None:
         device = agent.log_alpha.device
@@ -131,7 +131,7 @@ class JointUpdate:
         fill_loss, turns = self._fill_loss(o, memory, batch, m)
         grounding_loss, unexplained = self._grounding_loss(o, prediction, batch, m)
         loss_values |= fill_loss | grounding_loss
-        metrics = model_metrics(_detached(loss_values), change, i, d, m, c.model_norm)
+        metrics = model_metrics(detached(loss_values), change, i, d, m, c.model_norm)
         if agent.next_frame is not None:
             metrics["fill_loss"] = turns[2]
         hidden = memory.hidden.detach()
@@ -162,7 +162,7 @@ class JointUpdate:
             "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, m),
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
-        trace = Trace(_detached(loss_values), alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m)
+        trace = Trace(detached(loss_values), alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m)
         return loss_values, ValuePass(losses.priority(td_error, c.eta, m), value_metrics(trace, beta))
 
     def result(self, batch: Batch, model: ModelPass, value: ValuePass, norm: Tensor) -> UpdateResult:
@@ -188,7 +188,7 @@ class JointUpdate:
 
     def _trains_imputer(self, was_missing: Tensor) -> bool:
         """A GPU would have to wait to be asked, so there it is always trained."""
-        on_cpu, period = was_missing.device.type == "cpu", self._imputer_updates
+        on_cpu, period = was_missing.device.type == "cpu", self.imputer_updates
         return not on_cpu or bool(was_missing) or int(self.imputer_turns[0]) % period == 0
 
     def _grounding_loss(self, o: Tensor, prediction: Prediction, batch: Batch, m: Tensor) -> tuple[Losses, Tensor]:
@@ -301,51 +301,6 @@ class JointUpdate:
             self.generator.manual_seed(zlib.crc32(state.numpy().tobytes()))
 
 
-class AlternateUpdate(JointUpdate):
-    """Algorithm 1 as printed: model, what fills, critics, policy, temperature in turn, each from a fresh forward.
-
-    Each has an optimiser of its own, so that a memory that several losses train is moved by several.
-    """
-
-    _imputer_updates = 1  # it has a stage of its own
-    _STAGES = (
-        ("world_model", ("model_loss", "grounding_loss")),
-        ("next_frame", ("fill_loss",)),
-        ("critic", ("q_loss",)),
-        ("policy", ("policy_loss",)),
-        ("log_alpha", ("temperature_loss",)),
-    )
-
-    def _make_optimizers(self) -> list[torch.optim.Adam]:
-        return [adam(self.agent, self.config, "memory", part) for part, _ in self._stages()]
-
-    def _stages(self) -> list[tuple[str, tuple[str, ...]]]:
-        return [(part, names) for part, names in self._STAGES if getattr(self.agent, part) is not None]
-
-    def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
-        """One round from a Batch. Each metric is from its own stage's forward; priorities from the critics'."""
-        metrics: dict[str, Tensor] = {}
-        norms = []
-        for optimizer, (part, names) in zip(self.optimizers, self._stages(), strict=True):
-            loss_values, model, value = self.forward(batch, beta)
-            stage_losses = {name: loss for name, loss in loss_values.items() if name in names}
-            norms.append(self.step([optimizer], stage_losses.values()))
-            metrics |= _detached(stage_losses)
-            if part == "critic":
-                of_critics = model, value
-        model, value = of_critics
-        self.follow_model(model)
-        self.follow_value()
-        updated = self.result(batch, model, value, torch.stack(norms).norm())
-        return updated._replace(metrics=updated.metrics | metrics)
-
-
-def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:
-    """The update in the order that the config names."""
-    kind = JointUpdate if config.update_order == "joint" else AlternateUpdate
-    return kind(agent, burn_in, config, seed, bf16)
-
-
 def _target_copy(module: ModuleT) -> ModuleT:
     """A copy for passes under no_grad. Its parameters still say requires_grad: else matmul batches and copies."""
     copied = copy.deepcopy(module)
@@ -366,7 +321,7 @@ def _trained(batch: Batch, burn_in: int) -> tuple[Tensor, Tensor, Tensor, Tensor
     )
 
 
-def _detached(values: Losses) -> Losses:
+def detached(values: Losses) -> Losses:
     return {name: value.detach() for name, value in values.items()}
 
 

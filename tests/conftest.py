@@ -8,6 +8,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -68,10 +69,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: (not is_patient(item.nodeid), not item.nodeid.removeprefix("tests/").startswith(LONG)))
 
 
-def pytest_runtest_setup(item: pytest.Item) -> None:
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
     """A patient test steps back, where another worker may watch processes by the clock."""
-    if WORKER:
-        os.setpriority(os.PRIO_PROCESS, 0, NICENESS if is_patient(item.nodeid) else 0)
+    usual = os.getpriority(os.PRIO_PROCESS, 0)
+    if WORKER and is_patient(item.nodeid):
+        os.setpriority(os.PRIO_PROCESS, 0, max(usual, NICENESS))
+    try:
+        yield
+    finally:
+        with suppress(PermissionError):  # only root may take it back
+            os.setpriority(os.PRIO_PROCESS, 0, usual)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

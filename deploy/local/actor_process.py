@@ -12,8 +12,8 @@ from rmc.deploy.local.role_process import Process, RunConnection, wait_for_room
 from rmc.deploy.run.config import RunConfig
 from rmc.learner.initial_priority import InitialPriority
 
-ACTOR_IDLE_SECONDS = 0.01  # an actor that waits looks at Redis every 0.02 s
-EVALUATOR_IDLE_SECONDS = 0.05  # of 0.1 s
+ACTOR_IDLE_SECONDS = 0.01  # a waiting actor looks at Redis every 0.02 s
+EVALUATOR_IDLE_SECONDS = 0.05  # and an evaluator every 0.1 s
 EVALUATOR_NICENESS = 10  # it must not take the learner's core
 
 

@@ -24,7 +24,8 @@ from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import RunConfig, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import InitParts
-from rmc.learner.update import JointUpdate, make_update
+from rmc.learner.update import JointUpdate
+from rmc.learner.update_order import make_update
 
 OPTION = "--init-from"
 PREDICTS = ("normalizer.", "memory.", "world_model.", *FILL_PARTS)

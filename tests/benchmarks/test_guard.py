@@ -4,25 +4,32 @@ import dataclasses
 
 import pytest
 
-from benchmarks.guard import Line, gflops, verdict
+from benchmarks.guard import Line, faults, gflops
 
 BEFORE = [Line("cue", seed, "0000000", result, 80.0, 200.0) for seed, result in ((1, 3.0), (2, 4.0), (3, 3.5))]
 SAME = Line("cue", 1, "1111111", 3.0, 80.0, 200.0)
 
 
 @pytest.mark.parametrize(
-    ("changed", "judgement"),
+    ("changed", "worse"),
     [
-        ({}, "ok"),
-        ({"episode_return": 2.41}, "ok"),
-        ({"episode_return": 2.39}, "return below 80% of 3.0, the least of 3 lines"),
-        ({"updates_per_s": 40.0, "gflops": 100.0}, "ok"),  # a machine of half the speed
-        ({"updates_per_s": 71.0}, "speed below 90% of 400.0, the median of 3 lines"),
-        ({"task": "another"}, "nothing to compare with"),
+        ({}, []),
+        ({"episode_return": 2.41}, []),
+        ({"episode_return": 2.39}, ["return below 2.4; the least of 3 lines is 3.0"]),
+        ({"episode_return": float("nan")}, ["return below 2.4; the least of 3 lines is 3.0"]),
+        ({"updates_per_s": 40.0, "gflops": 100.0}, []),  # a machine of half the speed
+        ({"updates_per_s": 71.0}, ["speed below 90% of 400.0, the median of 3 lines"]),
+        ({"task": "another"}, ["nothing to compare with; --record makes a first line"]),
     ],
 )
-def test_what_is_worse_is_named(changed: dict[str, object], judgement: str) -> None:
-    assert verdict(dataclasses.replace(SAME, **changed), BEFORE) == judgement  # type: ignore[arg-type]
+def test_what_is_worse_is_named(changed: dict[str, object], worse: list[str]) -> None:
+    assert faults(dataclasses.replace(SAME, **changed), BEFORE) == worse  # type: ignore[arg-type]
+
+
+def test_a_return_below_zero_has_room_as_well() -> None:
+    before = [dataclasses.replace(one, episode_return=-100.0) for one in BEFORE]
+    assert not faults(dataclasses.replace(SAME, episode_return=-119.0), before)
+    assert faults(dataclasses.replace(SAME, episode_return=-121.0), before)
 
 
 def test_a_machine_multiplies() -> None:

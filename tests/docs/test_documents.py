@@ -14,7 +14,7 @@ from rmc.cli import main
 from rmc.cli.parser import COMMANDS
 from rmc.common import agent
 from rmc.common.env import wrappers
-from rmc.learner import diagnostics, losses, update
+from rmc.learner import diagnostics, losses, update, update_order
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -42,7 +42,10 @@ def test_the_faults_that_were_run_are_in_their_page() -> None:
 
 def test_every_equation_leads_to_its_code_and_back() -> None:
     """What the docs' table names is there, and its docstring names the equation."""
-    modules = {"losses": losses, "agent": agent, "update": update, "wrappers": wrappers, "diagnostics": diagnostics}
+    modules = {
+        "losses": losses, "agent": agent, "update": update, "update_order": update_order, "wrappers": wrappers,
+        "diagnostics": diagnostics,
+    }  # fmt: skip
     table = (ROOT / "docs" / "algorithm.md").read_text().split("## From the paper to the code")[1].split("\n\n")[1]
     seen = set()
     for row in table.splitlines()[2:]:

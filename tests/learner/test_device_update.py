@@ -16,7 +16,8 @@ from rmc.common.agent import Agent
 from rmc.learner.batch import clear_padding, view_batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.device_update import WARM_UP, CopiesAhead, CudaGraph, DeviceUpdate, HostCopy
-from rmc.learner.update import JointUpdate, make_update
+from rmc.learner.update import JointUpdate
+from rmc.learner.update_order import make_update
 from tests.learner.agents import ROBUST
 from tests.learner.rows import SPEC, random_rows
 

@@ -13,7 +13,7 @@ from rmc.common.agent_config import AgentConfig
 from rmc.learner import kernels
 from rmc.learner.config import UpdateConfig
 from rmc.learner.fused import FusedGRU, FusedHead, FusedTwinQ, fuse
-from rmc.learner.update import make_update
+from rmc.learner.update_order import make_update
 from tests.learner.rows import SPEC, random_rows, to_batch
 
 B, T = 6, 5

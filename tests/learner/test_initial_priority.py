@@ -13,7 +13,7 @@ from rmc.common.agent_config import AgentConfig, HeadInput
 from rmc.common.errors import MessageError
 from rmc.learner.config import UpdateConfig
 from rmc.learner.initial_priority import InitialPriority
-from rmc.learner.update import make_update
+from rmc.learner.update_order import make_update
 from tests.hostile import hostile_state
 from tests.learner.rows import SPEC, random_rows, to_batch
 

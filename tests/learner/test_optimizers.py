@@ -11,7 +11,9 @@ from rmc.common.agent_config import AgentConfig
 from rmc.learner.config import UpdateConfig
 from rmc.learner.fused import FusedHead, Rounded, fuse, rounded_weights
 from rmc.learner.kernels import BLOCK
-from rmc.learner.optimizers import CompiledAdam, adam, follow
+from rmc.learner.optimizers import CompiledAdam, adam, begin_moments, follow
+from rmc.learner.update_order import make_update
+from tests.learner.rows import SPEC, random_rows, to_batch
 
 SHAPES = ((), (3,), (7, 5), (2, 41, 60))
 RATES = {"lr": 3e-3, "betas": (0.8, 0.99), "eps": 1e-6}
@@ -56,16 +58,47 @@ def test_it_is_torchs_adam():
     assert compiled.state[ours[-1]]["step"] == 26
 
 
-def test_its_state_is_torchs():
-    before, after = parameters(), parameters()
-    compiled, plain = CompiledAdam([{"params": before}], {}), torch.optim.Adam([{"params": after}], fused=True)
-    give_gradients(before, 1)
-    compiled.step()
-    plain.load_state_dict(compiled.state_dict())
-    back = CompiledAdam([{"params": before}], {})
-    back.load_state_dict(plain.state_dict())
-    for value in before:
-        assert all(torch.equal(back.state[value][name], compiled.state[value][name]) for name in back.state[value])
+def test_either_goes_on_from_the_others_state():
+    ours, theirs = parameters(), parameters()
+    compiled, plain = CompiledAdam([{"params": ours}], {}), torch.optim.Adam([{"params": theirs}], fused=True)
+    for step in range(1, 9):
+        before, after = copy.deepcopy(compiled.state_dict()), copy.deepcopy(plain.state_dict())
+        if step > 1:
+            compiled.load_state_dict(after)
+            plain.load_state_dict(before)
+        for values, optimizer in ((ours, compiled), (theirs, plain)):
+            give_gradients(values, step)
+            optimizer.step()
+    for value, expected in zip(ours, theirs, strict=True):
+        assert torch.allclose(value, expected, rtol=1e-5, atol=1e-6)
+        assert compiled.state[value]["step"] == plain.state[expected]["step"] > 4
+
+
+def test_moments_of_another_size_are_not_read():
+    values = parameters()
+    optimizer = CompiledAdam([{"params": values}], {})
+    give_gradients(values, 1)
+    begin_moments(optimizer, values)
+    optimizer.state[values[2]]["exp_avg"] = torch.zeros(3)
+    with pytest.raises(AssertionError):
+        optimizer.step()
+
+
+@pytest.mark.parametrize("order", ["joint", "alternate"])
+def test_after_updates_every_copy_is_its_weight_rounded(order):
+    """Targets included, and amid a load."""
+    config = UpdateConfig(update_order=order, target_memory="ema")
+    network = AgentConfig(hidden=SPEC.state, embedding=8, heads=(16, 12))
+    update = make_update(Agent(SPEC.obs_dim, SPEC.action_dim, network), SPEC.burn_in, config, 0, bf16=True)
+    modules, batch = (update.agent, update.target_critic, update.target_memory), to_batch(random_rows(8))
+    begin = copy.deepcopy(update.state_dict())
+    for number in range(4):
+        if number == 2:
+            update.load_state_dict(begin)
+        update(batch, torch.tensor(0.1))
+        copies = rounded_weights(modules)
+        assert len(copies) == 13
+        assert all(torch.equal(low, weight.bfloat16()) for weight, low in copies.items())
 
 
 def test_a_nan_reaches_the_weight_and_no_other():

@@ -13,7 +13,8 @@ from rmc.common.errors import RmcError
 from rmc.learner.config import UpdateConfig
 from rmc.learner.device_update import DeviceUpdate
 from rmc.learner.pipelined_update import PipelinedUpdate
-from rmc.learner.update import JointUpdate, make_update
+from rmc.learner.update import JointUpdate
+from rmc.learner.update_order import make_update
 from tests.learner.rows import SPEC
 from tests.learner.test_device_update import BATCH, host_batch
 

@@ -13,7 +13,8 @@ from rmc.common.agent_config import AgentConfig
 from rmc.learner import losses
 from rmc.learner.config import UpdateConfig
 from rmc.learner.unroll import unroll
-from rmc.learner.update import TRAINS_MEMORY, JointUpdate, make_update
+from rmc.learner.update import TRAINS_MEMORY, JointUpdate
+from rmc.learner.update_order import make_update
 from tests.learner.agents import PAPER, ROBUST
 from tests.learner.rows import SPEC, observation_valid, random_rows, spoil_padding, to_batch
 

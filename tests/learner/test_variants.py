@@ -10,7 +10,7 @@ import torch
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.learner.config import UpdateConfig
-from rmc.learner.update import make_update
+from rmc.learner.update_order import make_update
 from tests.learner.agents import PAPER
 from tests.learner.plain_update import PlainUpdate
 from tests.learner.rows import SPEC, random_rows, to_batch

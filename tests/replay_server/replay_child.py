@@ -25,7 +25,7 @@ def main(url: str, run: str, folder: Path, capacity: int) -> None:
     sockets = SocketServer(server, SPEC, f"unix:{folder}/r.sock", SECRET, 64)
     stop = StopSignal()
     stop.install()
-    run_role(ReplayProcess(server, sockets), bus, stop)
+    run_role(ReplayProcess(server, sockets), bus, stop, idle_seconds=0.0)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ class Running:
         self.server = ReplayServer(SPEC, config, folder / "replay", 1, 10**9, 1, 1000, bus)
         sockets = SocketServer(self.server, SPEC, f"unix:{folder}/r.sock", SECRET, 64)
         self.process, self.stop = ReplayProcess(self.server, sockets), StopSignal()
-        self.thread = threading.Thread(target=run_role, args=(self.process, bus, self.stop))
+        self.thread = threading.Thread(target=partial(run_role, self.process, bus, self.stop, idle_seconds=0.0))
         self.thread.start()
 
     def end(self) -> None:

@@ -1,0 +1,55 @@
+"""The update in the order that the config names: all losses at once, or one after the other."""
+
+import torch
+from torch import Tensor
+
+from rmc.common.agent import Agent
+from rmc.learner.batch import Batch
+from rmc.learner.config import UpdateConfig
+from rmc.learner.optimizers import adam
+from rmc.learner.update import JointUpdate, UpdateResult, detached
+
+
+class AlternateUpdate(JointUpdate):
+    """Algorithm 1 as printed: model, what fills, critics, policy, temperature in turn, each from a fresh forward.
+
+    Each has an optimiser of its own, so that a memory that several losses train is moved by several.
+    """
+
+    imputer_updates = 1  # it has a stage of its own
+    _STAGES = (
+        ("world_model", ("model_loss", "grounding_loss")),
+        ("next_frame", ("fill_loss",)),
+        ("critic", ("q_loss",)),
+        ("policy", ("policy_loss",)),
+        ("log_alpha", ("temperature_loss",)),
+    )
+
+    def _make_optimizers(self) -> list[torch.optim.Adam]:
+        return [adam(self.agent, self.config, "memory", part) for part, _ in self._stages()]
+
+    def _stages(self) -> list[tuple[str, tuple[str, ...]]]:
+        return [(part, names) for part, names in self._STAGES if getattr(self.agent, part) is not None]
+
+    def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
+        """One round from a Batch. Each metric is from its own stage's forward; priorities from the critics'."""
+        metrics: dict[str, Tensor] = {}
+        norms = []
+        for optimizer, (part, names) in zip(self.optimizers, self._stages(), strict=True):
+            loss_values, model, value = self.forward(batch, beta)
+            stage_losses = {name: loss for name, loss in loss_values.items() if name in names}
+            norms.append(self.step([optimizer], stage_losses.values()))
+            metrics |= detached(stage_losses)
+            if part == "critic":
+                of_critics = model, value
+        model, value = of_critics
+        self.follow_model(model)
+        self.follow_value()
+        updated = self.result(batch, model, value, torch.stack(norms).norm())
+        return updated._replace(metrics=updated.metrics | metrics)
+
+
+def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:
+    """The update in the order that the config names."""
+    kind = JointUpdate if config.update_order == "joint" else AlternateUpdate
+    return kind(agent, burn_in, config, seed, bf16)
