@@ -176,6 +176,14 @@ def test_a_checkpoint_that_is_gone_is_one_warning(folder: RunFolder, caplog: pyt
     assert message.startswith("trackio: no 000000003.mp4: ")
 
 
+def plays(process: psutil.Process) -> bool:
+    """Whether it is rmc evaluate."""
+    try:
+        return "evaluate" in process.cmdline()
+    except psutil.Error:  # it has just ended
+        return False
+
+
 def test_a_film_that_is_being_made_ends_with_the_tracker(folder: RunFolder) -> None:
     saved(folder)
     keep_tracking(folder, Tracking("trackio", "my-project", (), "0123abcd", 1))
@@ -183,7 +191,7 @@ def test_a_film_that_is_being_made_ends_with_the_tracker(folder: RunFolder) -> N
     assert tracker is not None
     trained(folder, 700, 1.0)
     deadline = time.monotonic() + 60.0
-    while not (films := [p for p in psutil.Process().children(recursive=True) if "evaluate" in p.cmdline()]):
+    while not (films := [child for child in psutil.Process().children(recursive=True) if plays(child)]):
         assert time.monotonic() < deadline
         time.sleep(0.05)
     assert films[0].nice() == 19
