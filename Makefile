@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo wheel site guard test test-faults test-learning test-cluster test-container test-dm-control test-newest lint docs bench peers clean
+.PHONY: env demo wheel site guard test test-faults test-long test-cluster test-container test-dm-control test-newest lint docs bench peers clean
 
 env: $(STAMP)
 
@@ -52,9 +52,9 @@ test-faults: $(addprefix test-faults-,$(FAULTS)) docs
 test-faults-%: $(STAMP)
 	$(BIN)/python -m tests.faults.$*
 
-# Two tasks learnt to their goals, some minutes; make test has the shorter one.
-test-learning: $(STAMP)
-	$(BIN)/python -m pytest -x tests/integration/test_learning.py tests/integration/balance.py
+# The tests that take most of a minute or more, some ten minutes in all.
+test-long: $(STAMP)
+	$(BIN)/python -m pytest -m long --durations=25
 
 # Real ray up on three machines that are namespaces of this one: Linux, root, openssh-server, rsync, iproute2.
 ROUNDS ?= 5

@@ -129,6 +129,7 @@ def seen_memory(run: Training) -> dict[str, int]:
     return most
 
 
+@pytest.mark.long
 @pytest.mark.timeout(400)
 def test_estimates_are_what_a_real_run_takes(tmp_path: Path) -> None:
     output = dry_run(tmp_path / "planned")

@@ -1,4 +1,4 @@
-"""It learns a task that only a memory solves."""
+"""It learns: a task that only a memory solves, and a pendulum balanced to the time limit."""
 
 import time
 from pathlib import Path
@@ -27,6 +27,12 @@ SMALL = [
 FAST = ["--learning-rate", "5e-4", "--polyak", "0.99", "--target-memory", "ema", "--batch-size", "16"]
 DATA = ["--capacity", "5000", "--warmup-steps", "1000", "--priority-exponent", "0", "--episodes", "10"]
 pytestmark = pytest.mark.timeout(SECONDS + 30)
+
+
+@pytest.mark.long
+def test_one_actor_and_one_learner_balance_the_pendulum(tmp_path: Path) -> None:
+    pace = ["--total-steps", "8000", "--replay-ratio", "240", "--alpha-learning-rate", "1e-3"]
+    assert best_return(tmp_path / "run", "InvertedPendulum-v5", pace, 1000.0) == 1000.0
 
 
 def test_a_cue_is_remembered_over_twelve_steps(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 from tests.integration.running import Training, alive
 
 
+@pytest.mark.long
 def test_a_temporary_folder_that_vanishes_is_made_again(tmp_path: Path) -> None:
     """Roles that die later find Redis, the learner finds the replay server, and the run has its result."""
     with Training(tmp_path / "run", "--total-steps", "12000") as training:

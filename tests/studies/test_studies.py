@@ -48,6 +48,7 @@ def test_every_run_is_one_that_rmc_takes(name, scale):
     assert len(seen) == len(jobs) / len({job.seed for job in jobs})  # no two agents are the same
 
 
+@pytest.mark.long
 def test_a_study_runs_once_and_its_lines_can_be_plotted(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "RUNS", tmp_path)
     agents = {"ours": "train ENV --flicker 0.1", "theirs": "baseline sac ENV --flicker 0.1"}
@@ -137,6 +138,7 @@ def test_what_a_study_cannot_do_is_said(words, fault, monkeypatch, capsys):
     assert fault in f"{ending.value} {capsys.readouterr().err}"
 
 
+@pytest.mark.long
 def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "RUNS", tmp_path)
     agents = {"broken": "train ENV --gamma 7", "sound": "baseline sac ENV"}

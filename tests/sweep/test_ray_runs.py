@@ -41,6 +41,7 @@ def test_runs_are_spread_and_their_folders_come_without_the_ring(tmp_path: Path)
     assert not kept()
 
 
+@pytest.mark.long
 @pytest.mark.timeout(300)
 def test_a_stopped_and_a_lost_run_go_on_with_the_same_command(tmp_path: Path) -> None:
     folder, spec = tmp_path / "sweep", str(write_spec(tmp_path, **ENDLESS))
