@@ -277,11 +277,13 @@ def test_a_real_run_that_its_learner_holds_back(tmp_path: Path) -> None:
     assert "learner-bound: actors waited " in trained(tmp_path / "run", "InvertedPendulum-v5", "--replay-ratio", "64")
 
 
+@pytest.mark.long
 def test_a_real_run_that_its_environment_holds_back(tmp_path: Path) -> None:
     output = trained(tmp_path / "run", "tests.slow_env:Slow-v0", "--total-steps", "1500")
     assert "actor-bound: the learner waited " in output
 
 
+@pytest.mark.long
 def test_a_real_run_whose_evaluator_starves(tmp_path: Path) -> None:
     words = "--total-steps 1800 --replay-ratio 4 --warmup-steps 200 --checkpoint-steps 100 --episodes 20".split()  # noqa: SIM905
     output = trained(tmp_path / "run", "tests.slow_env:Slow-v0", *words)
