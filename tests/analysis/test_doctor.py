@@ -197,7 +197,8 @@ def test_threads_that_fight() -> None:
         str(finding) == "threads fight: the learner has 8 threads on 4 cores; --threads 3 leaves one to the other roles"
     )
     full = HOST | {"host_idle_share": 0.01}
-    busy = {"learner": shares(1.0), "actor_0": shares(0.9), "actor_1": shares(0.9), "replay": shares(0.5)}
+    learner = shares(1.0) | {"threads": 3}
+    busy = {"learner": learner, "actor_0": shares(0.9), "actor_1": shares(0.9), "replay": shares(0.5)}
     finding = host_faults.threads_fight(vitals(launcher=full, **busy), CONFIG)
     assert finding is not None
     assert finding.measured == "5.3 threads of the run are busy at a time, on 4 cores"
@@ -208,7 +209,7 @@ def test_threads_that_fight() -> None:
 def test_a_machine_that_others_use() -> None:
     finding = host_faults.oversubscribed(vitals(launcher=HOST | {"host_load": 9.0}, learner=shares(0.5)), CONFIG)
     assert finding is not None
-    assert finding.measured == "load 9.0 on 4 CPUs, of which this run is 1.5"
+    assert finding.measured == "load 9.0 on 4 CPUs, of which this run is 1.0"
     assert host_faults.oversubscribed(vitals(launcher=HOST), CONFIG) is None
     stolen = host_faults.stolen(vitals(launcher=HOST | {"host_steal_share": 0.25}), CONFIG)
     assert stolen is not None
