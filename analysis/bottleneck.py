@@ -106,7 +106,13 @@ def busy_threads(vitals: Vitals, config: RunConfig, cores: int) -> float:
     learner = vitals.busy("learner") or 0.0
     others = [vitals.busy(kind) or 0.0 for kind in ("actor", "replay", "evaluator")]
     counts = [len(vitals.of(kind)) for kind in ("actor", "replay", "evaluator")]
-    return learner * learner_threads(config, cores) + sum(n * busy for n, busy in zip(counts, others, strict=True))
+    threads = threads_of_learner(vitals, config, cores)
+    return learner * threads + sum(n * busy for n, busy in zip(counts, others, strict=True))
+
+
+def threads_of_learner(vitals: Vitals, config: RunConfig, cores: int) -> int:
+    """What it has chosen, or begins with."""
+    return int(vitals.last("learner", "threads")) or learner_threads(config, cores)
 
 
 def host_cores(vitals: Vitals) -> int:

@@ -2,11 +2,10 @@
 
 from statistics import median
 
-from rmc.analysis.bottleneck import busy_threads, free_cores, host_cores
+from rmc.analysis.bottleneck import busy_threads, free_cores, host_cores, threads_of_learner
 from rmc.analysis.finding import Finding
 from rmc.analysis.vitals import Vitals
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.preflight import learner_threads
 
 CROWDED = 1.15  # threads that are busy, for each core
 IDLE_CORES = 0.1  # of all cores: where more are idle, nobody fights for them
@@ -22,7 +21,7 @@ def threads_fight(vitals: Vitals, config: RunConfig) -> Finding | None:
     cores = host_cores(vitals)
     if not cores:
         return None
-    threads, busy = learner_threads(config, cores), busy_threads(vitals, config, cores)
+    threads, busy = threads_of_learner(vitals, config, cores), busy_threads(vitals, config, cores)
     if threads > cores:
         measured = f"the learner has {threads} threads on {cores} cores"
         return Finding("threads fight", measured, f"--threads {max(1, cores - 1)} leaves one to the other roles")

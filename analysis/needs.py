@@ -4,14 +4,14 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 
-from rmc.analysis.bottleneck import busy_threads
+from rmc.analysis.bottleneck import busy_threads, threads_of_learner
 from rmc.analysis.host_faults import CROWDED
 from rmc.analysis.vitals import Vitals
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.trial import RoleUse, Trial
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import Machine
-from rmc.deploy.run.preflight import DISK_RESERVE, learner_threads
+from rmc.deploy.run.preflight import DISK_RESERVE
 from rmc.replay_server import ring
 
 KEPT_BESIDE = 2  # checkpoints beside the newest: the best, and the one that is being written
@@ -135,8 +135,9 @@ def handles(roles: dict[str, RoleUse], machine: Machine) -> list[Need]:
 
 def threads(config: RunConfig, records: list[dict[str, Any]], machine: Machine) -> Need:
     """The learner's and one of every other role, and how many of them work at a time."""
-    learner, others = learner_threads(config, machine.cores), len(config.roles()) - 1
-    busy = busy_threads(Vitals(records).training(), config, machine.cores)
+    vitals, others = Vitals(records).training(), len(config.roles()) - 1
+    learner = threads_of_learner(vitals, config, machine.cores)
+    busy = busy_threads(vitals, config, machine.cores)
     text = f"{learner} learner + {others} others, {busy:.1f} busy"
     return Need("threads", text, f"{machine.cores} cores", max(learner, busy) <= CROWDED * machine.cores, False)
 

@@ -123,6 +123,10 @@ class DeviceUpdate:
         self._update.update_ema(number)
         return [result]
 
+    def use_threads(self, number: int) -> None:
+        """So many, where it runs on a CPU."""
+        torch.set_num_threads(number)
+
     def drain(self) -> list[UpdateResult]:
         """Nothing is pending."""
         return []

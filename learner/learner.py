@@ -6,7 +6,7 @@ import logging
 import pickle
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,6 +29,7 @@ from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.learner.device_update import DeviceUpdate, HostCopy
 from rmc.learner.learner_metrics import Drawn, LearnerMetrics, needs_weights
 from rmc.learner.pipelined_update import PipelinedUpdate
+from rmc.learner.thread_trial import ThreadTrial
 from rmc.learner.update import UpdateResult
 from rmc.learner.update_order import make_update
 
@@ -67,11 +68,13 @@ class Learner:
         seed: int,
         device: str = "cpu",
         header: PolicyHeader | None = None,
-        threads: tuple[int, int] = (0, 0),
+        threads: Sequence[int] = (),
+        two_processes: bool = False,
     ) -> None:
         """``header`` goes into the policy's file of every checkpoint, with the steps so far; None: bare weights.
 
-        ``threads`` are those of an update's two halves, value and model, if each is to have a process.
+        Of ``threads``, ascending, the fastest is taken, after a trial; none: torch's stay. With ``two_processes`` each
+        half of an update has one, and so many threads.
         """
         self.spec, self.config, self.replay, self.bus, self.checkpoints = spec, config, replay, bus, checkpoints
         self.device, self._header = torch.device(device), header
@@ -92,10 +95,11 @@ class Learner:
         bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_is_native(self.device))
         self.update = make_update(self.agent, spec.burn_in, update, seed, bf16)
         self._updated: DeviceUpdate | PipelinedUpdate = (
-            PipelinedUpdate(self.update, spec, config.batch_size, threads)
-            if threads[1]
+            PipelinedUpdate(self.update, spec, config.batch_size)
+            if two_processes
             else DeviceUpdate(self.update, spec, config.batch_size)
         )
+        self._threads, self._processes = ThreadTrial(threads, self._updated.use_threads), 1 + two_processes
         self._drawn: deque[Drawn] = deque()  # what is being learnt from
         self._metrics = LearnerMetrics(self.agent, spec, replay)
         self._returning: deque[tuple[NDArray[np.int64], HostCopy]] = deque()  # priorities, and of which windows
@@ -133,7 +137,9 @@ class Learner:
             return self.finished
         if self.updates + len(self._drawn) == 0:
             self._freeze_statistics()
+        began = time.perf_counter()
         self._learn(sample)
+        self._threads.note(time.perf_counter() - began)
         if self.env_steps >= self._next_checkpoint:
             self._settle()
             self.checkpoint()
@@ -263,6 +269,7 @@ class Learner:
             "env_steps": self.env_steps,
             "epoch": self.epoch,
             "time": time.time(),
+            "threads": self._threads.chosen,
         }
         if self._observed_before.count:
             progress["observed_before"] = self._observed_before.to_json()
@@ -294,6 +301,7 @@ class Learner:
             self.updates = self.last_checkpoint = int(progress["updates"])
             self.env_steps, epoch = int(progress["env_steps"]), int(progress["epoch"])
             self._checkpoint_steps = self.env_steps
+            self._threads.take_up(int(progress.get("threads", 0)))
             if "observed_before" in progress:
                 self._observed_before = ObservationStatistics.from_json(progress["observed_before"])
         except NOT_OURS as error:
@@ -316,6 +324,7 @@ class Learner:
             "checkpoint_env_steps": self._checkpoint_steps,
             "checkpoint_error": self._checkpoint_error,
             "damaged_checkpoints": self._damaged_checkpoints,
+            "threads": self._threads.chosen * self._processes,
             **self._metrics.take(self.updates),
         }
 

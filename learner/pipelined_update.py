@@ -37,7 +37,7 @@ from rmc.learner.update import (
 )
 
 AHEAD = 2  # batches that the model's half may be ahead
-NUMBER = struct.Struct("q")
+REQUEST = struct.Struct("qq")  # an update's number, and the threads that it takes
 ENDED = "the process of memory and world model has ended; the lines above say why"
 ALIGNMENT = 64  # bytes, a cache line
 
@@ -66,11 +66,9 @@ class PipelinedUpdate:
 
     in_flight = 0
 
-    def __init__(
-        self, update: JointUpdate, spec: WindowSpec, batch_size: int, threads: tuple[int, int] = (1, 1)
-    ) -> None:
-        """``threads`` are those of the value's half and of the model's."""
-        self._update, self._spec, self._batch_size, self._threads = update, spec, batch_size, threads
+    def __init__(self, update: JointUpdate, spec: WindowSpec, batch_size: int) -> None:
+        self._update, self._spec, self._batch_size = update, spec, batch_size
+        self._threads = 1  # of each half
         self._pending: deque[tuple[Slot, int]] = deque()
         self._number = 0  # of batches handed in
         self._slots: list[Slot] = []
@@ -98,6 +96,12 @@ class PipelinedUpdate:
         self._pending.append((slot, number))
         return [self._finish()] if len(self._pending) > AHEAD else []
 
+    def use_threads(self, number: int) -> None:
+        """So many for each half, from the next call on."""
+        self._threads = number
+        if self._slots:  # nothing may run on several before the other process is there
+            torch.set_num_threads(number)
+
     def drain(self) -> list[UpdateResult]:
         """The results of all that is pending; then no other process writes weights."""
         return [self._finish() for _ in range(len(self._pending))]
@@ -112,7 +116,7 @@ class PipelinedUpdate:
     def _send(self, number: int) -> None:
         assert self._pipe is not None
         try:
-            self._pipe.sendall(NUMBER.pack(number))
+            self._pipe.sendall(REQUEST.pack(number, self._threads))
         except OSError:
             raise RmcError(ENDED) from None
 
@@ -163,7 +167,7 @@ class PipelinedUpdate:
         if self._child == 0:
             self._be_the_other(parent, theirs)
         theirs.close()
-        torch.set_num_threads(self._threads[0])
+        torch.set_num_threads(self._threads)
 
     def _make_slot(self) -> Slot:
         raw = torch.zeros(self._batch_size, self._spec.dtype.itemsize, dtype=torch.uint8)
@@ -178,14 +182,15 @@ class PipelinedUpdate:
         """In the new process, which ends with the other one, or once that closes its end."""
         try:
             exit_with_parent(parent)
-            for number in (signal.SIGINT, signal.SIGTERM):  # the other one hears them
-                signal.signal(number, signal.SIG_IGN)
+            for one in (signal.SIGINT, signal.SIGTERM):  # the other one hears them
+                signal.signal(one, signal.SIG_IGN)
             setproctitle.setproctitle(MODEL_PROCESS)
             _close_all_but(requests.fileno())
-            torch.set_num_threads(self._threads[1])
             slots = cycle(self._slots)
-            while request := requests.recv(NUMBER.size, socket.MSG_WAITALL):
-                self._model_half(next(slots), *NUMBER.unpack(request))
+            while request := requests.recv(REQUEST.size, socket.MSG_WAITALL):
+                number, threads = REQUEST.unpack(request)
+                torch.set_num_threads(threads)
+                self._model_half(next(slots), number)
                 requests.sendall(b"\0")
         except BrokenPipeError:
             pass

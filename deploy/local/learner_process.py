@@ -14,7 +14,7 @@ from rmc.common.shard import Shard
 from rmc.deploy.local.role_process import Process, RunConnection, until_taken, wait_for_room
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.preflight import check_device, cores, learner_threads
+from rmc.deploy.run.preflight import check_device, cores, thread_choices, two_processes
 from rmc.learner.learner import Learner
 from rmc.learner.replay_client import ReplayClient
 from rmc.learner.sharded_replay import ShardedReplay
@@ -24,9 +24,7 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
     """The learner's process; checkpoints go to ``folder``. Its last record says ``finished`` where the run is."""
     secret, process = place.secret(), Process(place)
     config, spec, bus = process.config, process.config.window_spec(), process.bus
-    threads = learner_threads(config, cores())
-    model_threads = (threads + 1) // 2 if device == "cpu" and config.update.halves_are_apart() and threads > 1 else 0
-    torch.set_num_threads(1 if model_threads else threads)  # until the model's half has its process
+    torch.set_num_threads(1)  # until it is known whether the model's half has a process, and what is fastest
     check_device(device)
     wait_for_room(bus, Learner.name, process.stop)
     pinned, batch = device.startswith("cuda"), config.learner.batch_size
@@ -36,7 +34,7 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
     checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
     learner = Learner(
         spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device,
-        config.policy_header(), (threads - model_threads, model_threads),
+        config.policy_header(), thread_choices(config, cores(), device), two_processes(config, cores(), device),
     )  # fmt: skip
     run_role(learner, bus, process.stop, lambda: learner.finished)
     for client in clients:

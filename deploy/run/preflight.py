@@ -64,8 +64,21 @@ def check_device(device: str) -> None:
             raise ConfigError("--device", device, "PyTorch sees no CUDA device; use --device cpu")
 
 
+def two_processes(config: RunConfig, cores: int, device: str = "cpu") -> bool:
+    """Whether each half of an update has a process of its own."""
+    return device == "cpu" and config.update.halves_are_apart() and min(cores, config.learner.threads or cores) > 1
+
+
+def thread_choices(config: RunConfig, cores: int, device: str = "cpu") -> tuple[int, ...]:
+    """Threads of an update, of each half where both have a process: what ``--threads`` says, or what is to be tried."""
+    halves = 2 if two_processes(config, cores, device) else 1
+    if config.learner.threads:
+        return (max(1, config.learner.threads // halves),)
+    if device != "cpu":
+        return (1,)
+    return tuple(2**power for power in range(cores.bit_length()) if halves * 2**power <= cores)
+
+
 def learner_threads(config: RunConfig, cores: int) -> int:
-    """What ``--threads 0`` stands for on so many cores: all but one, and both of two where an update has two halves."""
-    all_but_one = max(1, cores - 1)
-    most = max(all_but_one, min(2, cores)) if config.update.halves_are_apart() else all_but_one
-    return config.learner.threads or most
+    """Threads of the learner where nothing has been tried yet: the least."""
+    return thread_choices(config, cores)[0] * (2 if two_processes(config, cores) else 1)

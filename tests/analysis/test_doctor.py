@@ -197,7 +197,8 @@ def test_threads_that_fight() -> None:
         str(finding) == "threads fight: the learner has 8 threads on 4 cores; --threads 3 leaves one to the other roles"
     )
     full = HOST | {"host_idle_share": 0.01}
-    busy = {"learner": shares(1.0), "actor_0": shares(0.9), "actor_1": shares(0.9), "replay": shares(0.5)}
+    learner = shares(1.0) | {"threads": 3}
+    busy = {"learner": learner, "actor_0": shares(0.9), "actor_1": shares(0.9), "replay": shares(0.5)}
     finding = host_faults.threads_fight(vitals(launcher=full, **busy), CONFIG)
     assert finding is not None
     assert finding.measured == "5.3 threads of the run are busy at a time, on 4 cores"
@@ -208,7 +209,7 @@ def test_threads_that_fight() -> None:
 def test_a_machine_that_others_use() -> None:
     finding = host_faults.oversubscribed(vitals(launcher=HOST | {"host_load": 9.0}, learner=shares(0.5)), CONFIG)
     assert finding is not None
-    assert finding.measured == "load 9.0 on 4 CPUs, of which this run is 1.5"
+    assert finding.measured == "load 9.0 on 4 CPUs, of which this run is 1.0"
     assert host_faults.oversubscribed(vitals(launcher=HOST), CONFIG) is None
     stolen = host_faults.stolen(vitals(launcher=HOST | {"host_steal_share": 0.25}), CONFIG)
     assert stolen is not None
@@ -277,11 +278,13 @@ def test_a_real_run_that_its_learner_holds_back(tmp_path: Path) -> None:
     assert "learner-bound: actors waited " in trained(tmp_path / "run", "InvertedPendulum-v5", "--replay-ratio", "64")
 
 
+@pytest.mark.long
 def test_a_real_run_that_its_environment_holds_back(tmp_path: Path) -> None:
     output = trained(tmp_path / "run", "tests.slow_env:Slow-v0", "--total-steps", "1500")
     assert "actor-bound: the learner waited " in output
 
 
+@pytest.mark.long
 def test_a_real_run_whose_evaluator_starves(tmp_path: Path) -> None:
     words = "--total-steps 1800 --replay-ratio 4 --warmup-steps 200 --checkpoint-steps 100 --episodes 20".split()  # noqa: SIM905
     output = trained(tmp_path / "run", "tests.slow_env:Slow-v0", *words)

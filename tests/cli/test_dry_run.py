@@ -35,7 +35,7 @@ def records() -> list[dict[str, Any]]:
     for second in range(12):
         of_replay = {"drawn_steps": 1920.0 * second, "windows": 5 * second, "env_steps": 60 * second}
         messages.append({"role": "replay", "time": 100.0 + second, "busy_share": 0.5, "waiting_share": 0.5} | of_replay)
-        of_learner = {"updates": 8 * second, "busy_share": 1.0, "waiting_share": 0.0}
+        of_learner = {"updates": 8 * second, "threads": 3, "busy_share": 1.0, "waiting_share": 0.0}
         messages.append({"role": "learner", "time": 100.5 + second} | of_learner)
     return messages
 

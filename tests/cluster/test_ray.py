@@ -92,6 +92,7 @@ def test_two_shards_speak_over_the_network_and_encrypted_where_redis_can(tmp_pat
         assert training.newest(role, "drawn_steps") > 0
 
 
+@pytest.mark.long
 def test_checkpoints_that_do_not_reach_the_head_are_said_and_brought_later(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
     launcher_log = folder.logs / "launcher.log"

@@ -157,6 +157,7 @@ def test_the_learner_stands_still(run: Loaded) -> None:
     assert row.passed, row
 
 
+@pytest.mark.long
 def test_the_learner_stands_still_and_is_replaced(run: Loaded) -> None:
     row = freeze(run, "learner", 1, 1.0)
     assert row.passed, row
@@ -200,6 +201,7 @@ def test_the_replay_server_is_killed_at_every_commit_point(full: Loaded) -> None
     assert tree_is_its_rebuild(full)
 
 
+@pytest.mark.long
 def test_a_learner_becomes_ten_times_slower(full: Loaded) -> None:
     usual = updates_in(full, 5.0)
     full.slow_down(SLOWER)
@@ -209,6 +211,7 @@ def test_a_learner_becomes_ten_times_slower(full: Loaded) -> None:
     assert row.passed, row
 
 
+@pytest.mark.long
 def test_the_replay_server_stands_still_and_is_replaced(full: Loaded) -> None:
     row = freeze(full, "replay", 1, 1.0)
     assert row.passed, row

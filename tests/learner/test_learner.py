@@ -39,12 +39,12 @@ class Setting:
         self.bus.append(0, EntryId(1, 0), encode_hello(SPEC))
         self.learner = self.start()
 
-    def start(self, policy_ema_updates: int = 0) -> Learner:
+    def start(self, policy_ema_updates: int = 0, threads: tuple[int, ...] = ()) -> Learner:
         checkpoints, update = (
             CheckpointFolder(self.folder / "checkpoints"),
             UpdateConfig(policy_ema_updates=policy_ema_updates),
         )
-        return Learner(SPEC, AGENT, update, CONFIG, self.server, self.bus, checkpoints, seed=1)
+        return Learner(SPEC, AGENT, update, CONFIG, self.server, self.bus, checkpoints, seed=1, threads=threads)
 
     def feed(self, windows: int, reward: float = 1.0) -> None:
         rows = random_rows(windows, self.seq)
@@ -69,6 +69,22 @@ def test_first_weights_are_out_before_any_experience(setting):
     assert setting.bus.latest_version() == (1, 0)
     assert not setting.learner.step()
     assert setting.learner.waiting_for() == "experience"
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_resumed_learner_takes_the_threads_that_were_chosen(setting):
+    setting.learner.close()
+    setting.learner = setting.start(threads=(2,))
+    setting.feed(20)
+    assert setting.learner.step()
+    assert setting.learner.metrics()["threads"] == torch.get_num_threads() == 2
+    setting.learner.close()
+    setting.learner = setting.start(threads=(1, 2))
+    assert setting.learner.metrics()["threads"] == torch.get_num_threads() == 2
+    setting.learner.close()
+    setting.learner = setting.start(threads=(1, 4))
+    assert setting.learner.metrics()["threads"] == 0
+    assert torch.get_num_threads() == 1
 
 
 def test_weights_that_redis_forgot_are_out_again(setting):

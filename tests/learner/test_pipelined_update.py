@@ -107,6 +107,24 @@ def test_a_process_that_ends_is_told():
     apart.close()
 
 
+def test_both_halves_take_the_threads_that_are_set(tmp_path, monkeypatch):
+    def note(number: int) -> None:
+        with (tmp_path / str(os.getpid())).open("a") as file:
+            file.write(f"{number} ")
+
+    monkeypatch.setattr("rmc.learner.pipelined_update.torch.set_num_threads", note)
+    apart = PipelinedUpdate(make("robust", False), SPEC, BATCH)
+    apart.use_threads(4)  # before there is another process: nothing may run on several
+    assert not list(tmp_path.iterdir())
+    apart(*host_batch(1), 0.1, 1)
+    apart.use_threads(2)
+    apart(*host_batch(2), 0.1, 2)
+    apart.drain()
+    apart.close()
+    ours, theirs = ((tmp_path / str(process)).read_text() for process in (os.getpid(), apart._child))
+    assert (ours, theirs) == ("4 2 ", "4 2 ")
+
+
 @pytest.mark.parametrize(
     "other",
     [
