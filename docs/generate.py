@@ -31,7 +31,8 @@ TRACKING = ["track", "track_project", "track_tags", "track_video_every"]
 BEGINNING = ["init_from", "init_parts"]
 # When a user should touch an option; what it does is said where it is defined.
 WHEN = {
-    "preset": "`memory` where a cue is needed long after, `paper` to compare with the paper, `debug` to see everything run within a minute",
+    "preset": "`memory` where a cue is needed long after, `paper` to compare with the paper, `debug` to see everything "
+    "run within a minute",
     "seed": "for every repetition",
     "total_steps": "always: it is the length of the run, and also where a finished one goes on to",
     "actors": "when the learner waits for experience; on two cores one actor is enough",
