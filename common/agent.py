@@ -80,6 +80,18 @@ class Memory(nn.Module):
         hidden = self._unroll(embedding, hidden[:, : self.gru.hidden_size].unsqueeze(0).contiguous())
         return MemoryOutput(hidden, self._skip(observation, embedding))
 
+    @torch.no_grad()
+    def start_gates(self, steps: int) -> None:
+        """Chrono initialisation: unit i forgets over u_i steps, drawn from 1 to ``steps`` - 1.
+
+        With z = sigmoid(b), h_t = z h_{t-1} + (1 - z) n_t keeps h for about 1 / (1 - z) = 1 + e^b steps, so b_i = log
+        u_i (Tallec and Ollivier, 2018, for the GRU).
+        """
+        size = self.gru.hidden_size
+        gate = slice(size, 2 * size)  # PyTorch's order: reset, update, candidate
+        self.gru.bias_ih_l0[gate] = torch.empty(size).uniform_(1.0, max(2.0, steps - 1.0)).log()
+        self.gru.bias_hh_l0[gate] = 0.0
+
     def step(self, observation: Tensor, missing: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
         """One step of it: (B, O) normalised, (B,) bool, (B, A), (B, H) -> (B, H) float32."""
         if self.head_input == "observation":

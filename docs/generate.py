@@ -31,7 +31,8 @@ TRACKING = ["track", "track_project", "track_tags", "track_video_every"]
 BEGINNING = ["init_from", "init_parts"]
 # When a user should touch an option; what it does is said where it is defined.
 WHEN = {
-    "preset": "`paper` to compare with the paper, `debug` to see everything run within a minute",
+    "preset": "`memory` where a cue is needed long after, `paper` to compare with the paper, `debug` to see everything "
+    "run within a minute",
     "seed": "for every repetition",
     "total_steps": "always: it is the length of the run, and also where a finished one goes on to",
     "actors": "when the learner waits for experience; on two cores one actor is enough",
@@ -63,6 +64,7 @@ WHEN = {
     "hidden": "up for large observations, down for speed",
     "embedding": "0 for the paper's raw input",
     "heads": "rarely",
+    "gate_init": "`chrono` where something seen once is needed many steps later; the preset `memory` has it",
     "layer_norm": "rarely: it cost return in a trial (`studies/notebook.md`)",
     "head_input": "`observation`, with `--scheme 2 --no-grounding --hidden 8 --embedding 0`, where all is seen and "
     "time counts: [level by 60 000 steps, far behind by 300 000](results.md); the embedding beside it cost return in "

@@ -26,7 +26,7 @@ from rmc.deploy.run.migrations import FORMAT, migrated
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
 
-Preset = Literal["robust", "paper", "debug"]
+Preset = Literal["robust", "memory", "paper", "debug"]
 LARGEST_WINDOW = 32 << 20  # bytes, half of what our Redis takes as a value
 ConfigT = TypeVar("ConfigT")
 

@@ -1,5 +1,7 @@
 """The presets: where a run's defaults come from."""
 
+from dataclasses import replace
+
 from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig
@@ -10,7 +12,7 @@ from rmc.replay_server.config import ReplayConfig
 
 def preset_config(name: Preset, env: EnvConfig) -> RunConfig:
     """A preset's RunConfig for an environment."""
-    return {"robust": robust, "paper": paper, "debug": debug}[name](env)
+    return {"robust": robust, "memory": memory, "paper": paper, "debug": debug}[name](env)
 
 
 def robust(env: EnvConfig) -> RunConfig:
@@ -23,6 +25,19 @@ def robust(env: EnvConfig) -> RunConfig:
         replay=ReplayConfig(replay_ratio=48.0, priority_exponent=0.0),
         update=UpdateConfig(scheme=3, policy_ema_updates=2_000),
         learner=LearnerConfig(batch_size=8, importance_exponent=0.0, publish_updates=80),
+    )
+
+
+def memory(env: EnvConfig) -> RunConfig:
+    """For what is seen once and needed long after: whole episodes as windows, a memory that begins by holding on."""
+    base = robust(env)
+    return replace(
+        base,
+        preset="memory",
+        agent=replace(base.agent, gate_init="chrono"),
+        actor=replace(base.actor, state_strategy="episode"),
+        replay=replace(base.replay, capacity=10_000),
+        update=replace(base.update, scheme=1),
     )
 
 

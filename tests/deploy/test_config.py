@@ -13,11 +13,11 @@ from rmc.common.agent_config import HeadInput
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig, flat, from_json, option, to_json
-from rmc.deploy.run.presets import debug, paper, preset_config, robust
+from rmc.deploy.run.presets import debug, memory, paper, preset_config, robust
 from rmc.deploy.run.validation import validate
 
 ENV = EnvConfig("InvertedPendulum-v5")
-NAMES: list[Preset] = ["robust", "paper", "debug"]
+NAMES: list[Preset] = ["robust", "memory", "paper", "debug"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -37,19 +37,28 @@ def test_the_paper_preset_is_the_papers() -> None:
     assert config.replay.warmup_steps == 10_000
 
 
+def test_the_memory_preset_has_whole_episodes_as_windows() -> None:
+    config = memory(EnvConfig("tests.memory_env:Memory40-v0", time_limit=44))
+    spec = config.window_spec()
+    assert (spec.burn_in, spec.train) == (0, 44)
+    assert config.agent.gate_init == "chrono"
+    assert not config.update.halves_are_apart()
+    assert config.actor == dataclasses.replace(robust(ENV).actor, state_strategy="episode")
+
+
 @given(
     st.floats(1e-6, 0.1),
     st.integers(1, 10**9),
     st.sampled_from(get_args(HeadInput)),
     st.sampled_from(["online", "ema"]),
 )
-def test_json_keeps_every_value(rate: float, steps: int, head_input: Any, memory: Any) -> None:
+def test_json_keeps_every_value(rate: float, steps: int, head_input: Any, target: Any) -> None:
     config = robust(ENV)
     config = dataclasses.replace(
         config,
         total_steps=steps,
         agent=dataclasses.replace(config.agent, head_input=head_input, heads=(7, 5)),
-        update=dataclasses.replace(config.update, learning_rate=rate, target_memory=memory),
+        update=dataclasses.replace(config.update, learning_rate=rate, target_memory=target),
     )
     assert from_json(to_json(config)) == config
 

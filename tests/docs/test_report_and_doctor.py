@@ -24,7 +24,10 @@ def ran(command: str, folder: Path) -> str:
 
 @pytest.mark.timeout(400)
 def test_their_commands_run(tmp_path: Path) -> None:
-    ran("rmc train InvertedPendulum-v5 --preset debug --total-steps 2000 --replay-ratio 64 --run-dir runs/first", tmp_path)
+    ran(
+        "rmc train InvertedPendulum-v5 --preset debug --total-steps 2000 --replay-ratio 64 --run-dir runs/first",
+        tmp_path,
+    )
     shutil.copytree(tmp_path / "runs" / "first", tmp_path / "runs" / "second")
     commands = [command for page in (REPORT, DOCTOR) for command in re.findall(r"```sh\n(rmc .*)\n```", page)]
     assert [command.split()[1] for command in commands] == ["report", "report", "doctor", "train"]

@@ -1,0 +1,34 @@
+"""How far back the memory reaches before anything is learnt."""
+
+import pytest
+import torch
+
+from rmc.common.agent import Memory
+from rmc.common.agent_config import AgentConfig
+
+STEPS = 100
+
+
+def reach(memory: Memory, steps: int) -> float:
+    """The size of d h_T / d o_1 after so many steps of silence."""
+    first = torch.ones(1, 1, 3, requires_grad=True)
+    o = torch.cat([first, torch.zeros(1, steps - 1, 3)], 1)
+    missing, actions = torch.zeros(1, steps, dtype=torch.bool), torch.zeros(1, steps, 2)
+    hidden = memory(o, missing, actions, torch.zeros(1, 64)).hidden
+    hidden[0, -1].sum().backward()
+    assert first.grad is not None
+    return float(first.grad.abs().sum())
+
+
+def test_chrono_initialisation_holds_what_was_seen_over_a_window() -> None:
+    torch.manual_seed(0)
+    memory = Memory(3, 2, AgentConfig(hidden=64, embedding=16))
+    before = reach(memory, STEPS)
+    memory.start_gates(STEPS)
+    assert reach(memory, STEPS) > 1e6 * before
+    size = memory.gru.hidden_size
+    bias = (memory.gru.bias_ih_l0 + memory.gru.bias_hh_l0)[size : 2 * size]
+    kept = 1.0 / (1.0 - torch.sigmoid(bias.detach()))  # steps
+    assert kept.min() >= 2.0
+    assert kept.max() <= STEPS + 1e-3
+    assert float(kept.mean()) == pytest.approx(1.0 + STEPS / 2, rel=0.2)
