@@ -9,7 +9,7 @@ import operator
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated, Any, cast, get_type_hints
+from typing import Annotated, Any, cast, get_args, get_type_hints
 
 import tyro
 
@@ -178,6 +178,4 @@ def _named_preset(words: list[str]) -> Preset:
     """The preset must be known before the options, whose defaults it gives; a wrong one is refused later."""
     presets = [word.partition("=")[2] for word in words if word.startswith("--preset=")]
     presets += [after for word, after in itertools.pairwise(words) if word == "--preset"]
-    if "paper" in presets[-1:]:
-        return "paper"
-    return "debug" if "debug" in presets[-1:] else "robust"
+    return next((name for name in get_args(Preset) if name in presets[-1:]), "robust")

@@ -3,17 +3,18 @@
 import dataclasses
 import logging
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from rmc.analysis.baseline_settings import BaselineConfig
 from rmc.cli import main, parser, run_options, train_options
 from rmc.common.env.config import EnvConfig
-from rmc.deploy.run.config import RunConfig, flat
+from rmc.deploy.run.config import Preset, RunConfig, flat
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
-from rmc.deploy.run.presets import debug
+from rmc.deploy.run.presets import debug, preset_config
 from tests.cli.test_main import complaint
 
 PENDULUM = "InvertedPendulum-v5"
@@ -44,6 +45,14 @@ def test_what_is_not_said_is_as_it_was(run: RunFolder) -> None:
         config, launch = parsed(*words, run.path)
         assert config == run.config()
         assert launch == options
+
+
+@pytest.mark.parametrize("name", get_args(Preset))
+def test_every_preset_gives_its_defaults(name: Preset) -> None:
+    expected = preset_config(name, EnvConfig(PENDULUM))
+    assert (
+        parsed("train", PENDULUM, "--preset", name)[0] == parsed("train", PENDULUM, f"--preset={name}")[0] == expected
+    )
 
 
 def test_what_is_said_is_all_that_changes(run: RunFolder) -> None:
