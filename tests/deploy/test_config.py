@@ -150,7 +150,7 @@ def test_the_longest_window_that_is_named_is_taken_and_no_longer_one(strategy: s
     assert with_value(config, path, most).window_spec().train * step == most
     with pytest.raises(ConfigError, match=f"take at most {most}$"):
         with_value(config, path, most + step).window_spec()
-    with pytest.raises(ConfigError, match="--burn-in=10000: .* smaller observations"):
+    with pytest.raises(ConfigError, match=r"--burn-in=10000: .* smaller observations"):
         with_value(with_value(config, "window.burn_in", 10_000), "actor.state_strategy", "burn-in").window_spec()
 
 
