@@ -45,12 +45,13 @@ class Replay:
 
     @property
     def observations(self) -> Tensor:
-        """(T, O) of which steps are taken, normalised."""
+        """(T, O) from which steps were taken, normalised."""
         return self._episode.observation[0, :-1]
 
-    def is_missing(self, start: int) -> bool:
-        """Whether that frame is missing: then nobody reads it."""
-        return bool(self._episode.missing[0, start])
+    @property
+    def missing(self) -> Tensor:
+        """(T,) bool, which of them nobody reads."""
+        return self._episode.missing[0, :-1]
 
     def differences(self, start: int, change: Tensor, delays: Tensor) -> list[Tensor]:
         """Of h, Q and the mean action, (D, K, ·) each, with (D, O) added to the observation at ``start``."""
@@ -81,11 +82,18 @@ def influence(agent: Agent, episodes: list[Episode]) -> tuple[Influence, Influen
     spreads = [
         _spread(torch.cat([part[0] for part in parts])) for parts in zip(*(r.outputs for r in replays), strict=True)
     ]
-    first = torch.stack([replay.observations[0] for replay in replays])
-    every = torch.cat([replay.observations for replay in replays])
-    starts = [(replay, 0) for replay in replays]
-    later = [(replay, replay.steps * i // (LATER + 1)) for replay in replays for i in range(1, LATER + 1)]
-    return _of_starts(starts, first.std(0), spreads), _of_starts(later, every.std(0), spreads)
+    first = [(replay, 0) for replay in replays]
+    later = [(replay, max(1, replay.steps * i // (LATER + 1))) for replay in replays for i in range(1, LATER + 1)]
+    return (
+        _of_starts(first, _deviation(replays, slice(1)), spreads),
+        _of_starts(later, _deviation(replays, slice(None)), spreads),
+    )
+
+
+def _deviation(replays: list[Replay], steps: slice) -> Tensor:
+    """(O,) of what was seen at those steps of all episodes."""
+    seen = torch.cat([replay.observations[steps][~replay.missing[steps]] for replay in replays])
+    return seen.std(0, correction=0) if len(seen) else seen.new_zeros(seen.shape[1])
 
 
 def _spread(values: Tensor) -> Tensor:
@@ -95,7 +103,7 @@ def _spread(values: Tensor) -> Tensor:
 
 def _of_starts(starts: list[tuple[Replay, int]], deviation: Tensor, spreads: list[Tensor]) -> Influence:
     """``deviation`` (O,) is what each dimension is changed by."""
-    starts = [(one, start) for one, start in starts if start + 1 < one.steps and not one.is_missing(start)]
+    starts = [(one, start) for one, start in starts if start + 1 < one.steps and not one.missing[start]]
     left = np.array([replay.steps - 1 - start for replay, start in starts])
     delays = tuple(k for k in DELAYS if len(left) and (left >= k).mean() >= REACHED)
     if not delays:

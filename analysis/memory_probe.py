@@ -73,9 +73,11 @@ def probes(agent: Agent, episodes: list[Episode], parts: list[HiddenPart]) -> li
 
 def _probe(name: str, rows: Samples, y: Doubles, at: NDArray[np.bool_]) -> Probe | None:
     """Of (N, Y) at some of the steps; None where there is nothing to train or test on."""
-    quarter = rows.quarter[at]
-    y = y[at][:, y[at].std(0) > LEAST_SPREAD] if at.any() else y[:0]
-    if not y.size or len(set(quarter.tolist())) < QUARTERS:
+    quarter, y = rows.quarter[at], y[at]
+    if len(set(quarter.tolist())) < QUARTERS:
+        return None
+    y = y[:, y[quarter < 2].std(0) > LEAST_SPREAD]
+    if not y.size:
         return None
     from_memory, from_newest = (explained(x[at], y, quarter) for x in (rows.h, rows.newest))
     return Probe(name, from_memory, from_newest) if isfinite(from_memory) else None
