@@ -94,8 +94,7 @@ def explained(x: Doubles, y: Doubles, quarter: NDArray[np.int64]) -> float:
 
 def _ridge(x: Doubles, y: Doubles, penalty: float) -> Doubles:
     """(X, Y) weights: (x'x / N + penalty)^-1 x'y / N."""
-    weights: Doubles = np.linalg.solve(x.T @ x / len(x) + penalty * np.eye(x.shape[1]), x.T @ y / len(x))
-    return weights
+    return np.asarray(np.linalg.solve(x.T @ x / len(x) + penalty * np.eye(x.shape[1]), x.T @ y / len(x)), np.float64)
 
 
 def _r2(y: Doubles, read: Doubles) -> float:

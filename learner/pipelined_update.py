@@ -41,7 +41,6 @@ AHEAD = 2  # batches that the model's half may be ahead
 NUMBER = struct.Struct("q")
 ENDED = "the process of memory and world model has ended; the lines above say why"
 ALIGNMENT = 64  # bytes, a cache line
-BY_STEP = ("z", "next_z", "curiosity", "hidden")  # what of the model's half has a time
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,11 @@ class Slot:
 
     def model_of(self, batch: Batch) -> ModelPass:
         """Where the model's half of that batch lies: the beginning of each place, where the batch is cut."""
-        return self.model._replace(**{name: _cut(getattr(self.model, name), batch.cut) for name in BY_STEP})
+        whole = self.model
+        z, next_z, curiosity, hidden = (
+            _cut(place, batch.cut) for place in (whole.z, whole.next_z, whole.curiosity, whole.hidden)
+        )
+        return whole._replace(z=z, next_z=next_z, curiosity=curiosity, hidden=hidden)
 
     def write(self, batch: Batch, model: ModelPass, norm: Tensor) -> None:
         """Put the model's half of that batch in."""

@@ -80,7 +80,8 @@ def test_the_cue_can_be_read_out_of_the_memory_that_holds_it(of_memory_env: list
 @pytest.mark.parametrize("agent", ["robust", "filling blanks", "observation beside", "without a memory"])
 def test_differences_are_those_of_two_whole_passes(agent: str, tmp_path: Path) -> None:
     """From the state before the change on, or over the whole episode: the same."""
-    config = RunConfig(EnvConfig("Pendulum-v1", flicker=0.3, time_limit=30), preset="debug", agent=AGENTS[agent])
+    env = EnvConfig("Pendulum-v1", flicker=0.3, time_limit=30)
+    config = RunConfig(env, preset="debug", seed=4, agent=AGENTS[agent])
     folder = make_run(tmp_path / "run", config)
     torch.manual_seed(0)
     network = Agent(3, 1, config.agent).eval()

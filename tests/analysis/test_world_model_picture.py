@@ -97,9 +97,9 @@ def test_the_command_writes_a_picture_and_says_it_in_numbers(
     assert "% 1 ahead" in output
     assert "% 15 ahead (100% is a guess of no change)" in output
     assert "worst dimensions" in output
-    assert re.search(r"^changed observation +changes +1 step later +5 +10 +20$", output, re.MULTILINE)
+    assert re.search(r"^changed observation +changes +1 step later +5 +10 +20 *$", output, re.MULTILINE)
     assert re.search(r"^first +h +(\d+% *){4}$", output, re.MULTILINE)
-    assert re.search(r"^observation, where missing +-?\d\.\d\d +-?\d\.\d\d$", output, re.MULTILINE)
+    assert re.search(r"^observation, where missing +-?\d\.\d\d +-?\d\.\d\d *$", output, re.MULTILINE)
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "no" / "seen.png")]) == 2
     assert "its folder is not there" in capsys.readouterr().err
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.xyz")]) == 2
