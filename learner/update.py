@@ -145,7 +145,7 @@ class JointUpdate:
         z_value, z_policy = (z if loss in TRAINS_MEMORY[c.scheme] else z.detach() for loss in ("value", "policy"))
         with self._autocast():
             mean, log_std = agent.policy(z_policy)
-            pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean))
+            pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean, batch.cut))
             with torch.no_grad():
                 next_q = self.target_critic(model.next_z, pi[:, 1:])
                 next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:])
@@ -213,8 +213,10 @@ class JointUpdate:
     def _unroll_target(self, o: Tensor, batch: Batch) -> MemoryOutput:
         return unroll(self.target_memory, o, batch, self.burn_in)
 
-    def _noise_like(self, x: Tensor) -> Tensor:
-        return torch.randn(x.shape, generator=self.generator, device=x.device)
+    def _noise_like(self, x: Tensor, cut: int) -> Tensor:
+        """(B, T, A) standard normal. That of the steps cut off is drawn, too: cut or not, a batch teaches the same."""
+        rows, steps, size = x.shape
+        return torch.randn(rows, steps + cut, size, generator=self.generator, device=x.device)[:, :steps]
 
     def _scaled(self, i: Tensor, m: Tensor) -> tuple[Tensor, Tensor]:
         """Curiosity in units of its running standard deviation, where configured, and its running variance."""

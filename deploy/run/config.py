@@ -80,12 +80,20 @@ class RunConfig:
             train = time_limit
         state = self.agent.state_size(obs_dim)
         spec = WindowSpec(obs_dim, action_dim, state, burn_in if strategy == "burn-in" else 0, train)
-        if 4 * spec.observations * (obs_dim + action_dim + 1) > LARGEST_WINDOW:
-            name = "--time-limit" if strategy == "episode" else "--trained-steps"
-            raise ConfigError(
-                name, train, f"a window would have more than {LARGEST_WINDOW >> 20} MiB; take fewer steps"
-            )
+        self._check_window(spec)
         return spec
+
+    def _check_window(self, spec: WindowSpec) -> None:
+        """Raises ConfigError where a window is larger than a message may be."""
+        most = LARGEST_WINDOW // (4 * (spec.obs_dim + spec.action_dim + 1)) - 1 - spec.burn_in
+        if spec.train <= most:
+            return
+        fault, repeat = f"a window would have more than {LARGEST_WINDOW >> 20} MiB", self.env.action_repeat
+        if most < 1:
+            raise ConfigError("--burn-in", spec.burn_in, f"{fault}; take fewer steps, or smaller observations")
+        if self.actor.state_strategy == "episode":
+            raise ConfigError("--time-limit", spec.train * repeat, f"{fault}; take at most {most * repeat}")
+        raise ConfigError("--trained-steps", spec.train, f"{fault}; take at most {most}")
 
     def policy_header(self) -> PolicyHeader:
         """What the files of this run's policies say about themselves, before any step. Raises ConfigError."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from rmc.analysis import curves, env_check, export, history, video, world_model_picture
+from rmc.analysis import curves, env_check, export, history, memory_picture, video, world_model_picture
 from rmc.analysis.evaluation import Progress, evaluate_policy
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
@@ -102,8 +102,9 @@ def export_policy(command: run_options.Export) -> int:
 
 
 def inspect(command: run_options.Inspect) -> int:
-    """Write a picture of what the world model knows, and say it in numbers."""
-    insight, console = world_model_picture.inspect(command.run, command.checkpoint, command.out), terminal()
+    """Write a picture of what the world model knows and the memory holds, and say it in numbers."""
+    console = terminal(max(terminal().width, memory_picture.WIDTH))
+    insight, memory = world_model_picture.inspect(command.run, command.checkpoint, command.out)
     ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in insight.open_loop.items())
     hardest = np.argsort(-insight.unexplained)[: world_model_picture.SHOWN]
     worst = ", ".join(f"{i} ({insight.unexplained[i]:.0%})" for i in hardest)
@@ -112,6 +113,7 @@ def inspect(command: run_options.Inspect) -> int:
         soft_wrap=True,
     )
     console.print(f"worst dimensions one step ahead: {worst}")
+    console.print(*memory_picture.tables(memory), sep="\n")
     console.print(f"{command.out}", soft_wrap=True)
     return 0
 

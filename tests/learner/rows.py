@@ -7,6 +7,7 @@ from rmc.common.window import Rows, WindowSpec
 from rmc.learner.batch import Batch, clear_padding, view_batch
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=5)
+LONG = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=60)
 
 
 def observation_valid(rows: Rows, spec: WindowSpec = SPEC) -> np.ndarray:
@@ -30,14 +31,19 @@ def spoil_padding(rows: Rows) -> None:
     rows["reward"][~stepped] = np.nan
 
 
-def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC) -> Rows:
-    """Rows of every shape: padded and real burn-in, full and partial, terminated and not."""
+def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC, longest: int | None = None) -> Rows:
+    """Rows of every shape: padded and real burn-in, full and partial, terminated and not.
+
+    Each trains ``longest`` steps at most, and where that is said the first one does.
+    """
     rng = np.random.default_rng(seed)
     rows = np.zeros(count, spec.dtype)
     rows["serial"] = np.arange(count)
     rows["first"] = rng.choice([0, spec.burn_in], count)
     rows["episode_step"] = spec.burn_in
-    rows["last"] = rng.integers(spec.burn_in + 1, spec.steps + 1, count)
+    rows["last"] = rng.integers(spec.burn_in + 1, spec.burn_in + (longest or spec.train) + 1, count)
+    if longest is not None:
+        rows["last"][0] = spec.burn_in + longest
     rows["terminated"] = rng.integers(0, 2, count)
     rows["missing"] = rng.uniform(size=rows["missing"].shape) < 0.3
     for name in ("observation", "action", "prev_action", "reward", "state"):

@@ -1,9 +1,11 @@
 """The batch's views against a plain loop over the rows."""
 
 import numpy as np
+import pytest
+import torch
 
-from rmc.learner.batch import clear_padding, importance_weights
-from tests.learner.rows import SPEC, random_rows, spoil_padding, to_batch
+from rmc.learner.batch import clear_padding, importance_weights, longest_steps, update_steps, view_batch
+from tests.learner.rows import LONG, SPEC, random_rows, spoil_padding, to_batch
 
 
 def test_fields_match_the_rows():
@@ -61,3 +63,32 @@ def test_padding_is_cleared_and_nothing_else_touched():
     spoil_padding(rows)
     clear_padding(rows, SPEC)
     assert (rows == clean).all()
+
+
+@pytest.mark.parametrize(
+    ("trained", "rounded"), [(1, 16), (16, 16), (17, 24), (24, 24), (25, 32), (33, 48), (49, 60), (60, 60)]
+)
+def test_the_longest_window_rounded_up_says_where_a_batch_ends(trained: int, rounded: int) -> None:
+    rows = random_rows(5, spec=LONG, longest=trained)
+    raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
+    assert longest_steps(raw, LONG) == LONG.burn_in + rounded
+    assert update_steps(raw, LONG, 2) == LONG.burn_in + rounded
+    assert update_steps(raw, LONG, 1) == LONG.steps
+
+
+def test_windows_of_the_usual_length_are_never_cut() -> None:
+    rows = random_rows(5, longest=1)
+    assert longest_steps(torch.from_numpy(rows.view("u1").reshape(len(rows), -1)), SPEC) == SPEC.steps
+
+
+def test_a_cut_batch_is_the_whole_one_without_padding() -> None:
+    rows = random_rows(6, spec=LONG, longest=20)
+    whole, raw = to_batch(rows, LONG), torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
+    steps = longest_steps(raw, LONG)
+    cut = view_batch(raw, torch.ones(len(rows)), LONG, steps)
+    assert (cut.cut, whole.cut) == (LONG.steps - steps, 0)
+    for name, value in vars(cut).items():
+        if name != "cut":
+            of_whole = getattr(whole, name)
+            assert torch.equal(value, of_whole[:, : value.shape[1]] if value.ndim > 1 else of_whole), name
+    assert not whole.observation_valid[:, steps + 1 :].any()

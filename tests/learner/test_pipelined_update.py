@@ -15,7 +15,7 @@ from rmc.learner.device_update import DeviceUpdate
 from rmc.learner.pipelined_update import PipelinedUpdate
 from rmc.learner.update import JointUpdate
 from rmc.learner.update_order import make_update
-from tests.learner.rows import SPEC
+from tests.learner.rows import LONG, SPEC
 from tests.learner.test_device_update import BATCH, host_batch
 
 ROBUST = UpdateConfig(scheme=3, curiosity=0.1, curiosity_scale="std", policy_ema_updates=100)
@@ -40,12 +40,15 @@ def make(agent: str, bf16: bool) -> JointUpdate:
 
 @pytest.mark.parametrize("bf16", [False, True])
 @pytest.mark.parametrize("agent", AGENTS)
-def test_it_is_the_same_update(agent, bf16):
+@pytest.mark.parametrize("spec", [SPEC, LONG], ids=["short windows", "cut windows"])
+def test_it_is_the_same_update(agent, bf16, spec):
     plain, update = make(agent, bf16), make(agent, bf16)
-    in_turn, apart = DeviceUpdate(plain, SPEC, BATCH), PipelinedUpdate(update, SPEC, BATCH)
+    in_turn, apart = DeviceUpdate(plain, spec, BATCH), PipelinedUpdate(update, spec, BATCH)
     expected, actual = [], []
     for step in range(1, 41):
-        raw, importance = host_batch(step, missing=step > 20)  # what imputes is trained at some updates, then at all
+        longest = (3, 20, 60, 40)[step % 4] if spec is LONG else None
+        # what imputes is trained at some updates, then at all
+        raw, importance = host_batch(step, missing=step > 20, spec=spec, longest=longest)
         for updated, results in ((in_turn, expected), (apart, actual)):
             results += copy.deepcopy(updated(raw, importance, 0.1 * step, step))
         if step % 15 == 0:  # as before weights are read

@@ -95,7 +95,7 @@ def test_each_stage_of_alternate_starts_from_what_the_one_before_left():
 
     def metrics(order: str, rate: float) -> dict[str, Tensor]:
         update = make(PAPER, update_order=order, learning_rate=rate, alpha_learning_rate=rate)
-        update._noise_like = lambda x: torch.full_like(x, 0.3)  # a forward more must not mean other noise
+        update._noise_like = lambda x, cut: torch.full_like(x, 0.3)  # a forward more must not mean other noise
         return update(to_batch(random_rows(8)), BETA).metrics
 
     names = ("model_loss", "q_loss", "policy_loss")  # the temperature's is 0 at first, whatever the policy
