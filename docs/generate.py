@@ -51,8 +51,7 @@ WHEN = {
     "track_video_every": "to see how the policy changes; each film takes a core for some seconds, at low priority",
     "dry_run": "before a long run, or on a machine that is new to it",
     "flicker": "for trials of partial observation",
-    "drop_sensors": "for trials of sensors that fail one by one, see "
-    "[missing sensors](missing-sensors.md)",
+    "drop_sensors": "for trials of sensors that fail one by one, see [missing sensors](missing-sensors.md)",
     "flicker_burst": "for failures that last; with `--flicker` or `--drop-sensors`",
     "delay": "for trials of sensors that are late",
     "hide": "for trials of partial observation",

@@ -35,7 +35,7 @@ from rmc.common.errors import ConfigError, EnvFault, RmcError
 from rmc.common.extra import how_to_install
 
 log = logging.getLogger(__name__)
-DM_CONTROL = "dm_control/"
+DM_CONTROL, PYBULLET = "dm_control/", "pybullet/"
 SHORTEST_TIMEOUT = 0.1  # seconds
 
 
@@ -189,7 +189,10 @@ def find_spec(env_id: str) -> EnvSpec:
     """What gymnasium knows of an environment; imports its module. Raises ConfigError."""
     module, _, name = env_id.rpartition(":")
     if name.startswith(DM_CONTROL):
-        _import_dm_control(env_id)
+        _import_tasks(env_id, ("shimmy", "dm_control"), "shimmy", how_to_install("dm-control"))
+    elif name.startswith(PYBULLET):
+        how = f"with Python 3.11: {how_to_install('pybullet')}"
+        _import_tasks(env_id, ("pybullet", "pybullet_envs_gymnasium"), "rmc.common.env.pybullet_tasks", how)
     elif module:
         _import_users_module(env_id, module)
     try:
@@ -221,13 +224,13 @@ def _import_users_module(env_id: str, module: str) -> None:
         raise ConfigError("ENV", env_id, f"{module} cannot be imported: {describe_error(error)}") from None
 
 
-def _import_dm_control(env_id: str) -> None:
-    """Its tasks are gymnasium's once shimmy is imported."""
-    if importlib.util.find_spec("dm_control") is None or importlib.util.find_spec("shimmy") is None:
-        raise ConfigError("ENV", env_id, f"shimmy or dm_control is missing; {how_to_install('dm-control')}")
+def _import_tasks(env_id: str, packages: tuple[str, str], module: str, how: str) -> None:
+    """Tasks are gymnasium's once a module is imported. Raises ConfigError where a package is missing."""
+    if not all(map(importlib.util.find_spec, packages)):
+        raise ConfigError("ENV", env_id, f"{' or '.join(packages)} is missing; {how}")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it looks for a screen, and says so where there is none
-        importlib.import_module("shimmy")
+        warnings.simplefilter("ignore")  # shimmy looks for a screen, and says so where there is none
+        importlib.import_module(module)
 
 
 def _redirect_mujoco_warnings() -> None:
