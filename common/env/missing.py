@@ -60,7 +60,8 @@ class DropSensors(Missing):
     stream = 0xD20B
 
     def __init__(self, env: Env, probability: float, burst: float = 1.0) -> None:
-        super().__init__(env, probability, burst, chains=env.observation_space.shape[0])  # type: ignore[index]
+        assert env.observation_space.shape
+        super().__init__(env, probability, burst, chains=env.observation_space.shape[0])
 
     def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
         missing = self.draw()

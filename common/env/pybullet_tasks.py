@@ -10,7 +10,7 @@ import importlib
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -22,6 +22,21 @@ PARTS = ("positions", "velocities")
 Part = Literal["positions", "velocities"]
 
 
+@contextmanager
+def _no_output() -> Iterator[None]:
+    """pybullet's C code prints when it is loaded and when it connects, amid what a command prints as JSON."""
+    sys.stdout.flush()
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    try:
+        yield
+    finally:
+        ctypes.CDLL(None).fflush(None)  # or it is printed later
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
+
+
 class ShownPart(gym.ObservationWrapper[Any, Any, Any]):
     """A walker's positions, or its velocities."""
 
@@ -31,6 +46,12 @@ class ShownPart(gym.ObservationWrapper[Any, Any, Any]):
         assert env.action_space.shape
         self._shown = shown_places(part, env.action_space.shape[0], env.observation_space.shape[0])
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, self._shown.shape, np.float32)
+        self._connected = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        with nullcontext() if self._connected else _no_output():
+            self._connected = True
+            return super().reset(seed=seed, options=options)
 
     def observation(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Of all numbers those that are shown."""
@@ -49,28 +70,13 @@ def make_walker(robot: str, part: Part, render_mode: str | None = None) -> Shown
     return ShownPart(getattr(envs, f"{robot}BulletEnv")(render_mode=render_mode), part)
 
 
-@contextmanager
-def _no_output() -> Iterator[None]:
-    """pybullet's C code says on stdout when it was built, amid what a command prints as JSON."""
-    sys.stdout.flush()
-    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    try:
-        yield
-    finally:
-        ctypes.CDLL(None).fflush(None)  # or it is said later
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(nowhere)
-
-
 with _no_output():
     importlib.import_module("pybullet")
 for _robot in ROBOTS:
     for _part in PARTS:
         gym.register(
             f"pybullet/{_robot}{_part.title()}-v0",
-            make_walker,
+            f"{__name__}:make_walker",
             max_episode_steps=1000,
             kwargs={"robot": _robot, "part": _part},
         )
