@@ -10,7 +10,7 @@ import importlib
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -26,14 +26,17 @@ Part = Literal["positions", "velocities"]
 def _no_output() -> Iterator[None]:
     """pybullet's C code prints when it is loaded and when it connects, amid what a command prints as JSON."""
     sys.stdout.flush()
-    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
+    sys.stderr.flush()
+    kept, nowhere = {number: os.dup(number) for number in (1, 2)}, os.open(os.devnull, os.O_WRONLY)
+    for number in kept:
+        os.dup2(nowhere, number)
     try:
         yield
     finally:
         ctypes.CDLL(None).fflush(None)  # or it is printed later
-        os.dup2(kept, 1)
-        os.close(kept)
+        for number, copy in kept.items():
+            os.dup2(copy, number)
+            os.close(copy)
         os.close(nowhere)
 
 
@@ -46,12 +49,6 @@ class ShownPart(gym.ObservationWrapper[Any, Any, Any]):
         assert env.action_space.shape
         self._shown = shown_places(part, env.action_space.shape[0], env.observation_space.shape[0])
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, self._shown.shape, np.float32)
-        self._connected = False
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        with nullcontext() if self._connected else _no_output():
-            self._connected = True
-            return super().reset(seed=seed, options=options)
 
     def observation(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Of all numbers those that are shown."""
@@ -67,7 +64,10 @@ def shown_places(part: Part, joints: int, size: int) -> NDArray[np.intp]:
 def make_walker(robot: str, part: Part, render_mode: str | None = None) -> ShownPart:
     """One of ``ROBOTS``, without a time limit."""
     envs = importlib.import_module("pybullet_envs_gymnasium.gym_locomotion_envs")
-    return ShownPart(getattr(envs, f"{robot}BulletEnv")(render_mode=render_mode), part)
+    env = getattr(envs, f"{robot}BulletEnv")(render_mode=render_mode)
+    with _no_output():
+        env.reset(seed=0)  # connects; later resets go back to the state of this one
+    return ShownPart(env, part)
 
 
 with _no_output():

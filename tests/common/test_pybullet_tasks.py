@@ -94,8 +94,17 @@ def test_velocities_are_what_the_simulator_calls_so(robot: str) -> None:
 
 @needs_pybullet
 def test_the_same_seed_gives_the_same_episode() -> None:
+    """In another environment, and in the same one after another episode."""
     first, second = (walked("Ant", "Positions", 20)[0] for _ in range(2))
     np.testing.assert_array_equal(first, second)
+    env, rng = make_env(EnvConfig(ANT)), np.random.default_rng(0)
+    env.reset(seed=2)
+    for _ in range(10):
+        env.step(np.ones(8, np.float32))
+    again = [env.reset(seed=1)[0]]
+    again += [env.step(rng.uniform(-1, 1, 8).astype(np.float32))[0] for _ in range(20)]
+    env.close()
+    np.testing.assert_array_equal(first, again)
     layout = env_layout(EnvConfig(ANT))
     assert (layout.obs_dim, layout.action_dim, layout.time_limit) == (17, 8, 1000)
 
@@ -115,3 +124,4 @@ def test_check_train_and_evaluate(tmp_path: Path, capfd: pytest.CaptureFixture[s
     words = ["evaluate", str(tmp_path / "run"), "--episodes", "1", "--json"]
     done = subprocess.run([sys.executable, "-m", "rmc.cli.main", *words], capture_output=True, text=True, timeout=100)
     assert json.loads(done.stdout)["env"] == ANT, done.stderr  # and nothing else
+    assert "pybullet" not in done.stderr
