@@ -58,7 +58,12 @@ def evaluate_blob(
     with _one_thread():
         seed = first_start(header.seed, final=True)
         match = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
-    return evaluation_metrics(match) | {"eval_flicker": env.flicker}
+    return evaluation_metrics(match) | missing_shares(env)
+
+
+def missing_shares(env: EnvConfig) -> dict[str, float]:
+    """What an evaluation's record says of the observations that were missing."""
+    return {"eval_flicker": env.flicker, "eval_drop_sensors": env.drop_sensors}
 
 
 def policy_env(header: PolicyHeader, config: EnvConfig) -> Env:

@@ -26,15 +26,16 @@ from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.env.describe import layout_of, shown, structure
 from rmc.common.env.faults import RAISED, call_env, describe_error, one_line
 from rmc.common.env.layout import EnvLayout
+from rmc.common.env.missing import DropSensors, Flicker
 from rmc.common.env.process_state import ApartCall
 from rmc.common.env.spaces import space_fault
 from rmc.common.env.watched_env import WatchedEnv
-from rmc.common.env.wrappers import Env, Flicker, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
+from rmc.common.env.wrappers import Delay, Env, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
 from rmc.common.errors import ConfigError, EnvFault, RmcError
 from rmc.common.extra import how_to_install
 
 log = logging.getLogger(__name__)
-DM_CONTROL = "dm_control/"
+DM_CONTROL, PYBULLET = "dm_control/", "pybullet/"
 SHORTEST_TIMEOUT = 0.1  # seconds
 
 
@@ -48,6 +49,8 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
     _redirect_mujoco_warnings()
     with ApartCall(config.id, "make", config.env_timeout):
         spec = find_spec(config.id)
+        limit = config.time_limit or spec.max_episode_steps
+        _check_delay(config, limit)
         env: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
     fault = call_env("spaces", lambda: space_fault(env.observation_space, env.action_space))
     if fault is None and config.hide != "nothing" and not structure(env):
@@ -56,7 +59,7 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
         with suppress(*RAISED):
             env.close()
         raise ConfigError("ENV", config.id, fault)
-    return _as_seen(env, config, config.time_limit or spec.max_episode_steps)
+    return _as_seen(env, config, limit)
 
 
 def _make(registered: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
@@ -110,8 +113,12 @@ def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> En
         wrapped = ObservationSlice(wrapped, seen_part)
     if config.noise:
         wrapped = Noise(wrapped, config.noise)
+    if config.delay:  # after the noise, which is the sensors' own, and before what is lost on the way
+        wrapped = Delay(wrapped, config.delay)
+    if config.drop_sensors:
+        wrapped = DropSensors(wrapped, config.drop_sensors, config.flicker_burst)
     if config.flicker:
-        wrapped = Flicker(wrapped, config.flicker)
+        wrapped = Flicker(wrapped, config.flicker, config.flicker_burst)
     return FrameStack(wrapped, config.frame_stack) if config.frame_stack > 1 else wrapped
 
 
@@ -156,23 +163,36 @@ def env_layout(config: EnvConfig) -> EnvLayout:
 
 
 def _check_options(config: EnvConfig) -> None:
-    if not 0.0 <= config.flicker <= 1.0:
-        raise ConfigError("--flicker", config.flicker, "a probability from 0 to 1")
+    for name in ("flicker", "drop_sensors"):
+        if not 0.0 <= getattr(config, name) <= 1.0:
+            raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), "a probability from 0 to 1")
+    if not 1.0 <= config.flicker_burst < math.inf:
+        raise ConfigError("--flicker-burst", config.flicker_burst, "a mean number of steps, 1 or more")
     if not 0.0 <= config.noise < math.inf:
         raise ConfigError("--noise", config.noise, "a standard deviation, 0 or more")
     if not config.env_timeout >= SHORTEST_TIMEOUT:
         raise ConfigError("--env-timeout", config.env_timeout, f"{SHORTEST_TIMEOUT} seconds or more")
-    for name, least in (("frame_stack", 1), ("action_repeat", 1), ("time_limit", 0)):
+    for name, least in (("frame_stack", 1), ("action_repeat", 1), ("time_limit", 0), ("delay", 0)):
         if getattr(config, name) < least:
             raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), f"{least} or more")
     check_kwargs(config.env_kwargs)
+
+
+def _check_delay(config: EnvConfig, limit: int | None) -> None:
+    """Raises ConfigError where an episode ends before anything but its first observation is seen."""
+    steps = -(-limit // config.action_repeat) if limit else None
+    if steps and config.delay >= steps:
+        raise ConfigError("--delay", config.delay, f"an episode ends after {steps} steps; take fewer")
 
 
 def find_spec(env_id: str) -> EnvSpec:
     """What gymnasium knows of an environment; imports its module. Raises ConfigError."""
     module, _, name = env_id.rpartition(":")
     if name.startswith(DM_CONTROL):
-        _import_dm_control(env_id)
+        _import_tasks(env_id, ("shimmy", "dm_control"), "shimmy", how_to_install("dm-control"))
+    elif name.startswith(PYBULLET):
+        how = f"with Python 3.11: {how_to_install('pybullet')}"
+        _import_tasks(env_id, ("pybullet", "pybullet_envs_gymnasium"), "rmc.common.env.pybullet_tasks", how)
     elif module:
         _import_users_module(env_id, module)
     try:
@@ -204,13 +224,13 @@ def _import_users_module(env_id: str, module: str) -> None:
         raise ConfigError("ENV", env_id, f"{module} cannot be imported: {describe_error(error)}") from None
 
 
-def _import_dm_control(env_id: str) -> None:
-    """Its tasks are gymnasium's once shimmy is imported."""
-    if importlib.util.find_spec("dm_control") is None or importlib.util.find_spec("shimmy") is None:
-        raise ConfigError("ENV", env_id, f"shimmy or dm_control is missing; {how_to_install('dm-control')}")
+def _import_tasks(env_id: str, packages: tuple[str, str], module: str, how: str) -> None:
+    """Tasks are gymnasium's once a module is imported. Raises ConfigError where a package is missing."""
+    if not all(map(importlib.util.find_spec, packages)):
+        raise ConfigError("ENV", env_id, f"{' or '.join(packages)} is missing; {how}")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it looks for a screen, and says so where there is none
-        importlib.import_module("shimmy")
+        warnings.simplefilter("ignore")  # shimmy looks for a screen, and says so where there is none
+        importlib.import_module(module)
 
 
 def _redirect_mujoco_warnings() -> None:

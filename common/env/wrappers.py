@@ -123,11 +123,15 @@ class ObservationSlice(gym.Wrapper[Floats, Floats, Floats, Floats]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
-        return observation[self._shown], info
+        return observation[self._shown], self._cut(info)
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation[self._shown], float(reward), terminated, truncated, info
+        return observation[self._shown], float(reward), terminated, truncated, self._cut(info)
+
+    def _cut(self, info: dict[str, Any]) -> dict[str, Any]:
+        flags = info.get("missing")
+        return info | {"missing": flags[self._shown]} if isinstance(flags, np.ndarray) else info
 
 
 class CorruptObservation(gym.Wrapper[Floats, Floats, Floats, Floats]):
@@ -163,22 +167,34 @@ class Noise(CorruptObservation):
         super().__init__(env)
         self._deviation = deviation
 
-    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:  # noqa: ARG002 (Flicker says so in it)
+    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:  # noqa: ARG002 (others say so in it)
         return observation + self._deviation * self._rng.standard_normal(observation.shape, np.float32)
 
 
-class Flicker(CorruptObservation):
-    """Whole observations become zeros, independently with probability p; ``info["missing"]`` says which."""
+class Delay(gym.Wrapper[Floats, Floats, Floats, Floats]):
+    """The observation of some steps ago, and whether it was missing; until then the episode's first one.
 
-    stream = 0xF11C
+    Rewards, ends and what else ``info`` says are of now.
+    """
 
-    def __init__(self, env: Env, probability: float) -> None:
+    def __init__(self, env: Env, steps: int) -> None:
         super().__init__(env)
-        self._probability = probability
+        self._past: deque[tuple[Floats, Any]] = deque(maxlen=steps + 1)
 
-    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
-        info["missing"] = bool(self._rng.random() < self._probability)
-        return np.zeros_like(observation) if info["missing"] else observation
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._past.extend([(observation, info.get("missing", False))] * (self._past.maxlen or 1))
+        return self._oldest(info)
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._past.append((observation, info.get("missing", False)))
+        observation, info = self._oldest(info)
+        return observation, float(reward), terminated, truncated, info
+
+    def _oldest(self, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
+        observation, missing = self._past[0]
+        return observation, info | {"missing": missing}
 
 
 class FrameStack(gym.Wrapper[Floats, Floats, Floats, Floats]):

@@ -81,9 +81,11 @@ def _check_baselines(what: str) -> None:
 
 
 def _result_line(played: dict[str, Any]) -> str:
-    mean, deviation, flicker = (played[f"eval_{name}"] for name in ("return_mean", "return_std", "flicker"))
-    missing = f" with {flicker:.0%} of the frames missing" if flicker else ""
-    text = f"{played['env']}{missing}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
+    mean, deviation = played["eval_return_mean"], played["eval_return_std"]
+    shares = {"frames": played["eval_flicker"], "sensors": played["eval_drop_sensors"]}
+    missing = " and ".join(f"{share:.0%} of the {name}" for name, share in shares.items() if share)
+    env = f"{played['env']} with {missing} missing" if missing else played["env"]
+    text = f"{env}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
     return f"{text}{cut_note(played)}, after {played['env_steps']:,} environment steps"
 
 

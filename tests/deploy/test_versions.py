@@ -1,7 +1,7 @@
 """Runs of older versions, kept as they were made: read by every command, and gone on with, their ring included.
 
 ``runs/format-1-a`` was made before keywords of environments, sizes.json and initial.json; ``format-1-b`` by the last
-version that wrote config.json without a format. Both ended at step 1500.
+version that wrote config.json without a format; ``format-2`` before sensors dropped out. All ended at step 1500.
 """
 
 import json
@@ -27,9 +27,10 @@ from rmc.replay_server.recovery import open_store
 
 RUNS = Path(__file__).parent / "runs"
 # Whoever changes this list raises FORMAT by a migration, and keeps a run of the version before in runs/.
-FORMAT_2 = """
-    env.id env.flicker env.hide env.noise env.frame_stack env.action_repeat env.time_limit env.env_timeout
-    env.env_kwargs preset seed total_steps actors window.burn_in window.trained_steps
+FORMAT_3 = """
+    env.id env.flicker env.drop_sensors env.flicker_burst env.delay env.hide env.noise env.frame_stack
+    env.action_repeat env.time_limit env.env_timeout env.env_kwargs preset seed total_steps actors
+    window.burn_in window.trained_steps
     agent.hidden agent.embedding agent.heads agent.layer_norm agent.head_input agent.critic_norm
     agent.normalize_observations agent.grounding agent.missing_flag agent.impute_missing agent.initial_priority
     actor.envs_per_actor actor.stride actor.state_strategy actor.reward_scale actor.refresh_steps actor.chunk_windows
@@ -44,7 +45,7 @@ FORMAT_2 = """
 """.split()  # noqa: SIM905
 
 
-@pytest.fixture(params=["format-1-a", "format-1-b"])
+@pytest.fixture(params=["format-1-a", "format-1-b", "format-2"])
 def old(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
     with tarfile.open(RUNS / f"{request.param}.tar.xz") as archive:
         archive.extractall(tmp_path, filter="data")
@@ -52,16 +53,17 @@ def old(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
 
 
 def test_an_option_comes_with_a_format() -> None:
-    assert sorted(flat(robust(EnvConfig("")))) == sorted(FORMAT_2)
-    assert FORMAT == 2
+    assert sorted(flat(robust(EnvConfig("")))) == sorted(FORMAT_3)
+    assert FORMAT == 3
 
 
 def test_its_options_are_read_in_the_words_of_this_version(old: RunFolder) -> None:
     config, raw = old.config(), json.loads((old.path / "config.json").read_text())
-    assert "format" not in raw
+    assert raw.get("format", 1) == int(old.path.name.split("-")[1])
     assert (config.agent.impute_missing, config.agent.missing_flag) == (True, True)
-    assert config.update.policy_ema_updates == raw["update"]["policy_average"] == 100
-    assert config.env.env_kwargs == {}
+    name = "policy_ema_updates" if "format" in raw else "policy_average"
+    assert config.update.policy_ema_updates == raw["update"][name] == 100
+    assert config.env == EnvConfig("InvertedPendulum-v5", flicker=0.2)  # later options as if there were none
     cut = raw["evaluator"].get("evaluation_seconds", 0.0)  # without the option, no evaluation was cut
     assert config.evaluator.evaluation_seconds == cut
     assert from_json(to_json(config)) == config
@@ -88,7 +90,8 @@ def test_its_ring_is_opened_whole(old: RunFolder) -> None:
     progress = store.ring.progress
     serials = np.arange(progress.valid_from, progress.next_serial)
     rows = store.ring.rows[serials % config.replay.capacity]
-    assert (len(serials), progress.env_steps, progress.replay_ratio) == (80, 1_500, 0.0)
+    ratio = 8.0 if old.path.name == "format-2" else 0.0  # which rings of format 1 do not know
+    assert (len(serials), progress.env_steps, progress.replay_ratio) == (80, 1_500, ratio)
     assert rows["serial"].tolist() == serials.tolist()
     real = np.arange(rows["missing"].shape[1]) <= rows["last"][:, None]
     real &= np.arange(rows["missing"].shape[1]) >= rows["first"][:, None]
@@ -120,7 +123,7 @@ def test_it_goes_on_with_ring_checkpoint_and_counters(old: RunFolder, capsys: py
     more = now.drawn_steps - before.drawn_steps
     assert before.draws < now.draws
     assert 300 * 4 - 16 * 15 <= more <= (now.env_steps - 1_500 + old.config().slack_steps()) * 4 + 16 * 15
-    (start,) = starts(old)
+    *_, start = starts(old)
     assert (start.env_steps, start.changes) == (
         1_500, {"total_steps": [1_500, 1_800], "replay.replay_ratio": [8.0, 4.0]}
     )  # fmt: skip
