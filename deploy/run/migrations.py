@@ -19,7 +19,12 @@ def _to_2(raw: Raw) -> None:
     _rename(raw, "update", policy_average="policy_ema_updates")
 
 
-MIGRATIONS: list[Callable[[Raw], None]] = [_to_2]  # the first is from format 1 to 2
+def _to_3(raw: Raw) -> None:
+    _add(raw, "agent", privileged_critic=False)
+    _add(raw, "layout", missing=1, privileged=0)  # in a policy's file; flags were one for a whole frame
+
+
+MIGRATIONS: list[Callable[[Raw], None]] = [_to_2, _to_3]  # the first is from format 1 to 2
 FORMAT = 1 + len(MIGRATIONS)
 
 
