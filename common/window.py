@@ -107,7 +107,7 @@ class WindowSpec:
 
 
 def row_dtype(fields: list[Field], checksum: bool) -> np.dtype[np.void]:
-    """Fields side by side, padded to 64 bytes; the last four are the ``checksum``, given by the ring, if there is one."""
+    """Fields side by side, padded to 64 bytes; the last four are the ``checksum``, given by the ring, if asked for."""
     packed = np.dtype(fields)
     assert packed.fields is not None
     used = packed.itemsize + CHECKSUM_BYTES * checksum

@@ -13,6 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from rmc.common.agent import Agent
+from rmc.common.window import WindowSpec
 from rmc.learner.batch import clear_padding, view_batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.device_update import WARM_UP, CopiesAhead, CudaGraph, DeviceUpdate, HostCopy
@@ -33,10 +34,12 @@ def make(order: str = "joint", device: str = "cpu", bf16: bool = False) -> Joint
     return make_update(agent, SPEC.burn_in, config, 3, bf16)
 
 
-def host_batch(seed: int, pinned: bool = False, missing: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
-    rows = random_rows(BATCH, seed)
+def host_batch(
+    seed: int, pinned: bool = False, missing: bool = True, spec: WindowSpec = SPEC
+) -> tuple[torch.Tensor, torch.Tensor]:
+    rows = random_rows(BATCH, seed, spec)
     rows["missing"] *= missing
-    clear_padding(rows, SPEC)
+    clear_padding(rows, spec)
     raw = torch.from_numpy(rows.view("u1").reshape(BATCH, -1))
     importance = torch.from_numpy(np.random.default_rng(seed).uniform(0.5, 1.0, BATCH).astype(np.float32))
     return (raw.pin_memory(), importance.pin_memory()) if pinned else (raw, importance)
