@@ -325,8 +325,15 @@ class Actor:
             self._broken += 1
             self._envs[env] = recreate_env(self._envs[env], self._make_env)
             observation, info = checked_reset(self._envs[env], self._new_seed(env))
-        privileged = None if self._privileged is None else info["privileged"]
-        self._builder.begin(env, observation, info.get("missing", False), privileged)
+        missing, privileged = info.get("missing", False), info.get("privileged", ())
+        sizes = np.size(missing), np.size(privileged) if self._spec.privileged else 0
+        if sizes not in ((1, self._spec.privileged), (self._spec.missing, self._spec.privileged)):
+            flags, numbers = sizes
+            raise EnvFault(
+                f"the environment gives {flags} flags of what is missing and {numbers} privileged numbers, "
+                f"the run began with {self._spec.missing} and {self._spec.privileged}"
+            )
+        self._builder.begin(env, observation, missing, privileged if self._spec.privileged else None)
         self._returns[env] = self._lengths[env] = 0
 
     def _cut_episodes(self) -> None:

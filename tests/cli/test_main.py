@@ -34,7 +34,8 @@ TRAIN_FLAGS = """
     --env-timeout --env-kwargs --config --run-dir --if-exists --launcher --device --redis-url
     --ray-address --all-cpus --tls --track --track-project --track-tags --track-video-every --dry-run
     --burn-in --trained-steps
-    --hidden --embedding --heads --layer-norm --head-input --critic-norm --normalize-observations --grounding
+    --hidden --embedding --heads --layer-norm --head-input --critic-norm --privileged-critic
+    --normalize-observations --grounding
     --missing-flag --impute-missing --initial-priority
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
     --capacity --replay-shards --replay-ratio --warmup-steps --priority-exponent --importance-exponent
