@@ -325,16 +325,21 @@ class Actor:
             self._broken += 1
             self._envs[env] = recreate_env(self._envs[env], self._make_env)
             observation, info = checked_reset(self._envs[env], self._new_seed(env))
-        missing, privileged = info.get("missing", False), info.get("privileged", ())
-        sizes = np.size(missing), np.size(privileged) if self._spec.privileged else 0
-        if sizes not in ((1, self._spec.privileged), (self._spec.missing, self._spec.privileged)):
-            flags, numbers = sizes
-            raise EnvFault(
-                f"the environment gives {flags} flags of what is missing and {numbers} privileged numbers, "
-                f"the run began with {self._spec.missing} and {self._spec.privileged}"
-            )
-        self._builder.begin(env, observation, missing, privileged if self._spec.privileged else None)
+        self._check_sizes(info)
+        privileged = None if self._privileged is None else info["privileged"]
+        self._builder.begin(env, observation, info.get("missing", False), privileged)
         self._returns[env] = self._lengths[env] = 0
+
+    def _check_sizes(self, info: dict[str, Any]) -> None:
+        """Raises EnvFault where a first reset says otherwise than the run's layout what is missing or privileged."""
+        flags, numbers = np.size(info.get("missing", False)), np.size(info.get("privileged", ()))
+        for name, size, sizes in (
+            ("missing", flags, (1, self._spec.missing)),
+            ("privileged", numbers, (self._spec.privileged,) if self._spec.privileged else (numbers,)),
+        ):
+            if size not in sizes:
+                fault = f'the environment\'s info["{name}"] has {size} values, when the run began {sizes[-1]}'
+                raise EnvFault(f"{fault}; give as many at every reset")
 
     def _cut_episodes(self) -> None:
         """The run's last steps are in: send what is open as if its time limit had come."""

@@ -29,15 +29,15 @@ class AgentConfig:
     critic_norm: bool = False
     """LayerNorm before the ReLUs of the critics."""
     privileged_critic: bool = False
-    """The critics, and nothing else, also read what the environment gives as info["privileged"]; or, without that, the
-    observation before anything was taken from it (by flicker, noise, hide). What acts reads none of it."""
+    """The critics, and nothing else, also read the environment's info["privileged"]. Where it gives none, that is the
+    observation before flicker, noise or hiding."""
     normalize_observations: bool = False
     """Observations are normalised by the replay server's running statistics."""
     grounding: bool = True
     """The world model also predicts the next observation's change and the reward."""
     missing_flag: bool = False
-    """The memory has one more input, which says whether the observation is missing (flickered out); or one for each
-    dimension, where they are missing one by one."""
+    """The memory has one more input, which says whether the observation is missing (flickered out). Where dimensions
+    are missing one by one, it has one for each."""
     impute_missing: bool = False
     """A small network fills a missing observation before the memory reads it. It predicts from the observation before
     (filled itself if it was missing), the memory and the last action. The stored state then is h and that observation.

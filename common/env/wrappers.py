@@ -36,7 +36,7 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
-        self._flags_numbers: bool | None = None  # whether ``info["missing"]`` is an array, once that is known
+        self._by_number: bool | None = None  # whether ``info["missing"]`` is an array, once that is known
         self.raw_observation_space, self.raw_action_space = env.observation_space, env.action_space
         low, high = bounds(env.action_space)
         self._scale = ActionScale(low, high)
@@ -68,9 +68,9 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
     def _own(self, info: Any) -> dict[str, Any]:
         own = _own(info, math.prod(self.observation_space.shape or ()))
         is_array = isinstance(own.get("missing"), np.ndarray)
-        if self._flags_numbers is None:
-            self._flags_numbers = is_array
-        if is_array and not self._flags_numbers:
+        if self._by_number is None:
+            self._by_number = is_array
+        if is_array and not self._by_number:
             fix = "return an array from the first reset on, or bools alone"
             raise EnvFault(f'the environment\'s info["missing"] is an array, at its first reset it was none; {fix}')
         return own
