@@ -105,7 +105,7 @@ def fill_loss(expected: Tensor, observation: Tensor, seen: Tensor, m: Tensor) ->
 
 def _observation_error(expected: Tensor, observation: Tensor, seen: Tensor, m: Tensor) -> Tensor:
     """L1 of (B, T, O), mean over what is ``seen`` (B, T, M)."""
-    by_flag = (expected - observation).abs().unflatten(-1, (seen.shape[-1], -1)).mean(-1)
+    by_flag = (expected - observation).abs().reshape(*seen.shape, -1).mean(-1)
     return masked_mean(by_flag, m.unsqueeze(-1) * seen)
 
 

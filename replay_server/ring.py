@@ -166,7 +166,7 @@ def _rewrite(path: Path, spec: WindowSpec, capacity: int) -> None:
     except ConfigError as error:
         raise ConfigError("--run-dir", str(path), f"it is of an older version, and rewriting it {error.fix}") from None
     _write_head(temporary, spec, capacity, progress)
-    rows: Rows = np.memmap(temporary, spec.dtype, "r+", offset=start, shape=(capacity,))
+    rows = np.memmap(temporary, spec.dtype, "r+", offset=start, shape=(capacity,))
     for begin in range(0, capacity, REWRITTEN_ROWS):
         part = np.zeros(len(old[begin : begin + REWRITTEN_ROWS]), spec.dtype)
         part.view(np.uint8).reshape(len(part), -1)[:, :size] = old[begin : begin + REWRITTEN_ROWS]
@@ -204,7 +204,7 @@ def _check_identity(path: Path, spec: WindowSpec, capacity: int) -> str:
     magic, fingerprint, stored, row_bytes = _IDENTITY.unpack(raw[:-4])
     if magic != _MAGIC:
         raise _unusable(path, "made by another version")
-    layout = fingerprint.decode()
+    layout: str = fingerprint.decode()
     if layout not in (spec.fingerprint, *former_fingerprints(spec)):
         fix = f"its windows are of layout {layout}, this run's of {spec.fingerprint}; use a new folder"
         raise ConfigError("--run-dir", str(path), fix)

@@ -299,8 +299,8 @@ class ReplayServer:
     def statistics(self) -> ObservationStatistics:
         """Running sums over all observations inserted so far."""
         progress = self._store.ring.progress
-        sums = (progress.observations, progress.total, progress.total_square)
-        return ObservationStatistics(*(numbers.copy() for numbers in sums))
+        count, total, total_square = progress.observations, progress.total, progress.total_square
+        return ObservationStatistics(count.copy(), total.copy(), total_square.copy())
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode from its start to that one; None where not all are there."""

@@ -82,7 +82,7 @@ class RunConfig:
         state = self.agent.state_size(obs_dim)
         burn_in = burn_in if strategy == "burn-in" else 0
         spec = WindowSpec(obs_dim, action_dim, state, burn_in, train, layout.missing, layout.privileged)
-        if 4 * spec.observations * (spec.statistics + action_dim + 1) > LARGEST_WINDOW:
+        if spec.observations * (4 * (spec.statistics + action_dim + 1) + spec.missing) > LARGEST_WINDOW:
             name = "--time-limit" if strategy == "episode" else "--trained-steps"
             raise ConfigError(
                 name, train, f"a window would have more than {LARGEST_WINDOW >> 20} MiB; take fewer steps"
