@@ -120,7 +120,7 @@ def test_full_size_with_extreme_inputs() -> None:
     observation = np.array([[1e6] * OBS_DIM, [-1e6] * OBS_DIM], np.float32)
     hidden = np.full((2, 256), 1.0, np.float32)
     zeros, noise = np.zeros((2, ACTION_DIM), np.float32), np.ones((2, ACTION_DIM), np.float32)
-    action, new_hidden = runner.act(observation, zeros, np.zeros(2, np.bool_), hidden, noise)
+    action, new_hidden = runner.act(observation, zeros, np.zeros((2, 1), np.bool_), hidden, noise)
     assert np.isfinite(new_hidden).all()
     assert (np.abs(action) <= 1).all()
 
@@ -129,9 +129,9 @@ def test_an_action_is_the_callers_to_keep() -> None:
     agent = make_agent(AgentConfig(hidden=8, embedding=8, heads=(8, 8)))
     runner = make_runner(agent)
     zeros = (np.zeros((ENVS, OBS_DIM), np.float32), *runner.start())
-    first, _ = runner.act(zeros[0], zeros[1], np.zeros(ENVS, np.bool_), zeros[2], None)
+    first, _ = runner.act(zeros[0], zeros[1], np.zeros((ENVS, 1), np.bool_), zeros[2], None)
     kept = first.copy()
-    runner.act(zeros[0] + 1, zeros[1], np.zeros(ENVS, np.bool_), zeros[2], None)
+    runner.act(zeros[0] + 1, zeros[1], np.zeros((ENVS, 1), np.bool_), zeros[2], None)
     np.testing.assert_array_equal(first, kept)
 
 
@@ -160,7 +160,13 @@ def test_refused_weights_change_nothing(spoilt: str) -> None:
     config = AgentConfig(hidden=8, embedding=8, heads=(8, 8), layer_norm=True, normalize_observations=True)
     agent, others = make_agent(config), make_agent(config, seed=1).policy_weights()
     runner = make_runner(agent)
-    given = (np.ones((ENVS, OBS_DIM), np.float32), runner.start()[0], np.zeros(ENVS, np.bool_), runner.start()[1], None)
+    given = (
+        np.ones((ENVS, OBS_DIM), np.float32),
+        runner.start()[0],
+        np.zeros((ENVS, 1), np.bool_),
+        runner.start()[1],
+        None,
+    )
     before = runner.act(*given)[0]
     with pytest.raises(MessageError):
         runner.load(save(others | {spoilt: torch.zeros(3, 7)}))
@@ -175,7 +181,13 @@ def test_weights_that_are_not_finite_are_refused_by_name(name: str, value: float
     )  # fmt: skip
     agent = make_agent(config)
     runner = make_runner(agent)
-    given = (np.ones((ENVS, OBS_DIM), np.float32), runner.start()[0], np.zeros(ENVS, np.bool_), runner.start()[1], None)
+    given = (
+        np.ones((ENVS, OBS_DIM), np.float32),
+        runner.start()[0],
+        np.zeros((ENVS, 1), np.bool_),
+        runner.start()[1],
+        None,
+    )
     before = runner.act(*given)[0]
     weights = {key: tensor.clone() for key, tensor in agent.broadcast_weights().items()}
     name = next(key for key in weights if key.startswith(name))
