@@ -1,6 +1,7 @@
 """Deterministic episodes of a policy: what its agent saw, and what was there but hidden from it.
 
-Shapes: T steps of an episode, O observation, A action, F numbers of the environment's own observation, S state.
+Shapes: T steps of an episode, O observation, A action, F numbers of the environment's own observation, M flags of what
+is missing, P privileged numbers, S state.
 """
 
 import dataclasses
@@ -21,6 +22,7 @@ from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.describe import layout_of, shown
 from rmc.common.env.layout import Part
+from rmc.common.env.make import make_env
 from rmc.common.env.wrappers import CorruptObservation, Env, Floats, FrameStack, ObservationSlice
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
@@ -38,13 +40,14 @@ class Episode:
     observation: Tensor  # (1, T + 1, O) normalised
     action: Tensor  # (1, T, A)
     reward: Tensor  # (T,), scaled as for training
-    missing: Tensor  # (1, T + 1) bool
+    missing: Tensor  # (1, T + 1, M) bool
+    privileged: Tensor  # (1, T + 1, P) normalised, what critics read beside
     own: Floats  # (T + 1, F), the environment's own observations
     probe: dict[str, NDArray[np.float64]]  # by name (T + 1,), of info["probe"]
 
     @property
     def seen(self) -> Tensor:
-        """(T,) bool: neither the step's frame nor the next one is missing."""
+        """(T, M) bool: missing neither in the step's frame nor in the next one."""
         return ~(self.missing[0, 1:] | self.missing[0, :-1])
 
     @property
@@ -90,13 +93,16 @@ def recorded(env: Env) -> tuple[Env, Record]:
 
 def hidden_parts(env: Env, config: EnvConfig) -> list[HiddenPart]:
     """What of the environment's own observation options take away, and when."""
-    whole = layout_of(env, dataclasses.replace(config, hide="nothing", frame_stack=1)).observations
+    whole = layout_of(
+        env, dataclasses.replace(config, hide="nothing", frame_stack=1), {}, privileged=False
+    ).observations
     first, last, _ = (shown(env, config.hide) or slice(None)).indices(whole[-1].stop)
+    never_as_it_is, partly_missing = bool(config.noise or config.delay), bool(config.flicker or config.drop_sensors)
     parts = []
     for part in whole:
         is_shown = first <= part.start and part.stop <= last
-        only_missing = is_shown and not config.noise and config.frame_stack == 1
-        if not is_shown or config.noise or config.flicker:
+        only_missing = is_shown and not never_as_it_is and config.frame_stack == 1
+        if not is_shown or never_as_it_is or partly_missing:
             parts.append(HiddenPart(_name(part, only_missing), slice(part.start, part.stop), only_missing))
     return parts
 
@@ -112,7 +118,9 @@ class Player:
     def __init__(self, folder: RunFolder, agent: Agent, config: RunConfig, checkpoint: str) -> None:
         """``agent`` gives the normaliser. Raises ConfigError."""
         self._agent, self._config, self._policy = agent, config, load_policy(folder.path, checkpoint)
-        self._env, self._record = recorded(self._policy.make_env())
+        privileged = agent.privileged_normalizer is not None
+        env = make_env(config.env, privileged=True) if privileged else self._policy.make_env()
+        self._env, self._record = recorded(env)
         self._played = 0
 
     def hidden_parts(self) -> list[HiddenPart]:
@@ -134,7 +142,7 @@ class Player:
         policy.reset()
         observations, own, infos, actions, rewards = [observation], [self._record.newest], [info], [], []
         for _ in range(LONGEST_EPISODE if is_first else LONGEST_FURTHER):
-            actions.append(policy.act(observation, bool(info.get("missing", False))))
+            actions.append(policy.act(observation, info.get("missing", False)))
             observation, reward, terminated, truncated, info = env.step(actions[-1])
             observations.append(observation)
             own.append(self._record.newest)
@@ -151,12 +159,17 @@ class Player:
     def _episode(
         self, observations: Floats, actions: Floats, rewards: list[float], infos: list[dict[str, Any]], own: Floats
     ) -> Episode:
-        missing = torch.tensor([bool(info.get("missing", False)) for info in infos])
+        flags = self._policy.header.layout.missing
+        missing = torch.from_numpy(np.stack([np.broadcast_to(info.get("missing", False), flags) for info in infos]))
+        beside = torch.from_numpy(np.stack([info.get("privileged", np.zeros(0, np.float32)) for info in infos]))
+        if self._agent.privileged_normalizer is None:
+            beside = beside[:, :0]  # an environment may give it to critics that do not read it
         return Episode(
             self._agent.normalizer(torch.from_numpy(observations), missing).unsqueeze(0),
             torch.from_numpy(actions).unsqueeze(0),
             torch.tensor(rewards),
             missing.unsqueeze(0),
+            self._agent.normalized_privileged(beside).unsqueeze(0),
             own,
             _probes([info.get("probe", {}) for info in infos], self._config.env.id),
         )

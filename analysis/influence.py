@@ -2,7 +2,8 @@
 
 Each dimension is changed alone, by one standard deviation; what follows it is replayed as it was recorded. Differences
 are relative to each quantity's own spread over all steps: 1 is as much as it varies by itself.
-Shapes: T steps of an episode, O observation, A action, S state, H hidden, D changed dimensions, K delays.
+Shapes: T steps of an episode, O observation, A action, S state, H hidden, M flags of what is missing,
+D changed dimensions, K delays.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rmc.analysis.episodes import Episode, remembered
-from rmc.common.agent import Agent, MemoryOutput
+from rmc.common.agent import Agent, MemoryOutput, critic_input
 
 DELAYS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 700, 1_000)
 EPISODES = 8  # in which observations are changed
@@ -50,7 +51,7 @@ class Replay:
 
     @property
     def missing(self) -> Tensor:
-        """(T,) bool, which of them nobody reads."""
+        """(T, M) bool, what of them nobody reads."""
         return self._episode.missing[0, :-1]
 
     def differences(self, start: int, change: Tensor, delays: Tensor) -> list[Tensor]:
@@ -71,7 +72,8 @@ class Replay:
         """h (B, K, H), Q of the actions taken (B, K, 1) and the mean action (B, K, A) at those steps (K,)."""
         features = self._agent.features(memory)
         taken = self._episode.action[:, steps].expand(len(features), -1, -1)
-        q = self._agent.critic(features, taken).mean(0).unsqueeze(-1)
+        beside = self._episode.privileged[:, steps].expand(len(features), -1, -1)
+        q = self._agent.critic(critic_input(features, beside), taken).mean(0).unsqueeze(-1)
         return memory.hidden, q, torch.tanh(self._agent.policy(features)[0])
 
 
@@ -92,8 +94,11 @@ def influence(agent: Agent, episodes: list[Episode]) -> tuple[Influence, Influen
 
 def _deviation(replays: list[Replay], steps: slice) -> Tensor:
     """(O,) of what was seen at those steps of all episodes."""
-    seen = torch.cat([replay.observations[steps][~replay.missing[steps]] for replay in replays])
-    return seen.std(0, correction=0) if len(seen) else seen.new_zeros(seen.shape[1])
+    values = torch.cat([replay.observations[steps] for replay in replays])
+    seen = torch.cat([~replay.missing[steps] for replay in replays]).expand_as(values)
+    count = seen.sum(0).clamp(min=1)
+    mean = (values * seen).sum(0) / count
+    return ((((values - mean) * seen).square()).sum(0) / count).sqrt()
 
 
 def _spread(values: Tensor) -> Tensor:
@@ -103,7 +108,7 @@ def _spread(values: Tensor) -> Tensor:
 
 def _of_starts(starts: list[tuple[Replay, int]], deviation: Tensor, spreads: list[Tensor]) -> Influence:
     """``deviation`` (O,) is what each dimension is changed by."""
-    starts = [(one, start) for one, start in starts if start + 1 < one.steps and not one.missing[start]]
+    starts = [(one, start) for one, start in starts if start + 1 < one.steps and not one.missing[start].all()]
     left = np.array([replay.steps - 1 - start for replay, start in starts])
     delays = tuple(k for k in DELAYS if len(left) and (left >= k).mean() >= REACHED)
     if not delays:

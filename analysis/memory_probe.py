@@ -37,7 +37,7 @@ class Samples:
     newest: Doubles  # (N, O), the newest observation that was seen, normalised
     own: Doubles  # (N, F), the environment's own observation
     probe: dict[str, Doubles]  # (N,)
-    missing: NDArray[np.bool_]  # (N,)
+    missing: NDArray[np.bool_]  # (N,), anything of the frame
     quarter: NDArray[np.int64]  # (N,), the same for all steps of an episode
 
 
@@ -49,7 +49,7 @@ def samples(agent: Agent, episodes: list[Episode]) -> Samples:
         np.concatenate([_newest(episode) for episode in episodes]),
         np.concatenate([episode.own for episode in episodes]).astype(np.float64),
         {name: np.concatenate([episode.probe[name] for episode in episodes]) for name in episodes[0].probe},
-        np.concatenate([episode.missing[0].numpy() for episode in episodes]),
+        np.concatenate([episode.missing[0].any(-1).numpy() for episode in episodes]),
         np.concatenate([np.full(len(h), index % QUARTERS) for index, _, h in joined]),
     )
 
@@ -57,8 +57,8 @@ def samples(agent: Agent, episodes: list[Episode]) -> Samples:
 def _newest(episode: Episode) -> Doubles:
     """(T + 1, O), zeros until one is seen."""
     observation, missing = episode.observation[0], episode.missing[0]
-    place = torch.where(missing, -1, torch.arange(len(missing))).cummax(0).values
-    newest: Doubles = torch.where((place < 0).unsqueeze(1), 0.0, observation[place.clamp(min=0)]).double().numpy()
+    place = torch.where(missing, -1, torch.arange(len(missing)).unsqueeze(1)).cummax(0).values.expand_as(observation)
+    newest: Doubles = torch.where(place < 0, 0.0, observation.gather(0, place.clamp(min=0))).double().numpy()
     return newest
 
 

@@ -1,6 +1,7 @@
 """``rmc inspect``: what a run's world model knows, along one episode, and what it remembers, as a picture and numbers.
 
-Shapes: T steps of the episode, O observation, A action, H hidden, K steps ahead. Observations are normalised ones.
+Shapes: T steps of the episode, O observation, A action, H hidden, M flags of what is missing, K steps ahead.
+Observations are normalised ones.
 """
 
 import importlib.util
@@ -54,7 +55,7 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     """The whole agent of a checkpoint, with its world model. Raises ConfigError."""
     spec = config.window_spec()
     folder.check_sizes(config.env.id, config.sizes())
-    agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
+    agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
     raw = choose_checkpoint(folder, checkpoint)[1][STATE]
     try:
         agent.load_state_dict(torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)["agent"])
@@ -75,7 +76,7 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
     latent_change = memory.hidden[0].diff(dim=0)
     real = episode.observation[0, 1:]
-    ahead = _open_loop(agent, memory, seen[0, :-1], episode.action[0])
+    ahead = _open_loop(agent, memory, seen[0, :-1], episode.action[0], episode.missing.shape[-1])
     return Insight(
         real=real.numpy(),
         predicted=ahead[1].numpy(),
@@ -88,10 +89,12 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     )
 
 
-def _open_loop(agent: Agent, memory: MemoryOutput, observation: Tensor, action: Tensor) -> dict[int, Tensor]:
+def _open_loop(
+    agent: Agent, memory: MemoryOutput, observation: Tensor, action: Tensor, flags: int
+) -> dict[int, Tensor]:
     """Horizon K -> (T - K + 1, O): from every step on, the model's own states and observations in place of the real.
 
-    Observations (T, O) to start from, actions (T, A).
+    Observations (T, O) to start from, actions (T, A); ``flags`` is M.
     """
     hidden, skip = memory.hidden[0, :-1], memory.skip[0, :-1]
     steps, predicted = len(action), {}
@@ -100,7 +103,7 @@ def _open_loop(agent: Agent, memory: MemoryOutput, observation: Tensor, action: 
         hidden, skip, observation, a = hidden[:count], skip[:count], observation[:count], action[ahead - 1 :]
         step = agent.world_model(agent.features(MemoryOutput(hidden, skip)), a)
         hidden, observation = hidden + step.hidden_change, observation + step.observation_change
-        skip = agent.memory.skip(observation, torch.zeros(count, dtype=torch.bool), a)
+        skip = agent.memory.skip(observation, torch.zeros(count, flags, dtype=torch.bool), a)
         if ahead in HORIZONS:
             predicted[ahead] = observation
     return predicted
@@ -114,7 +117,7 @@ def _error(predicted: Tensor, episode: Episode, horizon: int) -> tuple[Tensor, T
     """(O,) sums of |predicted - real| and of |real - where it started|, where both frames were seen."""
     observation = episode.observation[0]
     start, end = observation[: len(predicted)], observation[horizon:]
-    seen = (episode.seen[: len(predicted)] & episode.seen[horizon - 1 :]).unsqueeze(-1)
+    seen = episode.seen[: len(predicted)] & episode.seen[horizon - 1 :]
     return ((predicted - end).abs() * seen).sum(0), ((end - start).abs() * seen).sum(0)
 
 

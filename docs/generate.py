@@ -73,6 +73,8 @@ WHEN = {
     "time counts: [level by 60 000 steps, far behind by 300 000](results.md); the embedding beside it cost return in "
     "a trial (`studies/notebook.md`)",
     "critic_norm": "rarely: it cost return in a trial (`studies/notebook.md`)",
+    "privileged_critic": "where the simulator knows what sensors do not see: "
+    "[an environment of your own](custom-environments.md#seen-in-part)",
     "normalize_observations": "off, with `--no-impute-missing`, where they are scaled and their statistics keep moving",
     "grounding": "off for the paper's model, with `--scheme 1`; with scheme 3 it keeps the memory from collapsing",
     "impute_missing": "rarely: without it missing frames cost far more return, see [results](results.md)",

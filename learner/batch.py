@@ -1,6 +1,6 @@
 """A batch of rows as tensors: views into one block of bytes.
 
-Shapes: B batch, T steps, O observation, A action, S state; L_b burn-in.
+Shapes: B batch, T steps, O observation, A action, S state, M flags of what is missing, P privileged; L_b burn-in.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,8 @@ class Batch:
     reward: Tensor  # (B, T)
     terminated: Tensor  # (B, T), d_t: 1 at a true termination
     state: Tensor  # (B, S), the state before the first real observation
-    missing: Tensor  # (B, T + 1) bool
+    missing: Tensor  # (B, T + 1, M) bool
+    privileged: Tensor  # (B, T + 1, P) raw
     observation_valid: Tensor  # (B, T + 1) bool
     step_valid: Tensor  # (B, T) bool
     burned_in: Tensor  # (B,) bool: the burn-in is real
@@ -65,7 +66,7 @@ def clear_padding(rows: Rows, spec: WindowSpec) -> None:
     first, last = rows["first"][partial, None], rows["last"][partial, None]
     unobserved = (t < first) | (t > last)
     unstepped = (unobserved | (t == last))[:, :-1]
-    for absent, names in ((unobserved, ("observation", "missing")), (unstepped, ("action", "reward"))):
+    for absent, names in ((unobserved, ("observation", "missing", "privileged")), (unstepped, ("action", "reward"))):
         window, step = np.nonzero(absent)
         for name in names:
             rows[name][partial[window], step] = 0
@@ -117,6 +118,7 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec, steps: int | N
         terminated=ends.float(),
         state=field(floats, "state"),
         missing=field(raw, "missing")[:, : steps + 1] > 0,
+        privileged=field(floats, "privileged")[:, : steps + 1],
         observation_valid=observation_valid,
         step_valid=step_valid,
         burned_in=first == 0,

@@ -27,6 +27,7 @@ from rmc.common.env.describe import layout_of, shown, structure
 from rmc.common.env.faults import RAISED, call_env, describe_error, one_line
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.missing import DropSensors, Flicker
+from rmc.common.env.privileged import Privileged
 from rmc.common.env.process_state import ApartCall
 from rmc.common.env.spaces import space_fault
 from rmc.common.env.watched_env import WatchedEnv
@@ -39,10 +40,11 @@ DM_CONTROL, PYBULLET = "dm_control/", "pybullet/"
 SHORTEST_TIMEOUT = 0.1  # seconds
 
 
-def make_env(config: EnvConfig, render: bool = False) -> Env:
+def make_env(config: EnvConfig, render: bool = False, privileged: bool = False) -> Env:
     """One environment: (O,) float32 observations, (A,) float32 actions in [-1, 1], cut off at its time limit.
 
-    With ``render``, its ``render()`` gives frames. Raises ConfigError where it is unknown, or its spaces are none that
+    With ``render``, its ``render()`` gives frames; with ``privileged``, its ``info["privileged"]`` what critics alone
+    read, where there is anything. Raises ConfigError where it is unknown, or its spaces are none that
     the agent can learn in; EnvFault where it raises.
     """
     _check_options(config)
@@ -59,7 +61,7 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
         with suppress(*RAISED):
             env.close()
         raise ConfigError("ENV", config.id, fault)
-    return _as_seen(env, config, limit)
+    return _as_seen(env, config, limit, privileged)
 
 
 def _make(registered: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
@@ -101,10 +103,12 @@ def entry_point(spec: EnvSpec) -> Callable[..., Any]:
     return gym.envs.registration.load_env_creator(factory) if isinstance(factory, str) else factory
 
 
-def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> Env:
+def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None, privileged: bool) -> Env:
     """The environment as the agent sees it: each wrapper only where it does something."""
     seen_part = shown(env, config.hide)
     wrapped: Env = RescaledEnv(env)  # the innermost: it judges what the user's own code gives
+    if privileged:
+        wrapped = Privileged(wrapped, take_observation=_is_disturbed(config))
     if limit:
         wrapped = gym.wrappers.TimeLimit(wrapped, limit)
     if config.action_repeat > 1:
@@ -120,6 +124,11 @@ def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> En
     if config.flicker:
         wrapped = Flicker(wrapped, config.flicker, config.flicker_burst)
     return FrameStack(wrapped, config.frame_stack) if config.frame_stack > 1 else wrapped
+
+
+def _is_disturbed(config: EnvConfig) -> bool:
+    """Whether a wrapper takes something from the observation."""
+    return bool(config.flicker or config.drop_sensors or config.delay or config.noise or config.hide != "nothing")
 
 
 def checked_reset(env: Env, seed: int | None) -> tuple[Floats, dict[str, Any]]:
@@ -146,19 +155,30 @@ def further_env(make_env: Callable[[], Env], what: str) -> Env:
         raise RmcError(f"{what} cannot be made beside the others ({describe_error(error)}); {fix}") from error
 
 
-def first_env(config: EnvConfig) -> Env:
+def first_env(config: EnvConfig, privileged: bool = False) -> Env:
     """``make_env`` where nothing runs yet: whatever the environment raises is the user's to mend, as a ConfigError."""
     try:
-        return make_env(config)
+        return make_env(config, privileged=privileged)
     except EnvFault as fault:
         raise ConfigError("ENV", config.id, str(fault)) from None
 
 
-def env_layout(config: EnvConfig) -> EnvLayout:
-    """What the agent reads and gives there. Makes an environment; raises ConfigError."""
-    env = first_env(config)
-    layout = layout_of(env, config)
-    env.close()
+def env_layout(config: EnvConfig, privileged: bool = False) -> EnvLayout:
+    """What the agent reads and gives there. Makes and resets an environment; raises ConfigError.
+
+    With ``privileged`` also where it gives nothing that critics alone could read.
+    """
+    env = first_env(config, privileged)
+    try:
+        info = env.reset(seed=0)[1]
+        layout = layout_of(env, config, info, privileged)
+    except EnvFault as fault:
+        raise ConfigError("ENV", config.id, str(fault)) from None
+    finally:
+        env.close()
+    if privileged and not layout.privileged:
+        fix = f'{config.id} gives no info["privileged"], and nothing is taken from what is seen; leave the option'
+        raise ConfigError("--privileged-critic", True, fix)
     return layout
 
 

@@ -32,7 +32,7 @@ def make_run(path: Path, config: RunConfig) -> RunFolder:
     folder.unlock()
     torch.manual_seed(0)
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
-    agent.normalizer.freeze(10, torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
+    agent.normalizer.freeze(torch.tensor(10), torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
     state = io.BytesIO()
     torch.save({"agent": agent.state_dict()}, state)
     files = {"policy.safetensors": save(agent.policy_weights()), "learner.pt": state.getvalue()}

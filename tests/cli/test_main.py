@@ -35,8 +35,9 @@ TRAIN_FLAGS = """
     --config --run-dir --if-exists --launcher --device --redis-url --ray-address --all-cpus --tls
     --track --track-project --track-tags --track-video-every --dry-run
     --burn-in --trained-steps
-    --hidden --embedding --heads --gate-init --layer-norm --head-input --critic-norm --normalize-observations
-    --grounding --missing-flag --impute-missing --initial-priority
+    --hidden --embedding --heads --gate-init --layer-norm --head-input --critic-norm --privileged-critic
+    --normalize-observations --grounding
+    --missing-flag --impute-missing --initial-priority
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
     --capacity --replay-shards --replay-ratio --warmup-steps --priority-exponent --importance-exponent
     --learning-rate --memory-learning-scale

@@ -105,10 +105,10 @@ def test_the_python_api_runs(tmp_path: Path) -> None:
 @pytest.mark.timeout(300)
 def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "custom-environments.md").read_text()
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    (tmp_path / "shuttle.py").write_text(code)
+    for file, code in zip(("shuttle", "instruments"), re.findall(r"```python\n(.*?)```", page, re.DOTALL), strict=True):
+        (tmp_path / f"{file}.py").write_text(code)
     commands = re.findall(r"^rmc .*$", page, re.MULTILINE)
-    assert [command.split()[1] for command in commands] == ["check-env", "train", "evaluate"]
+    assert [command.split()[1] for command in commands] == ["check-env", "train", "evaluate", "train"]
     names = []
     for command in commands:
         shorter = ["--preset", "debug", "--total-steps", "1500"] * command.startswith("rmc train")

@@ -5,19 +5,23 @@ import pytest
 import torch
 
 from rmc.learner.batch import clear_padding, importance_weights, longest_steps, update_steps, view_batch
-from tests.learner.rows import LONG, SPEC, random_rows, spoil_padding, to_batch
+from tests.learner.rows import BY_NUMBER, LONG, SPEC, random_rows, spoil_padding, to_batch
 
 
-def test_fields_match_the_rows():
-    rows = random_rows(16)
-    batch = to_batch(rows)
+@pytest.mark.parametrize("spec", [SPEC, BY_NUMBER])
+def test_fields_match_the_rows(spec):
+    rows = random_rows(16, spec=spec)
+    batch = to_batch(rows, spec)
     for b, row in enumerate(rows):
         for t in range(SPEC.observations):
             real = row["first"] <= t <= row["last"]
             assert bool(batch.observation_valid[b, t]) == real
             wanted = row["observation"][t] if real else np.zeros(3)
             np.testing.assert_array_equal(batch.observation[b, t], wanted)
-            assert bool(batch.missing[b, t]) == bool(real and row["missing"][t])
+            assert batch.missing[b, t].tolist() == [bool(real and flag) for flag in row["missing"][t]]
+            np.testing.assert_array_equal(
+                batch.privileged[b, t], row["privileged"][t] if real else 0.0 * row["privileged"][t]
+            )
         for t in range(SPEC.steps):
             real = row["first"] <= t < row["last"]
             assert bool(batch.step_valid[b, t]) == real
@@ -57,12 +61,14 @@ def test_importance_weights_against_the_formula():
     assert (importance_weights(values, mass, windows, 0.0) == 1).all()
 
 
-def test_padding_is_cleared_and_nothing_else_touched():
-    rows = random_rows(16)
+@pytest.mark.parametrize("spec", [SPEC, BY_NUMBER])
+def test_padding_is_cleared_and_nothing_else_touched(spec):
+    rows = random_rows(16, spec=spec)
     clean = rows.copy()
     spoil_padding(rows)
-    clear_padding(rows, SPEC)
-    assert (rows == clean).all()
+    clear_padding(rows, spec)
+    for name in rows.dtype.names:
+        np.testing.assert_array_equal(rows[name], clean[name])
 
 
 @pytest.mark.parametrize(

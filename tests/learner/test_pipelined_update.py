@@ -10,12 +10,13 @@ import torch
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.errors import RmcError
+from rmc.common.window import WindowSpec
 from rmc.learner.config import UpdateConfig
 from rmc.learner.device_update import DeviceUpdate
 from rmc.learner.pipelined_update import PipelinedUpdate
 from rmc.learner.update import JointUpdate
 from rmc.learner.update_order import make_update
-from tests.learner.rows import LONG, SPEC
+from tests.learner.rows import BY_NUMBER, LONG, SPEC
 from tests.learner.test_device_update import BATCH, host_batch
 
 ROBUST = UpdateConfig(scheme=3, curiosity=0.1, curiosity_scale="std", policy_ema_updates=100)
@@ -33,16 +34,17 @@ AGENTS = {
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def make(agent: str, bf16: bool) -> JointUpdate:
+def make(agent: str, bf16: bool, spec: WindowSpec = SPEC) -> JointUpdate:
     torch.manual_seed(0)
-    return make_update(Agent(SPEC.obs_dim, SPEC.action_dim, AGENTS[agent]), SPEC.burn_in, ROBUST, 3, bf16)
+    network = Agent(spec.obs_dim, spec.action_dim, AGENTS[agent], spec.missing, spec.privileged)
+    return make_update(network, spec.burn_in, ROBUST, 3, bf16)
 
 
 @pytest.mark.parametrize("bf16", [False, True])
 @pytest.mark.parametrize("agent", AGENTS)
-@pytest.mark.parametrize("spec", [SPEC, LONG], ids=["short windows", "cut windows"])
+@pytest.mark.parametrize("spec", [SPEC, BY_NUMBER, LONG], ids=["by frame", "by number", "cut windows"])
 def test_it_is_the_same_update(agent, bf16, spec):
-    plain, update = make(agent, bf16), make(agent, bf16)
+    plain, update = make(agent, bf16, spec), make(agent, bf16, spec)
     in_turn, apart = DeviceUpdate(plain, spec, BATCH), PipelinedUpdate(update, spec, BATCH)
     expected, actual = [], []
     for step in range(1, 41):

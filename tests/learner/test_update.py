@@ -24,7 +24,7 @@ BETA = torch.tensor(0.5)
 def make(agent: AgentConfig, bf16: bool = False, **options: object) -> JointUpdate:
     torch.manual_seed(0)
     network = Agent(SPEC.obs_dim, SPEC.action_dim, agent)
-    network.normalizer.freeze(10, torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
+    network.normalizer.freeze(torch.tensor(10), torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
     return make_update(network, SPEC.burn_in, UpdateConfig(curiosity=0.5, **options), 3, bf16)  # type: ignore[arg-type]
 
 
