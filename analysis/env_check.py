@@ -130,7 +130,7 @@ def _facts(env: Env, played: Played) -> Iterator[str]:
 
 def _reach(env: Env, config: EnvConfig) -> str:
     """By default."""
-    return format_reach(WindowConfig().trained_steps, layout_of(env, config).time_limit)
+    return format_reach(WindowConfig().trained_steps, layout_of(env, config, {}, privileged=False).time_limit)
 
 
 def _nonsense(played: Played) -> Iterator[str]:

@@ -92,8 +92,9 @@ class Memory(nn.Module):
         """
         size = self.gru.hidden_size
         gate = slice(size, 2 * size)  # PyTorch's order: reset, update, candidate
-        self.gru.bias_ih_l0[gate] = torch.empty(size).uniform_(1.0, max(2.0, steps - 1.0)).log()
-        self.gru.bias_hh_l0[gate] = 0.0
+        _, _, from_input, from_hidden = self.gru.all_weights[0]
+        from_input[gate] = torch.empty(size).uniform_(1.0, max(2.0, steps - 1.0)).log()
+        from_hidden[gate] = 0.0
 
     def step(self, observation: Tensor, missing: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
         """One step of it: (B, O) normalised, (B, M) bool, (B, A), (B, H) -> (B, H) float32."""
