@@ -80,7 +80,7 @@ def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -
         for start in (0, 7, 40 - horizon):
             wanted = rolled_out(agent, episode, start, horizon)
             np.testing.assert_allclose(insight.ahead[horizon][start], wanted, atol=1e-5)
-    seen = episode.seen.numpy()
+    seen = episode.seen.numpy().squeeze(-1)
     assert 0 < seen.sum() < 40  # some frames were blank, and are left out
     before = np.concatenate([episode.observation[0, :1].numpy(), insight.real[:-1]])
     error, change = (np.abs(x - insight.real)[seen].sum(0) for x in (insight.predicted, before))
