@@ -167,6 +167,8 @@ class ReplayClient:
         try:
             body = self._ask(Kind.STATISTICS, {})[1]
             count = np.frombuffer(body, np.int64, counts).copy()
+            if (count < 0).any():
+                raise MessageError("count", f"{count.min()}, want a whole number from 0 on")
             sums = np.frombuffer(body, np.float64, offset=8 * counts).reshape(2, self._spec.statistics).copy()
             return ObservationStatistics(count, *sums)
         except AWAY as error:

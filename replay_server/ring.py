@@ -166,13 +166,12 @@ def _rewrite(path: Path, spec: WindowSpec, capacity: int) -> None:
     except ConfigError as error:
         raise ConfigError("--run-dir", str(path), f"it is of an older version, and rewriting it {error.fix}") from None
     _write_head(temporary, spec, capacity, progress)
-    rows = np.memmap(temporary, spec.dtype, "r+", offset=start, shape=(capacity,))
+    new = np.memmap(temporary, np.uint8, "r+", offset=start, shape=(capacity, spec.dtype.itemsize))  # padding, too
     for begin in range(0, capacity, REWRITTEN_ROWS):
-        part = np.zeros(len(old[begin : begin + REWRITTEN_ROWS]), spec.dtype)
-        part.view(np.uint8).reshape(len(part), -1)[:, :size] = old[begin : begin + REWRITTEN_ROWS]
-        add_checksums(part)
-        rows[begin : begin + REWRITTEN_ROWS] = part
-    rows.flush()
+        part = new[begin : begin + REWRITTEN_ROWS]
+        part[:, :size] = old[begin : begin + REWRITTEN_ROWS]
+        add_checksums(part.view(np.ndarray).view(spec.dtype)[:, 0])
+    new.flush()
     temporary.rename(path)
     log.info("replay ring: rewritten for this version, %d windows", progress.windows)
 

@@ -21,7 +21,7 @@ def _to_2(raw: Raw) -> None:
 
 def _to_3(raw: Raw) -> None:
     _add(raw, "env", drop_sensors=0.0, flicker_burst=1.0, delay=0)
-    _add(raw, "agent", privileged_critic=False)
+    _add(raw, "agent", gate_init="uniform", privileged_critic=False)
     _add(raw, "layout", missing=1, privileged=0)  # in a policy's file; flags were one for a whole frame
 
 

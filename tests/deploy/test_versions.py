@@ -1,7 +1,7 @@
 """Runs of older versions, kept as they were made: read by every command, and gone on with, their ring included.
 
 ``runs/format-1-a`` was made before keywords of environments, sizes.json and initial.json; ``format-1-b`` by the last
-version that wrote config.json without a format; ``format-2`` before sensors dropped out. All ended at step 1500.
+version that wrote config.json without a format; ``format-2`` before rows had checksums and sensors dropped out. All ended at step 1500.
 """
 
 import json
@@ -24,7 +24,6 @@ from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.presets import debug, robust
 from rmc.deploy.run.starts import starts
 from rmc.replay_server.recovery import open_store
-from rmc.replay_server.row_checksum import whole_rows
 
 RUNS = Path(__file__).parent / "runs"
 # Whoever changes this list raises FORMAT by a migration, and keeps a run of the version before in runs/.
@@ -32,8 +31,9 @@ FORMAT_3 = """
     env.id env.flicker env.drop_sensors env.flicker_burst env.delay env.hide env.noise env.frame_stack
     env.action_repeat env.time_limit env.env_timeout env.env_kwargs preset seed total_steps actors
     window.burn_in window.trained_steps
-    agent.hidden agent.embedding agent.heads agent.layer_norm agent.head_input agent.critic_norm
-    agent.normalize_observations agent.grounding agent.missing_flag agent.impute_missing agent.initial_priority
+    agent.hidden agent.embedding agent.heads agent.gate_init agent.layer_norm agent.head_input agent.critic_norm
+    agent.privileged_critic agent.normalize_observations agent.grounding agent.missing_flag agent.impute_missing
+    agent.initial_priority
     actor.envs_per_actor actor.stride actor.state_strategy actor.reward_scale actor.refresh_steps actor.chunk_windows
     actor.chunk_seconds actor.unacked_bytes
     replay.capacity replay.replay_ratio replay.warmup_steps replay.priority_exponent replay.replay_shards
@@ -62,9 +62,10 @@ def test_its_options_are_read_in_the_words_of_this_version(old: RunFolder) -> No
     config, raw = old.config(), json.loads((old.path / "config.json").read_text())
     assert raw.get("format", 1) == int(old.path.name.split("-")[1])
     assert (config.agent.impute_missing, config.agent.missing_flag) == (True, True)
-    name = "policy_ema_updates" if "format" in raw else "policy_average"
-    assert config.update.policy_ema_updates == raw["update"][name] == 100
-    assert config.env == EnvConfig("InvertedPendulum-v5", flicker=0.2)  # later options as if there were none
+    average = "policy_ema_updates" if "format" in raw else "policy_average"
+    assert config.update.policy_ema_updates == raw["update"][average] == 100
+    assert (config.env.env_kwargs, config.env.drop_sensors) == ({}, 0.0)  # later options as if there were none
+    assert (config.agent.privileged_critic, config.agent.gate_init) == (False, "uniform")
     cut = raw["evaluator"].get("evaluation_seconds", 0.0)  # without the option, no evaluation was cut
     assert config.evaluator.evaluation_seconds == cut
     assert from_json(to_json(config)) == config
@@ -90,11 +91,11 @@ def test_its_ring_is_opened_whole(old: RunFolder) -> None:
     store = open_store(old.replay, config.window_spec(), config.replay.capacity, 0.6)
     progress = store.ring.progress
     serials = np.arange(progress.valid_from, progress.next_serial)
-    rows = store.ring.rows[serials % config.replay.capacity]
-    ratio = 8.0 if old.path.name == "format-2" else 0.0  # which rings of format 1 do not know
+    rows = np.zeros(80, store.ring.spec.dtype)
+    assert store.ring.gather(serials % config.replay.capacity, rows).all()
+    ratio = 0.0 if old.path.name.startswith("format-1") else 8.0
     assert (len(serials), progress.env_steps, progress.replay_ratio) == (80, 1_500, ratio)
     assert rows["serial"].tolist() == serials.tolist()
-    assert whole_rows(rows).all()
     missing = rows["missing"][..., 0]
     real = np.arange(missing.shape[1]) <= rows["last"][:, None]
     real &= np.arange(missing.shape[1]) >= rows["first"][:, None]
