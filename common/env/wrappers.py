@@ -123,16 +123,15 @@ class ObservationSlice(gym.Wrapper[Floats, Floats, Floats, Floats]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
-        return observation[self._shown], self._of_shown(info)
+        return observation[self._shown], self._cut(info)
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation[self._shown], float(reward), terminated, truncated, self._of_shown(info)
+        return observation[self._shown], float(reward), terminated, truncated, self._cut(info)
 
-    def _of_shown(self, info: dict[str, Any]) -> dict[str, Any]:
-        """What is missing, where the environment says so of each dimension."""
-        missing = info.get("missing")
-        return info | {"missing": missing[self._shown]} if isinstance(missing, np.ndarray) else info
+    def _cut(self, info: dict[str, Any]) -> dict[str, Any]:
+        flags = info.get("missing")
+        return info | {"missing": flags[self._shown]} if isinstance(flags, np.ndarray) else info
 
 
 class CorruptObservation(gym.Wrapper[Floats, Floats, Floats, Floats]):
