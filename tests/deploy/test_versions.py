@@ -1,7 +1,8 @@
 """Runs of older versions, kept as they were made: read by every command, and gone on with, their ring included.
 
 ``runs/format-1-a`` was made before keywords of environments, sizes.json and initial.json; ``format-1-b`` by the last
-version that wrote config.json without a format; ``format-2`` before rows had checksums and sensors dropped out. All ended at step 1500.
+version that wrote config.json without a format; ``format-2`` before rows had checksums and sensors dropped out. All
+ended at step 1500.
 """
 
 import json
