@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo wheel site guard test test-faults test-long test-cluster test-container test-dm-control test-newest lint docs bench peers clean
+.PHONY: env demo wheel site guard test test-faults test-long test-cluster test-container test-dm-control test-pybullet test-newest lint docs bench peers clean
 
 env: $(STAMP)
 
@@ -75,6 +75,11 @@ test-dm-control:
 	$(VENV)-dm-control/bin/python -m pip install --quiet torch==2.13.0 -c $(VENV)-dm-control/constraints.txt
 	$(VENV)-dm-control/bin/python -m pip install --quiet -e '.[dm-control,dev]' -c $(VENV)-dm-control/constraints.txt
 	$(VENV)-dm-control/bin/python -m pytest tests/common/test_dm_control.py
+
+# The extra pybullet, 100 MB, in the same environment: Python 3.11.
+test-pybullet: $(STAMP)
+	$(BIN)/python -m pip install --quiet -e '.[pybullet]' -c constraints.txt
+	$(BIN)/python -m pytest tests/common/test_pybullet_tasks.py
 
 # mypy and import-linter read the packages as rmc.…: a tree of links that looks as an installed rmc does.
 TREE := build/tree/rmc

@@ -1,6 +1,7 @@
 """The actor: steps N environments with the newest policy and sends what happens as windows.
 
-Shapes: N environments, O observation, A action, S state (see ``AgentConfig.state_size``).
+Shapes: N environments, O observation, A action, S state (see ``AgentConfig.state_size``), M flags of what is missing,
+P privileged numbers.
 """
 
 import hashlib
@@ -80,10 +81,12 @@ class Actor:
         self._make_env, self._envs = make_env, [further_env(make_env, what) for _ in range(n)]
         self._faults: dict[int, Exception] = {}  # of this step, by environment
         self._broken = self._broken_starts = 0  # episodes that an environment's fault ended; in a row, at their start
-        self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, n)
+        self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, n, spec.missing)
         self._observation = np.zeros((n, spec.obs_dim), np.float32)
         self._reward = np.zeros(n, np.float32)
-        self._missing, self._terminated, self._truncated = (np.zeros(n, np.bool_) for _ in range(3))
+        self._terminated, self._truncated = (np.zeros(n, np.bool_) for _ in range(2))
+        self._missing = np.zeros((n, spec.missing), np.bool_)
+        self._privileged = np.zeros((n, spec.privileged), np.float32) if spec.privileged else None
         self._means, self._rate, self._episodes, self._resends = Means(), Rate(), 0, 0
         self._refused_weights = 0
         self._total_steps = 0
@@ -261,7 +264,7 @@ class Actor:
             self._steps -= self._builder.forget(i) + 1
         ended = self._builder.add(
             action, state, self._version.update, self._config.reward_scale * self._reward, self._observation,
-            self._missing, self._terminated, self._truncated,
+            self._missing, self._terminated, self._truncated, self._privileged,
         )  # fmt: skip
         self._next_poll = float("-inf")
         self._steps += n
@@ -277,6 +280,8 @@ class Actor:
         observation, reward, terminated, truncated, info = self._envs[i].step(action)
         self._observation[i], self._reward[i], self._missing[i] = observation, reward, info.get("missing", False)
         self._terminated[i], self._truncated[i] = terminated, truncated
+        if self._privileged is not None:
+            self._privileged[i] = info["privileged"]
 
     def _mark_non_finite(self) -> None:
         """Whose observation or reward is not finite. What a broken environment left behind must not end an episode."""
@@ -320,8 +325,21 @@ class Actor:
             self._broken += 1
             self._envs[env] = recreate_env(self._envs[env], self._make_env)
             observation, info = checked_reset(self._envs[env], self._new_seed(env))
-        self._builder.begin(env, observation, info.get("missing", False))
+        self._check_sizes(info)
+        privileged = None if self._privileged is None else info["privileged"]
+        self._builder.begin(env, observation, info.get("missing", False), privileged)
         self._returns[env] = self._lengths[env] = 0
+
+    def _check_sizes(self, info: dict[str, Any]) -> None:
+        """Raises EnvFault where a first reset says otherwise than the run's layout what is missing or privileged."""
+        flags, numbers = np.size(info.get("missing", False)), np.size(info.get("privileged", ()))
+        for name, size, sizes in (
+            ("missing", flags, (1, self._spec.missing)),
+            ("privileged", numbers, (self._spec.privileged,) if self._spec.privileged else (numbers,)),
+        ):
+            if size not in sizes:
+                fault = f'the environment\'s info["{name}"] has {size} values, when the run began {sizes[-1]}'
+                raise EnvFault(f"{fault}; give as many at every reset")
 
     def _cut_episodes(self) -> None:
         """The run's last steps are in: send what is open as if its time limit had come."""

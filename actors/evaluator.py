@@ -1,6 +1,6 @@
 """The evaluator: plays whole episodes with the policy's mean, without exploring.
 
-Shapes: N environments, here always one, O observation, A action, S state.
+Shapes: N environments, here always one, O observation, A action, S state, M flags of what is missing.
 """
 
 import logging
@@ -51,7 +51,7 @@ class PolicyLike(Protocol):
         noise: Floats | None,
         /,
     ) -> tuple[Floats, Floats]:
-        """(N, O), (N, A), (N,), (N, S), and noise or None for the mean -> (N, A) in [-1, 1], (N, S)."""
+        """(N, O), (N, A), (N, M), (N, S), and noise or None for the mean -> (N, A) in [-1, 1], (N, S)."""
 
 
 class Rollout:
@@ -125,7 +125,7 @@ class Rollout:
         return bool(terminated or truncated or self._length >= self._longest)
 
     def _see(self, observation: Floats, info: dict[str, Any]) -> None:
-        self._observation, self._missing = observation[None], np.array([bool(info.get("missing", False))])
+        self._observation, self._missing = observation[None], np.atleast_2d(info.get("missing", False))
 
     def _judge(self, over: bool) -> None:
         late = self._clock() >= self._deadline
@@ -175,8 +175,9 @@ class Evaluator:
         config: EvaluatorConfig,
         bus: Bus,
         clock: Callable[[], float] = time.monotonic,
+        missing: int = 1,
     ) -> None:
-        """``seed`` is the run's; ``clock`` times the looks for new policies."""
+        """``seed`` is the run's; ``clock`` times the looks for new policies; ``missing`` is M."""
         if config.episodes < 1:
             raise ConfigError("--episodes", config.episodes, "at least 1")
         self._seed, self._bus, self._clock, self._config = first_start(seed), bus, clock, config
@@ -184,7 +185,7 @@ class Evaluator:
         observation, action = self._env.observation_space.shape, self._env.action_space.shape
         assert observation
         assert action
-        self._runner = PolicyRunner(observation[0], action[0], agent, envs=1)
+        self._runner = PolicyRunner(observation[0], action[0], agent, 1, missing)
         self._version = Version(0, -1)  # the newest that was looked at: none yet
         self._refused_weights = 0
         self._match: Rollout | None = None

@@ -1,7 +1,7 @@
 """The policy on the CPU, fast at small batches: every product and every result in a buffer of its own.
 
-Shapes: N environments, O observation, A action, E embedding, H hidden, S state. Float32 throughout; agrees with
-``rmc.common.agent`` (its modules are the reference) to 1e-5.
+Shapes: N environments, O observation, A action, E embedding, H hidden, S state, M flags of what is missing.
+Float32 throughout; agrees with ``rmc.common.agent`` (its modules are the reference) to 1e-5.
 """
 
 import math
@@ -95,10 +95,12 @@ def _head(inputs: int, hidden: tuple[int, int], outputs: int, rows: int) -> tupl
 class PolicyRunner:
     """Observation, previous action and state in; action and next state out, for N environments."""
 
-    def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig, envs: int) -> None:
+    def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig, envs: int, missing: int = 1) -> None:
+        """``missing`` is M: 1, or O where the dimensions are missing one by one."""
         self._config, self._envs = config, envs
         self._obs_dim, self._action_dim = obs_dim, action_dim
-        inputs = obs_dim + action_dim + config.missing_flag
+        self._flags = missing * config.missing_flag
+        inputs = obs_dim + action_dim + self._flags
         embedding = config.embedding or inputs
         self._skip = {"hidden": 0, "hidden+embedding": embedding}.get(config.head_input, obs_dim)
         features = self._skip + (config.hidden if config.head_input != "observation" else 0)
@@ -149,14 +151,14 @@ class PolicyRunner:
     def act(
         self, observation: Floats, prev_action: Floats, missing: BoolArray, state: Floats, noise: Floats | None
     ) -> tuple[Floats, Floats]:
-        """(N, O) raw, (N, A), (N,), (N, S), and (N, A) standard normal noise -> (N, A) in [-1, 1], (N, S).
+        """(N, O) raw, (N, A), (N, M), (N, S), and (N, A) standard normal noise -> (N, A) in [-1, 1], (N, S).
 
         a = tanh(mean + std * noise); without noise, tanh(mean). The state returned is a buffer that
         the next call may overwrite; none of the arguments is changed.
         """
         filled, hidden = self._read_input(observation, prev_action, missing), state[:, : self._config.hidden]
         if self._next_frame and missing.any():
-            self._input[missing, : self._obs_dim] = self._expected(state, prev_action)[missing]
+            np.copyto(self._input[:, : self._obs_dim], self._expected(state, prev_action), where=missing)
         if self._config.head_input == "observation":
             x, new_hidden = filled[:, : self._obs_dim], self._gru.out.zero_()
         else:
@@ -182,14 +184,14 @@ class PolicyRunner:
             np.maximum(normalized, -NORMALIZED_CLIP, out=normalized)
         else:
             normalized[:] = observation
-        normalized[missing] = 0.0
+        np.copyto(normalized, 0.0, where=missing)
         x[:, self._obs_dim : self._obs_dim + self._action_dim] = prev_action
-        if self._config.missing_flag:
-            x[:, -1] = missing
+        if self._flags:
+            x[:, -self._flags :] = missing
         return torch.from_numpy(x)
 
     def _expected(self, state: Floats, prev_action: Floats) -> Floats:
-        """(N, S), (N, A) -> (N, O), the normalised observation that fills a missing frame."""
+        """(N, S), (N, A) -> (N, O), the normalised observation that fills what is missing."""
         x = torch.from_numpy(np.concatenate([state, prev_action], 1))
         for layer in self._next_frame:
             x = layer(x)

@@ -1,6 +1,7 @@
 """Cuts the steps of N environments into windows: order, episode ends, burn-in, stored state.
 
-Shapes: N environments, T = burn_in + train, O observation, A action, S state (see ``AgentConfig.state_size``).
+Shapes: N environments, T = burn_in + train, O observation, A action, S state (see ``AgentConfig.state_size``), M flags
+of what is missing, P privileged numbers.
 
 All environments step together, so one ring of T + 1 slots over time serves them all. A slot holds what
 is known when an observation arrives: it, the action, reward and weights version that led to it, and the
@@ -22,7 +23,7 @@ class Now(NamedTuple):
 
     observation: Floats  # (N, O)
     prev_action: Floats  # (N, A)
-    missing: BoolArray  # (N,)
+    missing: BoolArray  # (N, M)
     state: Floats  # (N, S), the state before ``observation``
 
 
@@ -45,7 +46,8 @@ class WindowBuilder:
         self._spec, self._stride, self._envs, self._store_states = spec, stride, envs, store_states
         self._slots = slots = spec.observations
         self._observation = np.zeros((slots, envs, spec.obs_dim), np.float32)
-        self._missing = np.zeros((slots, envs), np.bool_)
+        self._missing = np.zeros((slots, envs, spec.missing), np.bool_)
+        self._privileged = np.zeros((slots, envs, spec.privileged), np.float32)
         self._prev_action = np.zeros((slots, envs, spec.action_dim), np.float32)
         self._reward = np.zeros((slots, envs), np.float32)
         self._state = np.zeros((slots, envs, spec.state), np.float32)
@@ -77,11 +79,13 @@ class WindowBuilder:
         slot = self._time % self._slots
         return Now(self._observation[slot], self._prev_action[slot], self._missing[slot], self._state[slot])
 
-    def begin(self, env: int, observation: Floats, missing: bool) -> None:
-        """A new episode: (O,) its first observation; what was open of the one before is forgotten."""
+    def begin(self, env: int, observation: Floats, missing: bool | BoolArray, privileged: Floats | None = None) -> None:
+        """A new episode: (O,) its first observation, with (M,) and (P,); what was open before is forgotten."""
         slot = self._time % self._slots
         self._observation[slot, env] = observation
         self._missing[slot, env] = missing
+        if privileged is not None:
+            self._privileged[slot, env] = privileged
         self._prev_action[slot, env] = 0.0
         self._state[slot, env] = 0.0
         self._start[env] = self._time
@@ -107,8 +111,10 @@ class WindowBuilder:
         missing: BoolArray,
         terminated: BoolArray,
         truncated: BoolArray,
+        privileged: Floats | None = None,
     ) -> BoolArray:
-        """One step of every environment: (N, A), (N, S) state after ``now().observation``, (N,), (N, O), (N,).
+        """One step of every environment: (N, A), (N, S) state after ``now().observation``, (N,), (N, O), (N, M), (N,),
+        (N, P).
 
         ``observation`` is the true next one, of an ended episode its final one. Returns (N,) which episodes
         have ended; ``begin`` must follow for each of them.
@@ -121,6 +127,8 @@ class WindowBuilder:
         self._reward[slot] = reward
         self._observation[slot] = observation
         self._missing[slot] = missing
+        if privileged is not None:
+            self._privileged[slot] = privileged
         ended = terminated | truncated
         steps = self._time - self._start
         for env in np.flatnonzero(ended | (steps - self._block == self._spec.train)).tolist():
@@ -156,6 +164,8 @@ class WindowBuilder:
         fields["weights_update"][row] = self._update[(self._time - last + burn_in + 1) % self._slots]
         fields["observation"][row, first : last + 1] = self._observation[slots, env]
         fields["missing"][row, first : last + 1] = self._missing[slots, env]
+        if self._spec.privileged:
+            fields["privileged"][row, first : last + 1] = self._privileged[slots, env]
         fields["action"][row, first:last] = self._prev_action[slots[1:], env]
         fields["reward"][row, first:last] = self._reward[slots[1:], env]
         fields["prev_action"][row] = self._prev_action[slots[0], env]

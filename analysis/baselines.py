@@ -29,7 +29,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from rmc.actors.config import EvaluatorConfig
 from rmc.actors.evaluator import evaluation_metrics, first_start, play_episodes
 from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, read, validate
-from rmc.analysis.evaluation import FINAL_EPISODES, Progress, Watch
+from rmc.analysis.evaluation import FINAL_EPISODES, Progress, Watch, missing_shares
 from rmc.common.env.make import env_layout, make_env
 from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError
@@ -324,7 +324,7 @@ class _Run(BaseCallback):
             "env_steps": self.steps,
             "updates": self.updates,
             **self._play(FINAL_EPISODES, final=True),
-            "eval_flicker": self.config.env.flicker,
+            **missing_shares(self.config.env),
             "initial_return_mean": self._initial,
             "wall_s": self._wall(),
         }
@@ -354,7 +354,7 @@ def evaluate(
     match = play_episodes(SB3Adapter(model, scaled), lambda: make_env(env), episodes, seed, seconds, watch)
     bare.close()
     about = {"env": env.id, "preset": config.name, "seed": config.seed, **progress}
-    return about | evaluation_metrics(match) | {"eval_flicker": env.flicker}
+    return about | evaluation_metrics(match) | missing_shares(env)
 
 
 def _scaled_by(vec: VecEnv) -> Callable[[Floats], Floats]:

@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from rmc.common.env.config import EnvConfig
+from rmc.common.env.describe import layout_of
 from rmc.common.env.faults import RAISED, describe_error
 from rmc.common.env.make import first_env, make_env
 from rmc.common.env.process_state import changes
 from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Floats
 from rmc.common.errors import EnvFault
+from rmc.deploy.run.config import WindowConfig
+from rmc.deploy.run.memory_reach import format_reach
 
 BESIDE_THE_POINT = (  # of vectors, stretched actions, and what watches the environment
     "is -infinity", "is infinity", "symmetric and normalized", "different from the unwrapped version",
@@ -74,7 +77,7 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
         lines += stages.pop(0)()
     if changed := changes():
         lines.append(f"note: it changes {', '.join(changed)} of its process; training keeps its own apart")
-    for line in [*_facts(env, played), *dict.fromkeys(lines)]:
+    for line in [*_facts(env, played), _reach(env, config), *dict.fromkeys(lines)]:
         console.print(line, soft_wrap=True)
     env.close()
     sound = not _faults(lines)
@@ -123,6 +126,11 @@ def _facts(env: Env, played: Played) -> Iterator[str]:
     if played.lengths:
         ended = f"{played.terminated} of them terminated, the others cut off"
         yield f"{len(played.lengths)} episodes of {min(played.lengths)} to {max(played.lengths)} steps, {ended}"
+
+
+def _reach(env: Env, config: EnvConfig) -> str:
+    """By default."""
+    return format_reach(WindowConfig().trained_steps, layout_of(env, config, {}, privileged=False).time_limit)
 
 
 def _nonsense(played: Played) -> Iterator[str]:

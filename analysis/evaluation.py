@@ -53,12 +53,17 @@ def evaluate_blob(
     Raises ConfigError where its environment cannot be made, or has other sizes than the policy.
     """
     env = header.env if flicker is None else dataclasses.replace(header.env, flicker=flicker)
-    runner = PolicyRunner(header.obs_dim, header.action_dim, header.agent, envs=1)
+    runner = PolicyRunner(header.obs_dim, header.action_dim, header.agent, 1, header.layout.missing)
     runner.load(blob)
     with _one_thread():
         seed = first_start(header.seed, final=True)
         match = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
-    return evaluation_metrics(match) | {"eval_flicker": env.flicker}
+    return evaluation_metrics(match) | missing_shares(env)
+
+
+def missing_shares(env: EnvConfig) -> dict[str, float]:
+    """What an evaluation's record says of the observations that were missing."""
+    return {"eval_flicker": env.flicker, "eval_drop_sensors": env.drop_sensors}
 
 
 def policy_env(header: PolicyHeader, config: EnvConfig) -> Env:
@@ -106,4 +111,5 @@ def initial_policy(config: RunConfig) -> bytes:
     """The policy that the run's learner starts from, before it has learnt anything."""
     spec = config.window_spec()
     torch.manual_seed(config.seed)
-    return safetensors.torch.save(Agent(spec.obs_dim, spec.action_dim, config.agent).policy_weights())
+    agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
+    return safetensors.torch.save(agent.policy_weights())

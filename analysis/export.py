@@ -1,6 +1,7 @@
 """A policy as an ONNX file, for programs without torch.
 
 Inputs: observation (N, O) raw, previous_action (N, A), missing (N,) bool, state (N, S), zeros at an episode's start.
+Where its environment says by number what is missing, that is (N, O).
 Outputs: action (N, A) in [-1, 1], the policy's mean, and next_state (N, S).
 The model's metadata hold the policy's header, as its safetensors do.
 """
@@ -37,8 +38,11 @@ class _Step(nn.Module):
         self, observation: Tensor, previous_action: Tensor, missing: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor]:
         """See the module's docstring."""
+        by_number = missing.ndim == 2
+        missing = missing if by_number else missing.unsqueeze(1)
         if self.agent.config.impute_missing:  # as ``Policy.act`` has it
-            missing = missing | ~torch.isfinite(observation).all(1)
+            odd = ~torch.isfinite(observation)
+            missing = missing | (odd if by_number else odd.any(1, keepdim=True))
         normalized = self.agent.normalizer(observation, missing).unsqueeze(1)
         now = missing.unsqueeze(1), previous_action.unsqueeze(1), state
         remembered, _, state = self.agent.unroll(normalized, *now)
@@ -52,10 +56,12 @@ def export(policy: PolicyFile, out: Path) -> None:
         if importlib.util.find_spec(name) is None:
             raise ConfigError("--out", str(out), f"{name} is missing; {how_to_install('onnx')}")
     header = policy.header
-    agent = Agent(header.obs_dim, header.action_dim, header.agent)
+    flags = header.layout.missing
+    agent = Agent(header.obs_dim, header.action_dim, header.agent, flags)
     agent.load_state_dict(safetensors.torch.load(policy.blob), strict=False)
     two = [torch.zeros(2, size) for size in header.sizes().values()]
-    example = (two[0], two[1], torch.zeros(2, dtype=torch.bool), two[2])
+    missing = torch.zeros((2, flags) if flags > 1 else (2,), dtype=torch.bool)
+    example = (two[0], two[1], missing, two[2])
     rows = torch.export.Dim("rows", min=1)
     with _quiet():
         program = torch.onnx.export(

@@ -7,7 +7,7 @@
     action = policy.act(observation, info.get("missing", False))
     observation, reward, terminated, truncated, info = env.step(action)
 
-Shapes: N episodes side by side, O observation, A action, S state.
+Shapes: N episodes side by side, O observation, A action, S state, M flags of what is missing.
 """
 
 from pathlib import Path
@@ -94,8 +94,9 @@ class Policy:
     ) -> NDArray[Any]:
         """(O,) -> (A,) or (N, O) -> (N, A): the policy's mean, or a sample of it.
 
-        ``missing``, one or (N,), says that the frame is missing (``info["missing"]`` under flicker). A policy that
-        fills missing frames also takes one that is not finite for missing. ``units`` "agent" gives float32 in [-1, 1],
+        ``missing``, one or (N,), says that the frame is missing (``info["missing"]`` under flicker); where the policy's
+        environment says so by number, also (O,) or (N, O). A policy that fills what is missing also takes for missing
+        what is not finite. ``units`` "agent" gives float32 in [-1, 1],
         as ``make_env`` takes; "environment" what the environment itself takes: its units, dtype and shape, where its
         action is a Dict or a Tuple all numbers in a row. Raises ConfigError for what it cannot read.
         """
@@ -114,7 +115,7 @@ class Policy:
         """What acts in so many episodes; new ones begin after ``reset``."""
         if self._runner is None:
             header = self.header
-            runner = PolicyRunner(header.obs_dim, header.action_dim, header.agent, rows)
+            runner = PolicyRunner(header.obs_dim, header.action_dim, header.agent, rows, header.layout.missing)
             runner.load(self._file.blob)
             self._runner, (self._prev_action, self._state) = runner, runner.start()
         return self._runner
@@ -127,20 +128,28 @@ class Policy:
         return scaled.astype(parts[0].dtype).reshape(len(action), *parts[0].shape)
 
     def _read(self, observation: ArrayLike, missing: bool | BoolArray) -> tuple[Floats, BoolArray]:
-        """(N, O), and (N,) whether each counts as missing. Raises ConfigError; nothing is remembered of it then."""
+        """(N, O), and (N, M) what counts as missing. Raises ConfigError; nothing is remembered of it then."""
         rows = self._rows(observation)
-        absent = np.array(missing, bool)
-        if absent.shape not in ((), (len(rows),)):
-            raise ConfigError("missing", f"of shape {absent.shape}", f"give one, or one for each of {len(rows)} rows")
-        absent = np.broadcast_to(absent, len(rows)).copy()
-        odd = ~np.isfinite(rows) & ~absent[:, None]
+        absent = self._absent(np.array(missing, bool), rows, one=np.ndim(observation) == 1)
+        odd = ~np.isfinite(rows) & ~absent
         if odd.any():
             if not self.header.agent.impute_missing:
                 places = [place if len(rows) == 1 else (row, place) for row, place in np.argwhere(odd).tolist()]
                 values = dict(zip(places, rows[odd].tolist(), strict=True))
                 raise ConfigError("observation", values, "give finite numbers, or missing=True where there is none")
-            absent |= odd.any(1)
+            absent |= odd if absent.shape == odd.shape else odd.any(1, keepdims=True)
         return rows, absent
+
+    def _absent(self, missing: BoolArray, rows: Floats, one: bool) -> BoolArray:
+        """Flags as they were given -> (N, M); ``one`` row was given as (O,). Raises ConfigError."""
+        flags, count = self.header.layout.missing, len(rows)
+        by_number = [(count, flags), *([(flags,)] if one else [])] if flags > 1 else []
+        if missing.shape in by_number:
+            return missing.reshape(count, flags)
+        if missing.shape not in ((), (count,)):
+            fix = f"give one, or one for each of {count} rows" + (f", or {flags} for each" if flags > 1 else "")
+            raise ConfigError("missing", f"of shape {missing.shape}", fix)
+        return np.broadcast_to(missing.reshape(-1, 1), (count, flags)).copy()
 
     def _rows(self, observation: ArrayLike) -> Floats:
         """(O,) or (N, O) -> (N, O). Raises ConfigError."""

@@ -109,7 +109,8 @@ def _check_shapes(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> N
     """Before any memory is taken for what a header says. Raises MessageError."""
     try:
         with torch.device("meta"):
-            expected = Agent(header.obs_dim, header.action_dim, header.agent).policy_shapes()
+            agent = Agent(header.obs_dim, header.action_dim, header.agent, header.layout.missing)
+            expected = agent.policy_shapes()
     except (RuntimeError, OverflowError, TypeError) as error:  # of torch, for sizes that nothing can have
         reason = str(error).splitlines()[0]
         raise MessageError("damaged header", f"no networks have its sizes ({reason}); copy it again") from None
@@ -120,7 +121,7 @@ def _check_shapes(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> N
 
 
 def _check_weights(header: PolicyHeader, blob: bytes) -> None:
-    PolicyRunner(header.obs_dim, header.action_dim, header.agent, envs=1).load(blob)
+    PolicyRunner(header.obs_dim, header.action_dim, header.agent, 1, header.layout.missing).load(blob)
 
 
 def _of_run(folder: RunFolder, checkpoint: str) -> PolicyFile:

@@ -76,7 +76,7 @@ def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest:
     total = 0.0
     for _ in range(longest):
         video.send(_frame(env, frame.shape).tobytes())
-        action = policy.act(observation, bool(info.get("missing", False)))
+        action = policy.act(observation, info.get("missing", False))
         observation, reward, terminated, truncated, info = env.step(action)
         total += float(reward)
         if terminated or truncated:

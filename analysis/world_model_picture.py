@@ -1,11 +1,13 @@
-"""``rmc inspect``: what a run's world model knows, along one episode, as a picture and a few numbers.
+"""``rmc inspect``: what a run's world model knows, along one episode, and what it remembers, as a picture and numbers.
 
-Shapes: T steps of the episode, O observation, A action, H hidden, K steps ahead. Observations are normalised ones.
+Shapes: T steps of the episode, O observation, A action, H hidden, M flags of what is missing, K steps ahead.
+Observations are normalised ones.
 """
 
 import importlib.util
 import io
 import pickle
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -15,9 +17,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rmc.actors.evaluator import LONGEST_EPISODE
+from rmc.analysis import memory_picture
+from rmc.analysis.episodes import Episode, Player, remembered
+from rmc.analysis.memory_picture import Remembered, remember
 from rmc.analysis.out_file import check_writable
-from rmc.analysis.policy import load_policy
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError
@@ -32,21 +35,6 @@ PICTURES = (".png", ".pdf", ".svg", ".jpg")
 HORIZONS = (1, 5, 15)  # steps ahead
 SHOWN, SHOWN_STEPS = 4, 100  # dimensions in the picture, those that change the most, and from when on how long
 Floats = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Episode:
-    """What was played, as tensors with a batch of one."""
-
-    observation: Tensor  # (1, T + 1, O)
-    action: Tensor  # (1, T, A)
-    reward: Tensor  # (T,), scaled as for training
-    missing: Tensor  # (1, T + 1) bool
-
-    @property
-    def seen(self) -> Tensor:
-        """(T,) bool: neither the step's frame nor the next one is missing."""
-        return ~(self.missing[0, 1:] | self.missing[0, :-1])
 
 
 @dataclass(frozen=True)
@@ -67,7 +55,7 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     """The whole agent of a checkpoint, with its world model. Raises ConfigError."""
     spec = config.window_spec()
     folder.check_sizes(config.env.id, config.sizes())
-    agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
+    agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
     raw = choose_checkpoint(folder, checkpoint)[1][STATE]
     try:
         agent.load_state_dict(torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)["agent"])
@@ -78,44 +66,17 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     return agent.eval()
 
 
-def play(folder: RunFolder, agent: Agent, config: RunConfig, checkpoint: str) -> Episode:
-    """One deterministic episode."""
-    policy = load_policy(folder.path, checkpoint)
-    env = policy.make_env()
-    observation, info = env.reset(seed=config.seed)
-    policy.reset()
-    observations, missed, actions, rewards = [observation], [bool(info.get("missing", False))], [], []
-    for _ in range(LONGEST_EPISODE):
-        actions.append(policy.act(observation, missed[-1]))
-        observation, reward, terminated, truncated, info = env.step(actions[-1])
-        observations.append(observation)
-        missed.append(bool(info.get("missing", False)))
-        rewards.append(config.actor.reward_scale * float(reward))
-        if terminated or truncated:
-            break
-    env.close()
-    raw, missing = torch.from_numpy(np.stack(observations)), torch.tensor(missed)
-    return Episode(
-        agent.normalizer(raw, missing).unsqueeze(0),
-        torch.from_numpy(np.stack(actions)).unsqueeze(0),
-        torch.tensor(rewards),
-        missing.unsqueeze(0),
-    )
-
-
 @torch.no_grad()
 def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> Insight:
     """Everything from one pass over the episode, and open-loop rollouts from each of its steps.
 
     ``norm`` is that of the world model's error.
     """
-    previous = torch.cat([torch.zeros_like(episode.action[:, :1]), episode.action], 1)
-    start = torch.zeros(1, agent.config.state_size(agent.obs_dim))
-    memory, seen, _ = agent.unroll(episode.observation, episode.missing, previous, start)
+    memory, seen = remembered(agent, episode)
     prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
     latent_change = memory.hidden[0].diff(dim=0)
     real = episode.observation[0, 1:]
-    ahead = _open_loop(agent, memory, seen[0, :-1], episode.action[0])
+    ahead = _open_loop(agent, memory, seen[0, :-1], episode.action[0], episode.missing.shape[-1])
     return Insight(
         real=real.numpy(),
         predicted=ahead[1].numpy(),
@@ -128,10 +89,12 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     )
 
 
-def _open_loop(agent: Agent, memory: MemoryOutput, observation: Tensor, action: Tensor) -> dict[int, Tensor]:
+def _open_loop(
+    agent: Agent, memory: MemoryOutput, observation: Tensor, action: Tensor, flags: int
+) -> dict[int, Tensor]:
     """Horizon K -> (T - K + 1, O): from every step on, the model's own states and observations in place of the real.
 
-    Observations (T, O) to start from, actions (T, A).
+    Observations (T, O) to start from, actions (T, A); ``flags`` is M.
     """
     hidden, skip = memory.hidden[0, :-1], memory.skip[0, :-1]
     steps, predicted = len(action), {}
@@ -140,7 +103,7 @@ def _open_loop(agent: Agent, memory: MemoryOutput, observation: Tensor, action: 
         hidden, skip, observation, a = hidden[:count], skip[:count], observation[:count], action[ahead - 1 :]
         step = agent.world_model(agent.features(MemoryOutput(hidden, skip)), a)
         hidden, observation = hidden + step.hidden_change, observation + step.observation_change
-        skip = agent.memory.skip(observation, torch.zeros(count, dtype=torch.bool), a)
+        skip = agent.memory.skip(observation, torch.zeros(count, flags, dtype=torch.bool), a)
         if ahead in HORIZONS:
             predicted[ahead] = observation
     return predicted
@@ -154,37 +117,57 @@ def _error(predicted: Tensor, episode: Episode, horizon: int) -> tuple[Tensor, T
     """(O,) sums of |predicted - real| and of |real - where it started|, where both frames were seen."""
     observation = episode.observation[0]
     start, end = observation[: len(predicted)], observation[horizon:]
-    seen = (episode.seen[: len(predicted)] & episode.seen[horizon - 1 :]).unsqueeze(-1)
+    seen = episode.seen[: len(predicted)] & episode.seen[horizon - 1 :]
     return ((predicted - end).abs() * seen).sum(0), ((end - start).abs() * seen).sum(0)
 
 
-def inspect(run: Path, checkpoint: str, out: Path) -> Insight:
-    """Play, look, and write the picture. Raises ConfigError."""
+def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, Remembered]:
+    """Play several episodes, look at the first, and write the picture with what is remembered. Raises ConfigError."""
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError("--out", str(out), f"matplotlib is missing; {how_to_install('plot')}")
     check_writable("--out", out, PICTURES)
-    return inspect_to(RunFolder(run), checkpoint, out)
+    folder = RunFolder(run)
+    config, agent = _grounded(folder, checkpoint)
+    with closing(Player(folder, agent, config, checkpoint)) as player:
+        episodes, hidden = player.several(), player.hidden_parts()
+    insight = look(agent, episodes[0], config.update.model_norm)
+    memory = remember(agent, episodes, hidden)
+    draw(insight, _title(config), out, memory)
+    return insight, memory
 
 
-def inspect_to(folder: RunFolder, checkpoint: str, out: Path | BinaryIO) -> Insight:
-    """Play, look, and write the picture to a file, or as PNG to what is like one. Raises ConfigError."""
+def inspect_to(folder: RunFolder, checkpoint: str, out: BinaryIO) -> Insight:
+    """Play, look, and write the picture of one episode as PNG to what is like a file. Raises ConfigError."""
+    config, agent = _grounded(folder, checkpoint)
+    with closing(Player(folder, agent, config, checkpoint)) as player:
+        insight = look(agent, player.play(), config.update.model_norm)
+    draw(insight, _title(config), out)
+    return insight
+
+
+def _grounded(folder: RunFolder, checkpoint: str) -> tuple[RunConfig, Agent]:
     config = folder.config()
     if not config.agent.grounding:
         fix = "its world model predicts no observations; train with --grounding"
         raise ConfigError("RUN", str(folder.path), fix)
-    agent = load_agent(folder, config, checkpoint)
-    insight = look(agent, play(folder, agent, config, checkpoint), config.update.model_norm)
-    draw(insight, f"{config.env.id}, {config.preset}, seed {config.seed}", out)
-    return insight
+    return config, load_agent(folder, config, checkpoint)
 
 
-def draw(insight: Insight, title: str, out: Path | BinaryIO) -> None:
-    """Predicted against real amid the episode, then curiosity and reward over all of it."""
+def _title(config: RunConfig) -> str:
+    return f"{config.env.id}, {config.preset}, seed {config.seed}"
+
+
+def draw(insight: Insight, title: str, out: Path | BinaryIO, memory: Remembered | None = None) -> None:
+    """Predicted against real amid the episode, curiosity and reward over all of it; then what is remembered."""
     from matplotlib.figure import Figure  # an extra
 
     shown = np.argsort(-np.abs(np.diff(insight.real, axis=0)).mean(0))[:SHOWN]
-    figure = Figure(figsize=(11, 2.0 * (len(shown) + 2)), layout="constrained")
-    axes = figure.subplots(len(shown) + 2, 1)
+    count = len(shown) + 2 + (memory.panels if memory is not None else 0)
+    figure = Figure(figsize=(11, 2.0 * count), layout="constrained")
+    every = list(figure.subplots(count, 1))
+    axes = every[: len(shown) + 2]
+    if memory is not None:
+        memory_picture.draw(memory, every[len(shown) + 2 :])
     time = np.arange(1, len(insight.real) + 1)
     start = max(1, (len(time) - SHOWN_STEPS) // 2)
     for axis, dimension in zip(axes, shown, strict=False):

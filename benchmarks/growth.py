@@ -53,7 +53,7 @@ def batch(rounds: int, seconds: float) -> Table:
 def window(rounds: int, seconds: float) -> Table:
     """Updates a second at the default batch."""
     run, table = robust(ENV), []
-    for steps in (25, 50, 75, 100):
+    for steps in (25, 100, 250, 1_000):
         longer = replace(run, window=replace(run.window, trained_steps=steps - run.window.burn_in))
         name = f"growth, windows of {steps} steps"
         table.append((steps, _learning(name, longer, run.learner.batch_size, rounds, seconds)))

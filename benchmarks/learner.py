@@ -1,10 +1,12 @@
 """Trained transitions a second of the whole learner role, beside its bare update and stable-baselines3's SAC.
 
-    python -m benchmarks.learner [--env ENV] [--batches 8 32 64 256] [--rounds N] [--seconds S]
+    python -m benchmarks.learner [--env ENV] [--batches 8 32 64 256] [--longest 50 100 200] [--rounds N] [--seconds S]
 
 A transition is trained when it is in a batch as a trained step: 15 for each window, B for each of SAC's batches. The
 learner has one thread on the first core and draws from a real replay server, which has the last one with Redis; SAC has
 its transitions in memory, one thread on the first core in one row, two on the first and the last in the other.
+Then updates a second of batches of windows of 1 000 steps, of which the longest has so many real ones: cut to that
+beside whole. ``benchmarks.growth window`` has the role's updates of full windows by their length.
 """
 
 import dataclasses
@@ -15,6 +17,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 
 from benchmarks.harness import (
@@ -40,8 +43,8 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.window import WindowSpec
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.presets import robust
-from rmc.learner.batch import view_batch
-from rmc.learner.learner import Learner
+from rmc.learner.batch import clear_padding, longest_steps, view_batch
+from rmc.learner.learner import Learner, bf16_is_native
 from rmc.learner.replay_client import ReplayClient
 from rmc.learner.update_order import make_update
 from rmc.replay_server.config import ReplayConfig
@@ -50,6 +53,7 @@ Precision = Literal["auto", "bf16", "fp32"]
 PRECISIONS: tuple[Precision, ...] = ("bf16", "fp32")
 WINDOWS = 4800  # in the ring
 SAC_BATCH = 256
+LONG_WINDOW = 1_000  # steps
 
 
 @contextmanager
@@ -115,6 +119,33 @@ def measure(
         return compare(name, "transitions/s", lambda: speed(work, seconds), sac, ceiling, rounds)
 
 
+def cut(run: RunConfig, longest: int, seconds: float, rounds: int) -> list[Row]:
+    """Updates of one batch in place, cut where its longest window ends beside whole."""
+    window = dataclasses.replace(run.window, trained_steps=LONG_WINDOW - run.window.burn_in)
+    run = dataclasses.replace(run, window=window)
+    spec, count = run.window_spec(), run.learner.batch_size
+    rows = random_rows(spec, count)
+    rows["last"] = spec.burn_in + np.random.default_rng(0).integers(1, longest + 1, count)
+    rows["last"][0] = spec.burn_in + longest
+    clear_padding(rows, spec)
+    raw, beta = torch.from_numpy(rows.view("u1").reshape(count, -1)), torch.zeros(())
+
+    def measured(steps: int) -> Measure:
+        agent = Agent(spec.obs_dim, spec.action_dim, run.agent)
+        update = make_update(agent, spec.burn_in, run.update, 0, bf16_is_native(torch.device("cpu")))
+
+        def work() -> int:
+            update(view_batch(raw, torch.ones(count), spec, steps), beta)
+            return 1
+
+        speed(work, 1.0)
+        return lambda: speed(work, seconds)
+
+    name = f"learner, {run.env.id}, windows of {LONG_WINDOW} steps, {longest} real at most"
+    whole: dict[str, Measure | None] = {"whole windows": measured(spec.steps)}
+    return compare(name, "updates/s", measured(longest_steps(raw, spec)), whole, rounds=rounds)
+
+
 def _sac(stack: ExitStack, spec: WindowSpec, threads: int, seconds: float) -> Measure | None:
     """SAC in an environment of its own, on as many cores as it has threads."""
     cores, python = sorted(os.sched_getaffinity(0)), peer_python("peers")
@@ -129,7 +160,8 @@ def _sac(stack: ExitStack, spec: WindowSpec, threads: int, seconds: float) -> Me
 def main() -> None:
     parser = argument_parser(__doc__)
     parser.add_argument("--env", default="HalfCheetah-v5")
-    parser.add_argument("--batches", type=int, nargs="+", default=[8, 32, 64, 256])
+    parser.add_argument("--batches", type=int, nargs="*", default=[8, 32, 64, 256])
+    parser.add_argument("--longest", type=int, nargs="*", default=[50, 100, 200])
     options = parser.parse_args()
     run = robust(EnvConfig(options.env))
     torch.set_num_threads(1)
@@ -144,6 +176,8 @@ def main() -> None:
         for batch_size in options.batches:
             for precision in PRECISIONS:
                 rows += measure(run, bus, batch_size, precision, sac, options.seconds, options.rounds)
+    for longest in options.longest:
+        rows += cut(run, longest, options.seconds, options.rounds)
     save(rows)
 
 

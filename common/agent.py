@@ -1,6 +1,7 @@
 """The agent's networks: memory, world model, twin Q, policy, temperature.
 
-Shapes: B batch, T time, O observation, A action, H hidden, E embedding, Z = H (+ E) head input.
+Shapes: B batch, T time, O observation, A action, H hidden, E embedding, Z = H (+ E) head input, M flags of what is
+missing (1 for a whole frame, or O), P privileged numbers, which critics alone read.
 Equations are in ``learner/losses.py``; here is only what maps inputs to outputs.
 """
 
@@ -17,7 +18,7 @@ STD_FLOOR = 1e-2  # a constant dimension is not blown up
 
 
 class Normalizer(nn.Module):
-    """(o - mean) / std with frozen statistics, or o itself where that is off; a missing frame stays zero."""
+    """(o - mean) / std with frozen statistics, or o itself where that is off; what is missing stays zero."""
 
     mean: Tensor
     std: Tensor
@@ -29,20 +30,22 @@ class Normalizer(nn.Module):
         self.register_buffer("std", torch.ones(obs_dim))
 
     def forward(self, observation: Tensor, missing: Tensor) -> Tensor:
-        """(..., O) raw and (...) bool -> (..., O)."""
-        normalized = observation
-        if self.enabled:
-            normalized = ((observation - self.mean) / self.std).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
-        return torch.where(missing.unsqueeze(-1), 0.0, normalized)
+        """(..., O) raw and (..., M) bool -> (..., O)."""
+        return torch.where(missing, 0.0, self.scaled(observation))
 
-    def freeze(self, count: int, total: Tensor, total_square: Tensor) -> None:
-        """Take new statistics from sums over ``count`` observations; (O,) float64 each."""
-        if count < 2:
-            return
+    def scaled(self, observation: Tensor) -> Tensor:
+        """(..., O) raw -> (..., O), where nothing is missing."""
+        if not self.enabled:
+            return observation
+        return ((observation - self.mean) / self.std).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+
+    def freeze(self, count: Tensor, total: Tensor, total_square: Tensor) -> None:
+        """Take new statistics from sums over ``count`` numbers of each dimension, of fewer than 2 none; (O,) each."""
+        enough, count = count >= 2, count.clamp(min=1)
         mean = total / count
         variance = (total_square / count - mean * mean).clamp(min=0.0)
-        self.mean.copy_(mean)
-        self.std.copy_(variance.sqrt().clamp(min=STD_FLOOR))
+        self.mean.copy_(torch.where(enough, mean, self.mean))
+        self.std.copy_(torch.where(enough, variance.sqrt().clamp(min=STD_FLOOR), self.std))
 
 
 class MemoryOutput(NamedTuple):
@@ -55,12 +58,12 @@ class MemoryOutput(NamedTuple):
 class Memory(nn.Module):
     """Eq. 6: h_t = GRU(h_{t-1}, e_t), e_t = ReLU(Linear([o_t, a_{t-1}])) or the raw input.
 
-    Where asked, with a missing flag beside o_t.
+    Where asked, with M flags of what is missing beside o_t.
     """
 
-    def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
+    def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig, missing: int = 1) -> None:
         super().__init__()
-        width = obs_dim + action_dim + config.missing_flag
+        width = obs_dim + action_dim + missing * config.missing_flag
         self.missing_flag, self.head_input = config.missing_flag, config.head_input
         layers: list[nn.Module] = []
         if config.embedding:
@@ -73,7 +76,7 @@ class Memory(nn.Module):
         self.gru = nn.GRU(embedding, config.hidden, batch_first=True)
 
     def forward(self, observation: Tensor, missing: Tensor, prev_action: Tensor, hidden: Tensor) -> MemoryOutput:
-        """(B, T, O) normalised, (B, T) bool, (B, T, A), (B, S) the state before the first step, which begins with h."""
+        """(B, T, O) normalised, (B, T, M) bool, (B, T, A), (B, S) the state before the first, which begins with h."""
         if self.head_input == "observation":
             return MemoryOutput(observation.new_zeros(*observation.shape[:2], self.gru.hidden_size), observation)
         embedding = self._embedded(observation, missing, prev_action)
@@ -89,30 +92,31 @@ class Memory(nn.Module):
         """
         size = self.gru.hidden_size
         gate = slice(size, 2 * size)  # PyTorch's order: reset, update, candidate
-        self.gru.bias_ih_l0[gate] = torch.empty(size).uniform_(1.0, max(2.0, steps - 1.0)).log()
-        self.gru.bias_hh_l0[gate] = 0.0
+        _, _, from_input, from_hidden = self.gru.all_weights[0]
+        from_input[gate] = torch.empty(size).uniform_(1.0, max(2.0, steps - 1.0)).log()
+        from_hidden[gate] = 0.0
 
     def step(self, observation: Tensor, missing: Tensor, prev_action: Tensor, hidden: Tensor) -> Tensor:
-        """One step of it: (B, O) normalised, (B,) bool, (B, A), (B, H) -> (B, H) float32."""
+        """One step of it: (B, O) normalised, (B, M) bool, (B, A), (B, H) -> (B, H) float32."""
         if self.head_input == "observation":
             return torch.zeros_like(hidden)
         embedding = self._embedded(observation, missing, prev_action)
         return torch.gru_cell(embedding, hidden, *self.gru.all_weights[0])
 
     def skip(self, observation: Tensor, missing: Tensor, prev_action: Tensor) -> Tensor:
-        """What the heads read beside h: (..., O) normalised, (...) bool, (..., A) -> (..., ·)."""
+        """What the heads read beside h: (..., O) normalised, (..., M) bool, (..., A) -> (..., ·)."""
         return self._skip(observation, self._embedded(observation, missing, prev_action))
 
     def inputs(self, observation: Tensor, missing: Tensor, prev_action: Tensor) -> Tensor:
-        """What is embedded: (..., O) normalised, (...) bool, (..., A) -> (..., O + A), or one more with the flag."""
-        flag = [missing.unsqueeze(-1).to(observation.dtype)] if self.missing_flag else []
+        """What is embedded: (..., O) normalised, (..., M) bool, (..., A) -> (..., O + A), or M more with the flags."""
+        flag = [missing.to(observation.dtype)] if self.missing_flag else []
         return torch.cat([observation, prev_action, *flag], dim=-1)
 
     def _skip(self, observation: Tensor, embedding: Tensor) -> Tensor:
         return (embedding if self.head_input == "hidden+embedding" else observation)[..., : self.skip_dim]
 
     def _embedded(self, observation: Tensor, missing: Tensor, prev_action: Tensor) -> Tensor:
-        """(..., O) normalised, (...) bool, (..., A) -> (..., E)."""
+        """(..., O) normalised, (..., M) bool, (..., A) -> (..., E)."""
         embedding: Tensor = self.embed(self.inputs(observation, missing, prev_action))
         return embedding
 
@@ -240,6 +244,11 @@ def squashed_sample(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tenso
     return torch.tanh(u), (log_normal - log_slope).sum(-1)
 
 
+def critic_input(z: Tensor, privileged: Tensor) -> Tensor:
+    """What critics read: (B, T, Z), beside it (B, T, P) normalised."""
+    return torch.cat([z, privileged.to(z.dtype)], dim=-1) if privileged.shape[-1] else z
+
+
 class Agent(nn.Module):
     """The complete agent: memory, world model, critics, policy, temperature.
 
@@ -247,17 +256,21 @@ class Agent(nn.Module):
     ``critic`` where they rate their windows.
     """
 
-    def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
+    def __init__(
+        self, obs_dim: int, action_dim: int, config: AgentConfig, missing: int = 1, privileged: int = 0
+    ) -> None:
+        """``missing`` is M, ``privileged`` is P."""
         super().__init__()
         self.config, self.obs_dim, self.action_dim = config, obs_dim, action_dim
         self.normalizer = Normalizer(obs_dim, config.normalize_observations)
-        self.memory = Memory(obs_dim, action_dim, config)
+        self.memory = Memory(obs_dim, action_dim, config, missing)
         features = self.memory.skip_dim + (config.hidden if config.head_input != "observation" else 0)
         self.world_model = WorldModel(features, obs_dim, action_dim, config)
-        self.critic = TwinQ(features, action_dim, config)
+        self.critic = TwinQ(features + privileged, action_dim, config)
         self.policy = Policy(features, action_dim, config)
         self.log_alpha = nn.Parameter(torch.zeros(()))
         self.next_frame = ObservationImputer(obs_dim, action_dim, config) if config.impute_missing else None
+        self.privileged_normalizer = Normalizer(privileged, config.normalize_observations) if privileged else None
 
     def features(self, remembered: MemoryOutput) -> Tensor:
         """What the heads read: h_t, what is beside it, or both."""
@@ -268,12 +281,23 @@ class Agent(nn.Module):
                 return remembered.skip
         return torch.cat(remembered, dim=-1)
 
+    def normalized_privileged(self, privileged: Tensor) -> Tensor:
+        """What critics read beside z: (..., P) raw -> (..., P)."""
+        return privileged if self.privileged_normalizer is None else self.privileged_normalizer.scaled(privileged)
+
+    def freeze_statistics(self, count: Tensor, total: Tensor, total_square: Tensor) -> None:
+        """Take new statistics of observations, then of what is privileged: (1,) or (O + P,) and twice (O + P,)."""
+        sums = count.expand_as(total), total, total_square
+        self.normalizer.freeze(*(numbers[: self.obs_dim] for numbers in sums))
+        if self.privileged_normalizer is not None:
+            self.privileged_normalizer.freeze(*(numbers[self.obs_dim :] for numbers in sums))
+
     @torch.no_grad()
     def fill(self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """A missing o_t becomes what is expected from (h_{t-1}, o_{t-1}, a_{t-1}), o_{t-1} filled itself.
+        """What is missing of o_t becomes what is expected from (h_{t-1}, o_{t-1}, a_{t-1}), o_{t-1} filled itself.
 
-        (B, T, O) normalised, (B, T) bool, (B, T, A), (B, S) the state before the first step -> (B, T, O) and the state
-        after the last. No gradient.
+        (B, T, O) normalised, (B, T, M) bool, (B, T, A), (B, S) the state before the first step -> (B, T, O) and the
+        state after the last. No gradient.
         """
         assert self.next_frame is not None
         hidden, last_frame = state[:, : self.config.hidden], state[:, self.config.hidden :]
@@ -281,7 +305,7 @@ class Agent(nn.Module):
         with torch.autocast(observation.device.type, enabled=False):  # at a step at a time the casts outweigh the rest
             for o, was_missing, a in zip(observation.unbind(1), missing.unbind(1), prev_action.unbind(1), strict=True):
                 expected = self.next_frame(hidden, last_frame, a).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
-                last_frame = torch.where(was_missing.unsqueeze(1), expected, o)
+                last_frame = torch.where(was_missing, expected, o)
                 hidden = self.memory.step(last_frame, was_missing, a, hidden)
                 frames.append(last_frame.unsqueeze(1))
         return torch.cat(frames, 1), torch.cat([hidden, last_frame], 1)

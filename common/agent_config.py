@@ -8,7 +8,7 @@ NORMALIZED_CLIP = 10.0  # standard deviations
 HeadInput = Literal["hidden", "hidden+embedding", "hidden+observation", "observation"]
 POLICY_PARTS = ("normalizer.", "memory.", "policy.")  # what it takes to act
 FILL_PARTS = ("next_frame.",)  # what else it takes where missing frames are filled
-CRITIC_PARTS = ("critic.", "log_alpha")  # what else it takes to rate a window
+CRITIC_PARTS = ("critic.", "log_alpha", "privileged_normalizer.")  # what else it takes to rate a window
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,16 @@ class AgentConfig:
     an agent without a memory."""
     critic_norm: bool = False
     """LayerNorm before the ReLUs of the critics."""
+    privileged_critic: bool = False
+    """The critics, and nothing else, also read the environment's info["privileged"]. Where it gives none, that is the
+    observation before flicker, noise or hiding."""
     normalize_observations: bool = False
     """Observations are normalised by the replay server's running statistics."""
     grounding: bool = True
     """The world model also predicts the next observation's change and the reward."""
     missing_flag: bool = False
-    """The memory has one more input, which says whether the observation is missing (flickered out)."""
+    """The memory has one more input, which says whether the observation is missing (flickered out). Where dimensions
+    are missing one by one, it has one for each."""
     impute_missing: bool = False
     """A small network fills a missing observation before the memory reads it. It predicts from the observation before
     (filled itself if it was missing), the memory and the last action. The stored state then is h and that observation.

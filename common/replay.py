@@ -7,7 +7,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rmc.common.window import Rows
+from rmc.common.window import Rows, WindowSpec
 
 EPISODE_BYTES = 16 << 20  # of rows at most in the answer to ``Replay.episode``
 
@@ -42,25 +42,32 @@ EMPTY_SAMPLE = Sample(SampleStatus.WAIT, None, None, 0.0, 0, 0, 0)  # of a serve
 
 @dataclass(frozen=True)
 class ObservationStatistics:
-    """Sums over every real, non-missing observation inserted once; ``total`` and ``total_square`` (O,) float64."""
+    """Sums over every real number inserted once that is not missing, of D numbers by C counts (see ``WindowSpec``).
 
-    count: int
+    ``count`` (C,) int64; ``total`` and ``total_square`` (D,) float64: observations, then what is privileged.
+    """
+
+    count: NDArray[np.int64]
     total: NDArray[np.float64]
     total_square: NDArray[np.float64]
 
     @classmethod
-    def none(cls, obs_dim: int) -> Self:
+    def none(cls, spec: WindowSpec) -> Self:
         """Of no observation."""
-        return cls(0, np.zeros(obs_dim), np.zeros(obs_dim))
+        return cls(np.zeros(spec.counts, np.int64), np.zeros(spec.statistics), np.zeros(spec.statistics))
 
     @classmethod
     def from_json(cls, raw: dict[str, Any]) -> Self:
-        """The inverse of ``to_json``. Raises KeyError, TypeError, ValueError."""
-        return cls(int(raw["count"]), *(np.asarray(raw[name], np.float64) for name in ("total", "total_square")))
+        """The inverse of ``to_json``; of format 2, too, whose count is one number. Raises KeyError, TypeError,
+        ValueError.
+        """
+        sums = (np.asarray(raw[name], np.float64) for name in ("total", "total_square"))
+        return cls(np.atleast_1d(np.asarray(raw["count"], np.int64)), *sums)
 
     def to_json(self) -> dict[str, Any]:
         """As plain numbers and lists."""
-        return {"count": self.count, "total": self.total.tolist(), "total_square": self.total_square.tolist()}
+        names = ("count", "total", "total_square")
+        return {name: getattr(self, name).tolist() for name in names}
 
     def __add__(self, other: Self) -> Self:
         """Of the observations of both."""

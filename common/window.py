@@ -1,6 +1,7 @@
 """The window: the one definition of what a sequence is, from actor to learner.
 
-Shapes: T = burn_in + train steps; T + 1 observations; O observation, A action, S state (``AgentConfig.state_size``).
+Shapes: T = burn_in + train steps; T + 1 observations; O observation, A action, S state (``AgentConfig.state_size``),
+M flags of what is missing, P privileged numbers.
 
 A window is a row of a structured dtype, laid out as ``[burn_in | train | 1 bootstrap]``. Two indices
 say what is real: observations ``first <= t <= last`` and steps ``first <= t < last``. The last
@@ -15,14 +16,33 @@ Integers are signed because torch views them in place (see ``learner/batch.py``)
 import hashlib
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 ROW_ALIGNMENT = 64  # bytes: a cache line, so that whole-row gathers run at memory speed
+CHECKSUM_BYTES = 4
 
 Rows = NDArray[np.void]
 BoolArray = NDArray[np.bool_]
+Field = tuple[str, str, tuple[int, ...]] | tuple[str, np.dtype[Any]]
+HEADER_FIELDS: list[Field] = [
+    ("serial", "<i8", ()),  # given by the ring; slot = serial mod capacity
+    ("seq", "<i8", ()),  # origin: (actor, epoch, seq, k) names a window once and for all
+    ("weights_update", "<i8", ()),  # the learner's update count of the weights that acted
+    ("actor", "<i4", ()),
+    ("epoch", "<i4", ()),
+    ("k", "<i4", ()),  # place inside its stream entry
+    ("env", "<i4", ()),  # which of the actor's environments
+    ("episode_step", "<i4", ()),  # the first trained step, counted from its episode's start
+    ("first", "<i4", ()),
+    ("last", "<i4", ()),
+    ("terminated", "<i4", ()),  # 1: step last - 1 ended in a true termination
+    ("new_steps", "<i4", ()),  # trailing steps that no earlier window carried
+    ("new_observations", "<i4", ()),  # trailing observations that no earlier window carried
+    ("initial_priority", "<f4", ()),  # 0: enter with the largest priority seen
+]
 
 
 @dataclass(frozen=True)
@@ -34,6 +54,10 @@ class WindowSpec:
     state: int
     burn_in: int = 10
     train: int = 15
+    missing: int = 1
+    """M: 1 flag for a whole frame, or O, one for each dimension of the observation."""
+    privileged: int = 0
+    """P, numbers beside an observation that critics alone read."""
 
     @property
     def steps(self) -> int:
@@ -45,55 +69,57 @@ class WindowSpec:
         """T + 1: one more, the bootstrap observation."""
         return self.steps + 1
 
+    @property
+    def statistics(self) -> int:
+        """O + P, numbers whose running statistics are kept."""
+        return self.obs_dim + self.privileged
+
+    @property
+    def counts(self) -> int:
+        """How many counts these statistics take: 1 where all numbers are there or missing together, else O + P."""
+        return 1 if self.missing == 1 and not self.privileged else self.statistics
+
     @cached_property
     def dtype(self) -> np.dtype[np.void]:
-        """The row's structured dtype, padded to 64 bytes."""
-        return self._row("missing")
-
-    def _row(self, missing: str) -> np.dtype[np.void]:
-        """Of rows whose last field is called so."""
-        fields: list[tuple[str, str, tuple[int, ...]]] = [
-            ("serial", "<i8", ()),  # given by the ring; slot = serial mod capacity
-            ("seq", "<i8", ()),  # origin: (actor, epoch, seq, k) names a window once and for all
-            ("weights_update", "<i8", ()),  # the learner's update count of the weights that acted
-            ("actor", "<i4", ()),
-            ("epoch", "<i4", ()),
-            ("k", "<i4", ()),  # place inside its stream entry
-            ("env", "<i4", ()),  # which of the actor's environments
-            ("episode_step", "<i4", ()),  # the first trained step, counted from its episode's start
-            ("first", "<i4", ()),
-            ("last", "<i4", ()),
-            ("terminated", "<i4", ()),  # 1: step last - 1 ended in a true termination
-            ("new_steps", "<i4", ()),  # trailing steps that no earlier window carried
-            ("new_observations", "<i4", ()),  # trailing observations that no earlier window carried
-            ("initial_priority", "<f4", ()),  # 0: enter with the largest priority seen
-            ("observation", "<f4", (self.observations, self.obs_dim)),  # raw
-            ("action", "<f4", (self.steps, self.action_dim)),  # in [-1, 1]
-            ("prev_action", "<f4", (self.action_dim,)),
-            ("reward", "<f4", (self.steps,)),  # extrinsic
-            ("state", "<f4", (self.state,)),
-            (missing, "u1", (self.observations,)),  # 1: a flickered-out frame
-        ]
-        packed = np.dtype(fields)
-        itemsize = -(-packed.itemsize // ROW_ALIGNMENT) * ROW_ALIGNMENT
-        names = list(packed.names or ())
-        offsets = [int(packed.fields[name][1]) for name in names] if packed.fields else []
-        formats = [packed.fields[name][0] for name in names] if packed.fields else []
-        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
+        """The row's structured dtype, padded to 64 bytes; its last four are the checksum of all before."""
+        return row_dtype(
+            [
+                *HEADER_FIELDS,
+                ("observation", "<f4", (self.observations, self.obs_dim)),  # raw
+                ("action", "<f4", (self.steps, self.action_dim)),  # in [-1, 1]
+                ("prev_action", "<f4", (self.action_dim,)),
+                ("reward", "<f4", (self.steps,)),  # extrinsic
+                ("state", "<f4", (self.state,)),
+                ("privileged", "<f4", (self.observations, self.privileged)),  # raw
+                ("missing", "u1", (self.observations, self.missing)),  # 1: not seen
+            ],
+            checksum=True,
+        )
 
     @cached_property
     def fingerprint(self) -> str:
         """16 hexadecimal digits that change with the window's split and any field, shape or offset of the dtype."""
-        return self._digest(self.dtype)
-
-    @cached_property
-    def former_fingerprint(self) -> str:
-        """The fingerprint in the rings of config format 1, where ``missing`` was called ``blank``: the same bytes."""
-        return self._digest(self._row("blank"))
-
-    def _digest(self, dtype: np.dtype[np.void]) -> str:
-        return hashlib.sha256(repr((self.burn_in, self.train, dtype)).encode()).hexdigest()[:16]
+        return fingerprint(self, self.dtype)
 
     def trained_steps(self, rows: Rows) -> int:
         """Real trained steps in all rows, what a draw spends of the replay ratio."""
         return int((rows["last"] - self.burn_in).sum())
+
+
+def row_dtype(fields: list[Field], checksum: bool) -> np.dtype[np.void]:
+    """Fields side by side, padded to 64 bytes; the last four are the ``checksum``, given by the ring, if asked for."""
+    packed = np.dtype(fields)
+    assert packed.fields is not None
+    used = packed.itemsize + CHECKSUM_BYTES * checksum
+    itemsize = -(-used // ROW_ALIGNMENT) * ROW_ALIGNMENT
+    names, formats = list(packed.names or ()), [field[0] for field in packed.fields.values()]
+    offsets = [int(field[1]) for field in packed.fields.values()]
+    if checksum:
+        names, formats = [*names, "checksum"], [*formats, np.dtype("<u4")]
+        offsets.append(itemsize - CHECKSUM_BYTES)
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
+
+
+def fingerprint(spec: WindowSpec, dtype: np.dtype[np.void]) -> str:
+    """Of windows that are split so, in rows of that dtype: 16 hexadecimal digits."""
+    return hashlib.sha256(repr((spec.burn_in, spec.train, dtype)).encode()).hexdigest()[:16]

@@ -43,7 +43,7 @@ class Kind(IntEnum):
     WAIT = 6  # server -> client: the limiter holds the draw back
     FINISHED = 7  # server -> client: all steps are in and the ratio is spent
     PRIORITIES = 8  # client -> server: serials (int64) | priorities (float32); no reply
-    STATISTICS = 9  # client -> server, and its reply: count, then sum | sum of squares (float64)
+    STATISTICS = 9  # client -> server, and its reply: counts (int64) | sums | sums of squares (float64)
     STATS = 10  # client -> server, and its reply: the server's counters
     ERROR = 11  # server -> client: why the connection ends; fenced: its HMAC that a newer learner has come
     EPISODE = 12  # client -> server: serial, and its reply: count, then rows

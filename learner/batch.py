@@ -1,6 +1,6 @@
 """A batch of rows as tensors: views into one block of bytes.
 
-Shapes: B batch, T steps, O observation, A action, S state; L_b burn-in.
+Shapes: B batch, T steps, O observation, A action, S state, M flags of what is missing, P privileged; L_b burn-in.
 """
 
 from dataclasses import dataclass
@@ -13,6 +13,8 @@ from torch import Tensor
 
 from rmc.common.window import Rows, WindowSpec
 
+SHORTEST_CUT = 16  # trained steps down to which windows are cut: below, an update costs what its weights do
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -24,11 +26,13 @@ class Batch:
     reward: Tensor  # (B, T)
     terminated: Tensor  # (B, T), d_t: 1 at a true termination
     state: Tensor  # (B, S), the state before the first real observation
-    missing: Tensor  # (B, T + 1) bool
+    missing: Tensor  # (B, T + 1, M) bool
+    privileged: Tensor  # (B, T + 1, P) raw
     observation_valid: Tensor  # (B, T + 1) bool
     step_valid: Tensor  # (B, T) bool
     burned_in: Tensor  # (B,) bool: the burn-in is real
     importance: Tensor  # (B,)
+    cut: int  # steps of padding that all its windows have after the T
 
 
 def importance_weights(
@@ -62,18 +66,36 @@ def clear_padding(rows: Rows, spec: WindowSpec) -> None:
     first, last = rows["first"][partial, None], rows["last"][partial, None]
     unobserved = (t < first) | (t > last)
     unstepped = (unobserved | (t == last))[:, :-1]
-    for absent, names in ((unobserved, ("observation", "missing")), (unstepped, ("action", "reward"))):
+    for absent, names in ((unobserved, ("observation", "missing", "privileged")), (unstepped, ("action", "reward"))):
         window, step = np.nonzero(absent)
         for name in names:
             rows[name][partial[window], step] = 0
 
 
-def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec) -> Batch:
+def longest_steps(raw: Tensor, spec: WindowSpec) -> int:
+    """Steps up to where the longest window of (B, row bytes) on the host is real; what comes after pads all of them.
+
+    Trained steps are rounded up to 2^k or 3 * 2^(k-1), from ``SHORTEST_CUT`` on, so that updates have few shapes.
+    """
+    trained = int(raw.view(torch.int32)[:, _places(spec)["last"][2]].max()) - spec.burn_in
+    size = max(SHORTEST_CUT, 1 << (trained - 1).bit_length())
+    if size > SHORTEST_CUT and trained <= size // 4 * 3:
+        size = size // 4 * 3
+    return min(spec.steps, spec.burn_in + size)
+
+
+def update_steps(raw: Tensor, spec: WindowSpec, number: int) -> int:
+    """Steps that update ``number`` runs over: the whole window's in a run's first, so that memory is short at once."""
+    return spec.steps if number == 1 else longest_steps(raw, spec)
+
+
+def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec, steps: int | None = None) -> Batch:
     """(B, row bytes) uint8 and (B,) float32, on any device, to a Batch; static shapes, no host sync.
 
-    The rows' padding must be zero: see ``clear_padding``.
+    The rows' padding must be zero: see ``clear_padding``. The batch ends after ``steps``: see ``longest_steps``.
     """
     assert raw.shape[1] == spec.dtype.itemsize, (raw.shape, spec.dtype.itemsize)
+    steps = spec.steps if steps is None else steps
     places, floats, integers = _places(spec), raw.view(torch.float32), raw.view(torch.int32)
 
     def field(items: Tensor, name: str) -> Tensor:
@@ -81,23 +103,25 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec) -> Batch:
         return items.as_strided((len(raw), *shape), (items.stride(0), *strides), items.storage_offset() + offset)
 
     first, last = field(integers, "first"), field(integers, "last").unsqueeze(1)
-    action, prev = field(floats, "action"), field(floats, "prev_action")
+    action, prev = field(floats, "action")[:, :steps], field(floats, "prev_action")
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
     prev_action.scatter_(1, first.long().view(-1, 1, 1).expand(-1, 1, prev.shape[1]), prev.unsqueeze(1))
-    t = _times(spec.observations, raw.device)
+    t = _times(steps + 1, raw.device)
     observation_valid = (first.unsqueeze(1) <= t) & (t <= last)
     step_valid = observation_valid[:, :-1] & (t[:, :-1] < last)
     ends = (t[:, :-1] == last - 1) & (field(integers, "terminated").unsqueeze(1) > 0)
     return Batch(
-        observation=field(floats, "observation"),
+        observation=field(floats, "observation")[:, : steps + 1],
         prev_action=prev_action,
         action=action,
-        reward=field(floats, "reward"),
+        reward=field(floats, "reward")[:, :steps],
         terminated=ends.float(),
         state=field(floats, "state"),
-        missing=field(raw, "missing") > 0,
+        missing=field(raw, "missing")[:, : steps + 1] > 0,
+        privileged=field(floats, "privileged")[:, : steps + 1],
         observation_valid=observation_valid,
         step_valid=step_valid,
         burned_in=first == 0,
         importance=importance,
+        cut=spec.steps - steps,
     )

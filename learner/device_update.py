@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rmc.common.window import WindowSpec
-from rmc.learner.batch import view_batch
+from rmc.learner.batch import update_steps, view_batch
 from rmc.learner.update import JointUpdate, UpdateResult
 
 T = TypeVar("T")
@@ -102,11 +102,12 @@ class DeviceUpdate:
 
     def __init__(self, update: JointUpdate, spec: WindowSpec, batch_size: int) -> None:
         device = update.agent.log_alpha.device
-        self._update, self._spec = update, spec
+        self._update, self._spec, self._steps = update, spec, spec.steps
         self._raw = torch.zeros(batch_size, spec.dtype.itemsize, dtype=torch.uint8, device=device)
         self._importance, self._beta = torch.ones(batch_size, device=device), torch.zeros((), device=device)
         self._work, self._copy, self.in_flight = self._once, self._copy_now, 0
-        if device.type == "cuda":
+        self._cuts = device.type != "cuda"  # a graph has one shape
+        if not self._cuts:
             self._work = CudaGraph(self._once, update.generator)
             self._copy = CopiesAhead([self._raw, self._importance])
             self.in_flight = 1
@@ -119,6 +120,8 @@ class DeviceUpdate:
         """
         self._copy([raw, importance])
         self._beta.fill_(beta)
+        if self._cuts:
+            self._steps = update_steps(raw, self._spec, number)
         result = self._work()
         self._update.update_ema(number)
         return [result]
@@ -135,7 +138,7 @@ class DeviceUpdate:
         """Nothing is to be ended."""
 
     def _once(self) -> UpdateResult:
-        return self._update(view_batch(self._raw, self._importance, self._spec), self._beta)
+        return self._update(view_batch(self._raw, self._importance, self._spec, self._steps), self._beta)
 
     def _copy_now(self, tensors: list[Tensor]) -> None:
         for place, tensor in zip((self._raw, self._importance), tensors, strict=True):

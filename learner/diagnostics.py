@@ -1,7 +1,8 @@
 """What the learner measures of itself; nothing here changes what is learnt.
 
-Shapes: B batch, T = L_b + L_t steps of a window, O observation, A action, H hidden; n steps from an episode's start to
-a window's end. Staleness is R2D2's (Kapturowski et al., 2019, section 3), with Q of the actions that were taken.
+Shapes: B batch, T = L_b + L_t steps of a window, O observation, A action, H hidden, M flags of what is missing,
+P privileged; n steps from an episode's start to a window's end.
+Staleness is R2D2's (Kapturowski et al., 2019, section 3), with Q of the actions that were taken.
 """
 
 from typing import Literal, NamedTuple
@@ -11,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rmc.common.agent import Agent
+from rmc.common.agent import Agent, critic_input
 from rmc.common.window import BoolArray, Rows, WindowSpec
 from rmc.learner import losses
 
@@ -58,9 +59,11 @@ def value_metrics(trace: Trace, beta: Tensor) -> dict[str, Tensor]:
 
 
 def unexplained_change(predicted: Tensor, change: Tensor, m: Tensor) -> Tensor:
-    """(O,): mean size of the error over that of the change itself, by observation dimension; 1 is "no change"."""
-    weight = m.unsqueeze(-1)
-    return relative_l1_error(*((weight * x.abs()).sum((0, 1)) for x in (predicted - change, change)))
+    """(O,): mean size of the error over that of the change itself, by observation dimension; 1 is "no change".
+
+    ``m`` (B, T, M), M is 1 or O.
+    """
+    return relative_l1_error(*((m * x.abs()).sum((0, 1)) for x in (predicted - change, change)))
 
 
 def relative_l1_error(error: Tensor, size: Tensor) -> Tensor:
@@ -96,7 +99,8 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
     the stored state (…_stored) or are those trained, after the burn-in (…_burned, where there is one).
     """
     device = agent.log_alpha.device
-    observation, missing, action = (torch.from_numpy(x).to(device).unsqueeze(0) for x in _joined(episode, spec))
+    joined = (torch.from_numpy(x).to(device).unsqueeze(0) for x in _joined(episode, spec))
+    observation, missing, privileged, action = joined
     stored = torch.from_numpy(episode["state"][-1:].copy()).to(device)
     o, start = agent.normalizer(observation, missing), torch.zeros_like(stored)
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
@@ -106,8 +110,9 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
     replayed, recomputed = (
         agent.unroll(o[:, window], missing[:, window], prev_action[:, window], state)[0] for state in (stored, before)
     )
+    beside = agent.normalized_privileged(privileged[:, window])
     q, q_replayed = (
-        agent.critic(agent.features(remembered), action[:, -spec.steps :]).mean(0).squeeze(0)
+        agent.critic(critic_input(agent.features(remembered), beside), action[:, -spec.steps :]).mean(0).squeeze(0)
         for remembered in (recomputed, replayed)
     )
     gap = (q_replayed - q).abs() / q.abs().max().clamp(min=1e-8)
@@ -131,15 +136,17 @@ def _distance(replayed: Tensor, recomputed: Tensor) -> Tensor:
     return distance
 
 
-def _joined(episode: Rows, spec: WindowSpec) -> tuple[Floats, BoolArray, Floats]:
-    """Observations (n + 1, O), those missing (n + 1,), and actions (n, A) of overlapping windows in order."""
+def _joined(episode: Rows, spec: WindowSpec) -> tuple[Floats, BoolArray, Floats, Floats]:
+    """Observations (n + 1, O), what is missing (n + 1, M), privileged (n + 1, P), and actions (n, A) of overlapping
+    windows in order.
+    """
     starts = episode["episode_step"] - spec.burn_in  # of the window's first slot, in steps of the episode
     n = int(starts[-1] + episode["last"][-1])
-    observation = np.zeros((n + 1, spec.obs_dim), np.float32)
-    missing, action = np.zeros(n + 1, np.bool_), np.zeros((n, spec.action_dim), np.float32)
+    observation, privileged = (np.zeros((n + 1, size), np.float32) for size in (spec.obs_dim, spec.privileged))
+    missing, action = np.zeros((n + 1, spec.missing), np.bool_), np.zeros((n, spec.action_dim), np.float32)
     for row, start in zip(episode, starts.tolist(), strict=True):
         first, last = int(row["first"]), int(row["last"])
-        observation[start + first : start + last + 1] = row["observation"][first : last + 1]
-        missing[start + first : start + last + 1] = row["missing"][first : last + 1]
+        for name, joined in (("observation", observation), ("missing", missing), ("privileged", privileged)):
+            joined[start + first : start + last + 1] = row[name][first : last + 1]
         action[start + first : start + last] = row["action"][first:last]
-    return observation, missing, action
+    return observation, missing, privileged, action

@@ -155,7 +155,7 @@ def _bits(x: Tensor) -> NDArray[np.uint16]:
 def _fill(
     agent: Agent, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """(B, T, O), (B, T), (B, T, A), (B, S) -> (B, T, O), (B, S)."""
+    """(B, T, O), (B, T, M), (B, T, A), (B, S) -> (B, T, O), (B, S)."""
     assert agent.next_frame is not None
     gru, size = agent.memory.gru, agent.config.hidden
     nets = agent.next_frame.net, agent.memory.embed
@@ -172,7 +172,7 @@ def _fill(
         np.empty((len(state), 4 * size), np.float32),
     )
     seen, before = observation.clone(), state[:, size:]
-    by_step = (x.transpose(0, 1) for x in (seen, missing.unsqueeze(2), prev_action.to(BF16), inputs))
+    by_step = (x.transpose(0, 1) for x in (seen, missing, prev_action.to(BF16), inputs))
     for o, was_missing, a, x in zip(*by_step, strict=True):
         second = _layer(_layer(torch.cat([low, before.to(BF16), a], 1), w1, b1), w2, b2)
         expected = torch.mm(second, w3).float().add_(b3).add_(before)

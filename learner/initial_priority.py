@@ -9,12 +9,12 @@ import safetensors.torch
 import torch
 from numpy.typing import NDArray
 
-from rmc.common.agent import Agent, squashed_sample
+from rmc.common.agent import Agent, critic_input, squashed_sample
 from rmc.common.agent_config import AgentConfig
 from rmc.common.errors import MessageError
 from rmc.common.window import Rows, WindowSpec
 from rmc.learner import losses
-from rmc.learner.batch import view_batch
+from rmc.learner.batch import longest_steps, view_batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.unroll import impute, unroll
 
@@ -25,7 +25,7 @@ class InitialPriority:
     def __init__(self, spec: WindowSpec, agent: AgentConfig, update: UpdateConfig, seed: int) -> None:
         """``seed`` is for the actions that the policy is asked for. ``load`` must come first."""
         self._spec, self._update = spec, update
-        self._agent = Agent(spec.obs_dim, spec.action_dim, agent)
+        self._agent = Agent(spec.obs_dim, spec.action_dim, agent, spec.missing, spec.privileged)
         self._generator = torch.Generator().manual_seed(seed)
 
     def load(self, blob: bytes) -> None:
@@ -40,17 +40,18 @@ class InitialPriority:
         """Windows (B,) -> (B,)."""
         agent, steps = self._agent, slice(self._spec.burn_in, None)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
-        batch = view_batch(raw, torch.ones(len(rows)), self._spec)
+        batch = view_batch(raw, torch.ones(len(rows)), self._spec, longest_steps(raw, self._spec))
         m = batch.step_valid[:, steps].float()
         o = agent.normalizer(batch.observation, batch.missing)
         o = impute(agent, o, batch, self._spec.burn_in)
         z = agent.features(unroll(agent.memory, o, batch, self._spec.burn_in))
+        read = critic_input(z, agent.normalized_privileged(batch.privileged[:, steps]))
         mean, log_std = agent.policy(z)
         pi, log_pi = squashed_sample(mean, log_std, torch.randn(mean.shape, generator=self._generator))
-        next_value = losses.soft_value(agent.critic(z[:, 1:], pi[:, 1:]), agent.log_alpha.exp(), log_pi[:, 1:])
+        next_value = losses.soft_value(agent.critic(read[:, 1:], pi[:, 1:]), agent.log_alpha.exp(), log_pi[:, 1:])
         y = losses.td_target(
             batch.reward[:, steps], self._update.gamma, batch.terminated[:, steps], next_value, m, self._update.n_step
         )
-        td_error = (agent.critic(z[:, :-1], batch.action[:, steps]) - y).abs().mean(0)
+        td_error = (agent.critic(read[:, :-1], batch.action[:, steps]) - y).abs().mean(0)
         priority: NDArray[np.float32] = losses.priority(td_error, self._update.eta, m).numpy()
         return priority

@@ -80,7 +80,7 @@ class Learner:
         self.device, self._header = torch.device(device), header
         self.updates = self.env_steps = self.last_checkpoint = self._checkpoint_steps = 0
         self.finished = self._fenced = self._diverged = self._evaluation_due = False
-        self._observed_before = ObservationStatistics.none(spec.obs_dim)  # by the run that this one began with
+        self._observed_before = ObservationStatistics.none(spec)  # by the run that this one began with
         self._waiting = ""
         self._largest_reward = 0.0  # that was learnt from, as it was scaled
         self._look_at = 0.0  # when to ask next whether Redis still has the weights
@@ -88,7 +88,7 @@ class Learner:
         self._save_at, self._checkpoint_error = 0.0, ""
         torch.set_flush_denormal(True)  # into which Adam's moments of idle units decay: 13 % slower on a CPU
         torch.manual_seed(seed)  # the networks' initial weights
-        self.agent = Agent(spec.obs_dim, spec.action_dim, agent)
+        self.agent = Agent(spec.obs_dim, spec.action_dim, agent, spec.missing, spec.privileged)
         if agent.gate_init == "chrono":
             self.agent.memory.start_gates(spec.steps)
         self.agent.to(self.device)
@@ -229,8 +229,8 @@ class Learner:
     def _freeze_statistics(self) -> None:
         if self.agent.config.normalize_observations and self.env_steps > 0:
             statistics = self.replay.statistics() + self._observed_before
-            total, square = torch.from_numpy(statistics.total), torch.from_numpy(statistics.total_square)
-            self.agent.normalizer.freeze(statistics.count, total.to(self.device), square.to(self.device))
+            sums = (statistics.count, statistics.total, statistics.total_square)
+            self.agent.freeze_statistics(*(torch.from_numpy(numbers).to(self.device) for numbers in sums))
 
     def checkpoint(self) -> bool:
         """Save, broadcast, and ask for an evaluation of what was saved; ``step`` asks again if Redis is away.
@@ -271,7 +271,7 @@ class Learner:
             "time": time.time(),
             "threads": self._threads.chosen,
         }
-        if self._observed_before.count:
+        if self._observed_before.count.any():
             progress["observed_before"] = self._observed_before.to_json()
         files = {
             STATE: state.getvalue(),

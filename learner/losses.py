@@ -1,6 +1,7 @@
 """The losses of RMC, one function per equation, and nothing else.
 
-Shapes: B batch, T trained steps (L_t), O observation, A action, H hidden. All tensors float32.
+Shapes: B batch, T trained steps (L_t), O observation, A action, H hidden, M flags of what is missing: 1 or O.
+All tensors float32.
 Equations are numbered as in the paper; its s_t is h_t here.
 Notation: h_t memory, a_t action, r_t reward, d_t true termination, m_t mask (1 = real trained step),
 sg stop-gradient. Every loss is a masked mean, sum(m * x) / sum(m); what is minimised is their plain sum.
@@ -93,14 +94,19 @@ def temperature_loss(log_alpha: Tensor, log_pi: Tensor, target_entropy: float, m
 def grounding_loss(
     predicted: Tensor, observation: Tensor, predicted_reward: Tensor, r: Tensor, seen: Tensor, m: Tensor
 ) -> Tensor:
-    """L1 of o_{t+1} (mean over O) where ``seen``: not missing, nor o_t unless that was filled; plus L1 of r_t."""
-    error = masked_mean((predicted - observation).abs().mean(-1), m * seen)
-    return error + masked_mean((predicted_reward - r).abs(), m)
+    """L1 of o_{t+1} (mean over O) where ``seen`` (B, T, M): not missing, nor o_t unless that was filled; and of r_t."""
+    return _observation_error(predicted, observation, seen, m) + masked_mean((predicted_reward - r).abs(), m)
 
 
 def fill_loss(expected: Tensor, observation: Tensor, seen: Tensor, m: Tensor) -> Tensor:
-    """L1 of o_{t+1} (mean over O) that is to fill a missing frame, where ``seen``: it was not missing."""
-    return masked_mean((expected - observation).abs().mean(-1), m * seen)
+    """L1 of o_{t+1} (mean over O) that is to fill what is missing, where ``seen``: it was not missing."""
+    return _observation_error(expected, observation, seen, m)
+
+
+def _observation_error(expected: Tensor, observation: Tensor, seen: Tensor, m: Tensor) -> Tensor:
+    """L1 of (B, T, O), mean over what is ``seen`` (B, T, M)."""
+    by_flag = (expected - observation).abs().reshape(*seen.shape, -1).mean(-1)
+    return masked_mean(by_flag, m.unsqueeze(-1) * seen)
 
 
 def priority(td_error: Tensor, eta: float, m: Tensor) -> Tensor:

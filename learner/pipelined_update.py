@@ -5,6 +5,7 @@ numbers are those of the halves one after the other. Weights and moments of both
 whoever reads them calls ``drain`` first. Shapes: B batch.
 """
 
+import math
 import mmap
 import os
 import signal
@@ -25,7 +26,7 @@ from torch import Tensor
 from rmc.common.errors import RmcError
 from rmc.common.process.parent_death import exit_with_parent
 from rmc.common.window import WindowSpec
-from rmc.learner.batch import Batch, view_batch
+from rmc.learner.batch import Batch, update_steps, view_batch
 from rmc.learner.config import MODEL_PROCESS
 from rmc.learner.optimizers import begin_moments
 from rmc.learner.update import (
@@ -52,9 +53,17 @@ class Slot:
     model: ModelPass
     norm: Tensor  # of the model's gradient
 
-    def write(self, model: ModelPass, norm: Tensor) -> None:
-        """Put the model's half in."""
-        for place, tensor in zip(self.model[:-1], model[:-1], strict=True):
+    def model_of(self, batch: Batch) -> ModelPass:
+        """Where the model's half of that batch lies: the beginning of each place, where the batch is cut."""
+        whole = self.model
+        z, next_z, curiosity, hidden = (
+            _cut(place, batch.cut) for place in (whole.z, whole.next_z, whole.curiosity, whole.hidden)
+        )
+        return whole._replace(z=z, next_z=next_z, curiosity=curiosity, hidden=hidden)
+
+    def write(self, batch: Batch, model: ModelPass, norm: Tensor) -> None:
+        """Put the model's half of that batch in."""
+        for place, tensor in zip(self.model_of(batch)[:-1], model[:-1], strict=True):
             place.copy_(tensor.detach())
         for name, value in model.metrics.items():
             self.model.metrics[name].copy_(value)
@@ -132,15 +141,16 @@ class PipelinedUpdate:
     def _finish(self) -> UpdateResult:
         self._await_answer()
         (slot, number), update = self._pending.popleft(), self._update
-        batch = self._batch(slot)
-        loss_values, value = update.value_pass(batch, slot.model, slot.beta)
+        batch = self._batch(slot, number)
+        model = slot.model_of(batch)
+        loss_values, value = update.value_pass(batch, model, slot.beta)
         norm = update.step(update.optimizers[1:], loss_values.values())
         update.follow_value()
         update.update_ema(number, VALUE_PARTS)
-        return update.result(batch, slot.model, value, torch.hypot(norm, slot.norm))
+        return update.result(batch, model, value, torch.hypot(norm, slot.norm))
 
-    def _batch(self, slot: Slot) -> Batch:
-        return view_batch(slot.raw, slot.importance, self._spec)
+    def _batch(self, slot: Slot, number: int) -> Batch:
+        return view_batch(slot.raw, slot.importance, self._spec, update_steps(slot.raw, self._spec, number))
 
     def _start(self) -> None:
         """Share what both halves touch, and fork; before it, nothing may have run on several threads."""
@@ -201,12 +211,18 @@ class PipelinedUpdate:
         os._exit(0)
 
     def _model_half(self, slot: Slot, number: int) -> None:
-        update = self._update
-        loss_values, model = update.model_pass(self._batch(slot))
+        update, batch = self._update, self._batch(slot, number)
+        loss_values, model = update.model_pass(batch)
         norm = update.step(update.optimizers[:1], loss_values.values())
         update.follow_model(model)
         update.update_ema(number, MODEL_PARTS)
-        slot.write(model, norm)
+        slot.write(batch, model, norm)
+
+
+def _cut(place: Tensor, steps: int) -> Tensor:
+    """(B, T, ...) -> (B, T - steps, ...), the beginning of its memory."""
+    shape = (place.shape[0], place.shape[1] - steps, *place.shape[2:])
+    return place.view(-1)[: math.prod(shape)].view(shape)
 
 
 def _share(tensors: Iterable[Tensor]) -> None:

@@ -69,7 +69,7 @@ class ReplayClient:
         body = batch_size * (spec.dtype.itemsize + 8)  # rows, then float64 weights
         tensors = [torch.empty(body, dtype=torch.uint8, pin_memory=pinned) for _ in range(AHEAD)]
         self._buffers = [tensor.numpy().data for tensor in tensors]
-        self._answer = memoryview(bytearray(max(EPISODE_BYTES, spec.dtype.itemsize, 2 * 8 * spec.obs_dim)))
+        self._answer = memoryview(bytearray(max(EPISODE_BYTES, spec.dtype.itemsize, 3 * 8 * spec.statistics)))
         self._turn = self._in_flight = 0
         self._last = EMPTY_SAMPLE
         self._may_share = not pinned and hasattr(os, "memfd_create")
@@ -163,14 +163,17 @@ class ReplayClient:
 
     def statistics(self) -> ObservationStatistics:
         """Running observation statistics; a count of 0 while the server is away."""
-        obs_dim = self._spec.obs_dim
+        counts = self._spec.counts
         try:
-            meta, body = self._ask(Kind.STATISTICS, {})
-            total, square = np.frombuffer(body, np.float64).reshape(2, obs_dim).copy()
-            return ObservationStatistics(_count(meta, "count"), total, square)
+            body = self._ask(Kind.STATISTICS, {})[1]
+            count = np.frombuffer(body, np.int64, counts).copy()
+            if (count < 0).any():
+                raise MessageError("count", f"{count.min()}, want a whole number from 0 on")
+            sums = np.frombuffer(body, np.float64, offset=8 * counts).reshape(2, self._spec.statistics).copy()
+            return ObservationStatistics(count, *sums)
         except AWAY as error:
             log.warning("no statistics from the replay server: %s", error)
-            return ObservationStatistics(0, np.zeros(obs_dim), np.zeros(obs_dim))
+            return ObservationStatistics.none(self._spec)
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode from its start to that one; None where not all, or the server, are there."""

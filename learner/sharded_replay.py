@@ -128,8 +128,7 @@ class ShardedReplay:
     def statistics(self) -> ObservationStatistics:
         """The sums over all shards."""
         statistics = [stock.replay.statistics() for stock in self._stocks]
-        totals, squares = (np.sum([getattr(x, name) for x in statistics], axis=0) for name in ("total", "total_square"))
-        return ObservationStatistics(sum(x.count for x in statistics), totals, squares)
+        return sum(statistics[1:], statistics[0])
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode, which are all in one shard."""

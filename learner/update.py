@@ -1,6 +1,7 @@
 """The joint update: all losses from the parameters as they stood, one backward, one step.
 
-Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, H hidden, S state, Z head input.
+Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, H hidden, S state, Z head input, M flags of
+what is missing, P privileged.
 Nothing here waits for the host: no ``.item()``, no branch on a tensor, static shapes.
 """
 
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from rmc.common.agent import Agent, MemoryOutput, Prediction, squashed_sample
+from rmc.common.agent import Agent, MemoryOutput, Prediction, critic_input, squashed_sample
 from rmc.learner import losses
 from rmc.learner.batch import Batch
 from rmc.learner.config import UpdateConfig
@@ -141,19 +142,21 @@ class JointUpdate:
         """Intuition: one policy sample for every step serves both the target and the policy loss."""
         agent, c, z = self.agent, self.config, model.z
         a, r, d, m = _trained(batch, self.burn_in)
+        privileged = agent.normalized_privileged(batch.privileged[:, self.burn_in :])
         alpha = agent.log_alpha.exp().detach()
         z_value, z_policy = (z if loss in TRAINS_MEMORY[c.scheme] else z.detach() for loss in ("value", "policy"))
         with self._autocast():
             mean, log_std = agent.policy(z_policy)
-            pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean))
+            pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean, batch.cut))
             with torch.no_grad():
-                next_q = self.target_critic(model.next_z, pi[:, 1:])
+                next_q = self.target_critic(critic_input(model.next_z, privileged[:, 1:]), pi[:, 1:])
                 next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:])
                 y = losses.td_target(r + beta * model.curiosity, c.gamma, d, next_value, m, c.n_step)
-            q = agent.critic(z_value[:, :-1], a)
+            q = agent.critic(critic_input(z_value[:, :-1], privileged[:, :-1]), a)
             frozen = {name: value.detach() for name, value in agent.critic.named_parameters()}
             z_actor = z_policy if c.policy_through_q else z.detach()
-            q_pi = functional_call(agent.critic, frozen, (z_actor[:, :-1], pi[:, :-1]))
+            read = critic_input(z_actor[:, :-1], privileged[:, :-1])
+            q_pi = functional_call(agent.critic, frozen, (read, pi[:, :-1]))
             q_pi = q_pi[0] if c.policy_q == "first" else q_pi.min(0).values
 
         log_pi, td_error = log_pi[:, :-1], (q.detach() - y).abs().mean(0)
@@ -200,7 +203,8 @@ class JointUpdate:
         predicted, both = now + prediction.observation_change.float(), seen[:, 1:] * seen[:, :-1]
         grounded = seen[:, 1:] if self.agent.config.impute_missing else both
         loss = losses.grounding_loss(predicted, after, prediction.reward.float(), r, grounded, m)
-        return {"grounding_loss": loss}, unexplained_change(predicted.detach() - now, after - now, m * both)
+        unexplained = unexplained_change(predicted.detach() - now, after - now, m.unsqueeze(-1) * both)
+        return {"grounding_loss": loss}, unexplained
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)
@@ -213,8 +217,10 @@ class JointUpdate:
     def _unroll_target(self, o: Tensor, batch: Batch) -> MemoryOutput:
         return unroll(self.target_memory, o, batch, self.burn_in)
 
-    def _noise_like(self, x: Tensor) -> Tensor:
-        return torch.randn(x.shape, generator=self.generator, device=x.device)
+    def _noise_like(self, x: Tensor, cut: int) -> Tensor:
+        """(B, T, A) standard normal. That of the steps cut off is drawn, too: cut or not, a batch teaches the same."""
+        rows, steps, size = x.shape
+        return torch.randn(rows, steps + cut, size, generator=self.generator, device=x.device)[:, :steps]
 
     def _scaled(self, i: Tensor, m: Tensor) -> tuple[Tensor, Tensor]:
         """Curiosity in units of its running standard deviation, where configured, and its running variance."""
@@ -326,5 +332,5 @@ def detached(values: Losses) -> Losses:
 
 
 def _seen(batch: Batch) -> Tensor:
-    """(B, T + 1) float: the observation is real, and not missing."""
-    return (batch.observation_valid & ~batch.missing).float()
+    """(B, T + 1, M) float: the observation is real, and not missing."""
+    return (batch.observation_valid.unsqueeze(-1) & ~batch.missing).float()

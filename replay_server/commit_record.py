@@ -1,8 +1,9 @@
 """The commit record: what one commit makes durable, in two alternating copies with a CRC.
 
 Copy = header "<QII" (sequence, length, crc32(sequence + length + payload)) + payload
-Payload = fixed counters | statistics total, square (O float64 each) | streams (n, 4) int64 | replay ratio, float64
-Rings of config format 1 end before the replay ratio.
+Payload = fixed counters | statistics total, square (D float64 each) | streams (n, 4) int64 | replay ratio, float64 |
+further counts of the statistics (C - 1 int64)
+Rings of config format 1 end before the replay ratio. D numbers have statistics, of C counts: see ``WindowSpec``.
 The copy with the larger valid sequence is the present state; a torn write only spoils the older one.
 """
 
@@ -36,7 +37,8 @@ class StreamPosition(NamedTuple):
 class Progress:
     """The replay's counters. Mutable: the server changes it, then commits it."""
 
-    obs_dim: int
+    statistics: int  # D
+    counts: int = 1  # C
     valid_from: int = 0  # the oldest serial that may be sampled
     next_serial: int = 0
     env_steps: int = 0  # inserted
@@ -48,15 +50,17 @@ class Progress:
     begun_env_steps: int = 0  # environment steps that were in before this ring began, empty
     begun_drawn_steps: int = 0  # and trained steps that were drawn, from all shards
     max_priority: float = 1.0  # the largest seen
-    observations: int = 0  # count of the statistics
-    total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (O,)
-    total_square: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (O,)
+    observations: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (C,), of the statistics
+    total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (D,)
+    total_square: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (D,)
     streams: dict[int, StreamPosition] = field(default_factory=dict)
     replay_ratio: float = 0.0  # that the limiter held since this ring began; 0 where nobody has said it
 
     def __post_init__(self) -> None:
         if not self.total.size:
-            self.total, self.total_square = np.zeros(self.obs_dim), np.zeros(self.obs_dim)
+            self.total, self.total_square = np.zeros(self.statistics), np.zeros(self.statistics)
+        if not self.observations.size:
+            self.observations = np.zeros(self.counts, np.int64)
 
     @property
     def windows(self) -> int:
@@ -75,11 +79,12 @@ class Progress:
         counters = _COUNTERS.pack(
             self.valid_from, self.next_serial, self.env_steps, self.drawn_steps, self.draws, self.replay_epoch,
             self.evicted_priorities, self.elsewhere_steps, self.begun_env_steps, self.begun_drawn_steps,
-            self.max_priority, self.observations, len(self.streams),
+            self.max_priority, int(self.observations[0]), len(self.streams),
         )  # fmt: skip
         rows = [(actor, at.id.epoch, at.id.seq, at.settled_steps) for actor, at in self.streams.items()]
         streams = np.array(rows, np.int64).tobytes()
-        return counters + self.total.tobytes() + self.total_square.tobytes() + streams + _RATIO.pack(self.replay_ratio)
+        sums, further = self.total.tobytes() + self.total_square.tobytes(), self.observations[1:].tobytes()
+        return counters + sums + streams + _RATIO.pack(self.replay_ratio) + further
 
     def publish(self) -> bytes:
         """The same for a bus and for files, with a CRC-32 in front."""
@@ -92,43 +97,47 @@ def is_whole(published: bytes) -> bool:
     return published[: _CRC.size] == _CRC.pack(zlib.crc32(published[_CRC.size :]))
 
 
-def decode_progress(payload: bytes, obs_dim: int) -> Progress:
+def decode_progress(payload: bytes, statistics: int, counts: int = 1) -> Progress:
     """The inverse of ``Progress.encode``, for bytes whose CRC was right."""
-    counters = _COUNTERS.unpack_from(payload)
-    sums = np.frombuffer(payload, np.float64, 2 * obs_dim, _COUNTERS.size).reshape(2, obs_dim).copy()
-    table = np.frombuffer(payload, np.int64, 4 * counters[-1], _COUNTERS.size + sums.nbytes).reshape(-1, 4)
+    *counters, observations, streams = _COUNTERS.unpack_from(payload)
+    sums = np.frombuffer(payload, np.float64, 2 * statistics, _COUNTERS.size).reshape(2, statistics).copy()
+    table = np.frombuffer(payload, np.int64, 4 * streams, _COUNTERS.size + sums.nbytes).reshape(-1, 4)
     positions = {actor: StreamPosition(EntryId(epoch, seq), steps) for actor, epoch, seq, steps in table.tolist()}
-    progress = Progress(obs_dim, *counters[:-1])
+    progress = Progress(statistics, counts, *counters)
     progress.total, progress.total_square, progress.streams = sums[0], sums[1], positions
     rest = payload[_COUNTERS.size + sums.nbytes + table.nbytes :]
-    progress.replay_ratio = _RATIO.unpack(rest)[0] if rest else 0.0
+    progress.replay_ratio = _RATIO.unpack_from(rest)[0] if rest else 0.0
+    further = np.frombuffer(rest[_RATIO.size :], np.int64)
+    progress.observations = np.concatenate([np.array([observations]), further])
     return progress
 
 
-def decode_published(published: bytes, obs_dim: int) -> Progress | None:
+def decode_published(published: bytes, statistics: int, counts: int = 1) -> Progress | None:
     """``Progress.publish`` as a bus has kept it; None where it is damaged or not of such observations."""
     payload = published[_CRC.size :]
     if not is_whole(published) or len(payload) < _COUNTERS.size:
         return None
     streams = _COUNTERS.unpack_from(payload)[-1]
-    size = _COUNTERS.size + 16 * obs_dim + streams * _STREAM_BYTES
-    if len(payload) not in (size, size + _RATIO.size):
+    size = _COUNTERS.size + 16 * statistics + streams * _STREAM_BYTES
+    without_ratio = [size] if counts == 1 else []
+    if len(payload) not in [*without_ratio, size + _RATIO.size + 8 * (counts - 1)]:
         return None
-    return decode_progress(payload, obs_dim)
+    return decode_progress(payload, statistics, counts)
 
 
-def record_bytes(obs_dim: int) -> int:
+def record_bytes(statistics: int, counts: int = 1) -> int:
     """Room for one copy, in whole pages. A ratio always fits: without it the size is never a multiple of 16."""
-    size = _HEADER.size + _COUNTERS.size + 16 * obs_dim + MAX_STREAMS * _STREAM_BYTES
+    further = _RATIO.size + 8 * (counts - 1) if counts > 1 else 0
+    size = _HEADER.size + _COUNTERS.size + 16 * statistics + further + MAX_STREAMS * _STREAM_BYTES
     return -(-size // 4096) * 4096
 
 
 class RecordPair:
-    """Both copies, in a mapped region of ``2 * record_bytes(obs_dim)`` bytes."""
+    """Both copies, in a mapped region of ``2 * record_bytes(statistics, counts)`` bytes."""
 
-    def __init__(self, region: NDArray[np.uint8], obs_dim: int) -> None:
-        self._obs_dim = obs_dim
-        half = record_bytes(obs_dim)
+    def __init__(self, region: NDArray[np.uint8], statistics: int, counts: int = 1) -> None:
+        self._statistics, self._counts = statistics, counts
+        half = record_bytes(statistics, counts)
         self._copies = [region[:half].data, region[half : 2 * half].data]
         self._sequence = 0
 
@@ -147,7 +156,7 @@ class RecordPair:
         if not copies:
             return None
         self._sequence, payload = max(copies)
-        return decode_progress(payload, self._obs_dim)
+        return decode_progress(payload, self._statistics, self._counts)
 
 
 def _read_copy(copy: memoryview) -> tuple[int, bytes | None]:

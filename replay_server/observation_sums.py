@@ -1,6 +1,6 @@
 """Sums over new observations, by which they are normalised, in one pass over the rows.
 
-Shapes: n rows, T + 1 observations, O observation, F floats of a row.
+Shapes: n rows, T + 1 observations, O observation, M flags of what is missing, P privileged, F floats of a row.
 """
 
 import numpy as np
@@ -18,29 +18,36 @@ def _add_up(
     missing: NDArray[np.uint8],
     new: NDArray[np.int32],
     last: NDArray[np.int32],
+    count: NDArray[np.int64],
     total: NDArray[np.float64],
     total_square: NDArray[np.float64],
-) -> int:
-    """(n, F) with observations from ``offset`` on, (n, T + 1), (n,), (n,), adds to (O,) twice; how many there were."""
-    count, size = 0, total.shape[0]
+) -> None:
+    """(n, F) with K numbers an observation from ``offset`` on, (n, T + 1, M), (n,), (n,), adds to (M,), (K,) twice."""
+    size, flags = total.shape[0], missing.shape[2]
     for row in range(floats.shape[0]):
         for t in range(last[row] - new[row] + 1, last[row] + 1):
-            if missing[row, t] == 0:
-                count += 1
-                start = offset + t * size
-                for o in range(size):
-                    value = np.float64(floats[row, start + o])
-                    total[o] += value
-                    total_square[o] += value * value
-    return count
+            start = offset + t * size
+            for flag in range(flags):
+                if missing[row, t, flag] != 0:
+                    continue
+                count[flag] += 1
+                for k in range(flag, flag + 1) if flags > 1 else range(size):
+                    value = np.float64(floats[row, start + k])
+                    total[k] += value
+                    total_square[k] += value * value
 
 
 def observation_sums(rows: Rows, spec: WindowSpec) -> ObservationStatistics:
-    """Over the observations that no earlier window carried and that are not missing; padding is never read."""
-    total, total_square = np.zeros(spec.obs_dim), np.zeros(spec.obs_dim)
-    assert spec.dtype.fields is not None
-    offset = spec.dtype.fields["observation"][1] // 4
-    floats = rows.view(np.float32).reshape(len(rows), spec.dtype.itemsize // 4)
+    """Over what no earlier window carried and what is not missing; padding is never read."""
+    parts = [("observation", spec.obs_dim, rows["missing"])]
+    if spec.privileged:
+        parts.append(("privileged", spec.privileged, np.zeros((len(rows), spec.observations, 1), np.uint8)))
     new, last = np.minimum(rows["new_observations"], rows["last"] + 1), rows["last"]
-    count = _add_up(floats, offset, rows["missing"], new, last, total, total_square)
-    return ObservationStatistics(count, total, total_square)
+    floats = rows.view(np.float32).reshape(len(rows), spec.dtype.itemsize // 4)
+    assert spec.dtype.fields is not None
+    sums = []
+    for name, size, missing in parts:
+        count, total, total_square = np.zeros(missing.shape[2], np.int64), np.zeros(size), np.zeros(size)
+        _add_up(floats, spec.dtype.fields[name][1] // 4, missing, new, last, count, total, total_square)
+        sums.append((count if spec.counts == 1 else np.broadcast_to(count, size), total, total_square))
+    return ObservationStatistics(*map(np.concatenate, zip(*sums, strict=True)))

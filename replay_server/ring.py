@@ -4,10 +4,12 @@ Every window has a serial; its slot is serial mod capacity. An append (a) commit
 rows about to be overwritten, (b) writes the rows, (c) commits ``next_serial`` with all other progress.
 Killed anywhere (kill -9 included), the file says exactly which windows are whole: what the process stored
 in the map outlives it in the page cache. A power cut may lose or tear what the kernel had not yet
-written to disk; that is not promised against. A slot without its serial then holds no window (``holds``).
+written to disk; that is not promised against. A slot without its serial then holds no window (``holds``), and a row
+that does not fit its checksum is never drawn (``gather``).
 """
 
 import errno
+import logging
 import os
 import shutil
 import struct
@@ -20,11 +22,14 @@ from numpy.typing import NDArray
 from rmc.common.errors import ConfigError
 from rmc.common.window import Rows, WindowSpec
 from rmc.replay_server.commit_record import Progress, RecordPair, record_bytes
-from rmc.replay_server.row_check import row_faults
+from rmc.replay_server.former_rows import former_fingerprints, former_row_bytes
+from rmc.replay_server.row_checksum import add_checksums, whole_rows
 
 _IDENTITY = struct.Struct("<8s16sQQ")  # magic, fingerprint, capacity, row bytes; then its CRC
 _IDENTITY_BYTES = 4096
 _MAGIC = b"RMCRING3"
+REWRITTEN_ROWS = 4096  # at once
+log = logging.getLogger(__name__)
 Slots = NDArray[np.int64]
 Serials = NDArray[np.int64]
 
@@ -40,13 +45,14 @@ class Ring:
         self.spec, self.capacity = spec, capacity
         if not path.exists():
             _create(path, spec, capacity)
-        _check_identity(path, spec, capacity)
+        if _check_identity(path, spec, capacity) in former_fingerprints(spec):
+            _rewrite(path, spec, capacity)
         start = _rows_start(spec)
         self._head = np.memmap(path, np.uint8, "r+", shape=(start,))
         self._map = np.memmap(path, np.dtype((np.void, spec.dtype.itemsize)), "r+", offset=start, shape=(capacity,))
         self._blocks = self._map.view(np.ndarray)  # whole rows, copied as such
         self.rows: Rows = self._blocks.view(spec.dtype)
-        self._records = RecordPair(self._head.view(np.ndarray)[_IDENTITY_BYTES:], spec.obs_dim)
+        self._records = _records(self._head, spec)
         self._written = 0
         progress = self._records.read()
         if progress is None:
@@ -54,12 +60,14 @@ class Ring:
         self.progress = progress
 
     def write(self, rows: Rows) -> Slots:
-        """Steps (a) and (b): stamp serials into (n,) writable rows and store them; not sampled before ``commit``.
+        """Steps (a) and (b): stamp serials and checksums into (n,) writable rows and store them; not sampled before
+        ``commit``.
 
         Returns the slots written. Of more rows than the ring holds only the last are stored.
         """
         serials = np.arange(self.progress.next_serial, self.progress.next_serial + len(rows))
         rows["serial"] = serials
+        add_checksums(rows[-self.capacity :])
         valid_from = min(self.progress.next_serial, self.progress.next_serial + len(rows) - self.capacity)
         if valid_from > self.progress.valid_from:
             self.progress.valid_from = valid_from
@@ -91,7 +99,7 @@ class Ring:
         np.take(self._blocks, slots, out=out.view(self._blocks.dtype), mode="clip")  # clip: unbuffered
         serials = out["serial"]
         valid = (serials >= self.progress.valid_from) & (serials < self.progress.next_serial)
-        sound: NDArray[np.bool_] = valid & (serials % self.capacity == slots) & (row_faults(out, self.spec) == 0)
+        sound: NDArray[np.bool_] = valid & (serials % self.capacity == slots) & whole_rows(out)
         return sound
 
     def forget(self, slots: Slots) -> None:
@@ -109,7 +117,11 @@ class Ring:
 
 
 def _rows_start(spec: WindowSpec) -> int:
-    return _IDENTITY_BYTES + 2 * record_bytes(spec.obs_dim)
+    return _IDENTITY_BYTES + 2 * record_bytes(spec.statistics, spec.counts)
+
+
+def _records(head: NDArray[np.uint8], spec: WindowSpec) -> RecordPair:
+    return RecordPair(head.view(np.ndarray)[_IDENTITY_BYTES:], spec.statistics, spec.counts)
 
 
 def file_bytes(spec: WindowSpec, capacity: int) -> int:
@@ -125,13 +137,43 @@ def _identity(spec: WindowSpec, capacity: int) -> bytes:
 def _create(path: Path, spec: WindowSpec, capacity: int) -> None:
     """Under another name first, so that a ring is there whole or not at all."""
     temporary = path.with_suffix(".tmp")
-    start = _rows_start(spec)
     reserve(temporary, file_bytes(spec, capacity), capacity)
-    head = np.memmap(temporary, np.uint8, "r+", shape=(start,))
+    _write_head(temporary, spec, capacity, Progress(spec.statistics, spec.counts))
+    temporary.rename(path)
+
+
+def _write_head(path: Path, spec: WindowSpec, capacity: int, progress: Progress) -> None:
+    head = np.memmap(path, np.uint8, "r+", shape=(_rows_start(spec),))
     identity = _identity(spec, capacity)
     head[: len(identity)] = np.frombuffer(identity, np.uint8)
-    RecordPair(head[_IDENTITY_BYTES:].view(np.ndarray), spec.obs_dim).write(Progress(spec.obs_dim))
+    _records(head, spec).write(progress)
+
+
+def _rewrite(path: Path, spec: WindowSpec, capacity: int) -> None:
+    """In place of a ring of an older format the same with this format's rows; killed amid it, the old one is there.
+
+    Old rows begin as ours do: what lies behind them is the checksum, and up to it zeros.
+    """
+    size, start = former_row_bytes(spec), _rows_start(spec)
+    head = np.memmap(path, np.uint8, "r", shape=(start,))
+    progress = _records(head, spec).read()
+    if progress is None:
+        raise _unusable(path, "both commit records are damaged")
+    old = np.memmap(path, np.uint8, "r", offset=start, shape=(capacity, size))
+    temporary = path.with_suffix(".tmp")
+    try:
+        reserve(temporary, file_bytes(spec, capacity), capacity)
+    except ConfigError as error:
+        raise ConfigError("--run-dir", str(path), f"it is of an older version, and rewriting it {error.fix}") from None
+    _write_head(temporary, spec, capacity, progress)
+    new = np.memmap(temporary, np.uint8, "r+", offset=start, shape=(capacity, spec.dtype.itemsize))  # padding, too
+    for begin in range(0, capacity, REWRITTEN_ROWS):
+        part = new[begin : begin + REWRITTEN_ROWS]
+        part[:, :size] = old[begin : begin + REWRITTEN_ROWS]
+        add_checksums(part.view(np.ndarray).view(spec.dtype)[:, 0])
+    new.flush()
     temporary.rename(path)
+    log.info("replay ring: rewritten for this version, %d windows", progress.windows)
 
 
 def reserve(path: Path, size: int, capacity: int) -> None:
@@ -152,22 +194,25 @@ def reserve(path: Path, size: int, capacity: int) -> None:
         os.close(handle)
 
 
-def _check_identity(path: Path, spec: WindowSpec, capacity: int) -> None:
+def _check_identity(path: Path, spec: WindowSpec, capacity: int) -> str:
+    """The fingerprint of its windows, this version's or an older one's. Raises ConfigError."""
     with path.open("rb") as file:
         raw = file.read(_IDENTITY.size + 4)
     if len(raw) < _IDENTITY.size + 4 or zlib.crc32(raw[:-4]) != struct.unpack("<I", raw[-4:])[0]:
         raise _unusable(path, "not a replay ring, or a damaged one")
-    magic, fingerprint, stored, _ = _IDENTITY.unpack(raw[:-4])
+    magic, fingerprint, stored, row_bytes = _IDENTITY.unpack(raw[:-4])
     if magic != _MAGIC:
         raise _unusable(path, "made by another version")
-    if fingerprint not in (spec.fingerprint.encode(), spec.former_fingerprint.encode()):
-        fix = f"its windows are of layout {fingerprint.decode()}, this run's of {spec.fingerprint}; use a new folder"
+    layout: str = fingerprint.decode()
+    if layout not in (spec.fingerprint, *former_fingerprints(spec)):
+        fix = f"its windows are of layout {layout}, this run's of {spec.fingerprint}; use a new folder"
         raise ConfigError("--run-dir", str(path), fix)
     if stored != capacity:
         fix = f"the ring in {path.parent} has {stored}; keep that or use a new --run-dir"
         raise ConfigError("--capacity", capacity, fix)
-    if path.stat().st_size != file_bytes(spec, capacity):
+    if path.stat().st_size != _rows_start(spec) + capacity * row_bytes:
         raise _unusable(path, "cut short")
+    return layout
 
 
 def _unusable(path: Path, fault: str) -> ConfigError:

@@ -1,4 +1,4 @@
-"""Judges rows as windows of this run: when they come in, and whenever they are drawn, for a disk may have changed them.
+"""Judges rows as windows of this run when they come in; from then on their checksums tell what a disk has changed.
 
 Shapes: n rows, W words of four bytes in a row, F of them floats that must be finite.
 """
@@ -12,7 +12,7 @@ from rmc.common.compiled import compiled
 from rmc.common.window import Rows, WindowSpec
 
 INTEGERS = ("first", "last", "new_steps", "new_observations", "episode_step", "env")
-FLOATS = ("initial_priority", "observation", "action", "prev_action", "reward", "state")  # they lie side by side
+FLOATS = ("initial_priority", "observation", "action", "prev_action", "reward", "state", "privileged")  # side by side
 FAULTS = (
     "",
     "first is neither 0 nor burn_in",

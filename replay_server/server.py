@@ -98,7 +98,7 @@ class ReplayServer:
 
     def _read_published(self) -> Progress | None:
         published = self.bus.progress(self.name)
-        newest = decode_published(published, self.spec.obs_dim) if published else None
+        newest = decode_published(published, self.spec.statistics, self.spec.counts) if published else None
         if published and newest is None:
             log.warning("%s: the counters that were published are damaged; going on from the ring's", self.name)
         return newest
@@ -299,7 +299,8 @@ class ReplayServer:
     def statistics(self) -> ObservationStatistics:
         """Running sums over all observations inserted so far."""
         progress = self._store.ring.progress
-        return ObservationStatistics(progress.observations, progress.total.copy(), progress.total_square.copy())
+        count, total, total_square = progress.observations, progress.total, progress.total_square
+        return ObservationStatistics(count.copy(), total.copy(), total_square.copy())
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode from its start to that one; None where not all are there."""

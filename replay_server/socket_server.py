@@ -195,8 +195,8 @@ class SocketServer:
             self._priorities(frame)
         elif frame.kind is Kind.STATISTICS:
             statistics = self._server.statistics()
-            sums = (statistics.total.data.cast("B"), statistics.total_square.data.cast("B"))
-            connection.send(Kind.STATISTICS, {"count": statistics.count}, sums)
+            sums = (statistics.count, statistics.total, statistics.total_square)
+            connection.send(Kind.STATISTICS, {}, tuple(numbers.data.cast("B") for numbers in sums))
         elif frame.kind is Kind.SHARE:
             self._share(connection, frame.meta.get("batch_size"))
         elif frame.kind is Kind.EPISODE:

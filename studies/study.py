@@ -58,7 +58,10 @@ class Play:
 
 
 class Study:
-    """Agents by their names in the results, each as words of ``rmc`` with ENV for the environment."""
+    """Agents by their names in the results, each as words of ``rmc``.
+
+    ENV is the environment there, ``RUN:AGENT`` the folder of another agent's run of the same environment and seed.
+    """
 
     def __init__(self, name: str, agents: Mapping[str, str], small: Scale = SMALL, full: Scale = FULL) -> None:
         self.name, self.agents = name, {agent: shlex.split(words) for agent, words in agents.items()}
@@ -79,13 +82,16 @@ class Study:
         return [self._job(scale, *one) for one in product(seeds or size.seeds, envs or size.envs, agents)]
 
     def _job(self, scale: str, seed: int, env: str, agent: str) -> Job:
-        words = [env if word == "ENV" else word for word in self.agents[agent]]
+        own = {"ENV": env} | {f"RUN:{one}": str(self._folder(scale, seed, env, one)) for one in self.agents}
+        words = [own.get(word, word) for word in self.agents[agent]]
         tiny = {"train": TINY_OURS, "baseline": TINY}[words[0]].split() if scale == "smoke" else []
-        plain = "".join(letter if letter.isalnum() else "-" for letter in f"{env} {agent} {seed}")
-        folder = RUNS / f"{self.name}-{scale}" / plain
         size = ["--total-steps", str(self.scales[scale].steps), "--seed", str(seed)]
         words = [*words[:2], *tiny, *words[2:], *size]  # what the study says of it wins
-        return Job(folder, tuple(words), seed, {"agent": agent, "env": env})
+        return Job(self._folder(scale, seed, env, agent), tuple(words), seed, {"agent": agent, "env": env})
+
+    def _folder(self, scale: str, seed: int, env: str, agent: str) -> Path:
+        plain = "".join(letter if letter.isalnum() else "-" for letter in f"{env} {agent} {seed}")
+        return RUNS / f"{self.name}-{scale}" / plain
 
     def of_steps(self, steps: int) -> str:
         """The name of a scale that is small, but of so many environment steps."""

@@ -2,7 +2,7 @@
 
 Observations are (cue at the first step, else 0; 1 while the answer is asked for). In the answer phase a
 step's reward is cue x action. The cue is +1 or -1 with equal chance, so a policy that sees only the newest
-observation has an expected return of 0 at best; one that remembers reaches ``ANSWER_STEPS``.
+observation has an expected return of 0 at best; one that remembers reaches ``ANSWER_STEPS``. ``info["probe"]`` has it.
 """
 
 from typing import Any
@@ -29,12 +29,15 @@ class MemoryEnv(gym.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         self._cue = 1.0 if self.np_random.random() < 0.5 else -1.0
         self._step = 0
-        return self._observation(), {}
+        return self._observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         reward = self._cue * float(action[0]) if self._asked() else 0.0
         self._step += 1
-        return self._observation(), reward, self._step == self._delay + ANSWER_STEPS, False, {}
+        return self._observation(), reward, self._step == self._delay + ANSWER_STEPS, False, self._info()
+
+    def _info(self) -> dict[str, Any]:
+        return {"probe": {"cue": self._cue}}
 
     def _asked(self) -> bool:
         return self._step >= self._delay

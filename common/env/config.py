@@ -19,6 +19,13 @@ class EnvConfig:
     """Gymnasium id, like HalfCheetah-v5 or dm_control/walker-walk-v0, or module:EnvId-v0 for your own."""
     flicker: float = 0.0
     """Probability that an observation is replaced by zeros, at every step, the reset included."""
+    drop_sensors: float = 0.0
+    """Probability that a dimension of the observation is zero, each on its own, at every step, the reset included."""
+    flicker_burst: float = 1.0
+    """Mean steps in a row for which a flickered frame or a dropped sensor is missing; as many are missing as without.
+    Below 1 / (1 - probability), which is chance alone, it changes nothing."""
+    delay: int = 0
+    """Steps after which an observation reaches the agent; until then it sees the episode's first one."""
     hide: Literal["nothing", "velocities", "positions"] = "nothing"
     """Part of a MuJoCo observation that is left out."""
     noise: float = 0.0

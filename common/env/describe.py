@@ -3,6 +3,7 @@
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.layout import EnvLayout, Part
@@ -22,8 +23,11 @@ def shown(env: gym.Env[Any, Any], hide: str) -> slice | None:
     return {"nothing": None, "velocities": slice(0, positions), "positions": slice(positions, None)}[hide]
 
 
-def layout_of(env: Env, config: EnvConfig) -> EnvLayout:
-    """Of an environment as ``make_env`` gives it."""
+def layout_of(env: Env, config: EnvConfig, info: dict[str, Any], privileged: bool) -> EnvLayout:
+    """Of an environment as ``make_env`` gives it; ``info`` is that of its first reset.
+
+    Without ``privileged`` what it gives under that name is its own affair.
+    """
     observations, actions = env.get_wrapper_attr("raw_observation_space"), env.get_wrapper_attr("raw_action_space")
     low, high = bounds(actions)
     limit = env.spec.max_episode_steps if env.spec else None
@@ -34,6 +38,8 @@ def layout_of(env: Env, config: EnvConfig) -> EnvLayout:
         tuple(low.tolist()),
         tuple(high.tolist()),
         None if limit is None else -(-limit // config.action_repeat),
+        np.size(info.get("missing", False)),
+        np.size(info.get("privileged", ())) if privileged else 0,
     )
 
 

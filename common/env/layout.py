@@ -44,6 +44,10 @@ class EnvLayout:
     """(A,) highest values in the environment's units."""
     time_limit: int | None
     """Longest episode in the agent's steps; None where there is no limit."""
+    missing: int = 1
+    """M, flags of what is missing: 1 for a whole frame, or O where they come one by one."""
+    privileged: int = 0
+    """P, numbers that critics alone read."""
 
     def __post_init__(self) -> None:
         for name, parts in (("observations", self.observations), ("actions", self.actions)):
@@ -56,6 +60,10 @@ class EnvLayout:
             raise ConfigError("layout action_low", self.action_low, "must lie below action_high; restore the file")
         if self.frames < 1:
             raise ConfigError("layout frames", self.frames, "must be 1 or more; restore the file")
+        if self.missing not in (1, self.obs_dim):
+            raise ConfigError("layout missing", self.missing, f"must be 1 or {self.obs_dim}; restore the file")
+        if self.privileged < 0:
+            raise ConfigError("layout privileged", self.privileged, "must be 0 or more; restore the file")
 
     @property
     def obs_dim(self) -> int:

@@ -26,28 +26,33 @@ from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.env.describe import layout_of, shown, structure
 from rmc.common.env.faults import RAISED, call_env, describe_error, one_line
 from rmc.common.env.layout import EnvLayout
+from rmc.common.env.missing import DropSensors, Flicker
+from rmc.common.env.privileged import Privileged
 from rmc.common.env.process_state import ApartCall
 from rmc.common.env.spaces import space_fault
 from rmc.common.env.watched_env import WatchedEnv
-from rmc.common.env.wrappers import Env, Flicker, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
+from rmc.common.env.wrappers import Delay, Env, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
 from rmc.common.errors import ConfigError, EnvFault, RmcError
 from rmc.common.extra import how_to_install
 
 log = logging.getLogger(__name__)
-DM_CONTROL = "dm_control/"
+DM_CONTROL, PYBULLET = "dm_control/", "pybullet/"
 SHORTEST_TIMEOUT = 0.1  # seconds
 
 
-def make_env(config: EnvConfig, render: bool = False) -> Env:
+def make_env(config: EnvConfig, render: bool = False, privileged: bool = False) -> Env:
     """One environment: (O,) float32 observations, (A,) float32 actions in [-1, 1], cut off at its time limit.
 
-    With ``render``, its ``render()`` gives frames. Raises ConfigError where it is unknown, or its spaces are none that
+    With ``render``, its ``render()`` gives frames; with ``privileged``, its ``info["privileged"]`` what critics alone
+    read, where there is anything. Raises ConfigError where it is unknown, or its spaces are none that
     the agent can learn in; EnvFault where it raises.
     """
     _check_options(config)
     _redirect_mujoco_warnings()
     with ApartCall(config.id, "make", config.env_timeout):
         spec = find_spec(config.id)
+        limit = config.time_limit or spec.max_episode_steps
+        _check_delay(config, limit)
         env: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
     fault = call_env("spaces", lambda: space_fault(env.observation_space, env.action_space))
     if fault is None and config.hide != "nothing" and not structure(env):
@@ -56,7 +61,7 @@ def make_env(config: EnvConfig, render: bool = False) -> Env:
         with suppress(*RAISED):
             env.close()
         raise ConfigError("ENV", config.id, fault)
-    return _as_seen(env, config, config.time_limit or spec.max_episode_steps)
+    return _as_seen(env, config, limit, privileged)
 
 
 def _make(registered: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
@@ -98,10 +103,12 @@ def entry_point(spec: EnvSpec) -> Callable[..., Any]:
     return gym.envs.registration.load_env_creator(factory) if isinstance(factory, str) else factory
 
 
-def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> Env:
+def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None, privileged: bool) -> Env:
     """The environment as the agent sees it: each wrapper only where it does something."""
     seen_part = shown(env, config.hide)
     wrapped: Env = RescaledEnv(env)  # the innermost: it judges what the user's own code gives
+    if privileged:
+        wrapped = Privileged(wrapped, take_observation=_is_disturbed(config))
     if limit:
         wrapped = gym.wrappers.TimeLimit(wrapped, limit)
     if config.action_repeat > 1:
@@ -110,9 +117,18 @@ def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> En
         wrapped = ObservationSlice(wrapped, seen_part)
     if config.noise:
         wrapped = Noise(wrapped, config.noise)
+    if config.delay:  # after the noise, which is the sensors' own, and before what is lost on the way
+        wrapped = Delay(wrapped, config.delay)
+    if config.drop_sensors:
+        wrapped = DropSensors(wrapped, config.drop_sensors, config.flicker_burst)
     if config.flicker:
-        wrapped = Flicker(wrapped, config.flicker)
+        wrapped = Flicker(wrapped, config.flicker, config.flicker_burst)
     return FrameStack(wrapped, config.frame_stack) if config.frame_stack > 1 else wrapped
+
+
+def _is_disturbed(config: EnvConfig) -> bool:
+    """Whether a wrapper takes something from the observation."""
+    return bool(config.flicker or config.drop_sensors or config.delay or config.noise or config.hide != "nothing")
 
 
 def checked_reset(env: Env, seed: int | None) -> tuple[Floats, dict[str, Any]]:
@@ -139,40 +155,64 @@ def further_env(make_env: Callable[[], Env], what: str) -> Env:
         raise RmcError(f"{what} cannot be made beside the others ({describe_error(error)}); {fix}") from error
 
 
-def first_env(config: EnvConfig) -> Env:
+def first_env(config: EnvConfig, privileged: bool = False) -> Env:
     """``make_env`` where nothing runs yet: whatever the environment raises is the user's to mend, as a ConfigError."""
     try:
-        return make_env(config)
+        return make_env(config, privileged=privileged)
     except EnvFault as fault:
         raise ConfigError("ENV", config.id, str(fault)) from None
 
 
-def env_layout(config: EnvConfig) -> EnvLayout:
-    """What the agent reads and gives there. Makes an environment; raises ConfigError."""
-    env = first_env(config)
-    layout = layout_of(env, config)
-    env.close()
+def env_layout(config: EnvConfig, privileged: bool = False) -> EnvLayout:
+    """What the agent reads and gives there. Makes and resets an environment; raises ConfigError.
+
+    With ``privileged`` also where it gives nothing that critics alone could read.
+    """
+    env = first_env(config, privileged)
+    try:
+        info = env.reset(seed=0)[1]
+        layout = layout_of(env, config, info, privileged)
+    except EnvFault as fault:
+        raise ConfigError("ENV", config.id, str(fault)) from None
+    finally:
+        env.close()
+    if privileged and not layout.privileged:
+        fix = f'{config.id} gives no info["privileged"], and nothing is taken from what is seen; leave the option'
+        raise ConfigError("--privileged-critic", True, fix)
     return layout
 
 
 def _check_options(config: EnvConfig) -> None:
-    if not 0.0 <= config.flicker <= 1.0:
-        raise ConfigError("--flicker", config.flicker, "a probability from 0 to 1")
+    for name in ("flicker", "drop_sensors"):
+        if not 0.0 <= getattr(config, name) <= 1.0:
+            raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), "a probability from 0 to 1")
+    if not 1.0 <= config.flicker_burst < math.inf:
+        raise ConfigError("--flicker-burst", config.flicker_burst, "a mean number of steps, 1 or more")
     if not 0.0 <= config.noise < math.inf:
         raise ConfigError("--noise", config.noise, "a standard deviation, 0 or more")
     if not config.env_timeout >= SHORTEST_TIMEOUT:
         raise ConfigError("--env-timeout", config.env_timeout, f"{SHORTEST_TIMEOUT} seconds or more")
-    for name, least in (("frame_stack", 1), ("action_repeat", 1), ("time_limit", 0)):
+    for name, least in (("frame_stack", 1), ("action_repeat", 1), ("time_limit", 0), ("delay", 0)):
         if getattr(config, name) < least:
             raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), f"{least} or more")
     check_kwargs(config.env_kwargs)
+
+
+def _check_delay(config: EnvConfig, limit: int | None) -> None:
+    """Raises ConfigError where an episode ends before anything but its first observation is seen."""
+    steps = -(-limit // config.action_repeat) if limit else None
+    if steps and config.delay >= steps:
+        raise ConfigError("--delay", config.delay, f"an episode ends after {steps} steps; take fewer")
 
 
 def find_spec(env_id: str) -> EnvSpec:
     """What gymnasium knows of an environment; imports its module. Raises ConfigError."""
     module, _, name = env_id.rpartition(":")
     if name.startswith(DM_CONTROL):
-        _import_dm_control(env_id)
+        _import_tasks(env_id, ("shimmy", "dm_control"), "shimmy", how_to_install("dm-control"))
+    elif name.startswith(PYBULLET):
+        how = f"with Python 3.11: {how_to_install('pybullet')}"
+        _import_tasks(env_id, ("pybullet", "pybullet_envs_gymnasium"), "rmc.common.env.pybullet_tasks", how)
     elif module:
         _import_users_module(env_id, module)
     try:
@@ -204,13 +244,13 @@ def _import_users_module(env_id: str, module: str) -> None:
         raise ConfigError("ENV", env_id, f"{module} cannot be imported: {describe_error(error)}") from None
 
 
-def _import_dm_control(env_id: str) -> None:
-    """Its tasks are gymnasium's once shimmy is imported."""
-    if importlib.util.find_spec("dm_control") is None or importlib.util.find_spec("shimmy") is None:
-        raise ConfigError("ENV", env_id, f"shimmy or dm_control is missing; {how_to_install('dm-control')}")
+def _import_tasks(env_id: str, packages: tuple[str, str], module: str, how: str) -> None:
+    """Tasks are gymnasium's once a module is imported. Raises ConfigError where a package is missing."""
+    if not all(map(importlib.util.find_spec, packages)):
+        raise ConfigError("ENV", env_id, f"{' or '.join(packages)} is missing; {how}")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it looks for a screen, and says so where there is none
-        importlib.import_module("shimmy")
+        warnings.simplefilter("ignore")  # shimmy looks for a screen, and says so where there is none
+        importlib.import_module(module)
 
 
 def _redirect_mujoco_warnings() -> None:

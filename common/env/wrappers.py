@@ -30,11 +30,13 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
     """Observations as (O,) float32; actions in [-1, 1], stretched over the environment's own bounds, in its own shapes.
 
     The one judgement of what a user's environment gives: raises EnvFault where it is not what gymnasium asks for.
-    ``info["missing"]`` says that a frame is missing; ``info["blank"]``, its old name, is understood with one warning.
+    ``info["missing"]`` says that a frame is missing, or in an array of O which of its numbers are, from the first reset
+    on; ``info["blank"]``, its old name, is understood with one warning.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
+        self._by_number: bool | None = None  # whether ``info["missing"]`` is an array, once that is known
         self.raw_observation_space, self.raw_action_space = env.observation_space, env.action_space
         low, high = bounds(env.action_space)
         self._scale = ActionScale(low, high)
@@ -45,13 +47,13 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         result = call_env("reset", partial(self.env.reset, seed=seed, options=options))
         observation, info = _values("reset", result, RESET)
-        return vector(self.raw_observation_space, observation), _own(info)
+        return vector(self.raw_observation_space, observation), self._own(info)
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         result = call_env("step", self.env.step, self._stretched(action))
         observation, reward, terminated, truncated, info = _values("step", result, STEP)
         ends = _bool("terminated", terminated), _bool("truncated", truncated)
-        return vector(self.raw_observation_space, observation), _number("reward", reward), *ends, _own(info)
+        return vector(self.raw_observation_space, observation), _number("reward", reward), *ends, self._own(info)
 
     def render(self) -> Any:
         return call_env("render", self.env.render)
@@ -62,6 +64,16 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
             call_env("close", self.env.close)
         except EnvFault as fault:
             _warn_once(f"{fault}; it is left as it is")
+
+    def _own(self, info: Any) -> dict[str, Any]:
+        own = _own(info, math.prod(self.observation_space.shape or ()))
+        is_array = isinstance(own.get("missing"), np.ndarray)
+        if self._by_number is None:
+            self._by_number = is_array
+        if is_array and not self._by_number:
+            fix = "return an array from the first reset on, or bools alone"
+            raise EnvFault(f'the environment\'s info["missing"] is an array, at its first reset it was none; {fix}')
+        return own
 
     def _stretched(self, action: Floats) -> Any:
         """(A,) in [-1, 1] -> an action of the environment's own space, which it may change as it likes."""
@@ -92,8 +104,21 @@ def _bool(name: str, value: Any) -> bool:
     return value if isinstance(value, bool) else bool(_number(name, value, "a bool"))
 
 
-def _own(info: Any) -> dict[str, Any]:
-    """A copy of ``info``, its missing frame as a bool, also under the name that it had in 0.1."""
+def _missing(value: Any, size: int) -> bool | NDArray[np.bool_]:
+    """A bool for the whole frame, or (O,) bools where there is one for each of its ``size`` numbers."""
+    if isinstance(value, bool):
+        return value
+    flags = array('info["missing"]', value, "a bool")
+    if flags.size == 1:
+        return bool(flags.item())
+    if flags.shape != (size,):
+        fix = f"return a bool, or an array of {size} bools"
+        raise EnvFault(f'the environment\'s info["missing"] has shape {flags.shape}; {fix}')
+    return flags.astype(np.bool_)
+
+
+def _own(info: Any, size: int) -> dict[str, Any]:
+    """A copy of ``info``, what is missing as a bool or (O,) bools, also under the name that it had in 0.1."""
     if not isinstance(info, dict):
         raise EnvFault(f"the environment's info is {reprlib.repr(info)}; return a dict, {{}} if it says nothing")
     own = info.copy()
@@ -103,7 +128,7 @@ def _own(info: Any) -> dict[str, Any]:
         )
         own["missing"] = own.pop("blank")
     if "missing" in own:
-        own["missing"] = _bool('info["missing"]', own["missing"])
+        own["missing"] = _missing(own["missing"], size)
     return own
 
 
@@ -123,11 +148,15 @@ class ObservationSlice(gym.Wrapper[Floats, Floats, Floats, Floats]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
-        return observation[self._shown], info
+        return observation[self._shown], self._cut(info)
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation[self._shown], float(reward), terminated, truncated, info
+        return observation[self._shown], float(reward), terminated, truncated, self._cut(info)
+
+    def _cut(self, info: dict[str, Any]) -> dict[str, Any]:
+        flags = info.get("missing")
+        return info | {"missing": flags[self._shown]} if isinstance(flags, np.ndarray) else info
 
 
 class CorruptObservation(gym.Wrapper[Floats, Floats, Floats, Floats]):
@@ -163,22 +192,34 @@ class Noise(CorruptObservation):
         super().__init__(env)
         self._deviation = deviation
 
-    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:  # noqa: ARG002 (Flicker says so in it)
+    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:  # noqa: ARG002 (others say so in it)
         return observation + self._deviation * self._rng.standard_normal(observation.shape, np.float32)
 
 
-class Flicker(CorruptObservation):
-    """Whole observations become zeros, independently with probability p; ``info["missing"]`` says which."""
+class Delay(gym.Wrapper[Floats, Floats, Floats, Floats]):
+    """The observation of some steps ago, and whether it was missing; until then the episode's first one.
 
-    stream = 0xF11C
+    Rewards, ends and what else ``info`` says are of now.
+    """
 
-    def __init__(self, env: Env, probability: float) -> None:
+    def __init__(self, env: Env, steps: int) -> None:
         super().__init__(env)
-        self._probability = probability
+        self._past: deque[tuple[Floats, Any]] = deque(maxlen=steps + 1)
 
-    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
-        info["missing"] = bool(self._rng.random() < self._probability)
-        return np.zeros_like(observation) if info["missing"] else observation
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._past.extend([(observation, info.get("missing", False))] * (self._past.maxlen or 1))
+        return self._oldest(info)
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._past.append((observation, info.get("missing", False)))
+        observation, info = self._oldest(info)
+        return observation, float(reward), terminated, truncated, info
+
+    def _oldest(self, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
+        observation, missing = self._past[0]
+        return observation, info | {"missing": missing}
 
 
 class FrameStack(gym.Wrapper[Floats, Floats, Floats, Floats]):

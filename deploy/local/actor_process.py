@@ -1,6 +1,7 @@
 """The processes that play environments: actors and the evaluator."""
 
 import os
+from functools import partial
 
 import torch
 
@@ -26,9 +27,8 @@ def run_actor(place: RunConnection, index: int) -> None:
     wait_for_room(process.bus, f"actor-{index}", process.stop)
     torch.set_num_threads(1)
     spec, priority_fn = config.window_spec(), initial_priority(config, index)
-    actor = Actor(
-        index, config.seed, process.make_env, spec, config.agent, config.actor, process.bus, priority_fn=priority_fn
-    )
+    make_env = partial(process.make_env, config.agent.privileged_critic)
+    actor = Actor(index, config.seed, make_env, spec, config.agent, config.actor, process.bus, priority_fn=priority_fn)
     run_role(actor, process.bus, process.stop, idle_seconds=ACTOR_IDLE_SECONDS)
 
 
@@ -46,5 +46,6 @@ def run_evaluator(place: RunConnection) -> None:
     wait_for_room(process.bus, "evaluator", process.stop)
     torch.set_num_threads(1)
     os.nice(EVALUATOR_NICENESS)
-    evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, process.bus)
+    missing = config.layout.missing
+    evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, process.bus, missing=missing)
     run_role(evaluator, process.bus, process.stop, idle_seconds=EVALUATOR_IDLE_SECONDS)

@@ -58,7 +58,7 @@ class Lockstep:
             Actor(
                 index,
                 config.seed,
-                lambda: make_env(config.env),
+                lambda: make_env(config.env, privileged=config.agent.privileged_critic),
                 spec,
                 config.agent,
                 config.actor,
@@ -76,7 +76,8 @@ class Lockstep:
 
     def _evaluator(self, config: RunConfig, clock: Callable[[], float]) -> Evaluator:
         uncut = replace(config.evaluator, evaluation_seconds=0.0)  # no clock decides this, either
-        return Evaluator(config.seed, lambda: make_env(config.env), config.agent, uncut, self.bus, clock)
+        missing = config.layout.missing
+        return Evaluator(config.seed, lambda: make_env(config.env), config.agent, uncut, self.bus, clock, missing)
 
     @property
     def roles(self) -> list[Role]:

@@ -70,9 +70,9 @@ class Process:
             if not waits.wait(f"run {run} to be registered in that Redis"):
                 raise ConfigError("--run", run, "no run of this name is registered in that Redis; start it first")
 
-    def make_env(self) -> Env:
-        """A new environment of the run. Raises ConfigError where it has other sizes than the launcher's."""
-        env = make_env(self.config.env)
+    def make_env(self, privileged: bool = False) -> Env:
+        """A new environment of the run, as ``make_env``. Raises ConfigError where its sizes are not the launcher's."""
+        env = make_env(self.config.env, privileged=privileged)
         check_sizes(self.config.env.id, self.config.sizes(), env_sizes(env))
         return env
 

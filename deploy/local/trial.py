@@ -143,9 +143,18 @@ def _name(words: list[str], commands: dict[str, tuple[str, ...]]) -> str:
 
 
 def _memory(process: psutil.Process) -> int:
-    """Where it can be told, pages that several processes map count in parts."""
+    """The most until now: what an update takes for a moment counts. Pages that several map count in parts on Linux."""
     full = process.memory_full_info()
-    return int(getattr(full, "pss", full.rss))
+    return int(getattr(full, "pss", full.rss)) + max(0, _peak_bytes(process.pid) - int(full.rss))
+
+
+def _peak_bytes(pid: int) -> int:
+    """The largest resident size of a process so far; 0 where the system does not tell."""
+    with suppress(OSError):
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) << 10
+    return 0
 
 
 def _checkpoint_bytes(folder: RunFolder) -> int:

@@ -66,11 +66,12 @@ class RunConfig:
     @cached_property
     def layout(self) -> EnvLayout:
         """What the agent reads and gives. Makes an environment once; raises ConfigError."""
-        return env_layout(self.env)
+        return env_layout(self.env, self.agent.privileged_critic)
 
     def window_spec(self) -> WindowSpec:
         """The window that every role of the run speaks. Makes an environment once; raises ConfigError."""
-        obs_dim, action_dim, time_limit = self.layout.obs_dim, self.layout.action_dim, self.layout.time_limit
+        layout = self.layout
+        obs_dim, action_dim, time_limit = layout.obs_dim, layout.action_dim, layout.time_limit
         burn_in, train, strategy = self.window.burn_in, self.window.trained_steps, self.actor.state_strategy
         if strategy == "episode":
             if time_limit is None:
@@ -79,13 +80,22 @@ class RunConfig:
                 )
             train = time_limit
         state = self.agent.state_size(obs_dim)
-        spec = WindowSpec(obs_dim, action_dim, state, burn_in if strategy == "burn-in" else 0, train)
-        if 4 * spec.observations * (obs_dim + action_dim + 1) > LARGEST_WINDOW:
-            name = "--time-limit" if strategy == "episode" else "--trained-steps"
-            raise ConfigError(
-                name, train, f"a window would have more than {LARGEST_WINDOW >> 20} MiB; take fewer steps"
-            )
+        burn_in = burn_in if strategy == "burn-in" else 0
+        spec = WindowSpec(obs_dim, action_dim, state, burn_in, train, layout.missing, layout.privileged)
+        self._check_window(spec)
         return spec
+
+    def _check_window(self, spec: WindowSpec) -> None:
+        """Raises ConfigError where a window is larger than a message may be."""
+        most = LARGEST_WINDOW // (4 * (spec.statistics + spec.action_dim + 1) + spec.missing) - 1 - spec.burn_in
+        if spec.train <= most:
+            return
+        fault, repeat = f"a window would have more than {LARGEST_WINDOW >> 20} MiB", self.env.action_repeat
+        if most < 1:
+            raise ConfigError("--burn-in", spec.burn_in, f"{fault}; take fewer steps, or smaller observations")
+        if self.actor.state_strategy == "episode":
+            raise ConfigError("--time-limit", spec.train * repeat, f"{fault}; take at most {most * repeat}")
+        raise ConfigError("--trained-steps", spec.train, f"{fault}; take at most {most}")
 
     def policy_header(self) -> PolicyHeader:
         """What the files of this run's policies say about themselves, before any step. Raises ConfigError."""
@@ -95,7 +105,8 @@ class RunConfig:
         """What a run's networks and windows were made for, in words. Raises ConfigError."""
         spec = self.window_spec()
         whole = {"steps an episode": spec.train} if self.actor.state_strategy == "episode" else {}
-        return {"observations": spec.obs_dim, "actions": spec.action_dim, **whole}
+        privileged = {"privileged numbers": spec.privileged} if spec.privileged else {}
+        return {"observations": spec.obs_dim, "actions": spec.action_dim, **privileged, **whole}
 
     def shards(self) -> list[Shard]:
         """The replay servers."""

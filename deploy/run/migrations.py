@@ -19,7 +19,13 @@ def _to_2(raw: Raw) -> None:
     _rename(raw, "update", policy_average="policy_ema_updates")
 
 
-MIGRATIONS: list[Callable[[Raw], None]] = [_to_2]  # the first is from format 1 to 2
+def _to_3(raw: Raw) -> None:
+    _add(raw, "env", drop_sensors=0.0, flicker_burst=1.0, delay=0)
+    _add(raw, "agent", gate_init="uniform", privileged_critic=False)
+    _add(raw, "layout", missing=1, privileged=0)  # in a policy's file; flags were one for a whole frame
+
+
+MIGRATIONS: list[Callable[[Raw], None]] = [_to_2, _to_3]  # the first is from format 1 to 2
 FORMAT = 1 + len(MIGRATIONS)
 
 

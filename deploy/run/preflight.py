@@ -18,9 +18,16 @@ DISK_RESERVE = 256 << 20  # bytes left for checkpoints, metrics and logs
 def check_machine(config: RunConfig, options: LaunchOptions) -> None:
     """Raises ConfigError where the device, the disk or the memory does not do. On Ray, the device is a node's."""
     if options.launcher != "ray":
-        check_device(options.device)
+        check_learner(config, options.device)
     runs = Path("runs") if options.run_dir is None else options.run_dir / "replay"
     check_ring_fits(config.window_spec(), config.replay.capacity, runs.resolve())
+
+
+def check_learner(config: RunConfig, device: str) -> None:
+    """Raises ConfigError where the device is not there, or a CPU's memory holds no batch."""
+    check_device(device)
+    if device == "cpu":
+        check_batch_fits(config)
 
 
 def check_ring_fits(spec: WindowSpec, capacity: int, folder: Path) -> None:
@@ -42,6 +49,22 @@ def check_ring_fits(spec: WindowSpec, capacity: int, folder: Path) -> None:
     if size > memory:
         fits = memory // spec.dtype.itemsize
         raise ConfigError("--capacity", capacity, f"takes {_gb(size)} of {_gb(memory)} memory; take at most {fits}")
+
+
+def check_batch_fits(config: RunConfig) -> None:
+    """Raises ConfigError where an update's batch is larger than the machine's memory, by the least that it can take.
+
+    That is its rows, and of each trained step what the way back reads: the GRU's gates and state in float32, and in
+    bfloat16 the hidden layers of world model, policy, and both critics of two actions. ``--dry-run`` measures the rest.
+    """
+    spec, heads, size = config.window_spec(), config.agent.heads, config.learner.batch_size
+    step = 4 * 5 * config.agent.hidden + 2 * 6 * sum(heads)
+    window, memory = spec.dtype.itemsize + spec.train * step, psutil.virtual_memory().total
+    if size * window <= memory:
+        return
+    fault = f"an update of windows of {spec.steps} steps takes {_gb(size * window)} of {_gb(memory)} memory"
+    fix = f"take at most {memory // window}" if memory >= window else "take fewer steps a window"
+    raise ConfigError("--batch-size", size, f"{fault}; {fix}")
 
 
 def _gb(size: int) -> str:

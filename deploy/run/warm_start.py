@@ -20,6 +20,7 @@ from rmc.common.agent_config import FILL_PARTS, POLICY_PARTS
 from rmc.common.checkpoint import POLICY, PROGRESS, STATE
 from rmc.common.errors import ConfigError
 from rmc.common.replay import ObservationStatistics
+from rmc.common.window import WindowSpec
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import RunConfig, option
 from rmc.deploy.run.folder import RunFolder
@@ -36,8 +37,8 @@ PARTS: dict[InitParts, tuple[str, ...]] = {  # the beginnings of what is taken
 }
 NOT_IN: dict[InitParts, set[str]] = {  # options of the networks that say nothing of these parts
     "all": {"initial_priority"},
-    "memory+world-model": {"initial_priority", "critic_norm"},
-    "policy": {"initial_priority", "critic_norm", "grounding"},
+    "memory+world-model": {"initial_priority", "critic_norm", "privileged_critic"},
+    "policy": {"initial_priority", "critic_norm", "privileged_critic", "grounding"},
 }
 
 
@@ -64,7 +65,7 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
         state = torch.load(io.BytesIO(files[STATE]), map_location="cpu", weights_only=True)
         _check_sizes(init_from, parts, source, config, state["agent"])
         update = _begun(config, state, parts, bool(source.update.policy_ema_updates))
-        progress = _progress(state["agent"], json.loads(files[PROGRESS])["env_steps"])
+        progress = _progress(config.window_spec(), update.agent, json.loads(files[PROGRESS])["env_steps"], parts)
     except (KeyError, RuntimeError, ValueError, EOFError, UnpicklingError) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         fix = f"its checkpoint {number} cannot be used ({reason}); use another"
@@ -92,6 +93,8 @@ def _check_sizes(
     init_from: str, parts: InitParts, source: RunConfig, config: RunConfig, agent: dict[str, Tensor]
 ) -> None:
     sizes = {"observations": len(agent["normalizer.mean"]), "actions": len(agent["policy.net.4.bias"]) // 2}
+    if parts == "all" and "privileged_normalizer.mean" in agent:
+        sizes["privileged numbers"] = len(agent["privileged_normalizer.mean"])
     for name, ours in config.sizes().items():
         if sizes.get(name, ours) != ours:
             raise ConfigError(OPTION, init_from, f"that run has {sizes[name]} {name}, this one has {ours}; use another")
@@ -106,7 +109,8 @@ def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages:
     """The run's own learner before its first update, with what is taken in its place."""
     spec, prefixes = config.window_spec(), PARTS[parts]
     torch.manual_seed(config.seed)  # the rest is as the learner would make it
-    update = make_update(Agent(spec.obs_dim, spec.action_dim, config.agent), spec.burn_in, config.update, config.seed)
+    agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
+    update = make_update(agent, spec.burn_in, config.update, config.seed)
     weights = {name: value for name, value in state["agent"].items() if name.startswith(prefixes)}
     update.agent.load_state_dict(update.agent.state_dict() | weights)
     update.target_memory.load_state_dict(update.agent.memory.state_dict())
@@ -118,9 +122,13 @@ def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages:
     return update
 
 
-def _progress(agent: dict[str, Tensor], env_steps: int) -> dict[str, Any]:
-    """Of a learner that has done nothing. What normalises its observations weighs as much as the steps it is from."""
-    mean, std = (agent[f"normalizer.{name}"].double() for name in ("mean", "std"))
-    total, total_square = mean * env_steps, (std.square() + mean.square()) * env_steps
-    before = ObservationStatistics(env_steps, total.numpy(), total_square.numpy())
+def _progress(spec: WindowSpec, agent: Agent, env_steps: int, parts: InitParts) -> dict[str, Any]:
+    """Of a learner that has done nothing. What normalises what it reads weighs as much as the steps it is from."""
+    normalizers = [agent.normalizer, *([agent.privileged_normalizer] if agent.privileged_normalizer else [])]
+    mean, std = (torch.cat([getattr(one, name) for one in normalizers]).double() for name in ("mean", "std"))
+    count = torch.full((spec.counts,), env_steps)
+    if parts != "all":
+        count[spec.obs_dim :] = 0  # what critics alone read is new
+    total, total_square = mean * count, (std.square() + mean.square()) * count
+    before = ObservationStatistics(count.numpy(), total.numpy(), total_square.numpy())
     return {"updates": 0, "env_steps": 0, "epoch": 0, "time": time.time(), "observed_before": before.to_json()}

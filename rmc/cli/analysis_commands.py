@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from rmc.analysis import curves, env_check, export, history, video, world_model_picture
+from rmc.analysis import curves, env_check, export, history, memory_picture, video, world_model_picture
 from rmc.analysis.evaluation import Progress, evaluate_policy
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
@@ -81,9 +81,11 @@ def _check_baselines(what: str) -> None:
 
 
 def _result_line(played: dict[str, Any]) -> str:
-    mean, deviation, flicker = (played[f"eval_{name}"] for name in ("return_mean", "return_std", "flicker"))
-    missing = f" with {flicker:.0%} of the frames missing" if flicker else ""
-    text = f"{played['env']}{missing}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
+    mean, deviation = played["eval_return_mean"], played["eval_return_std"]
+    shares = {"frames": played["eval_flicker"], "sensors": played["eval_drop_sensors"]}
+    missing = " and ".join(f"{share:.0%} of the {name}" for name, share in shares.items() if share)
+    env = f"{played['env']} with {missing} missing" if missing else played["env"]
+    text = f"{env}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
     return f"{text}{cut_note(played)}, after {played['env_steps']:,} environment steps"
 
 
@@ -102,8 +104,9 @@ def export_policy(command: run_options.Export) -> int:
 
 
 def inspect(command: run_options.Inspect) -> int:
-    """Write a picture of what the world model knows, and say it in numbers."""
-    insight, console = world_model_picture.inspect(command.run, command.checkpoint, command.out), terminal()
+    """Write a picture of what the world model knows and the memory holds, and say it in numbers."""
+    console = terminal(max(terminal().width, memory_picture.WIDTH))
+    insight, memory = world_model_picture.inspect(command.run, command.checkpoint, command.out)
     ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in insight.open_loop.items())
     hardest = np.argsort(-insight.unexplained)[: world_model_picture.SHOWN]
     worst = ", ".join(f"{i} ({insight.unexplained[i]:.0%})" for i in hardest)
@@ -112,6 +115,7 @@ def inspect(command: run_options.Inspect) -> int:
         soft_wrap=True,
     )
     console.print(f"worst dimensions one step ahead: {worst}")
+    console.print(*memory_picture.tables(memory), sep="\n")
     console.print(f"{command.out}", soft_wrap=True)
     return 0
 

@@ -14,7 +14,7 @@ from rmc.deploy.local.trial import TRAINED_SECONDS, run_trial, trial_config
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import this_machine
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.preflight import check_device
+from rmc.deploy.run.preflight import check_learner
 from rmc.deploy.run.validation import validate, validate_launch
 
 FITS, NOT, SLOWER = "ok", "DOES NOT FIT", "slower"
@@ -26,7 +26,7 @@ def dry_run(config: RunConfig, options: LaunchOptions, console: Console) -> int:
     validate_launch(config, options)
     if options.launcher != "local":
         raise ConfigError("--dry-run", True, f"a trial needs --launcher local, not {options.launcher}")
-    check_device(options.device)
+    check_learner(config, options.device)
     place_for_sockets()
     from rmc.analysis import evaluation  # imports torch
 

@@ -17,6 +17,7 @@ from rmc.deploy.ray import launcher, placement
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.memory_reach import reach_note
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine, cores
 from rmc.deploy.run.tracking import choose_tracking, keep_tracking
@@ -48,6 +49,8 @@ def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> int
     folder.unlock()
     launcher.launch(config, folder, options.device, options.all_cpus, options.tls)
     console.print(f"run folder {folder.path}", soft_wrap=True)
+    if note := reach_note(config):
+        console.print(note, soft_wrap=True)
     with signals_caught(hangup=False) as stop:
         attach.watch(folder, console, _passes_on(stop, folder))
     return say_end(folder, console)

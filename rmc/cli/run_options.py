@@ -50,7 +50,7 @@ class Export:
 
 @dataclass(frozen=True)
 class Inspect:
-    """Show what a run's world model knows: a picture of one episode, predicted against real."""
+    """Show what a run's world model knows and what its memory holds, as a picture and in numbers."""
 
     run: Positional[Path]
     """The run's folder."""

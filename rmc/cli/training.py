@@ -21,6 +21,7 @@ from rmc.deploy.redis.connect import connect
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.memory_reach import reach_note
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.state import STOPPED
@@ -58,6 +59,8 @@ def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, consol
     end: dict[str, Any] = {"state": "failed"}
     try:
         console.print(f"run folder {folder.path}", soft_wrap=True)
+        if note := reach_note(config):
+            console.print(note, soft_wrap=True)
         before = _before(config, folder, console)
         console.print(f"before training: {format_evaluation(before)}")
         tracker = start_tracker(folder)

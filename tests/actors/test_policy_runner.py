@@ -20,10 +20,10 @@ from tests.hostile import Touch, hostile_state
 OBS_DIM, ACTION_DIM, ENVS = 5, 3, 4
 
 
-def make_agent(config: AgentConfig, seed: int = 0) -> Agent:
+def make_agent(config: AgentConfig, seed: int = 0, missing: int = 1) -> Agent:
     """With statistics, scales and gates away from their defaults, so that each of them shows."""
     generator = torch.Generator().manual_seed(seed)
-    agent = Agent(OBS_DIM, ACTION_DIM, config)
+    agent = Agent(OBS_DIM, ACTION_DIM, config, missing)
     with torch.no_grad():
         for value in agent.parameters():
             value.copy_(torch.randn(value.shape, generator=generator) * 0.3)
@@ -33,8 +33,8 @@ def make_agent(config: AgentConfig, seed: int = 0) -> Agent:
     return agent
 
 
-def make_runner(agent: Agent, envs: int = ENVS) -> PolicyRunner:
-    runner = PolicyRunner(agent.obs_dim, agent.action_dim, agent.config, envs)
+def make_runner(agent: Agent, envs: int = ENVS, missing: int = 1) -> PolicyRunner:
+    runner = PolicyRunner(agent.obs_dim, agent.action_dim, agent.config, envs, missing)
     runner.load(save(agent.policy_weights()))
     return runner
 
@@ -48,7 +48,7 @@ def reference(
     hidden, last = state[:, : agent.config.hidden], state[:, agent.config.hidden :]
     if agent.config.impute_missing:
         expected = agent.next_frame(hidden, last, prev_action).clamp(-10.0, 10.0)
-        normalized = torch.where(missing.unsqueeze(1), expected, normalized)
+        normalized = torch.where(missing, expected, normalized)
     remembered = agent.memory(normalized.unsqueeze(1), missing.unsqueeze(1), prev_action.unsqueeze(1), hidden)
     mean, log_std = agent.policy(agent.features(remembered).squeeze(1))
     action = torch.tanh(mean) if noise is None else squashed_sample(mean, log_std, noise)[0]
@@ -56,6 +56,7 @@ def reference(
     return action, torch.cat([after, normalized], 1) if agent.config.impute_missing else after
 
 
+@pytest.mark.parametrize("flags", [1, OBS_DIM])
 @pytest.mark.parametrize(
     ("embedding", "layer_norm", "head_input", "normalize", "missing_flag", "impute_missing"),
     [
@@ -64,21 +65,22 @@ def reference(
     ],
 )
 def test_agrees_with_the_agent(
-    embedding: int, layer_norm: bool, head_input: HeadInput, normalize: bool, missing_flag: bool, impute_missing: bool
-) -> None:
+    embedding: int, layer_norm: bool, head_input: HeadInput, normalize: bool, missing_flag: bool, impute_missing: bool,
+    flags: int,
+) -> None:  # fmt: skip
     config = AgentConfig(
         hidden=12, embedding=embedding, heads=(9, 7), layer_norm=layer_norm, head_input=head_input,
         normalize_observations=normalize, missing_flag=missing_flag, impute_missing=impute_missing,
     )  # fmt: skip
-    agent = make_agent(config)
-    runner = make_runner(agent)
+    agent = make_agent(config, missing=flags)
+    runner = make_runner(agent, missing=flags)
     rng = np.random.default_rng(0)
     prev_action, hidden = runner.start()
     assert not prev_action.any()
     assert not hidden.any()
     for step in range(30):
         observation = rng.normal(0, 8, (ENVS, OBS_DIM)).astype(np.float32)  # some are clipped
-        missing = rng.random(ENVS) < 0.3
+        missing = rng.random((ENVS, flags)) < 0.3
         noise = None if step % 3 == 0 else rng.standard_normal((ENVS, ACTION_DIM), np.float32)
         given = [observation, prev_action, missing, hidden]
         kept = [x.copy() for x in given]
@@ -103,7 +105,7 @@ def test_both_ways_to_multiply_agree_with_the_agent(envs: int) -> None:
     observation, prev_action, hidden, noise = (
         rng.uniform(-1, 1, (envs, size)).astype(np.float32) for size in (OBS_DIM, ACTION_DIM, 256, ACTION_DIM)
     )
-    missing = np.zeros(envs, np.bool_)
+    missing = np.zeros((envs, 1), np.bool_)
     action, new_hidden = make_runner(agent, envs).act(observation, prev_action, missing, hidden, noise)
     tensors = [torch.from_numpy(x) for x in (observation, prev_action, missing, hidden, noise)]
     expected = reference(agent, *tensors)
@@ -118,7 +120,7 @@ def test_full_size_with_extreme_inputs() -> None:
     observation = np.array([[1e6] * OBS_DIM, [-1e6] * OBS_DIM], np.float32)
     hidden = np.full((2, 256), 1.0, np.float32)
     zeros, noise = np.zeros((2, ACTION_DIM), np.float32), np.ones((2, ACTION_DIM), np.float32)
-    action, new_hidden = runner.act(observation, zeros, np.zeros(2, np.bool_), hidden, noise)
+    action, new_hidden = runner.act(observation, zeros, np.zeros((2, 1), np.bool_), hidden, noise)
     assert np.isfinite(new_hidden).all()
     assert (np.abs(action) <= 1).all()
 
@@ -127,9 +129,9 @@ def test_an_action_is_the_callers_to_keep() -> None:
     agent = make_agent(AgentConfig(hidden=8, embedding=8, heads=(8, 8)))
     runner = make_runner(agent)
     zeros = (np.zeros((ENVS, OBS_DIM), np.float32), *runner.start())
-    first, _ = runner.act(zeros[0], zeros[1], np.zeros(ENVS, np.bool_), zeros[2], None)
+    first, _ = runner.act(zeros[0], zeros[1], np.zeros((ENVS, 1), np.bool_), zeros[2], None)
     kept = first.copy()
-    runner.act(zeros[0] + 1, zeros[1], np.zeros(ENVS, np.bool_), zeros[2], None)
+    runner.act(zeros[0] + 1, zeros[1], np.zeros((ENVS, 1), np.bool_), zeros[2], None)
     np.testing.assert_array_equal(first, kept)
 
 
@@ -158,7 +160,13 @@ def test_refused_weights_change_nothing(spoilt: str) -> None:
     config = AgentConfig(hidden=8, embedding=8, heads=(8, 8), layer_norm=True, normalize_observations=True)
     agent, others = make_agent(config), make_agent(config, seed=1).policy_weights()
     runner = make_runner(agent)
-    given = (np.ones((ENVS, OBS_DIM), np.float32), runner.start()[0], np.zeros(ENVS, np.bool_), runner.start()[1], None)
+    given = (
+        np.ones((ENVS, OBS_DIM), np.float32),
+        runner.start()[0],
+        np.zeros((ENVS, 1), np.bool_),
+        runner.start()[1],
+        None,
+    )
     before = runner.act(*given)[0]
     with pytest.raises(MessageError):
         runner.load(save(others | {spoilt: torch.zeros(3, 7)}))
@@ -173,7 +181,13 @@ def test_weights_that_are_not_finite_are_refused_by_name(name: str, value: float
     )  # fmt: skip
     agent = make_agent(config)
     runner = make_runner(agent)
-    given = (np.ones((ENVS, OBS_DIM), np.float32), runner.start()[0], np.zeros(ENVS, np.bool_), runner.start()[1], None)
+    given = (
+        np.ones((ENVS, OBS_DIM), np.float32),
+        runner.start()[0],
+        np.zeros((ENVS, 1), np.bool_),
+        runner.start()[1],
+        None,
+    )
     before = runner.act(*given)[0]
     weights = {key: tensor.clone() for key, tensor in agent.broadcast_weights().items()}
     name = next(key for key in weights if key.startswith(name))

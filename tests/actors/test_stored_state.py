@@ -30,9 +30,8 @@ AGENTS = {
     )
     for shape, embedding in (("embedded", 12), ("raw", 0))
 }
-AGENTS["filled"] = make_agent(
-    dataclasses.replace(AGENTS["embedded"].config, head_input="hidden+observation", impute_missing=True)
-)
+FILLING = dataclasses.replace(AGENTS["embedded"].config, head_input="hidden+observation", impute_missing=True)
+AGENTS["filled"], AGENTS["filled by number"] = (make_agent(FILLING, missing=flags) for flags in (1, OBS_DIM))
 
 
 def play(
@@ -43,7 +42,7 @@ def play(
     An observation ends in its environment and its time / 100, which is where in ``states``, time -> (N, H),
     the actor's own h is found.
     """
-    runner, envs = make_runner(AGENTS[agent_name], len(lengths)), len(lengths)
+    runner, envs = make_runner(AGENTS[agent_name], len(lengths), spec.missing), len(lengths)
     builder = WindowBuilder(spec, stride, envs, capacity=envs)
     rng = np.random.default_rng(seed)
     rows, states = [], []
@@ -59,7 +58,7 @@ def play(
         action, hidden = runner.act(*builder.now(), rng.standard_normal((envs, ACTION_DIM), np.float32))
         states.append(hidden[:, :HIDDEN].copy())
         done, terminates = np.array([time % length == 0 for length in lengths]), rng.random(envs) < 0.5
-        missing = rng.random(envs) < 0.2
+        missing = rng.random((envs, spec.missing)) < 0.2
         ended = builder.add(
             action, hidden, 1, np.zeros(envs, np.float32), observe(time), missing, done & terminates, done & ~terminates
         )
@@ -92,7 +91,8 @@ def test_the_learner_reproduces_the_actors_memory(
     agent_name: str, burn_in: int, train: int, data: st.DataObject, lengths: list[int], seed: int
 ) -> None:
     state = AGENTS[agent_name].config.state_size(OBS_DIM)
-    spec = WindowSpec(OBS_DIM, ACTION_DIM, state, burn_in, train)
+    flags = OBS_DIM if agent_name == "filled by number" else 1
+    spec = WindowSpec(OBS_DIM, ACTION_DIM, state, burn_in, train, flags)
     rows, states = play(agent_name, spec, data.draw(st.integers(1, train), label="stride"), lengths, seed)
     rows = rows[data.draw(st.permutations(range(len(rows))), label="batch positions")]
     batch, hidden = relearned(agent_name, rows, spec)

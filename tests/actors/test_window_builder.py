@@ -30,7 +30,8 @@ class Play:
 @st.composite
 def plays(draw: st.DrawFn) -> Play:
     train = draw(st.integers(1, 7))
-    spec = WindowSpec(OBS_DIM, ACTION_DIM, HIDDEN, burn_in=draw(st.integers(0, 6)), train=train)
+    missing, privileged = draw(st.sampled_from([1, OBS_DIM])), draw(st.integers(0, 2))
+    spec = WindowSpec(OBS_DIM, ACTION_DIM, HIDDEN, draw(st.integers(0, 6)), train, missing, privileged)
     length = st.integers(1, 4 * spec.steps)
     lengths = draw(st.lists(st.lists(length, min_size=1, max_size=4), min_size=1, max_size=3))
     return Play(spec, draw(st.integers(1, train)), lengths)
@@ -50,7 +51,7 @@ def run(play: Play, steps: int, cut: bool = True, store_states: bool = True) -> 
     builder = WindowBuilder(play.spec, play.stride, envs, capacity=envs, store_states=store_states)
     episode, k = np.zeros(envs, int), np.zeros(envs, int)
     for env in range(envs):
-        builder.begin(env, name(env, 0, 0), missing=_is_missing(0))
+        builder.begin(env, name(env, 0, 0), _missing(0, play.spec), _privileged(name(env, 0, 0), play.spec))
     taken = []
     for time in range(steps):
         now = builder.now()
@@ -63,12 +64,14 @@ def run(play: Play, steps: int, cut: bool = True, store_states: bool = True) -> 
         done = np.array([k[env] == play.length(env, episode[env]) for env in range(envs)])
         ended = builder.add(
             action=-here, state=then, update=time, reward=k.astype(np.float32), observation=then,
-            missing=k % 5 == 3, terminated=done & (k % 2 == 0), truncated=done & (k % 2 == 1),
+            missing=np.stack([_missing(one, play.spec) for one in k]), terminated=done & (k % 2 == 0),
+            truncated=done & (k % 2 == 1), privileged=_privileged(then, play.spec),
         )  # fmt: skip
         np.testing.assert_array_equal(ended, done)
         for env in np.flatnonzero(ended).tolist():
             episode[env], k[env] = episode[env] + 1, 0
-            builder.begin(env, name(env, episode[env], 0), missing=_is_missing(0))
+            first = name(env, episode[env], 0)
+            builder.begin(env, first, _missing(0, play.spec), _privileged(first, play.spec))
         taken.append(builder.take().copy())
     if cut:
         builder.cut()
@@ -77,8 +80,12 @@ def run(play: Play, steps: int, cut: bool = True, store_states: bool = True) -> 
     return join_rows(taken, play.spec), episode.tolist()
 
 
-def _is_missing(k: int) -> bool:
-    return k % 5 == 3
+def _missing(k: int, spec: WindowSpec) -> np.ndarray:
+    return (k + np.arange(spec.missing)) % 5 == 3
+
+
+def _privileged(named: np.ndarray, spec: WindowSpec) -> np.ndarray | None:
+    return 2 * named[..., : spec.privileged] if spec.privileged else None
 
 
 @given(plays(), st.integers(1, 80))
@@ -109,7 +116,9 @@ def test_windows(play: Play, steps: int) -> None:
         np.testing.assert_array_equal(row["observation"][first : last + 1], expected)
         np.testing.assert_array_equal(row["action"][first:last], -expected[:-1])
         np.testing.assert_array_equal(row["reward"][first:last], expected[1:, 2])
-        assert row["missing"][first : last + 1].tolist() == [_is_missing(k0 + i) for i in range(last - first + 1)]
+        missing = [_missing(k0 + i, spec).tolist() for i in range(last - first + 1)]
+        assert row["missing"][first : last + 1].tolist() == missing
+        np.testing.assert_array_equal(row["privileged"][first : last + 1], 2 * expected[:, : spec.privileged])
         # the stored state is the one before the first real observation
         np.testing.assert_array_equal(row["state"], expected[0] if k0 else 0 * expected[0])
         np.testing.assert_array_equal(row["prev_action"], -(expected[0] - [0, 0, 1]) if k0 else 0 * expected[0])
@@ -118,7 +127,13 @@ def test_windows(play: Play, steps: int) -> None:
         assert block == last_start.get((env, episode), -play.stride) + play.stride
         last_start[env, episode] = block
         # masks: everything outside is zero
-        for field, end in (("observation", last + 1), ("action", last), ("reward", last), ("missing", last + 1)):
+        for field, end in (
+            ("observation", last + 1),
+            ("action", last),
+            ("reward", last),
+            ("missing", last + 1),
+            ("privileged", last + 1),
+        ):
             assert not row[field][:first].any()
             assert not row[field][end:].any()
         # ends
@@ -177,8 +192,9 @@ def test_begin_forgets_an_open_window() -> None:
     spec = WindowSpec(OBS_DIM, ACTION_DIM, HIDDEN, burn_in=2, train=4)
     builder = WindowBuilder(spec, 4, envs=1, capacity=1)
     zeros, no = np.zeros((1, 3), np.float32), np.zeros(1, np.bool_)
+    seen = np.zeros((1, 1), np.bool_)
     builder.begin(0, name(0, 0, 0), missing=False)
-    builder.add(zeros, zeros, 0, zeros[:, 0], zeros, no, no, no)
+    builder.add(zeros, zeros, 0, zeros[:, 0], zeros, seen, no, no)
     assert builder.open
     builder.begin(0, name(0, 1, 0), missing=False)
     assert not builder.open

@@ -23,6 +23,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.starts import starts
 from tests import habits
 
@@ -99,7 +100,7 @@ def test_rmc_resume_goes_on_with_it(tmp_path, capsys):
     assert train(settings, folder, Console(width=400), stop) == 130
     (printed,) = re.findall(r"to go on:\n  rmc (.*)\n", capsys.readouterr().out)
     raw = json.loads((folder / "config.json").read_bytes())
-    assert raw.pop("format") == 2
+    assert raw.pop("format") == FORMAT
     del raw["env"]["env_kwargs"]
     (folder / "config.json").write_text(json.dumps(raw))
     (folder / "history.jsonl").unlink()
@@ -109,7 +110,7 @@ def test_rmc_resume_goes_on_with_it(tmp_path, capsys):
     assert read(RunFolder(folder)) == dataclasses.replace(settings, total_steps=250, episodes=2)
     (start,) = starts(RunFolder(folder))
     assert (start.env_steps, start.changes) == (1, {"total_steps": [300, 250], "episodes": [5, 2]})
-    assert json.loads((folder / "config.json").read_bytes())["format"] == 2
+    assert json.loads((folder / "config.json").read_bytes())["format"] == FORMAT
 
 
 def test_another_agent_is_not_gone_on_with(tmp_path):

@@ -59,7 +59,7 @@ def make_run(
     folder.unlock()
     torch.manual_seed(0)
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
-    agent.normalizer.freeze(10, torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
+    agent.normalizer.freeze(torch.tensor(10), torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
     progress = {"updates": 7, "env_steps": 70}
     metadata = dataclasses.replace(config.policy_header(), **progress).metadata() if header else None
     policy = save(agent.policy_weights(), metadata)

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from rmc.analysis import world_model_picture
-from rmc.analysis.world_model_picture import HORIZONS, Episode, load_agent, look, play
+from rmc.analysis import episodes
+from rmc.analysis.episodes import Episode, Player
+from rmc.analysis.world_model_picture import HORIZONS, load_agent, look
 from rmc.cli import main
 from rmc.common.agent import Agent
 from rmc.common.checkpoint import CheckpointFolder
@@ -30,7 +32,7 @@ def make_run(path: Path, config: RunConfig) -> RunFolder:
     folder.unlock()
     torch.manual_seed(0)
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
-    agent.normalizer.freeze(10, torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
+    agent.normalizer.freeze(torch.tensor(10), torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
     state = io.BytesIO()
     torch.save({"agent": agent.state_dict()}, state)
     files = {"policy.safetensors": save(agent.policy_weights()), "learner.pt": state.getvalue()}
@@ -70,7 +72,7 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
 def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -> None:
     folder = make_run(tmp_path / "run", config)
     agent = load_agent(folder, config, "latest")
-    episode = play(folder, agent, config, "latest")
+    episode = Player(folder, agent, config, "latest").play()
     insight = look(agent, episode)
     assert episode.action.shape[1] == 40
     for horizon in HORIZONS:
@@ -78,7 +80,7 @@ def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -
         for start in (0, 7, 40 - horizon):
             wanted = rolled_out(agent, episode, start, horizon)
             np.testing.assert_allclose(insight.ahead[horizon][start], wanted, atol=1e-5)
-    seen = episode.seen.numpy()
+    seen = episode.seen.numpy().squeeze(-1)
     assert 0 < seen.sum() < 40  # some frames were blank, and are left out
     before = np.concatenate([episode.observation[0, :1].numpy(), insight.real[:-1]])
     error, change = (np.abs(x - insight.real)[seen].sum(0) for x in (insight.predicted, before))
@@ -95,6 +97,9 @@ def test_the_command_writes_a_picture_and_says_it_in_numbers(
     assert "% 1 ahead" in output
     assert "% 15 ahead (100% is a guess of no change)" in output
     assert "worst dimensions" in output
+    assert re.search(r"^changed observation +changes +1 step later +5 +10 +20 *$", output, re.MULTILINE)
+    assert re.search(r"^first +h +(\d+% *){4}$", output, re.MULTILINE)
+    assert re.search(r"^observation, where missing +-?\d\.\d\d +-?\d\.\d\d *$", output, re.MULTILINE)
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "no" / "seen.png")]) == 2
     assert "its folder is not there" in capsys.readouterr().err
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.xyz")]) == 2
@@ -104,11 +109,11 @@ def test_the_command_writes_a_picture_and_says_it_in_numbers(
 def test_an_episode_that_never_ends_is_looked_at_for_a_while(
     config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(world_model_picture, "LONGEST_EPISODE", 25)
+    monkeypatch.setattr(episodes, "LONGEST_EPISODE", 25)
     scaled = dataclasses.replace(config, actor=dataclasses.replace(config.actor, reward_scale=0.5))
     folder = make_run(tmp_path / "run", scaled)
     agent = load_agent(folder, scaled, "latest")
-    short, plain = (play(folder, agent, run, "latest") for run in (scaled, config))
+    short, plain = (Player(folder, agent, run, "latest").play() for run in (scaled, config))
     assert short.action.shape[1] == 25
     torch.testing.assert_close(short.reward, 0.5 * plain.reward)  # as the world model has learnt it
 

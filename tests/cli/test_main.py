@@ -30,12 +30,14 @@ DEBUG = ["train", PENDULUM, "--preset", "debug"]
 # Whoever changes this list changes what users have in their scripts.
 TRAIN_FLAGS = """
     --init-from --init-parts
-    --preset --seed --total-steps --actors --flicker --hide --noise --frame-stack --action-repeat --time-limit
-    --env-timeout --env-kwargs --config --run-dir --if-exists --launcher --device --redis-url
-    --ray-address --all-cpus --tls --track --track-project --track-tags --track-video-every --dry-run
+    --preset --seed --total-steps --actors --flicker --drop-sensors --flicker-burst --delay --hide --noise
+    --frame-stack --action-repeat --time-limit --env-timeout --env-kwargs
+    --config --run-dir --if-exists --launcher --device --redis-url --ray-address --all-cpus --tls
+    --track --track-project --track-tags --track-video-every --dry-run
     --burn-in --trained-steps
-    --hidden --embedding --heads --gate-init --layer-norm --head-input --critic-norm --normalize-observations
-    --grounding --missing-flag --impute-missing --initial-priority
+    --hidden --embedding --heads --gate-init --layer-norm --head-input --critic-norm --privileged-critic
+    --normalize-observations --grounding
+    --missing-flag --impute-missing --initial-priority
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
     --capacity --replay-shards --replay-ratio --warmup-steps --priority-exponent --importance-exponent
     --learning-rate --memory-learning-scale
@@ -45,7 +47,10 @@ TRAIN_FLAGS = """
     --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads
     --episodes --evaluation-seconds
 """.split()  # noqa: SIM905
-ENV_FLAGS = "--flicker --hide --noise --frame-stack --action-repeat --time-limit --env-timeout --env-kwargs".split()  # noqa: SIM905
+ENV_FLAGS = """
+    --flicker --drop-sensors --flicker-burst --delay --hide --noise --frame-stack --action-repeat --time-limit
+    --env-timeout --env-kwargs
+""".split()  # noqa: SIM905
 NEW_RUN_FLAGS = {"--run-dir", "--config", "--if-exists", "--init-from", "--init-parts"}
 RESUME_FLAGS = [flag for flag in TRAIN_FLAGS if flag not in NEW_RUN_FLAGS]
 OTHER_FLAGS = {

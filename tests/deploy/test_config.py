@@ -142,8 +142,25 @@ def test_values_that_do_not_go_together_are_refused() -> None:
 
 def test_a_window_that_no_redis_would_take_is_refused() -> None:
     config = with_value(robust(EnvConfig("InvertedPendulum-v5", time_limit=2**31)), "actor.state_strategy", "episode")
-    with pytest.raises(ConfigError, match=r"--time-limit=2147483648: .* more than 32 MiB"):
+    with pytest.raises(ConfigError, match=r"--time-limit=2147483648: .* more than 32 MiB; take at most \d+"):
         config.window_spec()
+
+
+@pytest.mark.parametrize("strategy", ["burn-in", "episode"])
+def test_the_longest_window_that_is_named_is_taken_and_no_longer_one(strategy: str) -> None:
+    env = EnvConfig("HumanoidStandup-v5", frame_stack=10, time_limit=10_000, action_repeat=2)
+    config = with_value(robust(env), "actor.state_strategy", strategy)
+    config = with_value(config, "window.trained_steps", 10_000)
+    with pytest.raises(ConfigError, match="take at most") as caught:
+        config.window_spec()
+    most = int(str(caught.value).rpartition(" ")[2])
+    path = "env.time_limit" if strategy == "episode" else "window.trained_steps"
+    step = 2 if strategy == "episode" else 1
+    assert with_value(config, path, most).window_spec().train * step == most
+    with pytest.raises(ConfigError, match=f"take at most {most}$"):
+        with_value(config, path, most + step).window_spec()
+    with pytest.raises(ConfigError, match=r"--burn-in=10000: .* smaller observations"):
+        with_value(with_value(config, "window.burn_in", 10_000), "actor.state_strategy", "burn-in").window_spec()
 
 
 @pytest.mark.parametrize(

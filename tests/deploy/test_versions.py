@@ -1,7 +1,8 @@
 """Runs of older versions, kept as they were made: read by every command, and gone on with, their ring included.
 
 ``runs/format-1-a`` was made before keywords of environments, sizes.json and initial.json; ``format-1-b`` by the last
-version that wrote config.json without a format. Both ended at step 1500.
+version that wrote config.json without a format; ``format-2`` before rows had checksums and sensors dropped out. All
+ended at step 1500.
 """
 
 import json
@@ -27,11 +28,13 @@ from rmc.replay_server.recovery import open_store
 
 RUNS = Path(__file__).parent / "runs"
 # Whoever changes this list raises FORMAT by a migration, and keeps a run of the version before in runs/.
-FORMAT_2 = """
-    env.id env.flicker env.hide env.noise env.frame_stack env.action_repeat env.time_limit env.env_timeout
-    env.env_kwargs preset seed total_steps actors window.burn_in window.trained_steps
-    agent.hidden agent.embedding agent.heads agent.layer_norm agent.head_input agent.critic_norm
-    agent.normalize_observations agent.grounding agent.missing_flag agent.impute_missing agent.initial_priority
+FORMAT_3 = """
+    env.id env.flicker env.drop_sensors env.flicker_burst env.delay env.hide env.noise env.frame_stack
+    env.action_repeat env.time_limit env.env_timeout env.env_kwargs preset seed total_steps actors
+    window.burn_in window.trained_steps
+    agent.hidden agent.embedding agent.heads agent.gate_init agent.layer_norm agent.head_input agent.critic_norm
+    agent.privileged_critic agent.normalize_observations agent.grounding agent.missing_flag agent.impute_missing
+    agent.initial_priority
     actor.envs_per_actor actor.stride actor.state_strategy actor.reward_scale actor.refresh_steps actor.chunk_windows
     actor.chunk_seconds actor.unacked_bytes
     replay.capacity replay.replay_ratio replay.warmup_steps replay.priority_exponent replay.replay_shards
@@ -44,7 +47,7 @@ FORMAT_2 = """
 """.split()  # noqa: SIM905
 
 
-@pytest.fixture(params=["format-1-a", "format-1-b"])
+@pytest.fixture(params=["format-1-a", "format-1-b", "format-2"])
 def old(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
     with tarfile.open(RUNS / f"{request.param}.tar.xz") as archive:
         archive.extractall(tmp_path, filter="data")
@@ -52,16 +55,18 @@ def old(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
 
 
 def test_an_option_comes_with_a_format() -> None:
-    assert sorted(flat(robust(EnvConfig("")))) == sorted(FORMAT_2)
-    assert FORMAT == 2
+    assert sorted(flat(robust(EnvConfig("")))) == sorted(FORMAT_3)
+    assert FORMAT == 3
 
 
 def test_its_options_are_read_in_the_words_of_this_version(old: RunFolder) -> None:
     config, raw = old.config(), json.loads((old.path / "config.json").read_text())
-    assert "format" not in raw
+    assert raw.get("format", 1) == int(old.path.name.split("-")[1])
     assert (config.agent.impute_missing, config.agent.missing_flag) == (True, True)
-    assert config.update.policy_ema_updates == raw["update"]["policy_average"] == 100
-    assert config.env.env_kwargs == {}
+    average = "policy_ema_updates" if "format" in raw else "policy_average"
+    assert config.update.policy_ema_updates == raw["update"][average] == 100
+    assert (config.env.env_kwargs, config.env.drop_sensors) == ({}, 0.0)  # later options as if there were none
+    assert (config.agent.privileged_critic, config.agent.gate_init) == (False, "uniform")
     cut = raw["evaluator"].get("evaluation_seconds", 0.0)  # without the option, no evaluation was cut
     assert config.evaluator.evaluation_seconds == cut
     assert from_json(to_json(config)) == config
@@ -87,12 +92,15 @@ def test_its_ring_is_opened_whole(old: RunFolder) -> None:
     store = open_store(old.replay, config.window_spec(), config.replay.capacity, 0.6)
     progress = store.ring.progress
     serials = np.arange(progress.valid_from, progress.next_serial)
-    rows = store.ring.rows[serials % config.replay.capacity]
-    assert (len(serials), progress.env_steps, progress.replay_ratio) == (80, 1_500, 0.0)
+    rows = np.zeros(80, store.ring.spec.dtype)
+    assert store.ring.gather(serials % config.replay.capacity, rows).all()
+    ratio = 0.0 if old.path.name.startswith("format-1") else 8.0
+    assert (len(serials), progress.env_steps, progress.replay_ratio) == (80, 1_500, ratio)
     assert rows["serial"].tolist() == serials.tolist()
-    real = np.arange(rows["missing"].shape[1]) <= rows["last"][:, None]
-    real &= np.arange(rows["missing"].shape[1]) >= rows["first"][:, None]
-    assert 0.1 < rows["missing"][real].mean() < 0.3  # flicker 0.2
+    missing = rows["missing"][..., 0]
+    real = np.arange(missing.shape[1]) <= rows["last"][:, None]
+    real &= np.arange(missing.shape[1]) >= rows["first"][:, None]
+    assert 0.1 < missing[real].mean() < 0.3  # flicker 0.2
     assert np.count_nonzero(store.tree.values(np.arange(80))) == 80
     store.close()
 
@@ -120,7 +128,7 @@ def test_it_goes_on_with_ring_checkpoint_and_counters(old: RunFolder, capsys: py
     more = now.drawn_steps - before.drawn_steps
     assert before.draws < now.draws
     assert 300 * 4 - 16 * 15 <= more <= (now.env_steps - 1_500 + old.config().slack_steps()) * 4 + 16 * 15
-    (start,) = starts(old)
+    *_, start = starts(old)
     assert (start.env_steps, start.changes) == (
         1_500, {"total_steps": [1_500, 1_800], "replay.replay_ratio": [8.0, 4.0]}
     )  # fmt: skip

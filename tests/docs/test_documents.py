@@ -13,7 +13,7 @@ from docs.generate import page
 from rmc.cli import main
 from rmc.cli.parser import COMMANDS
 from rmc.common import agent
-from rmc.common.env import wrappers
+from rmc.common.env import missing
 from rmc.learner import diagnostics, losses, update, update_order
 
 ROOT = Path(__file__).parents[2]
@@ -43,7 +43,7 @@ def test_the_faults_that_were_run_are_in_their_page() -> None:
 def test_every_equation_leads_to_its_code_and_back() -> None:
     """What the docs' table names is there, and its docstring names the equation."""
     modules = {
-        "losses": losses, "agent": agent, "update": update, "update_order": update_order, "wrappers": wrappers,
+        "losses": losses, "agent": agent, "update": update, "update_order": update_order, "missing": missing,
         "diagnostics": diagnostics,
     }  # fmt: skip
     table = (ROOT / "docs" / "algorithm.md").read_text().split("## From the paper to the code")[1].split("\n\n")[1]
@@ -105,10 +105,10 @@ def test_the_python_api_runs(tmp_path: Path) -> None:
 @pytest.mark.timeout(300)
 def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "custom-environments.md").read_text()
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    (tmp_path / "shuttle.py").write_text(code)
+    for file, code in zip(("shuttle", "instruments"), re.findall(r"```python\n(.*?)```", page, re.DOTALL), strict=True):
+        (tmp_path / f"{file}.py").write_text(code)
     commands = re.findall(r"^rmc .*$", page, re.MULTILINE)
-    assert [command.split()[1] for command in commands] == ["check-env", "train", "evaluate"]
+    assert [command.split()[1] for command in commands] == ["check-env", "train", "evaluate", "train"]
     names = []
     for command in commands:
         shorter = ["--preset", "debug", "--total-steps", "1500"] * command.startswith("rmc train")

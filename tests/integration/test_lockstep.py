@@ -82,3 +82,14 @@ def test_the_ratio_and_the_total_are_kept(straight):
     debt = (stats["env_steps"] - 200) * 8.0 - stats["drawn_steps"]
     batch = 8 * 15
     assert -(slack * 8.0 + batch) <= debt <= batch
+
+
+def test_batches_that_are_cut_give_the_same_bits_across_a_stop(tmp_path):
+    """Whole episodes as windows: most end early, so that updates run over a part of them."""
+    actor = dataclasses.replace(CONFIG.actor, state_strategy="episode")
+    config = dataclasses.replace(CONFIG, env=EnvConfig("InvertedPendulum-v5", time_limit=100), actor=actor)
+    straight = run(config, tmp_path / "straight")
+    stopped = run(config, tmp_path / "stopped", stop_after_checkpoints=1)
+    assert 1 < stopped.learner.updates < straight.learner.updates
+    assert straight.learner._updated._steps < config.window_spec().steps
+    assert_same(straight, run(config, tmp_path / "stopped"))

@@ -13,6 +13,7 @@ import torch
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.starts import starts
 from rmc.replay_server.recovery import open_store
 from tests.integration.running import ENVIRONMENT, Training
@@ -85,4 +86,4 @@ def test_a_changed_ratio_and_rate_count_from_there(tmp_path):
     output = rmc(f"rmc stats {folder}", tmp_path).stdout
     assert "4 starts; from step 1,5" in output
     assert "--replay-ratio 32 to 4, --learning-rate 0.0003 to 1e-05" in output
-    assert json.loads((folder / "config.json").read_text())["format"] == 2
+    assert json.loads((folder / "config.json").read_text())["format"] == FORMAT

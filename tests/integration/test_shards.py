@@ -1,5 +1,6 @@
 """Several replay servers are one: the same distribution, the same weights, the same ratio, and each step once."""
 
+import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ from scipy import stats
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.replay import SampleStatus
 from rmc.common.shard import Shard
+from rmc.common.window import WindowSpec
 from rmc.learner.batch import importance_weights
 from rmc.learner.sharded_replay import ShardedReplay
 from rmc.replay_server.config import ReplayConfig
@@ -27,14 +29,16 @@ FREE_AND_SMALL = ReplayConfig(capacity=40, replay_ratio=1e9, warmup_steps=0)
 class Whole:
     """Replay servers in this thread, and the learner's view of them."""
 
-    def __init__(self, folder: Path, count: int, config: ReplayConfig = FREE, total: int = 10**9) -> None:
+    def __init__(
+        self, folder: Path, count: int, config: ReplayConfig = FREE, total: int = 10**9, spec: WindowSpec = SPEC
+    ) -> None:
         self.bus = MemoryBus()
         self.servers = [
-            ReplayServer(SPEC, config, folder / str(k), 3, total, ACTORS, 64, self.bus, Shard(k, count))
+            ReplayServer(spec, config, folder / str(k), 3, total, ACTORS, 64, self.bus, Shard(k, count))
             for k in range(count)
         ]
-        self.replay = ShardedReplay(self.servers, SPEC, BATCH, seed=1)
-        self.senders = [Sender(self.bus, actor) for actor in range(ACTORS)]
+        self.replay = ShardedReplay(self.servers, spec, BATCH, seed=1)
+        self.senders = [Sender(self.bus, actor, spec) for actor in range(ACTORS)]
         self.take_in()
 
     def take_in(self) -> None:
@@ -114,6 +118,20 @@ def test_statistics_and_counters_are_those_of_one_server(wholes: list[Whole]) ->
     for other in (two, four):
         np.testing.assert_allclose(other.total, one.total)
         np.testing.assert_allclose(other.total_square, one.total_square)
+
+
+def test_windows_by_number_with_what_critics_see_are_drawn_and_counted_alike(tmp_path: Path) -> None:
+    spec = dataclasses.replace(SPEC, missing=SPEC.obs_dim, privileged=2)
+    one, two = (Whole(tmp_path / f"of-{count}", count, spec=spec) for count in (1, 2))
+    for whole in (one, two):
+        whole.send(WINDOWS)
+        rows = whole.replay.sample(BATCH).rows
+        assert rows is not None
+        assert (rows["missing"].shape, rows["privileged"].shape) == ((BATCH, 7, 3), (BATCH, 7, 2))
+        assert whole.replay.statistics().count.tolist() == [sum(WINDOWS) * spec.train] * 5
+    np.testing.assert_allclose(one.replay.statistics().total, two.replay.statistics().total)
+    for server in (*one.servers, *two.servers):
+        server.close()
 
 
 def test_an_episode_is_found_in_its_shard(wholes: list[Whole]) -> None:

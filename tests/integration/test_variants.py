@@ -63,6 +63,8 @@ VARIANTS: list[dict[str, Any]] = [
     {"flicker": 0.5, "missing_flag": True, "normalize_observations": True},
     {"flicker": 0.5, "impute_missing": True, "normalize_observations": True},
     {"flicker": 0.5, "impute_missing": True, "normalize_observations": True, "initial_priority": "actor"},
+    {"flicker": 0.5, "flicker_burst": 4.0, "delay": 2, "impute_missing": True, "normalize_observations": True},
+    {"drop_sensors": 0.3, "frame_stack": 2},
     {"hide": "velocities"},
     {"hide": "positions"},
     {"noise": 0.1},

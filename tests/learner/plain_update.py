@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rmc.common.agent import Agent, Memory
+from rmc.common.agent import Agent, Memory, Normalizer
 from rmc.learner.config import UpdateConfig
 
 REACHES_MEMORY = {1: "MV", 2: "V", 3: "M", 4: "MVP", 5: "MP", 6: "VP"}  # model, value, policy: table 1 of the paper
@@ -92,19 +92,20 @@ class PlainUpdate:
         return {t: known[t] for t in range(self.burn_in, int(row["last"]) + 1)}
 
     def embedded(self, memory: Memory, row: np.void, t: int, o: Tensor, previous: Tensor) -> Tensor:
-        flag = [torch.tensor([float(row["missing"][t])])] if self.agent.config.missing_flag else []
+        flag = [torch.tensor(row["missing"][t]).float()] if self.agent.config.missing_flag else []
         return memory.embed(torch.cat([o, previous, *flag]))
 
     @torch.no_grad()
     def impute(self, row: np.void) -> dict[int, Tensor]:
-        """By observation, what the memory is given: for a blank one what the model expects, where it is asked."""
+        """By observation, what the memory is given: for what is missing what is expected, where it is asked."""
         memory, numbers = self.agent.memory, {}
         h, last = torch.tensor(row["state"]).tensor_split([self.agent.config.hidden])
         for t in range(int(row["first"]), int(row["last"]) + 1):
             previous = torch.tensor(row["prev_action"] if t == row["first"] else row["action"][t - 1])
             numbers[t] = self.seen(row, t)
-            if self.agent.config.impute_missing and row["missing"][t]:
-                numbers[t] = self.agent.next_frame(h, last, previous).clamp(-10, 10)
+            if self.agent.config.impute_missing:
+                expected = self.agent.next_frame(h, last, previous).clamp(-10, 10)
+                numbers[t] = torch.where(torch.tensor(row["missing"][t] > 0), expected, numbers[t])
             last = numbers[t]
             without = self.agent.config.head_input == "observation"
             h = 0 * h if without else gru(memory, self.embedded(memory, row, t, numbers[t], previous), h)
@@ -112,11 +113,19 @@ class PlainUpdate:
 
     def seen(self, row: np.void, t: int) -> Tensor:
         """The observation as the networks see it."""
-        if row["missing"][t]:
-            return torch.zeros(self.agent.obs_dim)
-        o = torch.tensor(row["observation"][t])
-        normalizer = self.agent.normalizer
-        return ((o - normalizer.mean) / normalizer.std).clamp(-10, 10) if normalizer.enabled else o
+        o = normalized(self.agent.normalizer, row["observation"][t])
+        return torch.where(torch.tensor(row["missing"][t] > 0), 0.0, o)
+
+    def critics_z(self, row: np.void, t: int, z: Tensor) -> Tensor:
+        """What the critics read."""
+        normalizer = self.agent.privileged_normalizer
+        return z if normalizer is None else torch.cat([z, normalized(normalizer, row["privileged"][t])])
+
+    @staticmethod
+    def by_flag(error: Tensor, seen: np.ndarray) -> list[Tensor]:
+        """The mean error of what each flag says is seen: of the whole frame, or one number."""
+        parts = error.chunk(len(seen))
+        return [part.mean() for part, is_seen in zip(parts, seen, strict=True) if is_seen]
 
     def z(self, known: Known) -> Tensor:
         parts = {"hidden": known.h, "embedding": known.e, "observation": known.o}
@@ -154,15 +163,16 @@ class PlainUpdate:
                 window[t] = 0.0 if self.ends(row, t) else error.item()
                 if agent.config.grounding:
                     wanted = self.seen(row, t + 1) - online[t].o
-                    if not row["missing"][t + 1] and (agent.config.impute_missing or not row["missing"][t]):
-                        sums["observation"].append((predicted.observation_change - wanted).abs().mean())
+                    seen = (row["missing"][t + 1] == 0) & (agent.config.impute_missing | (row["missing"][t] == 0))
+                    sums["observation"] += self.by_flag((predicted.observation_change - wanted).abs(), seen)
                     sums["reward"].append((predicted.reward - float(row["reward"][t])).abs())
-                if agent.config.impute_missing and not row["missing"][t + 1]:
+                if agent.config.impute_missing:
                     expected = agent.next_frame(online[t].h.detach(), online[t].o, a)
-                    sums["F"].append((expected - self.seen(row, t + 1)).abs().mean())
+                    seen = row["missing"][t + 1] == 0
+                    sums["F"] += self.by_flag((expected - self.seen(row, t + 1)).abs(), seen)
                 pi, log_pi = self.sample(self.reaching("P", z), noise[b, t - self.burn_in])
                 climbed = self.reaching("P", z) if c.policy_through_q else z.detach()
-                q_pi = twin_q(agent.critic, climbed, pi, frozen=True)
+                q_pi = twin_q(agent.critic, self.critics_z(row, t, climbed), pi, frozen=True)
                 sums["P"].append(alpha * log_pi - (q_pi[0] if c.policy_q == "first" else q_pi.min()))
                 sums["T"].append(-agent.log_alpha * (log_pi.detach() - agent.action_dim))
             errors.append(window)
@@ -173,7 +183,8 @@ class PlainUpdate:
             td_errors = []
             for t in range(self.burn_in, int(row["last"])):
                 y = self.target(row, t, i[b], beta, online, target, noise[b])
-                q = twin_q(agent.critic, self.reaching("V", self.z(online[t])), torch.tensor(row["action"][t]))
+                read = self.critics_z(row, t, self.reaching("V", self.z(online[t])))
+                q = twin_q(agent.critic, read, torch.tensor(row["action"][t]))
                 sums["V"].append(float(importance[b]) * 0.5 * ((q[0] - y) ** 2 + (q[1] - y) ** 2))
                 td_errors.append((q.detach() - y).abs().mean().item())
             priorities.append(c.eta * max(td_errors) + (1.0 - c.eta) * sum(td_errors) / len(td_errors))
@@ -213,8 +224,13 @@ class PlainUpdate:
                 break
         pi, log_pi = self.sample(self.z(online[t]), noise[t - self.burn_in])
         reads = target if c.target_memory == "ema" else online
-        q = twin_q(self.target_critic, self.z(reads[t]), pi)
+        q = twin_q(self.target_critic, self.critics_z(row, t, self.z(reads[t])), pi)
         return y + discount * float(q.min() - self.agent.log_alpha.exp() * log_pi)
+
+
+def normalized(normalizer: Normalizer, numbers: np.ndarray) -> Tensor:
+    x = torch.tensor(numbers)
+    return ((x - normalizer.mean) / normalizer.std).clamp(-10, 10) if normalizer.enabled else x
 
 
 def gru(memory: Memory, e: Tensor, h: Tensor) -> Tensor:

@@ -1,5 +1,7 @@
 """Random but lawful rows for the learner's tests."""
 
+import dataclasses
+
 import numpy as np
 import torch
 
@@ -7,6 +9,8 @@ from rmc.common.window import Rows, WindowSpec
 from rmc.learner.batch import Batch, clear_padding, view_batch
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=5)
+LONG = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=60)
+BY_NUMBER = dataclasses.replace(SPEC, missing=3, privileged=2)  # what is missing comes by number; critics see more
 
 
 def observation_valid(rows: Rows, spec: WindowSpec = SPEC) -> np.ndarray:
@@ -25,26 +29,33 @@ def spoil_padding(rows: Rows) -> None:
     """Write what no number is wherever a row holds nothing."""
     observed, stepped = observation_valid(rows), step_valid(rows)
     rows["observation"][~observed] = np.nan
+    rows["privileged"][~observed] = np.nan
     rows["missing"][~observed] = 1
     rows["action"][~stepped] = np.inf
     rows["reward"][~stepped] = np.nan
 
 
-def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC) -> Rows:
-    """Rows of every shape: padded and real burn-in, full and partial, terminated and not."""
+def random_rows(count: int, seed: int = 0, spec: WindowSpec = SPEC, longest: int | None = None) -> Rows:
+    """Rows of every shape: padded and real burn-in, full and partial, terminated and not.
+
+    Each trains ``longest`` steps at most, and where that is said the first one does.
+    """
     rng = np.random.default_rng(seed)
     rows = np.zeros(count, spec.dtype)
     rows["serial"] = np.arange(count)
     rows["first"] = rng.choice([0, spec.burn_in], count)
     rows["episode_step"] = spec.burn_in
-    rows["last"] = rng.integers(spec.burn_in + 1, spec.steps + 1, count)
+    rows["last"] = rng.integers(spec.burn_in + 1, spec.burn_in + (longest or spec.train) + 1, count)
+    if longest is not None:
+        rows["last"][0] = spec.burn_in + longest
     rows["terminated"] = rng.integers(0, 2, count)
     rows["missing"] = rng.uniform(size=rows["missing"].shape) < 0.3
-    for name in ("observation", "action", "prev_action", "reward", "state"):
+    for name in ("observation", "action", "prev_action", "reward", "state", "privileged"):
         rows[name] = rng.uniform(-1.0, 1.0, rows[name].shape)
     observed, stepped = observation_valid(rows, spec), step_valid(rows, spec)
     rows["observation"] *= observed[..., None]
-    rows["missing"] *= observed
+    rows["privileged"] *= observed[..., None]
+    rows["missing"] *= observed[..., None]
     rows["action"] *= stepped[..., None]
     rows["reward"] *= stepped
     return rows

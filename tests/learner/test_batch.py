@@ -1,21 +1,27 @@
 """The batch's views against a plain loop over the rows."""
 
 import numpy as np
+import pytest
+import torch
 
-from rmc.learner.batch import clear_padding, importance_weights
-from tests.learner.rows import SPEC, random_rows, spoil_padding, to_batch
+from rmc.learner.batch import clear_padding, importance_weights, longest_steps, update_steps, view_batch
+from tests.learner.rows import BY_NUMBER, LONG, SPEC, random_rows, spoil_padding, to_batch
 
 
-def test_fields_match_the_rows():
-    rows = random_rows(16)
-    batch = to_batch(rows)
+@pytest.mark.parametrize("spec", [SPEC, BY_NUMBER])
+def test_fields_match_the_rows(spec):
+    rows = random_rows(16, spec=spec)
+    batch = to_batch(rows, spec)
     for b, row in enumerate(rows):
         for t in range(SPEC.observations):
             real = row["first"] <= t <= row["last"]
             assert bool(batch.observation_valid[b, t]) == real
             wanted = row["observation"][t] if real else np.zeros(3)
             np.testing.assert_array_equal(batch.observation[b, t], wanted)
-            assert bool(batch.missing[b, t]) == bool(real and row["missing"][t])
+            assert batch.missing[b, t].tolist() == [bool(real and flag) for flag in row["missing"][t]]
+            np.testing.assert_array_equal(
+                batch.privileged[b, t], row["privileged"][t] if real else 0.0 * row["privileged"][t]
+            )
         for t in range(SPEC.steps):
             real = row["first"] <= t < row["last"]
             assert bool(batch.step_valid[b, t]) == real
@@ -55,9 +61,40 @@ def test_importance_weights_against_the_formula():
     assert (importance_weights(values, mass, windows, 0.0) == 1).all()
 
 
-def test_padding_is_cleared_and_nothing_else_touched():
-    rows = random_rows(16)
+@pytest.mark.parametrize("spec", [SPEC, BY_NUMBER])
+def test_padding_is_cleared_and_nothing_else_touched(spec):
+    rows = random_rows(16, spec=spec)
     clean = rows.copy()
     spoil_padding(rows)
-    clear_padding(rows, SPEC)
-    assert (rows == clean).all()
+    clear_padding(rows, spec)
+    for name in rows.dtype.names:
+        np.testing.assert_array_equal(rows[name], clean[name])
+
+
+@pytest.mark.parametrize(
+    ("trained", "rounded"), [(1, 16), (16, 16), (17, 24), (24, 24), (25, 32), (33, 48), (49, 60), (60, 60)]
+)
+def test_the_longest_window_rounded_up_says_where_a_batch_ends(trained: int, rounded: int) -> None:
+    rows = random_rows(5, spec=LONG, longest=trained)
+    raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
+    assert longest_steps(raw, LONG) == LONG.burn_in + rounded
+    assert update_steps(raw, LONG, 2) == LONG.burn_in + rounded
+    assert update_steps(raw, LONG, 1) == LONG.steps
+
+
+def test_windows_of_the_usual_length_are_never_cut() -> None:
+    rows = random_rows(5, longest=1)
+    assert longest_steps(torch.from_numpy(rows.view("u1").reshape(len(rows), -1)), SPEC) == SPEC.steps
+
+
+def test_a_cut_batch_is_the_whole_one_without_padding() -> None:
+    rows = random_rows(6, spec=LONG, longest=20)
+    whole, raw = to_batch(rows, LONG), torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
+    steps = longest_steps(raw, LONG)
+    cut = view_batch(raw, torch.ones(len(rows)), LONG, steps)
+    assert (cut.cut, whole.cut) == (LONG.steps - steps, 0)
+    for name, value in vars(cut).items():
+        if name != "cut":
+            of_whole = getattr(whole, name)
+            assert torch.equal(value, of_whole[:, : value.shape[1]] if value.ndim > 1 else of_whole), name
+    assert not whole.observation_valid[:, steps + 1 :].any()

@@ -13,13 +13,14 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from rmc.common.agent import Agent
+from rmc.common.window import WindowSpec
 from rmc.learner.batch import clear_padding, view_batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.device_update import WARM_UP, CopiesAhead, CudaGraph, DeviceUpdate, HostCopy
 from rmc.learner.update import JointUpdate
 from rmc.learner.update_order import make_update
 from tests.learner.agents import ROBUST
-from tests.learner.rows import SPEC, random_rows
+from tests.learner.rows import LONG, SPEC, random_rows
 
 BATCH = 8
 
@@ -33,10 +34,12 @@ def make(order: str = "joint", device: str = "cpu", bf16: bool = False) -> Joint
     return make_update(agent, SPEC.burn_in, config, 3, bf16)
 
 
-def host_batch(seed: int, pinned: bool = False, missing: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
-    rows = random_rows(BATCH, seed)
+def host_batch(
+    seed: int, pinned: bool = False, missing: bool = True, spec: WindowSpec = SPEC, longest: int | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    rows = random_rows(BATCH, seed, spec, longest)
     rows["missing"] *= missing
-    clear_padding(rows, SPEC)
+    clear_padding(rows, spec)
     raw = torch.from_numpy(rows.view("u1").reshape(BATCH, -1))
     importance = torch.from_numpy(np.random.default_rng(seed).uniform(0.5, 1.0, BATCH).astype(np.float32))
     return (raw.pin_memory(), importance.pin_memory()) if pinned else (raw, importance)
@@ -53,6 +56,27 @@ def test_it_is_the_same_update(order):
         assert torch.equal(result.priorities, expected.priorities)
         assert all(torch.equal(result.metrics[name], value) for name, value in expected.metrics.items())
     assert all(map(torch.equal, update.agent.state_dict().values(), plain.agent.state_dict().values()))
+
+
+@pytest.mark.parametrize("order", ["joint", "alternate"])
+def test_a_cut_batch_teaches_what_the_whole_one_does(order):
+    """To rounding: sums over other lengths are taken in another order. Noise and beta are the same."""
+    whole, update = make(order), make(order)
+    cut, lengths = DeviceUpdate(update, LONG, BATCH), [3, 16, 17, 60, 30, 3, 48, 25]
+    for number, longest in enumerate(lengths, 1):
+        raw, importance = host_batch(number, spec=LONG, longest=longest)
+        expected = whole(view_batch(raw, importance, LONG), torch.tensor(0.1))
+        (result,) = cut(raw, importance, 0.1, number)
+        steps = result.hidden.shape[1] - 1
+        assert steps == (60 if number == 1 else {3: 16, 16: 16, 17: 24, 60: 60, 30: 32, 48: 48, 25: 32}[longest])
+        assert torch.equal(result.observed, expected.observed[:, : steps + 1])
+        assert not expected.observed[:, steps + 1 :].any()
+        torch.testing.assert_close(result.priorities, expected.priorities, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(result.metrics, expected.metrics, rtol=1e-4, atol=1e-5)
+        real = result.observed.unsqueeze(-1)
+        torch.testing.assert_close(result.hidden * real, expected.hidden[:, : steps + 1] * real, rtol=1e-4, atol=1e-5)
+    assert torch.equal(update.generator.get_state(), whole.generator.get_state())
+    torch.testing.assert_close(update.agent.state_dict(), whole.agent.state_dict(), rtol=1e-4, atol=1e-5)
 
 
 class OnDevice(TorchDispatchMode):

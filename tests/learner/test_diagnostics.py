@@ -36,7 +36,7 @@ def remembered(agent: Agent, episode: dict[str, np.ndarray], hidden: np.ndarray,
             for x in (episode["observation"][k], episode["missing"][k], episode["action"][k], before)
         )
         seen = agent.normalizer(o, missing)
-        if agent.config.impute_missing and missing:
+        if agent.config.impute_missing and missing.all():
             seen = agent.next_frame(state, last, previous[0]).unsqueeze(1)
         step = agent.memory(seen, missing, previous, state)
         state, last = step.hidden[:, 0], seen[:, 0] if agent.config.impute_missing else last
@@ -55,7 +55,7 @@ def play(agent: Agent, spec: WindowSpec, blanks: float = 0.2) -> tuple[dict[str,
     episode = {
         "observation": rng.normal(size=(STEPS + 1, spec.obs_dim)).astype(np.float32),
         "action": rng.uniform(-1, 1, (STEPS, spec.action_dim)).astype(np.float32),
-        "missing": rng.random(STEPS + 1) < blanks,
+        "missing": rng.random((STEPS + 1, spec.missing)) < blanks,
     }
     states = [np.zeros(spec.state, np.float32)]
     states += [h for h, _ in remembered(agent, episode, states[0], 0, STEPS)]
@@ -89,7 +89,7 @@ def test_todays_weights_find_nothing_stale(spec: WindowSpec, config: AgentConfig
 def test_where_nothing_is_blank_the_state_is_that_of_the_step_by_step_way():
     agent, state = make_agent(1, FILLING), torch.randn(2, FILLING.state_size(SPEC.obs_dim))
     o, action = torch.randn(2, 6, SPEC.obs_dim), torch.rand(2, 6, SPEC.action_dim)
-    sequence = (o, torch.zeros(2, 6, dtype=torch.bool), action, state)
+    sequence = (o, torch.zeros(2, 6, 1, dtype=torch.bool), action, state)
     with torch.no_grad():
         _, seen, after = agent.unroll(*sequence)
         torch.testing.assert_close(after, agent.fill(*sequence)[1])

@@ -125,26 +125,28 @@ def test_parameters_keep_their_names_and_values(pair):
 FILLING = AgentConfig(hidden=24, embedding=20, heads=(40, 28), impute_missing=True)
 
 
-def impute(config, low, scale=1.0):
-    """By a plain and a fused agent, and the observations and which of them were blank."""
+def impute(config, low, scale=1.0, flags=1):
+    """By a plain and a fused agent, and the observations and which of their numbers were missing."""
     torch.manual_seed(0)
-    plain = Agent(3, 2, config)
+    plain = Agent(3, 2, config, flags)
     with torch.no_grad():
         plain.next_frame.net[4].weight *= scale
     fused = copy.deepcopy(plain)
     fuse(fused)
     generator = torch.Generator().manual_seed(3)
     o, action, state = (torch.randn(shape, generator=generator) for shape in ((B, T, 3), (B, T, 2), (B, 27)))
-    missing = torch.rand(B, T, generator=generator) < 0.5
-    o[missing] = 0.0
+    missing = torch.rand(B, T, flags, generator=generator) < 0.5
+    o[missing.expand_as(o)] = 0.0
     with torch.autocast("cpu", torch.bfloat16, enabled=low):
         filled = [agent.fill(o, missing, action, state) for agent in (plain, fused)]
-    return *filled, o, missing
+    return *filled, o, missing.expand_as(o)
 
 
+@pytest.mark.parametrize("flags", [1, 3])
 @pytest.mark.parametrize("flag", [False, True])
-def test_blanks_are_filled_to_the_precision_of_bfloat16_and_nothing_else_is_touched(flag):
-    (plain, plain_after), (fused, after), o, missing = impute(dataclasses.replace(FILLING, missing_flag=flag), low=True)
+def test_blanks_are_filled_to_the_precision_of_bfloat16_and_nothing_else_is_touched(flag, flags):
+    config = dataclasses.replace(FILLING, missing_flag=flag)
+    (plain, plain_after), (fused, after), o, missing = impute(config, low=True, flags=flags)
     assert torch.equal(fused[~missing], o[~missing])
     gap = (fused - plain)[missing].norm() / plain[missing].norm()
     assert 1e-5 < gap < 0.01

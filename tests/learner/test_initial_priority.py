@@ -11,28 +11,31 @@ import torch
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig, HeadInput
 from rmc.common.errors import MessageError
+from rmc.common.window import WindowSpec
 from rmc.learner.config import UpdateConfig
 from rmc.learner.initial_priority import InitialPriority
 from rmc.learner.update_order import make_update
 from tests.hostile import hostile_state
-from tests.learner.rows import SPEC, random_rows, to_batch
+from tests.learner.rows import BY_NUMBER, SPEC, random_rows, to_batch
 
 
+@pytest.mark.parametrize("sizes", [SPEC, BY_NUMBER], ids=["by frame", "by number"])
 @pytest.mark.parametrize("n_step", [1, 3])
 @pytest.mark.parametrize("fill", [False, True])
 @pytest.mark.parametrize("head_input", ["hidden", "hidden+observation"])
-def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput, fill: bool) -> None:
+def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput, fill: bool, sizes: WindowSpec) -> None:
     config = AgentConfig(
         hidden=SPEC.state, embedding=7, heads=(10, 9), head_input=head_input, normalize_observations=True,
         initial_priority="actor", impute_missing=fill,
     )  # fmt: skip
     torch.manual_seed(0)
-    agent = Agent(SPEC.obs_dim, SPEC.action_dim, config)
-    agent.normalizer.freeze(10, torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
+    agent = Agent(SPEC.obs_dim, SPEC.action_dim, config, sizes.missing, sizes.privileged)
+    total = torch.ones(sizes.statistics)
+    agent.freeze_statistics(torch.tensor([10]), total, 20.0 * total)
     with torch.no_grad():
         agent.log_alpha.fill_(-1.0)
     update = UpdateConfig(n_step=n_step, gamma=0.9, eta=0.6)
-    spec = dataclasses.replace(SPEC, state=config.state_size(SPEC.obs_dim))
+    spec = dataclasses.replace(sizes, state=config.state_size(SPEC.obs_dim))
     priority_fn = InitialPriority(spec, config, update, seed=3)
     priority_fn.load(safetensors.torch.save(agent.broadcast_weights()))
     rows = random_rows(6, spec=spec)

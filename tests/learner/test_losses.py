@@ -139,12 +139,19 @@ def test_temperature_rises_when_entropy_is_too_low():
     assert log_alpha.grad < 0.0
 
 
-def test_grounding_loss(rng, m):
+@pytest.mark.parametrize("flags", [1, OBS])
+def test_grounding_loss(rng, m, flags):
     f, change = rng.normal(size=(2, B, T, OBS))
     fr, r = rng.normal(size=(2, B, T))
-    seen = (rng.uniform(size=(B, T)) < 0.6).astype(np.float32)
-    visible = [(b, t) for b, t in real_steps(m) if seen[b, t]]
-    o_part = sum(np.abs(f[b, t] - change[b, t]).mean() for b, t in visible) / len(visible)
+    seen = (rng.uniform(size=(B, T, flags)) < 0.6).astype(np.float32)
+    parts = [slice(None)] if flags == 1 else list(range(OBS))  # what each flag speaks of
+    errors = [
+        np.abs(f[b, t] - change[b, t])[part].mean()
+        for b, t in real_steps(m)
+        for flag, part in enumerate(parts)
+        if seen[b, t, flag]
+    ]
+    o_part = np.mean(errors)
     r_part = sum(abs(fr[b, t] - r[b, t]) for b, t in real_steps(m)) / len(real_steps(m))
     loss = losses.grounding_loss(*tensors(f, change, fr, r, seen, m)).item()
     assert loss == pytest.approx(o_part + r_part, rel=1e-5)

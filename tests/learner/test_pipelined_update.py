@@ -10,12 +10,13 @@ import torch
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.errors import RmcError
+from rmc.common.window import WindowSpec
 from rmc.learner.config import UpdateConfig
 from rmc.learner.device_update import DeviceUpdate
 from rmc.learner.pipelined_update import PipelinedUpdate
 from rmc.learner.update import JointUpdate
 from rmc.learner.update_order import make_update
-from tests.learner.rows import SPEC
+from tests.learner.rows import BY_NUMBER, LONG, SPEC
 from tests.learner.test_device_update import BATCH, host_batch
 
 ROBUST = UpdateConfig(scheme=3, curiosity=0.1, curiosity_scale="std", policy_ema_updates=100)
@@ -33,19 +34,23 @@ AGENTS = {
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def make(agent: str, bf16: bool) -> JointUpdate:
+def make(agent: str, bf16: bool, spec: WindowSpec = SPEC) -> JointUpdate:
     torch.manual_seed(0)
-    return make_update(Agent(SPEC.obs_dim, SPEC.action_dim, AGENTS[agent]), SPEC.burn_in, ROBUST, 3, bf16)
+    network = Agent(spec.obs_dim, spec.action_dim, AGENTS[agent], spec.missing, spec.privileged)
+    return make_update(network, spec.burn_in, ROBUST, 3, bf16)
 
 
 @pytest.mark.parametrize("bf16", [False, True])
 @pytest.mark.parametrize("agent", AGENTS)
-def test_it_is_the_same_update(agent, bf16):
-    plain, update = make(agent, bf16), make(agent, bf16)
-    in_turn, apart = DeviceUpdate(plain, SPEC, BATCH), PipelinedUpdate(update, SPEC, BATCH)
+@pytest.mark.parametrize("spec", [SPEC, BY_NUMBER, LONG], ids=["by frame", "by number", "cut windows"])
+def test_it_is_the_same_update(agent, bf16, spec):
+    plain, update = make(agent, bf16, spec), make(agent, bf16, spec)
+    in_turn, apart = DeviceUpdate(plain, spec, BATCH), PipelinedUpdate(update, spec, BATCH)
     expected, actual = [], []
     for step in range(1, 41):
-        raw, importance = host_batch(step, missing=step > 20)  # what imputes is trained at some updates, then at all
+        longest = (3, 20, 60, 40)[step % 4] if spec is LONG else None
+        # what imputes is trained at some updates, then at all
+        raw, importance = host_batch(step, missing=step > 20, spec=spec, longest=longest)
         for updated, results in ((in_turn, expected), (apart, actual)):
             results += copy.deepcopy(updated(raw, importance, 0.1 * step, step))
         if step % 15 == 0:  # as before weights are read

@@ -24,7 +24,7 @@ BETA = torch.tensor(0.5)
 def make(agent: AgentConfig, bf16: bool = False, **options: object) -> JointUpdate:
     torch.manual_seed(0)
     network = Agent(SPEC.obs_dim, SPEC.action_dim, agent)
-    network.normalizer.freeze(10, torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
+    network.normalizer.freeze(torch.tensor(10), torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
     return make_update(network, SPEC.burn_in, UpdateConfig(curiosity=0.5, **options), 3, bf16)  # type: ignore[arg-type]
 
 
@@ -95,7 +95,7 @@ def test_each_stage_of_alternate_starts_from_what_the_one_before_left():
 
     def metrics(order: str, rate: float) -> dict[str, Tensor]:
         update = make(PAPER, update_order=order, learning_rate=rate, alpha_learning_rate=rate)
-        update._noise_like = lambda x: torch.full_like(x, 0.3)  # a forward more must not mean other noise
+        update._noise_like = lambda x, cut: torch.full_like(x, 0.3)  # a forward more must not mean other noise
         return update(to_batch(random_rows(8)), BETA).metrics
 
     names = ("model_loss", "q_loss", "policy_loss")  # the temperature's is 0 at first, whatever the policy

@@ -9,11 +9,12 @@ import torch
 
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
+from rmc.common.window import WindowSpec
 from rmc.learner.config import UpdateConfig
 from rmc.learner.update_order import make_update
 from tests.learner.agents import PAPER
 from tests.learner.plain_update import PlainUpdate
-from tests.learner.rows import SPEC, random_rows, to_batch
+from tests.learner.rows import BY_NUMBER, SPEC, random_rows, to_batch
 
 ROBUST = AgentConfig(
     hidden=SPEC.state,
@@ -64,13 +65,24 @@ AGENTS = [
 @pytest.mark.parametrize("agent", AGENTS)
 @pytest.mark.parametrize("options", VARIANTS, ids=lambda options: "-".join(f"{k}={v}" for k, v in options.items()))
 def test_three_updates_are_those_of_the_equations(agent: AgentConfig, options: dict[str, object]) -> None:
+    assert_same_updates(SPEC, agent, options)
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("options", [{}, {"update_order": "alternate", "scheme": 4}, {"target_memory": "ema"}])
+def test_so_they_are_by_number_and_where_critics_see_more(agent: AgentConfig, options: dict[str, object]) -> None:
+    assert_same_updates(BY_NUMBER, agent, options)
+
+
+def assert_same_updates(sizes: WindowSpec, agent: AgentConfig, options: dict[str, object]) -> None:
     torch.manual_seed(0)
-    network = Agent(SPEC.obs_dim, SPEC.action_dim, agent)
-    network.normalizer.freeze(10, torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
+    network = Agent(SPEC.obs_dim, SPEC.action_dim, agent, sizes.missing, sizes.privileged)
+    total = torch.ones(sizes.statistics)
+    network.freeze_statistics(torch.tensor([10]), total, 20.0 * total)
     config = UpdateConfig(curiosity=BETA, learning_rate=1e-2, **options)  # type: ignore[arg-type]
     plain = PlainUpdate(copy.deepcopy(network), SPEC.burn_in, config, seed=3)
     update = make_update(network, SPEC.burn_in, config, seed=3)
-    spec = dataclasses.replace(SPEC, state=agent.state_size(SPEC.obs_dim))
+    spec = dataclasses.replace(sizes, state=agent.state_size(SPEC.obs_dim))
     for turn in range(3):
         rows, importance = random_rows(4, turn, spec), np.linspace(0.3, 1.0, 4).astype(np.float32)
         expected, priorities = plain(rows, importance, BETA)

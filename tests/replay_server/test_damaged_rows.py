@@ -22,7 +22,8 @@ WORDS = {  # field, value, and why a row with it can be none
     "initial_priority": (-1.0, "initial_priority is negative"),
 }
 DAMAGE = [(name, value) for name, (value, _) in WORDS.items()]
-DAMAGE += [(name, value) for name in FLOATS for value in (np.nan, np.inf, -np.inf)]
+THERE = [name for name in FLOATS if SPEC.dtype[name].itemsize]
+DAMAGE += [(name, value) for name in THERE for value in (np.nan, np.inf, -np.inf)]
 DAMAGE += [("serial", 2**40), ("serial", -1), ("serial", 4)]
 
 

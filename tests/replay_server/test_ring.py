@@ -1,8 +1,10 @@
 """The ring: what was committed is there, whole and once, wherever the process was killed."""
 
+import dataclasses
 import shutil
 import struct
 import tempfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +14,16 @@ from hypothesis import strategies as st
 
 from rmc.common.bus.protocol import EntryId
 from rmc.common.errors import ConfigError
-from rmc.common.window import WindowSpec
-from rmc.replay_server.commit_record import Progress, RecordPair, StreamPosition, decode_progress, record_bytes
+from rmc.common.window import WindowSpec, fingerprint
+from rmc.replay_server import former_rows
+from rmc.replay_server.commit_record import (
+    Progress,
+    RecordPair,
+    StreamPosition,
+    decode_progress,
+    decode_published,
+    record_bytes,
+)
 from rmc.replay_server.ring import Ring
 from tests.replay_server.support import SPEC, make_rows
 
@@ -24,11 +34,11 @@ def marks(ring: Ring) -> list[int]:
     """The marks of all windows that may be sampled, by serial, after checking that each is whole."""
     serials = np.arange(ring.progress.valid_from, ring.progress.next_serial)
     rows = np.zeros(len(serials), SPEC.dtype)
-    ring.gather(serials % ring.capacity, rows)
+    assert ring.gather(serials % ring.capacity, rows).all()
     assert rows["serial"].tolist() == serials.tolist()
     for row in rows:  # a window's contents follow from its mark
         (original,) = make_rows(1, int(row["reward"][0]))
-        original["serial"] = row["serial"]
+        original["serial"], original["checksum"] = row["serial"], row["checksum"]
         assert row.tobytes() == original.tobytes()
     return [int(mark) for mark in rows["reward"][:, 0]]
 
@@ -86,7 +96,7 @@ def tear_newest_record(path: Path) -> None:
 )
 def test_progress_survives_the_round_trip(numbers: list[int], streams: dict[int, tuple[int, int, int]]) -> None:
     *counters, observations = numbers
-    progress = Progress(SPEC.obs_dim, *counters, max_priority=3.5, observations=observations)
+    progress = Progress(SPEC.obs_dim, 1, *counters, max_priority=3.5, observations=np.array([observations]))
     progress.total += [1.0, 2.0, 3.0]
     progress.replay_ratio = 0.1
     progress.streams = {actor: StreamPosition(EntryId(e, s), n) for actor, (e, s, n) in streams.items()}
@@ -149,3 +159,75 @@ def test_space_is_taken_at_once(tmp_path: Path) -> None:
     Ring(tmp_path / "ring", SPEC, 5000)
     status = (tmp_path / "ring").stat()
     assert status.st_blocks * 512 >= status.st_size > 5000 * SPEC.dtype.itemsize
+
+
+ALL = dataclasses.replace(SPEC, missing=3, privileged=2)
+
+
+def test_counts_by_number_survive_the_round_trip_and_fit_into_a_record() -> None:
+    size, counts = ALL.statistics, ALL.counts
+    assert (size, counts) == (5, 5)
+    progress = Progress(size, counts, replay_ratio=4.0, observations=np.arange(1, 6))
+    progress.streams = {actor: StreamPosition(EntryId(1, 0), 0) for actor in range(4096)}
+    for dims in (size, 165, 166, 376):
+        records = RecordPair(np.zeros(2 * record_bytes(dims, dims), np.uint8), dims, dims)
+        many = dataclasses.replace(
+            progress, statistics=dims, counts=dims, observations=np.arange(dims), total=np.ones(dims),
+            total_square=np.ones(dims),
+        )  # fmt: skip
+        records.write(many)
+        read = records.read()
+        assert read is not None
+        assert read.encode() == many.encode()
+        assert read.observations.tolist() == list(range(dims))
+    assert decode_published(progress.publish(), size, counts) is not None
+    assert decode_published(progress.publish(), size) is None  # of other windows
+    assert decode_published(Progress(size).publish(), size, counts) is None
+
+
+@pytest.mark.parametrize("missing", ["missing", "blank"])
+def test_a_ring_of_an_older_version_is_rewritten(tmp_path: Path, missing: str) -> None:
+    """Its windows, counters and priorities' slots are what they were; damaged, it is refused as ever."""
+    path, capacity = tmp_path / "ring", 5
+    write_former_ring(path, missing, make_rows(8, 1), capacity)
+    (tmp_path / "ring.tmp").write_bytes(b"of a start that was killed")
+    before = path.read_bytes()
+    for _ in range(2):
+        ring = Ring(path, SPEC, capacity)
+        assert marks(ring) == [4, 5, 6, 7, 8]
+        assert (ring.progress.env_steps, ring.progress.next_serial) == (77, 8)
+        assert not (tmp_path / "ring.tmp").exists()
+    for spec in (ALL, dataclasses.replace(SPEC, privileged=1)):
+        path.write_bytes(before)
+        with pytest.raises(ConfigError, match=f"this run's of {spec.fingerprint}; use a new folder"):
+            Ring(path, spec, capacity)
+    path.write_bytes(before[:-1])
+    with pytest.raises(ConfigError, match="cut short"):
+        Ring(path, SPEC, capacity)
+
+
+def test_an_older_ring_without_room_to_rewrite_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_former_ring(tmp_path / "ring", "missing", make_rows(3), 5)
+    before = (tmp_path / "ring").read_bytes()
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10, 10, 0))  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match=r"--run-dir=.*older version, and rewriting it needs .* GiB in "):
+        Ring(tmp_path / "ring", SPEC, 5)
+    assert (tmp_path / "ring").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["ring"]
+
+
+def write_former_ring(path: Path, missing: str, rows: np.ndarray, capacity: int) -> None:
+    """As the versions before checksums wrote it: these rows, the oldest first, of which the last are there."""
+    dtype = former_rows._former_dtype(SPEC, missing)
+    kept = np.zeros(capacity, dtype)
+    for serial, row in enumerate(rows):
+        slot = kept[serial % capacity]
+        for name in dtype.names or ():
+            slot[name] = row["missing"][:, 0] if name == missing else row[name]
+        slot["serial"] = serial
+    identity = struct.pack("<8s16sQQ", b"RMCRING3", fingerprint(SPEC, dtype).encode(), capacity, dtype.itemsize)
+    identity += struct.pack("<I", zlib.crc32(identity))
+    records = np.zeros(2 * record_bytes(SPEC.obs_dim), np.uint8)
+    progress = Progress(SPEC.obs_dim, next_serial=len(rows), valid_from=max(0, len(rows) - capacity), env_steps=77)
+    RecordPair(records, SPEC.obs_dim).write(progress)
+    path.write_bytes(identity.ljust(RECORDS_START, b"\0") + records.tobytes() + kept.tobytes())

@@ -12,6 +12,7 @@ from rmc.common.bus.protocol import Bus, EntryId, Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusUnavailable, FencedError
 from rmc.common.replay import SampleStatus
+from rmc.common.window import WindowSpec
 from rmc.common.wire import encode_windows
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.observation_sums import observation_sums
@@ -114,18 +115,34 @@ def test_statistics_against_a_loop_and_padding_changes_nothing() -> None:
         row["observation"][t].astype(float)
         for row in rows
         for t in range(row["last"] - row["new_observations"] + 1, row["last"] + 1)
-        if not row["missing"][t]
+        if not row["missing"][t].any()
     ]
     sums = observation_sums(rows, SPEC)
     assert sums.count == len(expected)
     np.testing.assert_allclose(sums.total, np.sum(expected, axis=0), rtol=1e-9)
     np.testing.assert_allclose(sums.total_square, np.sum(np.square(expected), axis=0), rtol=1e-9)
     rows["observation"][~observation_valid(rows, SPEC)] = np.nan
-    rows["observation"][rows["missing"] == 1] = 1e30
+    rows["observation"][rows["missing"][..., 0] == 1] = 1e30
     again = observation_sums(rows, SPEC)
     assert again.count == sums.count
     assert np.array_equal(again.total, sums.total)
     assert np.array_equal(again.total_square, sums.total_square)
+
+
+def test_statistics_by_number_leave_out_what_is_missing_alone() -> None:
+    spec, rng = WindowSpec(3, 2, 4, burn_in=2, train=4, missing=3, privileged=2), np.random.default_rng(5)
+    rows = make_rows(50, spec=spec)
+    rows["missing"] = rng.random(rows["missing"].shape) < 0.4
+    rows["privileged"] = rng.normal(size=rows["privileged"].shape)
+    new = np.s_[:, -spec.train :]
+    seen = rows["missing"][new] == 0
+    observed, privileged = (rows[name][new].astype(float) for name in ("observation", "privileged"))
+    sums = observation_sums(rows, spec)
+    assert sums.count.tolist() == [*seen.sum((0, 1)), *[50 * spec.train] * 2]
+    expected = np.concatenate([(observed * seen).sum((0, 1)), privileged.sum((0, 1))])
+    np.testing.assert_allclose(sums.total, expected, rtol=1e-9)
+    expected = np.concatenate([(observed**2 * seen).sum((0, 1)), (privileged**2).sum((0, 1))])
+    np.testing.assert_allclose(sums.total_square, expected, rtol=1e-9)
 
 
 def test_statistics_survive_a_restart_and_count_once(make: Make, bus: MemoryBus) -> None:

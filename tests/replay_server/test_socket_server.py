@@ -121,11 +121,11 @@ def test_priorities_statistics_and_stats(serve: Serve) -> None:
     serials, priorities = np.array([0, 7, 10**6], np.int64), np.array([2, 5, 9], np.float32)
     connection.send(Kind.PRIORITIES, {"count": 3}, (serials.tobytes(), priorities.tobytes()))
     connection.send(Kind.STATISTICS, {})
-    header, meta, body = connection.receive(memoryview(bytearray(BIG)))
+    header, _, body = connection.receive(memoryview(bytearray(BIG)))
     expected = served.replay.statistics()
     assert header.kind is Kind.STATISTICS
-    assert meta["count"] == expected.count == 200 * SPEC.train
-    assert bytes(body) == expected.total.tobytes() + expected.total_square.tobytes()
+    assert expected.count.tolist() == [200 * SPEC.train]
+    assert bytes(body) == b"".join(x.tobytes() for x in (expected.count, expected.total, expected.total_square))
     connection.send(Kind.STATS, {})
     _, stats = connection.receive_small()
     assert stats["evicted_priorities"] == 1
@@ -375,7 +375,7 @@ def test_half_a_header_or_half_a_body_keeps_nobody_waiting(serve: Serve) -> None
 
 
 def test_a_client_that_does_not_read_keeps_nobody_waiting_and_gets_its_own_batch(serve: Serve) -> None:
-    served = serve(ReplayConfig(capacity=60_000, replay_ratio=1e9, warmup_steps=0), windows=4000)
+    served = serve(ReplayConfig(capacity=60_000, replay_ratio=1e9, warmup_steps=0), windows=3000)
     silent, busy = served.connect(), served.connect()
     silent._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     for _ in range(30):  # more than the kernel's buffers take

@@ -20,7 +20,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RESULT, RunFolder
 from rmc.deploy.run.validation import validate
 from rmc.sweep.pool import Ending
-from studies import averaging, generalisation, study
+from studies import averaging, generalisation, pybullet, study
 from studies.study import Play, Scale, Study
 
 NAMES = sorted({path.stem for path in Path(studies.__file__).parent.glob("*.py")} - {"__init__", "study"})
@@ -41,10 +41,11 @@ def test_every_run_is_one_that_rmc_takes(name, scale):
         command = parser.parse(job.command(job.folder))
         assert isinstance(command, train_options.Train | run_options.Baseline)
         assert (command.seed, command.run_dir, command.env.id) == (job.seed, job.folder, job.values["env"])
-        config = command.config()
+        config, begins_with = command.config(), None
         if isinstance(command, train_options.Train):
             validate(config)
-        seen.add(repr(dataclasses.replace(config, seed=0)))
+            begins_with = command.init_from, command.init_parts
+        seen.add(repr((dataclasses.replace(config, seed=0), begins_with)))
     assert len(seen) == len(jobs) / len({job.seed for job in jobs})  # no two agents are the same
 
 
@@ -222,3 +223,25 @@ def test_how_it_was_played_is_drawn(tmp_path):
     (tmp_path / "lines").write_text(json.dumps(line))
     generalisation.draw(tmp_path / "seen.png", [tmp_path / "lines"] * 2)
     assert (tmp_path / "seen.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_run_may_begin_with_another_agents():
+    """Of the same environment and seed, and its job comes before."""
+    agents = {"first": "train ENV", "second": "train ENV --init-from 'RUN:first'"}
+    jobs = Study("tiny", agents, small=Scale(1000, (1, 2), ("InvertedPendulum-v5",))).jobs("small")
+    assert [job.values["agent"] for job in jobs] == ["first", "second"] * 2
+    for source, job in zip(jobs[::2], jobs[1::2], strict=True):
+        assert job.words[job.words.index("--init-from") + 1] == str(source.folder)
+        assert source.seed == job.seed
+
+
+def test_pybullets_walkers_stand_beside_what_is_public(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(study, "RUNS", tmp_path)
+    (job, *_) = pybullet.STUDY.jobs("small")
+    job.folder.mkdir(parents=True)
+    RunFolder(job.folder).write_result(dict.fromkeys(RESULT, 500_000))
+    (tmp_path / "lines").write_text(json.dumps(pybullet.play(job)))
+    pybullet.report(tmp_path / "lines")
+    assert capsys.readouterr().out.splitlines()[2:] == [
+        "| pybullet/AntPositions-v0 | 1 | 500,000 | 500,000 ± 500,000 | 3,045 | 2,597 |"
+    ]

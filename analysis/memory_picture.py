@@ -1,0 +1,97 @@
+"""What an agent remembers, as panels of a picture and as tables: influence over delay, what h tells of the hidden."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from rmc.analysis.episodes import Episode, HiddenPart
+from rmc.analysis.influence import Influence, influence
+from rmc.analysis.memory_probe import Probe, probes
+from rmc.common.agent import Agent
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes  # an extra
+
+COLOURS = {"h": "tab:purple", "Q": "tab:orange", "action": "tab:blue"}
+TABLE_DELAYS = (1, 5, 10, 20, 50, 100, 300, 1_000)
+LEAST_R2 = -1.0  # drawn
+WIDTH = 100  # columns that the tables take
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """What an agent remembers."""
+
+    first: Influence  # of an episode's first observation
+    later: Influence
+    probes: list[Probe]
+
+    @property
+    def panels(self) -> int:
+        """That ``draw`` needs."""
+        return 1 + bool(self.probes)
+
+
+def remember(agent: Agent, episodes: list[Episode], parts: list[HiddenPart]) -> Remembered:
+    """From several episodes, and what they hide from the agent."""
+    return Remembered(*influence(agent, episodes), probes(agent, episodes, parts))
+
+
+def curves(one: Influence) -> dict[str, list[float]]:
+    """By quantity, one value for each delay."""
+    return {"h": one.h.tolist(), "Q": one.q.tolist(), "action": one.action.tolist()}
+
+
+def draw(memory: Remembered, axes: "list[Axes]") -> None:
+    """Influence in the first of ``panels`` axes, probes in the second."""
+    for name, one, style in (("first", memory.first, "-"), ("later", memory.later, "--")):
+        for quantity, values in curves(one).items():
+            label = f"{quantity}, {name} observation"
+            axes[0].plot(one.delays, values, style, color=COLOURS[quantity], marker=".", label=label)
+    axes[0].set_xscale("log")
+    axes[0].set_ylim(bottom=0.0)
+    axes[0].set_xlabel("steps after an observation is changed")
+    axes[0].set_ylabel("change / spread")
+    axes[0].legend(ncols=2, fontsize="small")
+    if memory.probes:
+        _draw_probes(memory.probes, axes[1])
+
+
+def _draw_probes(of: list[Probe], axis: "Axes") -> None:
+    places = range(len(of))
+    for offset, label, values, colour in (
+        (-0.2, "from h", [one.from_memory for one in of], "tab:purple"),
+        (0.2, "from the newest observation", [one.from_newest for one in of], "lightgrey"),
+    ):
+        lengths = [max(value, LEAST_R2) for value in values]
+        axis.barh([place + offset for place in places], lengths, 0.4, color=colour, label=label)
+    axis.set_yticks(list(places), [one.name for one in of])
+    axis.invert_yaxis()
+    axis.set_xlim(LEAST_R2 if any(min(one.from_memory, one.from_newest) < 0.0 for one in of) else 0.0, 1.0)
+    axis.set_xlabel("R² of what is hidden, read linearly")
+    axis.legend(fontsize="small")
+
+
+def tables(memory: Remembered) -> list[str | Table]:
+    """For a terminal."""
+    head = "one observation is changed; how much that changes later, as a share of each quantity's own spread:"
+    return [head, _influence_table(memory), *([_probe_table(memory.probes)] if memory.probes else [])]
+
+
+def _influence_table(memory: Remembered) -> Table:
+    delays = [k for k in TABLE_DELAYS if k in {*memory.first.delays, *memory.later.delays}]
+    heads = [f"{k} step{'s' * (k > 1)} later" if k == delays[0] else f"{k:,}" for k in delays]
+    table = Table("changed observation", "changes", *heads, box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name, one in (("first", memory.first), ("later", memory.later)):
+        for quantity, values in curves(one).items():
+            by_delay = dict(zip(one.delays, values, strict=True))
+            table.add_row(name, quantity, *(f"{by_delay[k]:.0%}" if k in by_delay else "" for k in delays))
+    return table
+
+
+def _probe_table(of: list[Probe]) -> Table:
+    table = Table("hidden", "R² from h", "from the newest observation", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for one in of:
+        table.add_row(one.name, *(f"{value:.2f}" for value in (one.from_memory, one.from_newest)))
+    return table

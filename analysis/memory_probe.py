@@ -1,0 +1,103 @@
+"""What can be read linearly out of h: a ridge regression in closed form, trained and tested on different episodes.
+
+What is read is what the agent is not shown: hidden parts of the observation, and what ``info["probe"]`` says.
+Shapes: N steps of several episodes, X numbers that are read from, Y numbers that are read.
+"""
+
+from dataclasses import dataclass
+from math import isfinite
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rmc.analysis.episodes import Episode, HiddenPart, remembered
+from rmc.common.agent import Agent
+
+Doubles = NDArray[np.float64]
+PENALTIES = (1e-4, 1e-2, 1.0)  # of the squared weights, as shares of the inputs' variance; one is chosen
+QUARTERS = 4  # of the episodes: two to train on, one to choose the penalty by, one to test on
+LEAST_SPREAD = 1e-6  # of what is read: what never changes says nothing
+
+
+@dataclass(frozen=True)
+class Probe:
+    """R² on the test's episodes: 1 reads everything, 0 no more than the mean."""
+
+    name: str
+    from_memory: float
+    from_newest: float  # from the newest observation that was seen, alone
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Rows of several episodes."""
+
+    h: Doubles  # (N, H)
+    newest: Doubles  # (N, O), the newest observation that was seen, normalised
+    own: Doubles  # (N, F), the environment's own observation
+    probe: dict[str, Doubles]  # (N,)
+    missing: NDArray[np.bool_]  # (N,), anything of the frame
+    quarter: NDArray[np.int64]  # (N,), the same for all steps of an episode
+
+
+def samples(agent: Agent, episodes: list[Episode]) -> Samples:
+    """All steps of all episodes, each with its last observation."""
+    joined = [(index, episode, remembered(agent, episode)[0].hidden[0]) for index, episode in enumerate(episodes)]
+    return Samples(
+        np.concatenate([h.double().numpy() for _, _, h in joined]),
+        np.concatenate([_newest(episode) for episode in episodes]),
+        np.concatenate([episode.own for episode in episodes]).astype(np.float64),
+        {name: np.concatenate([episode.probe[name] for episode in episodes]) for name in episodes[0].probe},
+        np.concatenate([episode.missing[0].any(-1).numpy() for episode in episodes]),
+        np.concatenate([np.full(len(h), index % QUARTERS) for index, _, h in joined]),
+    )
+
+
+def _newest(episode: Episode) -> Doubles:
+    """(T + 1, O), zeros until one is seen."""
+    observation, missing = episode.observation[0], episode.missing[0]
+    place = torch.where(missing, -1, torch.arange(len(missing)).unsqueeze(1)).cummax(0).values.expand_as(observation)
+    newest: Doubles = torch.where(place < 0, 0.0, observation.gather(0, place.clamp(min=0))).double().numpy()
+    return newest
+
+
+def probes(agent: Agent, episodes: list[Episode], parts: list[HiddenPart]) -> list[Probe]:
+    """Of each hidden part and of what the environment says; what never changes is left out."""
+    rows = samples(agent, episodes)
+    every = np.ones(len(rows.h), np.bool_)
+    wanted = [(part.name, rows.own[:, part.columns], rows.missing if part.only_missing else every) for part in parts]
+    wanted += [(name, values[:, None], every) for name, values in rows.probe.items()]
+    return [probe for name, y, at in wanted if (probe := _probe(name, rows, y, at)) is not None]
+
+
+def _probe(name: str, rows: Samples, y: Doubles, at: NDArray[np.bool_]) -> Probe | None:
+    """Of (N, Y) at some of the steps; None where there is nothing to train or test on."""
+    quarter, y = rows.quarter[at], y[at]
+    if len(set(quarter.tolist())) < QUARTERS:
+        return None
+    y = y[:, y[quarter < 2].std(0) > LEAST_SPREAD]
+    if not y.size:
+        return None
+    from_memory, from_newest = (explained(x[at], y, quarter) for x in (rows.h, rows.newest))
+    return Probe(name, from_memory, from_newest) if isfinite(from_memory) else None
+
+
+def explained(x: Doubles, y: Doubles, quarter: NDArray[np.int64]) -> float:
+    """R² of (N, Y) read from (N, X), over the last quarter; each number of Y weighs the same."""
+    trained, chosen, tested = quarter < 2, quarter == 2, quarter == 3
+    x, y = ((each - each[trained].mean(0)) / np.maximum(each[trained].std(0), LEAST_SPREAD) for each in (x, y))
+    weights = [_ridge(x[trained], y[trained], penalty) for penalty in PENALTIES]
+    best = max(weights, key=lambda one: _r2(y[chosen], x[chosen] @ one))
+    return _r2(y[tested], x[tested] @ best)
+
+
+def _ridge(x: Doubles, y: Doubles, penalty: float) -> Doubles:
+    """(X, Y) weights: (x'x / N + penalty)^-1 x'y / N."""
+    return np.asarray(np.linalg.solve(x.T @ x / len(x) + penalty * np.eye(x.shape[1]), x.T @ y / len(x)), np.float64)
+
+
+def _r2(y: Doubles, read: Doubles) -> float:
+    """1 - squared error / squared distance from the mean; minus infinity where y does not change."""
+    varied = ((y - y.mean(0)) ** 2).sum()
+    return float(1.0 - ((y - read) ** 2).sum() / varied) if varied > 0.0 else -np.inf

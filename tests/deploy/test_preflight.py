@@ -1,0 +1,55 @@
+"""What does not fit this machine is refused in one line, which says what does."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import psutil
+import pytest
+
+from rmc.common.agent_config import AgentConfig
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import RunConfig, WindowConfig
+from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.preflight import check_batch_fits, check_machine
+from rmc.deploy.run.presets import robust
+
+
+@pytest.fixture
+def memory(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Bytes of a machine that has little of it."""
+    size = 200_000_000
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(total=size))
+    return size
+
+
+def run(trained_steps: int, batch_size: int) -> RunConfig:
+    config = robust(EnvConfig("HalfCheetah-v5"))
+    learner = dataclasses.replace(config.learner, batch_size=batch_size)
+    replay = dataclasses.replace(config.replay, capacity=100)
+    return dataclasses.replace(config, window=WindowConfig(10, trained_steps), learner=learner, replay=replay)
+
+
+def test_a_batch_of_long_windows_that_no_memory_holds_is_refused_with_the_largest_that_it_may(memory: int) -> None:
+    check_batch_fits(run(990, 8))
+    with pytest.raises(
+        ConfigError, match=r"^--batch-size=64: .* of windows of 1000 steps takes .* GB of 0.2 GB"
+    ) as error:
+        check_batch_fits(run(990, 64))
+    most = int(str(error.value).rpartition(" ")[2])
+    check_batch_fits(run(990, most))
+    with pytest.raises(ConfigError, match=f"take at most {most}$"):
+        check_batch_fits(run(990, most + 1))
+    with pytest.raises(ConfigError, match="take fewer steps a window"):
+        check_batch_fits(dataclasses.replace(run(9_990, 1), agent=AgentConfig(hidden=4_096)))
+
+
+def test_a_run_is_refused_so_before_it_starts_but_on_a_gpu(memory: int, tmp_path, monkeypatch) -> None:
+    from rmc.deploy.run import preflight
+
+    monkeypatch.setattr(preflight, "check_device", lambda _: None)
+    options = LaunchOptions(tmp_path / "run", "fail", "local", "cpu", None)
+    with pytest.raises(ConfigError, match="--batch-size=64"):
+        check_machine(run(990, 64), options)
+    check_machine(run(990, 64), dataclasses.replace(options, device="cuda"))
+    check_machine(run(15, 64), options)
