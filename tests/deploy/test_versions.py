@@ -31,7 +31,8 @@ FORMAT_3 = """
     env.id env.flicker env.hide env.noise env.frame_stack env.action_repeat env.time_limit env.env_timeout
     env.env_kwargs preset seed total_steps actors window.burn_in window.trained_steps
     agent.hidden agent.embedding agent.heads agent.layer_norm agent.head_input agent.critic_norm
-    agent.privileged_critic agent.normalize_observations agent.grounding agent.missing_flag agent.impute_missing agent.initial_priority
+    agent.privileged_critic agent.normalize_observations agent.grounding agent.missing_flag agent.impute_missing
+    agent.initial_priority
     actor.envs_per_actor actor.stride actor.state_strategy actor.reward_scale actor.refresh_steps actor.chunk_windows
     actor.chunk_seconds actor.unacked_bytes
     replay.capacity replay.replay_ratio replay.warmup_steps replay.priority_exponent replay.replay_shards
