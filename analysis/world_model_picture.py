@@ -180,6 +180,6 @@ def draw(insight: Insight, title: str, out: Path | BinaryIO, memory: Remembered 
     axes[-1].plot(time, insight.predicted_reward, color="tab:blue", linewidth=0.8, label="predicted")
     axes[-1].set_ylabel("reward")
     axes[-1].set_xlabel("step of the episode")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=len(insight.ahead) + 1)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(insight.ahead) + 1)
     figure.suptitle(f"{title}: the world model against one episode (observations normalised)")
     figure.savefig(out, dpi=110)
