@@ -50,6 +50,7 @@ def draw(memory: Remembered, axes: "list[Axes]") -> None:
             label = f"{quantity}, {name} observation"
             axes[0].plot(one.delays, values, style, color=COLOURS[quantity], marker=".", label=label)
     axes[0].set_xscale("log")
+    axes[0].xaxis.set_major_formatter("{x:g}")
     axes[0].set_ylim(bottom=0.0)
     axes[0].set_xlabel("steps after an observation is changed")
     axes[0].set_ylabel("change / spread")

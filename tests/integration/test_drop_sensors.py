@@ -41,4 +41,6 @@ def test_a_run_trains_and_is_evaluated_with_sensors_missing(tmp_path: Path, caps
         assert main.run(["evaluate", str(what), "--episodes", "1", "--json"]) == 0
         played = json.loads(capsys.readouterr().out)
         assert (played["eval_drop_sensors"], played["eval_flicker"]) == (0.3, 0.0)
+    assert main.run(["evaluate", str(run), "--episodes", "1", "--flicker", "0.2"]) == 0
+    assert "Pendulum-v1 with 20% of the frames and 30% of the sensors missing: return" in capsys.readouterr().out
     assert main.run(["inspect", str(run), "--out", str(tmp_path / "inspect.png")]) == 0
