@@ -119,7 +119,7 @@ def test_the_normaliser_goes_on_from_the_sources(source: RunFolder, tmp_path: Pa
         run = Lockstep(OTHER, folder.path)
         run.learner.publish()
         own = run.server.statistics()
-        mean = (theirs * 1_200 + torch.from_numpy(own.total)) / (1_200 + own.count)
+        mean = (theirs * 1_200 + torch.from_numpy(own.total)) / (1_200 + int(own.count[0]))
         run.close()
         torch.testing.assert_close(published(run)["normalizer.mean"], mean.float(), atol=1e-3, rtol=1e-3)
 
