@@ -81,6 +81,5 @@ class LearnerConfig:
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     """Matrix products in bfloat16 (auto: where this CPU or GPU has instructions for it) or float32."""
     threads: int = 0
-    """CPU threads of the learner. 0 tries 1, 2, 4 … of this machine's cores within the first minutes, and keeps the
-    fastest. With several cores and scheme 3, memory and world model train in a process of their own, and both have as
-    many. 1 keeps one process. On Ray and in lockstep 0 takes one."""
+    """CPU threads of the learner. 0 tries 1, 2, 4 … and keeps the fastest; one on Ray and in lockstep. From 2 on, or 0
+    with two cores, memory and world model of scheme 3 train in a process of their own."""

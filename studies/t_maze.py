@@ -10,7 +10,7 @@ AGENTS = {
     "without a memory": "train ENV --preset memory --head-input observation --no-grounding --no-impute-missing",
     "RecurrentPPO": "baseline recurrent-ppo ENV",
 }
-STUDY = Study("t-maze", AGENTS, small=Scale(100_000, (1, 2, 3), ("studies.t_maze_env:TMaze50-v0",)))
+STUDY = Study("t_maze", AGENTS, small=Scale(100_000, (1, 2, 3), ("studies.t_maze_env:TMaze50-v0",)))
 
 if __name__ == "__main__":
     STUDY.main()

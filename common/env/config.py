@@ -42,6 +42,11 @@ class EnvConfig:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keywords that the environment is made with, like goal=1.5 map=maze pose=[0,1]: numbers, words, JSON."""
 
+    def takes_away(self) -> bool:
+        """Whether any option takes something from the observation."""
+        missing = self.flicker or self.drop_sensors
+        return bool(missing or self.delay or self.noise) or self.hide != "nothing"
+
 
 def read_kwargs(words: Sequence[str]) -> dict[str, Any]:
     """NAME=VALUE words as keywords, their values typed. Raises ConfigError."""

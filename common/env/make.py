@@ -108,7 +108,7 @@ def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None, privi
     seen_part = shown(env, config.hide)
     wrapped: Env = RescaledEnv(env)  # the innermost: it judges what the user's own code gives
     if privileged:
-        wrapped = Privileged(wrapped, take_observation=_is_disturbed(config))
+        wrapped = Privileged(wrapped, take_observation=config.takes_away())
     if limit:
         wrapped = gym.wrappers.TimeLimit(wrapped, limit)
     if config.action_repeat > 1:
@@ -124,11 +124,6 @@ def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None, privi
     if config.flicker:
         wrapped = Flicker(wrapped, config.flicker, config.flicker_burst)
     return FrameStack(wrapped, config.frame_stack) if config.frame_stack > 1 else wrapped
-
-
-def _is_disturbed(config: EnvConfig) -> bool:
-    """Whether a wrapper takes something from the observation."""
-    return bool(config.flicker or config.drop_sensors or config.delay or config.noise or config.hide != "nothing")
 
 
 def checked_reset(env: Env, seed: int | None) -> tuple[Floats, dict[str, Any]]:

@@ -1,6 +1,5 @@
 """How far back a memory can learn, beside how long an episode lasts, in one line."""
 
-from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import RunConfig
 
 
@@ -22,11 +21,7 @@ def reach_note(config: RunConfig) -> str | None:
     """That line where it matters: something older may count, and observations may not show it. Raises ConfigError."""
     steps, time_limit = config.window_spec().train, config.layout.time_limit
     is_whole = time_limit is not None and time_limit <= steps
-    if is_whole or config.agent.head_input == "observation" or not may_hide(config.env):
+    may_hide = config.env.takes_away() or ":" in config.env.id  # options say so, or it is the user's own
+    if is_whole or config.agent.head_input == "observation" or not may_hide:
         return None
     return format_reach(steps, time_limit)
-
-
-def may_hide(env: EnvConfig) -> bool:
-    """Whether observations may not show all, as far as can be told: options say so, or it is the user's own."""
-    return bool(env.flicker or env.noise) or env.hide != "nothing" or ":" in env.id

@@ -198,7 +198,9 @@ def test_the_environments_keywords_and_sizes_are_kept(tmp_path, monkeypatch, cap
     assert read(RunFolder(tmp_path / "run")).env == env
     assert of_run(RunFolder(tmp_path / "run")).env == "tests.habits:Wants-v0, goal=1.5, size=4, time limit 20"
     grown = Box(-99.0, 99.0, (5,), np.float32)
-    monkeypatch.setattr(habits.Wants, "__init__", lambda self, **_: setattr(self, "observation_space", grown))
+    monkeypatch.setattr(
+        habits.Wants, "__init__", lambda self, **_: vars(self).update(observation_space=grown, goal=1.5)
+    )
     says = "the environment now has 5 observations, the run was trained with 4"
     assert rmc(["evaluate", str(tmp_path / "run")]) == 2
     assert says in capsys.readouterr().err

@@ -51,7 +51,9 @@ def test_an_environments_own_privileged_numbers_are_float32_and_a_copy() -> None
     assert missing[1] or speed == pytest.approx(10.0 * observation[1])
 
 
-@pytest.mark.parametrize("taken", [{"flicker": 0.5}, {"noise": 1.0}, {"hide": "velocities"}])
+@pytest.mark.parametrize(
+    "taken", [{"flicker": 0.5}, {"drop_sensors": 0.3}, {"delay": 3}, {"noise": 1.0}, {"hide": "velocities"}]
+)
 def test_without_them_they_are_the_observation_before_anything_is_taken(taken: dict[str, Any]) -> None:
     clear = infos_of(EnvConfig(CHEETAH), privileged=False)
     seen = infos_of(EnvConfig(CHEETAH, **taken, frame_stack=2), privileged=True)

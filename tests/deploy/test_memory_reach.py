@@ -42,6 +42,8 @@ def test_the_line_names_both_lengths_and_the_options() -> None:
         run(time_limit=40),
         run("Pendulum-v1", flicker=0.5),
         run("Pendulum-v1", noise=0.1),
+        run("Pendulum-v1", drop_sensors=0.1),
+        run("Pendulum-v1", delay=2),
         run("HalfCheetah-v5", hide="velocities"),
         run(trained_steps=99),
     ],

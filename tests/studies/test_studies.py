@@ -23,7 +23,7 @@ from rmc.sweep.pool import Ending
 from studies import averaging, generalisation, pybullet, study
 from studies.study import Play, Scale, Study
 
-NAMES = sorted({path.stem for path in Path(studies.__file__).parent.glob("*.py")} - {"__init__", "study"})
+NAMES = sorted({path.stem for path in Path(studies.__file__).parent.glob("*.py")} - {"__init__", "study", "t_maze_env"})
 
 
 @pytest.mark.parametrize("name", NAMES)
