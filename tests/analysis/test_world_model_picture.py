@@ -83,7 +83,7 @@ def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -
     seen = episode.seen.numpy().squeeze(-1)
     assert 0 < seen.sum() < 40  # some frames were blank, and are left out
     before = np.concatenate([episode.observation[0, :1].numpy(), insight.real[:-1]])
-    error, change = (np.abs(x - insight.real)[seen[:, 0]].sum(0) for x in (insight.predicted, before))
+    error, change = (np.abs(x - insight.real)[seen].sum(0) for x in (insight.predicted, before))
     np.testing.assert_allclose(insight.unexplained, error / change, rtol=1e-4)
 
 

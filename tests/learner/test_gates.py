@@ -1,4 +1,4 @@
-"""How far back the memory reaches before anything is learnt."""
+"""How far back the memory's gates reach before anything is learnt."""
 
 import pytest
 import torch
