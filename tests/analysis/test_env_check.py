@@ -131,3 +131,11 @@ def test_what_cannot_be_made_is_one_line(capsys):
     assert main.run(["check-env", "CartPole-v1"]) == 2
     assert "actions are Discrete" in capsys.readouterr().err
     assert main.run(["check-env", "HalfCheetah-v5", "--steps", "0"]) == 2
+
+
+def test_what_options_take_away_is_no_fault(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--drop-sensors", "0.3", "--flicker", "0.2", "--flicker-burst", "4", "--delay", "3", "--steps", "100"]
+    status, printed = checked("Pendulum-v1", capsys, *words)
+    assert status == 0
+    assert "observations 3, actions 1, time limit 200" in printed
+    assert "fault" not in printed

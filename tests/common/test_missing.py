@@ -219,11 +219,3 @@ def test_a_run_refuses_it_before_it_begins(words: list[str], says: str, capsys: 
     assert main.run([*run, *words]) == 2
     assert capsys.readouterr().err == f"rmc: {says}\n"
     assert not (tmp_path / "run").exists()
-
-
-def test_such_an_environment_can_be_checked(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--drop-sensors", "0.3", "--flicker", "0.2", "--flicker-burst", "4", "--delay", "3", "--steps", "100"]
-    assert main.run(["check-env", "Ones-v0", *words]) == 0
-    printed = capsys.readouterr().out
-    assert f"observations {SIZE}, actions 1, time limit 100" in printed
-    assert "fault" not in printed
