@@ -32,6 +32,7 @@ def test_a_killed_launcher_takes_everything_along(tmp_path: Path) -> None:
         again.interrupt()
 
 
+@pytest.mark.long
 def test_a_temporary_folder_with_a_long_and_odd_name_is_no_fault(tmp_path: Path) -> None:
     """Sockets lie in it, or in another one where their paths do not fit."""
     odd = tmp_path / f'a#b?c%d e"f\\g{"x" * 60}'

@@ -38,6 +38,7 @@ def test_neither_ends_the_run_or_a_role(tmp_path: Path) -> None:
         assert training.interrupt() < 20
 
 
+@pytest.mark.long
 def test_answers_that_pass_are_waited_out_and_one_that_does_not_names_its_key(tmp_path: Path) -> None:
     with (
         tempfile.TemporaryDirectory() as short,

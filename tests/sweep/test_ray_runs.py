@@ -26,6 +26,7 @@ def kept() -> list[Path]:
     return list(BASE.iterdir()) if BASE.exists() else []
 
 
+@pytest.mark.long
 def test_runs_are_spread_and_their_folders_come_without_the_ring(tmp_path: Path) -> None:
     folder, spec = tmp_path / "sweep", str(write_spec(tmp_path, seeds=(1, 2)))
     with Sweeping(folder, spec, *RAY) as sweep:
