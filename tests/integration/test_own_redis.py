@@ -6,6 +6,7 @@ from contextlib import closing
 from pathlib import Path
 
 import psutil
+import pytest
 import redis
 
 from rmc.deploy.redis.server import RedisServer
