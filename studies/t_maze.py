@@ -1,12 +1,13 @@
 """The passive T-maze: is a cue at the first step remembered to the end of a corridor of L steps?
 
-Best is 1. An agent without a memory stands beside ours: it makes 0 on average.
+Best is 1. Beside the preset for it stand the default, and an agent without a memory, which makes 0 on average.
 """
 
 from studies.study import Scale, Study
 
 AGENTS = {
     "memory": "train ENV --preset memory",
+    "robust": "train ENV",
     "without a memory": "train ENV --preset memory --head-input observation --no-grounding --no-impute-missing",
     "RecurrentPPO": "baseline recurrent-ppo ENV",
 }
