@@ -32,7 +32,7 @@ NEEDS_TORCH := common/test_process_state.py common/test_wire.py replay_server/te
 WITHOUT_TORCH := import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; print(*(one for one in project["dependencies"] if not one.startswith("torch")), sep="\n")
 
 test-newest: $(VENV)-$(NEWEST)/.installed
-	$(VENV)-$(NEWEST)/bin/python -m pytest -q tests/common tests/cli/test_startup.py tests/replay_server $(addprefix --ignore tests/,$(NEEDS_TORCH))
+	$(VENV)-$(NEWEST)/bin/python -m pytest -q -n 2 tests/common tests/cli/test_startup.py tests/replay_server $(addprefix --ignore tests/,$(NEEDS_TORCH))
 
 $(VENV)-$(NEWEST)/.installed: pyproject.toml constraints.txt
 	test -n "$(NEWEST_PYTHON)" || { echo "no Python $(NEWEST) here: make test-newest NEWEST_PYTHON=/path/to/python$(NEWEST)"; exit 1; }

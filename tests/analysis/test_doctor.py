@@ -274,6 +274,7 @@ def trained(folder: Path, *words: str) -> str:
     return asked.stdout
 
 
+@pytest.mark.long
 def test_a_real_run_that_its_learner_holds_back(tmp_path: Path) -> None:
     assert "learner-bound: actors waited " in trained(tmp_path / "run", "InvertedPendulum-v5", "--replay-ratio", "64")
 

@@ -16,6 +16,7 @@ ENV_TIMEOUT = 2.0
 OPTIONS = ("--total-steps", "10000000", "--replay-ratio", "8", "--env-timeout", str(ENV_TIMEOUT))
 
 
+@pytest.mark.long
 def test_neither_ends_the_run_or_a_role(tmp_path: Path) -> None:
     with (
         tempfile.TemporaryDirectory() as short,
