@@ -33,7 +33,7 @@ class AgentConfig:
     """LayerNorm before the ReLUs of the critics."""
     privileged_critic: bool = False
     """The critics, and nothing else, also read the environment's info["privileged"]. Where it gives none, that is the
-    observation before flicker, noise or hiding."""
+    observation before any option takes from it."""
     normalize_observations: bool = False
     """Observations are normalised by the replay server's running statistics."""
     grounding: bool = True

@@ -1,7 +1,9 @@
 """The learner role against a real replay server in the same thread."""
 
+import dataclasses
 import io
 import json
+import sys
 import time
 
 import numpy as np
@@ -69,6 +71,17 @@ def test_first_weights_are_out_before_any_experience(setting):
     assert setting.bus.latest_version() == (1, 0)
     assert not setting.learner.step()
     assert setting.learner.waiting_for() == "experience"
+
+
+@pytest.mark.parametrize("start", ["uniform", "chrono"])
+def test_gates_start_as_the_agent_says(start, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "AGENT", dataclasses.replace(AGENT, gate_init=start))
+    fresh = Setting(tmp_path)
+    gru = fresh.learner.agent.memory.gru
+    update_gates = (gru.bias_ih_l0 + gru.bias_hh_l0)[gru.hidden_size : 2 * gru.hidden_size]
+    assert bool((update_gates >= 0.0).all()) is (start == "chrono")
+    fresh.learner.close()
+    fresh.server.close()
 
 
 @pytest.mark.usefixtures("one_thread")
