@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo wheel site guard test test-faults test-long test-cluster test-container test-dm-control test-pybullet test-newest lint docs bench peers clean
+.PHONY: env demo wheel site guard test test-failed test-faults test-long test-cluster test-container test-dm-control test-pybullet test-newest lint docs bench peers clean
 
 env: $(STAMP)
 
@@ -22,6 +22,10 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder --durations=25 --durations-min=5
+
+# Those that failed when they last ran, one after the other.
+test-failed: $(STAMP)
+	$(BIN)/python -m pytest --last-failed --last-failed-no-failures none
 
 # The newest Python that every wheel resolves for, without torch, whose wheels there bring gigabytes of CUDA: all that
 # never imports it, in an environment of its own.

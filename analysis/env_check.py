@@ -16,6 +16,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.describe import layout_of
 from rmc.common.env.faults import RAISED, describe_error
 from rmc.common.env.make import first_env, make_env
+from rmc.common.env.privileged import Privileged
 from rmc.common.env.process_state import changes
 from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Floats
@@ -70,6 +71,7 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
         lambda: _guarded(lambda: played.play(env, steps, seed=0)),
         lambda: _nonsense(played),
         lambda: _hints(env, played),
+        lambda: _for_critics(env),
         lambda: _second(config),
     ]
     lines: list[str] = []
@@ -157,6 +159,20 @@ def _hints(env: Env, played: Played) -> Iterator[str]:
         yield "note: no episode ended; without a time limit an evaluation stops at 10 000 steps (--time-limit)"
     if not np.array_equal(_again(env), _again(env)):
         yield "note: the same seed and actions gave other observations; runs will not be repeatable"
+
+
+def _for_critics(env: Env) -> Iterator[str]:
+    """Whether ``--privileged-critic`` could take what the environment gives under that name, if it does."""
+    watched = Privileged(env, take_observation=False)
+    try:
+        given = watched.reset(seed=2)[1].get("privileged")
+        if given is None:
+            return
+        Played().play(watched, REPEATED_STEPS, seed=2)
+    except EnvFault as fault:
+        yield f"note: --privileged-critic would end in: {fault}"
+    else:
+        yield f'note: info["privileged"] has {given.size} numbers, which critics alone read with --privileged-critic'
 
 
 def _second(config: EnvConfig) -> Iterator[str]:

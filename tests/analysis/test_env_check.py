@@ -43,6 +43,13 @@ class Unrewarded(Odd):
         return self._observation(), 0.0, False, False, {}
 
 
+class Untold(Odd):
+    """What critics alone may read is no number."""
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        return super().reset(**options)[0], {"privileged": [1.0, np.nan]}
+
+
 class Rewarded(Odd):
     """Each reward has the same size, but for every hundredth."""
 
@@ -59,6 +66,7 @@ for _name, _sizes in {
 }.items():  # fmt: skip
     gym.register(f"{_name}-v0", Rewarded, kwargs=dict(zip(("size", "rare"), _sizes, strict=False)))
 gym.register("Odd-v0", entry_point=Odd)
+gym.register("Untold-v0", entry_point=Untold)
 gym.register("Unrewarded-v0", entry_point=Unrewarded)
 
 
@@ -139,3 +147,16 @@ def test_what_options_take_away_is_no_fault(capsys: pytest.CaptureFixture[str]) 
     assert status == 0
     assert "observations 3, actions 1, time limit 200" in printed
     assert "fault" not in printed
+
+
+@pytest.mark.parametrize(
+    ("env", "words"),
+    [
+        ("tests.partial_env:Partial-v0", 'info["privileged"] has 2 numbers, which critics alone read'),
+        ("Untold-v0", '--privileged-critic would end in: the environment\'s info["privileged"] is not finite'),
+    ],
+)
+def test_what_critics_alone_may_read_is_noted(env: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    status, text = checked(env, capsys, "--steps", "100")
+    assert status == 0
+    assert f"note: {words}" in text
