@@ -90,7 +90,7 @@ def _bare(run: RunConfig, batch_size: int, precision: Precision, seconds: float)
     batch = view_batch(torch.from_numpy(rows.view("u1").reshape(batch_size, -1)), torch.ones(batch_size), spec)
 
     def work() -> int:
-        parts, _ = update.forward(batch, beta)
+        parts, *_ = update.forward(batch, beta)
         agent.zero_grad(set_to_none=True)
         sum(parts.values()).backward()  # type: ignore[union-attr]
         return batch_size * spec.train

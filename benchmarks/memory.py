@@ -20,12 +20,13 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.window import WindowSpec
 from rmc.common.wire import encode_windows
 from rmc.deploy.run.presets import robust
+from rmc.learner.config import MODEL_PROCESS
 from rmc.replay_server.ring import Ring
 
 ROWS = 10_000  # of the ring that is measured
 CHUNK = 16  # windows an entry
 LOOK_SECONDS = 0.2
-ROLES = ("launcher", "redis", "replay", "learner", "evaluator", "actor")
+ROLES = ("launcher", "redis", "replay", "learner", "evaluator", "actor", MODEL_PROCESS)
 
 
 def sizes(env_id: str) -> list[Row]:
@@ -77,7 +78,8 @@ def _look(launcher: psutil.Process, readings: dict[str, list[float]]) -> None:
             words, held = process.cmdline(), process.memory_info().rss
         except psutil.Error:  # it has ended meanwhile
             continue
-        role = next((role for role in ROLES if role in words), "redis")
+        words = ["redis"] if any("redis-server" in word for word in words) else [word.strip() for word in words]
+        role = next((role for role in ROLES if role in words), "launcher")  # or a child of it that has no name yet
         readings["launcher" if process == launcher else role].append(held / 1e6)
 
 
