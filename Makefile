@@ -113,7 +113,7 @@ guard: $(STAMP)
 	$(BIN)/python -m benchmarks.guard
 
 # Each beside what a user would pick instead, where make peers has installed that. Results: docs/performance.md.
-BENCHMARKS := replay ingest learner actor weights growth memory cuda end-to-end
+BENCHMARKS := replay ingest learner actor weights growth memory cuda end-to-end update-time
 
 bench: $(addprefix bench-,$(BENCHMARKS))
 
