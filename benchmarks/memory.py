@@ -78,7 +78,8 @@ def _look(launcher: psutil.Process, readings: dict[str, list[float]]) -> None:
             words, held = process.cmdline(), process.memory_info().rss
         except psutil.Error:  # it has ended meanwhile
             continue
-        words = ["redis"] if any("redis-server" in word for word in words) else [word.strip() for word in words]
+        server = any(f"{name}-server" in word for name in ("redis", "valkey") for word in words)
+        words = ["redis"] if server else [word.strip() for word in words]
         role = next((role for role in ROLES if role in words), "launcher")  # or a child of it that has no name yet
         readings["launcher" if process == launcher else role].append(held / 1e6)
 

@@ -16,7 +16,7 @@ def test_a_bare_pass_trains_steps() -> None:
 @pytest.mark.parametrize(
     ("words", "role"),
     [
-        (["/usr/bin/redis-server unixsocket:/tmp/x.sock"], "redis"),
+        (["/usr/bin/valkey-server unixsocket:/tmp/x.sock"], "redis"),
         ([f"{MODEL_PROCESS}   "], MODEL_PROCESS),
         (["python", "-P", "-m", "rmc.deploy.local.role_process", "actor", "0"], "actor"),
     ],
