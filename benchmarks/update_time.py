@@ -63,7 +63,16 @@ def sampled(run: Path, pids: dict[str, int], seconds: float) -> dict[str, dict[s
 
 def _spy(pid: int, out: Path, seconds: float) -> subprocess.Popen[bytes]:
     words = [str(Path(sys.executable).with_name("py-spy")), "record", "--pid", str(pid), "--rate", str(RATE)]
-    words += ["--duration", str(round(seconds)), "--format", "raw", "--full-filenames", "--output", str(out)]
+    words += [
+        "--nonblocking",
+        "--duration",
+        str(round(seconds)),
+        "--format",
+        "raw",
+        "--full-filenames",
+        "--output",
+        str(out),
+    ]
     return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
@@ -82,7 +91,7 @@ def category(stack: list[str]) -> str:
     ]
     for name, file, _ in frames:
         for kind, functions in BY_FUNCTION.items():
-            if f"{Path(file).name}:{name}" in functions:
+            if f"{Path(file).name}:{name.rpartition('.')[2]}" in functions:
                 return kind
     _, file, number = frames[-1]
     text = linecache.getline(file, int(number or 0))
