@@ -35,7 +35,7 @@ from benchmarks.harness import (
     save,
     speed,
 )
-from benchmarks.sender import CHUNK, Sender
+from benchmarks.sender import Sender
 from rmc.common.agent import Agent
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
@@ -61,7 +61,7 @@ def replay_of(run: RunConfig) -> Iterator[RedisBus]:
     """A replay server with windows to draw, as fast as it is asked."""
     with replay_process(run.window_spec(), ReplayConfig(replay_ratio=1e9, warmup_steps=0)) as bus:
         sender = Sender(bus, run.window_spec())
-        for _ in range(WINDOWS // CHUNK):
+        for _ in range(WINDOWS // sender.chunk):
             sender.send()
         sender.wait()
         yield bus

@@ -3,19 +3,19 @@
 import time
 
 from benchmarks.harness import random_rows
-from rmc.common.bus.protocol import EntryId
-from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.bus.protocol import Bus, EntryId
 from rmc.common.window import WindowSpec
-from rmc.common.wire import encode_hello, encode_windows
+from rmc.common.wire import MAX_ENTRY_BYTES, encode_hello, encode_windows
 
-CHUNK = 16  # windows an entry
+CHUNK = 16  # windows an entry, fewer of large ones
 
 
 class Sender:
     """Actor 0; each entry is encoded anew, as an actor does."""
 
-    def __init__(self, bus: RedisBus, spec: WindowSpec) -> None:
-        self.bus, self.spec, self._rows = bus, spec, random_rows(spec, CHUNK)
+    def __init__(self, bus: Bus, spec: WindowSpec) -> None:
+        self.bus, self.spec, self.chunk = bus, spec, min(CHUNK, max(1, MAX_ENTRY_BYTES // spec.dtype.itemsize))
+        self._rows = random_rows(spec, self.chunk)
         self._epoch, self.seq, self._acknowledged = bus.take_epoch("actor-0"), 0, 0
         self.bus.append(0, EntryId(self._epoch, 0), encode_hello(spec))
 
