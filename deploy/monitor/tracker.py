@@ -44,7 +44,7 @@ class Tracker:
         with self._log.open("ab") as errors:
             self._process = subprocess.Popen(
                 words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, env=environment,
-                start_new_session=True,  # Ctrl-C is the launcher's
+                process_group=0,  # Ctrl-C is the launcher's; in a session of its own, a film's priority would not count
             )  # fmt: skip
         assert self._process.stdout is not None
         os.set_blocking(self._process.stdout.fileno(), False)
