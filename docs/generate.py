@@ -26,8 +26,10 @@ TITLES = {
     "evaluator": "Evaluation",
 }
 HEAD, RULE = "| option | default | what it is | when to touch it |", "|---|---|---|---|"
-PLACEMENT = ["run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls"]
-PLACEMENT += ["metrics_port", "metrics_host", "dry_run"]
+PLACEMENT = [
+    "run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls", "metrics_port",
+    "metrics_host", "dry_run",
+]  # fmt: skip
 TRACKING = ["track", "track_project", "track_tags", "track_video_every"]
 BEGINNING = ["init_from", "init_parts"]
 # When a user should touch an option; what it does is said where it is defined.

@@ -66,7 +66,8 @@ def scraped(port: int) -> str:
 
 def test_every_role_is_shown(board: RunStatus, port: int) -> None:
     with exporter.served(board, "first", LaunchOptions(None, metrics_port=port)):
-        text = scraped(port)
+        for _ in range(2 * exporter.MOST_CLIENTS):
+            text = scraped(port)
     families = list(text_string_to_metric_families(text))
     shown = {(one.name, *one.labels.values()): one.value for family in families for one in family.samples}
     silent = shown.pop(("rmc_silent_seconds", "actor-0"))
@@ -102,24 +103,10 @@ def test_strangers_take_few_handles_and_the_end_waits_for_none(board: RunStatus,
         strangers = [socket.create_connection((HERE, port), timeout=10) for _ in range(exporter.MOST_CLIENTS)]
         with socket.create_connection((HERE, port), timeout=10) as one_more:
             assert one_more.recv(1) == b""
-        strangers.pop().close()
-        for _ in range(100):  # the room that it leaves
-            if "rmc_run_info" in _scraped_or_nothing(port):
-                break
-            time.sleep(0.05)
-        else:
-            raise AssertionError("no room came back")
         began = time.monotonic()
     assert time.monotonic() - began < 2.0
     for stranger in strangers:
         stranger.close()
-
-
-def _scraped_or_nothing(port: int) -> str:
-    try:
-        return scraped(port)
-    except OSError:
-        return ""
 
 
 def test_a_port_that_is_taken_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
