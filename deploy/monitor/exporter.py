@@ -71,8 +71,12 @@ class RunCollector(Collector):
         yield InfoMetricFamily("rmc_run", "The run.", about)
         for name, text, value in (
             ("total_steps", "Environment steps of the run's total.", board.total_steps),
-            ("evaluation_return", "Mean return of the last evaluation.", board.last and board.last.return_mean),
-            ("evaluation_return_best", "The best so far.", board.best and board.best.return_mean),
+            (
+                "evaluation_return",
+                "Mean return of the last evaluation.",
+                board.last.return_mean if board.last else None,
+            ),
+            ("evaluation_return_best", "The best so far.", board.best.return_mean if board.best else None),
         ):
             yield GaugeMetricFamily(f"rmc_{name}", text, value)
         silent = board.silent()

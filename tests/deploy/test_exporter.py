@@ -21,6 +21,7 @@ from rmc.deploy.local.role_command import launcher_command
 from rmc.deploy.monitor import exporter
 from rmc.deploy.monitor.run_status import RunStatus
 from rmc.deploy.run.launch_options import LaunchOptions
+from tests.integration.running import free_port
 
 ROOT = Path(__file__).parents[2]
 ALERTS = ROOT / "deploy" / "monitor" / "alerts.yaml"
@@ -43,8 +44,7 @@ CASES = [  # an alert, what it looks at, and in which minutes it is silent and f
 
 @pytest.fixture
 def port() -> int:
-    with socket.create_server((HERE, 0)) as free:
-        return int(free.getsockname()[1])
+    return free_port()
 
 
 @pytest.fixture

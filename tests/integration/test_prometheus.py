@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import socket
 import subprocess
 import time
 import urllib.parse
@@ -13,16 +12,11 @@ from typing import Any, Self
 
 import pytest
 
-from tests.integration.running import Training
+from tests.integration.running import Training, free_port
 
 MONITOR = Path(__file__).parents[2] / "deploy" / "monitor"
 HERE = "127.0.0.1"
 SILENT = 'ALERTS{alertname="RmcRoleSilent", alertstate="firing", role="actor-0"}'
-
-
-def free_port() -> int:
-    with socket.create_server((HERE, 0)) as free:
-        return int(free.getsockname()[1])
 
 
 class Prometheus:
