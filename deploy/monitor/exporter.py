@@ -71,12 +71,8 @@ class RunCollector(Collector):
         yield InfoMetricFamily("rmc_run", "The run.", about)
         for name, text, value in (
             ("total_steps", "Environment steps of the run's total.", board.total_steps),
-            (
-                "evaluation_return",
-                "Mean return of the last evaluation.",
-                board.last.return_mean if board.last else None,
-            ),
-            ("evaluation_return_best", "The best so far.", board.best.return_mean if board.best else None),
+            ("evaluation_return", "Mean of the last evaluation.", board.last.return_mean if board.last else None),
+            ("evaluation_return_best", "Mean of the best one.", board.best.return_mean if board.best else None),
         ):
             yield GaugeMetricFamily(f"rmc_{name}", text, value)
         silent = board.silent()
