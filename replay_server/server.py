@@ -319,6 +319,8 @@ class ReplayServer:
             "env_steps": progress.env_steps,
             "windows": progress.next_serial,
             "ring_fill": progress.windows / self._store.ring.capacity,
+            "ring_windows": progress.windows,
+            "ring_capacity": self._store.ring.capacity,
             "draws": progress.draws,
             "drawn_steps": progress.drawn_steps,
             "replay_ratio": limiter.ratio(self._inserted, self._drawn) * self._share,

@@ -31,6 +31,7 @@ def train(
     track_project: str | None = None,
     track_tags: Sequence[str] = (),
     track_video_every: int | None = None,
+    metrics_port: int | None = None,
 ) -> dict[str, Any]:
     """Train a run to its ``total_steps``, or go on with the one in ``run_dir``; its ``result.json``.
 
@@ -53,6 +54,7 @@ def train(
         track_project=track_project,
         track_tags=tuple(track_tags),
         track_video_every=track_video_every,
+        metrics_port=metrics_port,
     )
     return _train(config, options)
 
@@ -67,6 +69,7 @@ def resume(
     launcher: Launcher | None = None,
     device: str | None = None,
     redis_url: str | None = None,
+    metrics_port: int | None = None,
 ) -> dict[str, Any]:
     """Go on with the run in ``run_dir``; its ``result.json``. What is None stays as it was at the last start.
 
@@ -75,7 +78,7 @@ def resume(
     folder = RunFolder(Path(run_dir))
     config, options = folder.config(), last_launch(folder, launcher)
     settings: dict[str, Any] = {"total_steps": total_steps, "actors": actors}
-    how: dict[str, Any] = {"device": device, "redis_url": redis_url}
+    how: dict[str, Any] = {"device": device, "redis_url": redis_url, "metrics_port": metrics_port}
     if replay_ratio is not None:
         settings["replay"] = replace(config.replay, replay_ratio=replay_ratio)
     if learning_rate is not None:

@@ -144,6 +144,9 @@ class MemoryBus:
             cursors[role] = str(forgotten + len(kept))
         return records, cursors
 
+    def memory_bytes(self) -> int:
+        return 0
+
     def request_stop(self, reason: str) -> None:
         self._stop = reason
 

@@ -173,6 +173,9 @@ class Bus(Protocol):
         What is no record is left out.
         """
 
+    def memory_bytes(self) -> int:
+        """What its server has allocated; 0 where there is none, or it does not say."""
+
     def request_stop(self, reason: str) -> None:
         """Ask every role to end."""
 

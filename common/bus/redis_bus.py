@@ -249,6 +249,12 @@ class RedisBus(RedisConnection):
             self.refused[error.reason] += 1
             return None
 
+    def memory_bytes(self) -> int:
+        try:
+            return int(self.call(self.redis.memory_stats)["total.allocated"])
+        except ConfigError:  # in a Redis of the user's own, whom it does not let ask
+            return 0
+
     def request_stop(self, reason: str) -> None:
         self.call(lambda: self.redis.set(self.key("stop"), reason))
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from rmc.common.shard import Shard
 from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.launch_options import LaunchOptions
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,10 @@ def replay_command(shard: Shard, run: str, folder: str, listen: str, secrets: Se
     return RoleCommand(shard.role, ("role", "replay", *words), forked=False)
 
 
-def launcher_command(folder: str, ray_address: str, device: str, all_cpus: bool, tls: bool) -> RoleCommand:
+def launcher_command(folder: str, ray_address: str, options: LaunchOptions) -> RoleCommand:
     """That of a run's launcher on a Ray cluster's head."""
-    words = [folder, "--ray-address", ray_address, "--device", device]
-    words += ["--all-cpus"] * all_cpus + ["--tls"] * tls
+    words = [folder, "--ray-address", ray_address, "--device", options.device]
+    words += ["--all-cpus"] * options.all_cpus + ["--tls"] * options.tls
+    if options.metrics_port is not None:
+        words += ["--metrics-port", str(options.metrics_port), "--metrics-host", options.metrics_host]
     return RoleCommand("launcher", ("role", "launcher", *words), single_thread=False, ends=True)

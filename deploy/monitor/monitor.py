@@ -40,9 +40,10 @@ class Monitor:
         self.roles: Callable[[], tuple[str, ...]] = config.roles  # who may have something to say
         self._cursors: dict[str, str] = {}
         self._refused = 0  # records and values that could not be read
+        self._redis_bytes = 0
         self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
         self._next_record, self._is_away = 0.0, False
-        self._metrics_log, self._host = MetricsLog(folder, flat(config)), HostFigures()
+        self._metrics_log, self._host = MetricsLog(folder, flat(config)), HostFigures(folder.path)
         self._folder, self._writable, self._tracker = folder, True, tracker
         self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
         self.view, self.outage = View(self.board, console), OutageLog("launcher")
@@ -66,14 +67,16 @@ class Monitor:
 
         Raises ConfigError where the run's folder was deleted or moved.
         """
-        was_away = self._is_away
+        was_away, due = self._is_away, time.monotonic() >= self._next_record
         try:
             self._take_in(bus)
+            if due:
+                self._redis_bytes = bus.memory_bytes()
             self.outage.end()
         except (BusUnavailable, BusFull) as error:
             self.outage.begin(error)
         self._is_away = self.outage.seconds > 0
-        if time.monotonic() >= self._next_record or self._is_away != was_away:
+        if due or self._is_away != was_away:
             self._next_record = time.monotonic() + RECORD_SECONDS
             self._look_at_folder()
             self._record_launcher()
@@ -128,6 +131,7 @@ class Monitor:
                 **restarts,
                 "refused_values": self._refused,
                 "redis_away_s": self.outage.seconds,
+                "redis_memory_bytes": self._redis_bytes,
                 "not_running": " ".join(self.unplaced()),
                 **self._host.take(),
             }

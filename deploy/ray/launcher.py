@@ -23,6 +23,7 @@ from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, last_line
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 
 BEGIN_SECONDS = 60.0  # of the launcher's host
 
@@ -53,7 +54,7 @@ def joined(address: str, cpus: int | None = None) -> Iterator[None]:
         ray.shutdown()
 
 
-def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> None:
+def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None:
     """Start a run's launcher on this node, which must be the head. Raises ConfigError."""
     context = ray.get_runtime_context()
     head = next((node for node in ray.nodes() if "node:__internal_head__" in node["Resources"]), None)
@@ -63,13 +64,13 @@ def launch(config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, en
         )
     for file in (tls.CERTIFICATE, tls.KEY):  # for the address that the head has now
         (folder.path / file).unlink(missing_ok=True)
-    command = launcher_command(str(folder.path), context.gcs_address, device, all_cpus, encrypted)
-    options = ray.remote(LauncherActor).options(
+    command = launcher_command(str(folder.path), context.gcs_address, options)
+    actor = ray.remote(LauncherActor).options(
         name=actor_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
         max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
     )  # fmt: skip
     task = Task(folder.name, command, {}, {}, os.getcwd())
-    host = options.remote(task, str(folder.path), config.learner.keep_checkpoints)
+    host = actor.remote(task, str(folder.path), config.learner.keep_checkpoints)
     try:
         ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)
     except ray.exceptions.RayError as error:

@@ -49,18 +49,29 @@ def _copied_bytes_per_s() -> float:
 class HostFigures:
     """What the launcher says of its machine in each of its records."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
+        """The disk is the one that ``folder`` is on."""
+        self._folder = folder
         self._source, self._target = (np.full(SAMPLED_BYTES, value, np.uint8) for value in (1, 2))
 
     def take(self) -> dict[str, float]:
         """Flat; shares of CPU time are since the last call."""
-        return _figures() | {"host_copy_bytes_per_s": self._copied_per_s()}
+        return _figures() | _disk(self._folder) | {"host_copy_bytes_per_s": self._copied_per_s()}
 
     def _copied_per_s(self) -> float:
         """By this thread's own CPU time, so that waiting for a CPU does not count: what is left is memory."""
         began = time.thread_time()
         np.copyto(self._target, self._source)
         return SAMPLED_BYTES / max(time.thread_time() - began, 1e-6)
+
+
+def _disk(folder: Path) -> dict[str, float]:
+    """What is left of it; nothing where the folder is gone, which others say."""
+    try:
+        disk = shutil.disk_usage(folder)
+    except OSError:
+        return {}
+    return {"host_disk_free_bytes": disk.free, "host_disk_bytes": disk.total}
 
 
 def _figures() -> dict[str, float]:

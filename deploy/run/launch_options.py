@@ -28,3 +28,5 @@ class LaunchOptions:
     track_project: str | None = None
     track_tags: tuple[str, ...] = ()
     track_video_every: int | None = None
+    metrics_port: int | None = None
+    metrics_host: str = "127.0.0.1"

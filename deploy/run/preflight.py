@@ -1,8 +1,10 @@
 """Whether this machine can do it, asked before anything starts: the ring, the device, the cores."""
 
+import errno
 import os
 import re
 import shutil
+import socket
 from pathlib import Path
 
 import psutil
@@ -16,11 +18,31 @@ DISK_RESERVE = 256 << 20  # bytes left for checkpoints, metrics and logs
 
 
 def check_machine(config: RunConfig, options: LaunchOptions) -> None:
-    """Raises ConfigError where the device, the disk or the memory does not do. On Ray, the device is a node's."""
+    """Raises ConfigError where device, disk, memory or port does not do. On Ray, the device is a node's."""
     if options.launcher != "ray":
         check_learner(config, options.device)
     runs = Path("runs") if options.run_dir is None else options.run_dir / "replay"
     check_ring_fits(config.window_spec(), config.replay.capacity, runs.resolve())
+    check_port(options)
+
+
+def check_port(options: LaunchOptions) -> None:
+    """Raises ConfigError where metrics are to be served, and cannot be there now."""
+    host, port = options.metrics_host, options.metrics_port
+    if port is None and host != LaunchOptions.metrics_host:
+        raise ConfigError("--metrics-host", host, "say which port: give --metrics-port, or leave it")
+    if port is None:
+        return
+    if not 1 <= port <= 65_535:
+        raise ConfigError("--metrics-port", port, "take a port from 1 to 65535")
+    try:
+        *_, address = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_STREAM)[0]
+        socket.create_server(address[:2]).close()
+    except (OSError, UnicodeError) as error:
+        if not isinstance(error, OSError) or isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            fix = "is no IPv4 address of this machine; take one, like 127.0.0.1"
+            raise ConfigError("--metrics-host", host, fix) from None
+        raise ConfigError("--metrics-port", port, f"{os.strerror(error.errno or 0)} on {host}; take another") from None
 
 
 def check_learner(config: RunConfig, device: str) -> None:

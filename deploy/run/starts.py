@@ -18,7 +18,9 @@ from rmc.deploy.run.config import option
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import Launcher, LaunchOptions
 
-KEPT = ("launcher", "device", "redis_url", "ray_address", "all_cpus", "tls")  # of how a run was started last
+KEPT = (  # of how a run was started last
+    "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls", "metrics_port", "metrics_host",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

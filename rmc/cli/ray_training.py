@@ -47,7 +47,7 @@ def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> int
     folder = open_run(config, options.run_dir, options.if_exists, options)
     keep_tracking(folder, tracking)
     folder.unlock()
-    launcher.launch(config, folder, options.device, options.all_cpus, options.tls)
+    launcher.launch(config, folder, options)
     console.print(f"run folder {folder.path}", soft_wrap=True)
     if note := reach_note(config):
         console.print(note, soft_wrap=True)

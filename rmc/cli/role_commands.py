@@ -1,5 +1,6 @@
 """``rmc role``: this process is one role of a run."""
 
+import dataclasses
 import logging
 import os
 import signal
@@ -63,7 +64,6 @@ def launch(command: LauncherRole) -> int:
     folder = RunFolder(command.run)
     config = folder.config()
     folder.lock()
-    launch_options = LaunchOptions(
-        folder.path, "resume", "ray", command.device, None, command.ray_address, command.all_cpus, command.tls
-    )
+    named = {item.name: getattr(command, item.name) for item in dataclasses.fields(command) if item.name != "run"}
+    launch_options = LaunchOptions(folder.path, launcher="ray", **named)
     return training.conduct(config, folder, launch_options, terminal(400))

@@ -22,6 +22,10 @@ class LauncherRole:
     """An actor for every CPU left."""
     tls: bool = False
     """Encrypt what the roles say across machines."""
+    metrics_port: int | None = None
+    """Serve the run's metrics to Prometheus on this port."""
+    metrics_host: str = "127.0.0.1"
+    """Where that port listens."""
 
 
 @dataclass(frozen=True)

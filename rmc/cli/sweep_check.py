@@ -16,7 +16,9 @@ from rmc.deploy.run.validation import validate, validate_launch
 from rmc.sweep.job import Job
 from rmc.sweep.spec import Range, Spec
 
-RESERVED = ("run_dir", "if_exists", "redis_url", "ray_address", "all_cpus", "tls", "dry_run")
+RESERVED = (
+    "run_dir", "if_exists", "redis_url", "ray_address", "all_cpus", "tls", "metrics_port", "metrics_host", "dry_run",
+)  # fmt: skip
 LENGTH = "--total-steps"
 FILES = ("--config", "--init-from")  # that the nodes of a cluster do not have
 

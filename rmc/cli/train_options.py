@@ -107,6 +107,10 @@ class Train:
     """The run's tags in the tracker."""
     track_video_every: int | None = None
     """Film every so-manieth evaluated checkpoint for the tracker; 0, the default, films the final policy alone."""
+    metrics_port: int | None = None
+    """Serve the run's metrics to Prometheus on this port, at /metrics; by default on none."""
+    metrics_host: str = "127.0.0.1"
+    """Where that port listens; 0.0.0.0 is everywhere, and shows the metrics to whoever reaches this machine."""
     dry_run: bool = False
     """Train for some seconds in a temporary folder, and tell what the run needs beside what this machine has: memory,
     disk, bandwidth, handles, threads, time. Exit status 1 where it does not fit."""

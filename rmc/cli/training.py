@@ -1,5 +1,6 @@
 """``rmc train`` from its checks to ``result.json``."""
 
+from contextlib import AbstractContextManager, nullcontext
 from statistics import mean
 from typing import Any
 
@@ -65,10 +66,13 @@ def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, consol
         console.print(f"before training: {format_evaluation(before)}")
         tracker = start_tracker(folder)
         monitor = Monitor(folder, config, console, tracker)
+        if options.metrics_port is not None:
+            console.print(f"metrics on {options.metrics_host}, port {options.metrics_port}", soft_wrap=True)
         if options.launcher == "manual":
             console.print(f"start the roles with --run {folder.name}", soft_wrap=True)
         try:
-            with signals_caught() as stop:  # before and after, nothing runs that Ctrl-C could not end at once
+            # before and after, nothing runs that Ctrl-C could not end at once
+            with signals_caught() as stop, _metrics_served(folder, monitor, options):
                 finished = _launch(config, folder, options, monitor, stop)
         finally:
             monitor.close()
@@ -92,6 +96,14 @@ def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, consol
         folder.unlock(status)
     console.print(f"before training: {format_evaluation(before)}")
     return say_result(folder, console)
+
+
+def _metrics_served(folder: RunFolder, monitor: Monitor, options: LaunchOptions) -> AbstractContextManager[None]:
+    if options.metrics_port is None:
+        return nullcontext()
+    from rmc.deploy.monitor import exporter  # every role would hold a web server
+
+    return exporter.served(monitor.board, folder.name, options)
 
 
 def _video(config: RunConfig, folder: RunFolder, console: Console) -> str | None:

@@ -33,7 +33,7 @@ TRAIN_FLAGS = """
     --preset --seed --total-steps --actors --flicker --drop-sensors --flicker-burst --delay --hide --noise
     --frame-stack --action-repeat --time-limit --env-timeout --env-kwargs
     --config --run-dir --if-exists --launcher --device --redis-url --ray-address --all-cpus --tls
-    --track --track-project --track-tags --track-video-every --dry-run
+    --track --track-project --track-tags --track-video-every --metrics-port --metrics-host --dry-run
     --burn-in --trained-steps
     --hidden --embedding --heads --gate-init --layer-norm --head-input --critic-norm --privileged-critic
     --normalize-observations --grounding
@@ -78,7 +78,7 @@ OTHER_FLAGS = {
     "stop": [],
     "cluster": [],
     "completion": [],
-    "role launcher": ["--ray-address", "--device", "--all-cpus", "--tls"],
+    "role launcher": ["--ray-address", "--device", "--all-cpus", "--tls", "--metrics-port", "--metrics-host"],
     "role actor": ["--run", "--redis-url", "--index"],
     "role replay": ["--run", "--redis-url", "--folder", "--listen", "--shard", "--secret-file", "--tls-folder"],
     "role learner": ["--run", "--redis-url", "--folder", "--device", "--secret-file", "--tls-folder"],
@@ -158,6 +158,9 @@ def test_a_wrong_option_is_one_short_line(words: str, said: str, capsys: pytest.
         ([*DEBUG, "--track-tags", "a", "b"], "--track-tags"),
         ([*DEBUG, "--track", "wandb", "--track-project", "a/b"], "--track-project='a/b'"),
         ([*DEBUG, "--track", "trackio", "--track-tags", "x" * 65], "--track-tags"),
+        ([*DEBUG, "--metrics-port", "0"], "--metrics-port=0: take a port from 1 to 65535"),
+        ([*DEBUG, "--metrics-port", "9", "--metrics-host", "203.0.113.1"], "--metrics-host='203.0.113.1': is no"),
+        ([*DEBUG, "--metrics-host", "0.0.0.0"], "--metrics-host='0.0.0.0': say which port"),
         ([], "train"),
         (["trian"], "trian"),
         (["train"], "train"),

@@ -72,11 +72,12 @@ def test_what_is_said_is_all_that_changes(run: RunFolder) -> None:
 
 def test_another_launcher_takes_the_device_alone_along(tmp_path: Path) -> None:
     path, config = tmp_path / "run", debug(EnvConfig(PENDULUM))
-    last = LaunchOptions(path, "resume", "ray", "cuda", None, "local", all_cpus=True, tls=True)
+    last = LaunchOptions(path, "resume", "ray", "cuda", None, "local", all_cpus=True, tls=True, metrics_port=9464)
     open_run(config, path, "fail", last).unlock()
     assert parsed("resume", path)[1] == last
     assert parsed("resume", path, "--launcher", "local")[1] == LaunchOptions(path, "resume", "local", "cuda")
     assert parsed("resume", path, "--launcher", "ray", "--no-tls")[1] == dataclasses.replace(last, tls=False)
+    assert parsed("resume", path, "--metrics-port", "None")[1] == dataclasses.replace(last, metrics_port=None)
 
 
 def test_a_new_folder_beside_it_begins_with_the_preset(run: RunFolder) -> None:

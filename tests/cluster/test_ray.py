@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from ray.cluster_utils import Cluster
 from rmc.deploy.run.folder import RunFolder
 from tests.cluster import machines
 from tests.deploy.test_tls import lacks_tls
-from tests.integration.running import ENVIRONMENT, Training
+from tests.integration.running import ENVIRONMENT, Training, free_port
 
 ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
 
@@ -59,9 +60,11 @@ def ring(folder: Path) -> Path:
 
 
 def test_a_run_on_a_ray_of_its_own(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    with Training(folder, "--launcher", "ray", "--ray-address", "local") as training:
+    folder, port = tmp_path / "run", free_port()
+    with Training(folder, "--launcher", "ray", "--ray-address", "local", "--metrics-port", str(port)) as training:
         training.wait_for_updates()
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
+            assert b'rmc_updates{role="learner"}' in answer.read()
         assert ring(folder).exists()
         assert training.finish(240) == 0, training.text() + training.logs()
     result = json.loads((folder / "result.json").read_text())

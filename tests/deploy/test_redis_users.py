@@ -82,6 +82,7 @@ def test_every_role_can_do_its_work(server: RedisServer) -> None:
     actor.append(0, EntryId(5, 0), b"hello")
     for _ in range(2):  # the second is refused by its id, and looked up
         actor.append(0, EntryId(5, 1), b"windows")
+    assert (launcher.memory_bytes() > 0, actor.memory_bytes()) == (True, 0)  # it may not ask
     owner = ReplayOwner("replay", 5)
     assert replay.progress("replay") == b"counted"
     assert replay.actors() == [0]

@@ -26,9 +26,11 @@ def rmc(at: Path, *words: str) -> str:
 
 
 def test_a_run_is_watched(tmp_path: Path) -> None:
-    trained = rmc(tmp_path, "train", "InvertedPendulum-v5", "--preset", "debug", "--run-dir", "runs/first", *SHORT)
+    *looks, served = re.findall(r"```sh\nrmc (.*)\n```", WATCHING)
+    trained = rmc(tmp_path, *served.split(), *SHORT)
+    assert "metrics on 127.0.0.1, port 9464\n" in trained
     assert re.search(r"^\d+% \| \d+ of 600 steps \| .* updates/s \| eval .* \| 0:00:\d\d$", trained, re.MULTILINE)
-    stats, as_json, listed = (rmc(tmp_path, *words.split()) for words in re.findall(r"```sh\nrmc (.*)\n```", WATCHING))
+    stats, as_json, listed = (rmc(tmp_path, *words.split()) for words in looks)
     assert "InvertedPendulum-v5 · debug · seed 0 · finished" in stats
     assert "600 of 600" in stats
     assert "latent rank" in stats

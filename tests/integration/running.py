@@ -4,6 +4,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -17,6 +18,12 @@ import psutil
 
 START_SECONDS = 120.0  # five processes import torch on two cores that other tests may use
 ENVIRONMENT = {**os.environ, "RMC_SECRET": "", "COLUMNS": "200"}
+
+
+def free_port() -> int:
+    """Of this machine's own address."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return int(free.getsockname()[1])
 
 
 class Training:

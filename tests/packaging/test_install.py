@@ -68,6 +68,8 @@ def binaries(request: pytest.FixtureRequest, sources: Path, tmp_path_factory: py
         assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"rmc"}
         assert {
             "rmc/deploy/cluster/aws.yaml",
+            "rmc/deploy/monitor/alerts.yaml",
+            "rmc/deploy/monitor/dashboard.json",
             "rmc/py.typed",
             "rmc/analysis/report.html",
             "rmc/common/bus/redis_bus.py",
