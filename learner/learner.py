@@ -1,12 +1,9 @@
 """The learner role: draw, update, give priorities back, publish weights, checkpoint, resume."""
 
-import io
-import json
 import logging
-import pickle
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +16,7 @@ from torch import Tensor
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Bus, Version
-from rmc.common.checkpoint import POLICY, PROGRESS, STATE, CheckpointFolder
+from rmc.common.checkpoint import STATE, CheckpointFolder
 from rmc.common.errors import CheckpointError, FencedError, RmcError
 from rmc.common.policy_header import PolicyHeader
 from rmc.common.replay import ObservationStatistics, Replay, Sample, SampleStatus
@@ -27,6 +24,7 @@ from rmc.common.window import WindowSpec
 from rmc.learner.batch import clear_padding, importance_weights
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.learner.device_update import DeviceUpdate, HostCopy
+from rmc.learner.learner_checkpoint import NOT_OURS, LearnerProgress, all_finite, pack, take_up
 from rmc.learner.learner_metrics import Drawn, LearnerMetrics, needs_weights
 from rmc.learner.pipelined_update import PipelinedUpdate
 from rmc.learner.thread_trial import ThreadTrial
@@ -34,7 +32,6 @@ from rmc.learner.update import UpdateResult
 from rmc.learner.update_order import make_update
 
 log = logging.getLogger(__name__)
-NOT_OURS = (pickle.UnpicklingError, EOFError, RuntimeError, LookupError, ValueError, TypeError, AttributeError)
 LARGE_REWARD = 1e4  # a step's, from which it is the likely cause of a divergence
 SAVE_AGAIN_SECONDS = 10.0  # after a checkpoint that could not be written
 LOOK_SECONDS = 5.0  # between looks, while waiting, whether Redis still has the weights
@@ -216,7 +213,7 @@ class Learner:
         return replace(self._header, env_steps=self.env_steps, updates=self.updates).metadata()
 
     def _check_finite(self, state: Any) -> None:
-        self._diverged = not all(map(is_finite, tensors_in(state)))
+        self._diverged = not all_finite(state)
         if self._diverged:
             raise RmcError(f"update {self.updates}: training has diverged, weights are not finite; {self._remedy()}")
 
@@ -261,24 +258,13 @@ class Learner:
         Raises CheckpointError where that cannot be, RmcError where any of it is not finite.
         """
         began = time.monotonic()
-        learnt, state = self.update.state_dict(), io.BytesIO()
-        self._check_finite(learnt)  # critics or moments may be spoilt while the policy, for one more update, is not
-        torch.save(learnt, state)
-        progress: dict[str, Any] = {
-            "updates": self.updates,
-            "env_steps": self.env_steps,
-            "epoch": self.epoch,
-            "time": time.time(),
-            "threads": self._threads.chosen,
-        }
-        if self._observed_before.count.any():
-            progress["observed_before"] = self._observed_before.to_json()
-        files = {
-            STATE: state.getvalue(),
-            POLICY: self._sound(self.update.policy_weights(), self._metadata()),
-            PROGRESS: json.dumps(progress).encode(),
-        }
-        self.checkpoints.save(self.updates, files)
+        state = self.update.state_dict()
+        self._check_finite(state)  # critics or moments may be spoilt while the policy, for one more update, is not
+        policy = self._sound(self.update.policy_weights(), self._metadata())
+        progress = LearnerProgress(
+            self.updates, self.env_steps, self.epoch, self._threads.chosen, self._observed_before
+        )
+        self.checkpoints.save(self.updates, pack(state, policy, progress))
         self.checkpoints.note_save(time.monotonic() - began)
 
     def _after(self, env_steps: int) -> int:
@@ -295,21 +281,17 @@ class Learner:
             return 0
         number, files = newest
         try:
-            state = torch.load(io.BytesIO(files[STATE]), map_location=self.device, weights_only=True)
-            self.update.load_state_dict(state)
-            progress = json.loads(files[PROGRESS])
-            self.updates = self.last_checkpoint = int(progress["updates"])
-            self.env_steps, epoch = int(progress["env_steps"]), int(progress["epoch"])
-            self._checkpoint_steps = self.env_steps
-            self._threads.take_up(int(progress.get("threads", 0)))
-            if "observed_before" in progress:
-                self._observed_before = ObservationStatistics.from_json(progress["observed_before"])
+            progress = take_up(files, self.update, self.device)
         except NOT_OURS as error:
             reason = (str(error).strip() or "empty").splitlines()[0]
             raise CheckpointError(f"{self.checkpoints.path(number)}: {STATE} is not this run's ({reason})") from None
+        self.updates = self.last_checkpoint = progress.updates
+        self.env_steps = self._checkpoint_steps = progress.env_steps
+        self._threads.take_up(progress.threads)
+        self._observed_before = progress.observed_before or self._observed_before
         self._next_checkpoint = self._after(self.env_steps)
         log.info("resumed at update %d, environment step %d", self.updates, self.env_steps)
-        return epoch
+        return progress.epoch
 
     def waiting_for(self) -> str:
         return self._waiting
@@ -339,17 +321,3 @@ class Learner:
             log.warning("%s; the checkpoint of update %d is the last", error, self.last_checkpoint)
         self._updated.close()
         self.checkpoints.unlock()
-
-
-def tensors_in(state: Any) -> Iterator[Tensor]:
-    """Every tensor in nested dicts and lists."""
-    if isinstance(state, Tensor):
-        yield state
-    elif isinstance(state, dict | list):
-        for part in state.values() if isinstance(state, dict) else state:
-            yield from tensors_in(part)
-
-
-def is_finite(values: Tensor) -> bool:
-    """Whether all are. Their sum is only where they are, and takes a CPU a fraction of the time."""
-    return bool(values.sum().isfinite()) or bool(values.isfinite().all())  # large ones may overflow it

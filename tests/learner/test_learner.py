@@ -19,7 +19,8 @@ from rmc.common.errors import CheckpointError, FencedError, RmcError
 from rmc.common.wire import encode_hello, encode_windows
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.learner.diagnostics import latent_rank
-from rmc.learner.learner import Learner, is_finite
+from rmc.learner.learner import Learner
+from rmc.learner.learner_checkpoint import all_finite
 from rmc.learner.update import AVERAGE_UPDATES
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.server import ReplayServer
@@ -392,7 +393,7 @@ def step_for_long(setting: Setting) -> None:
     ],
 )  # fmt: skip
 def test_large_values_are_finite(values, expected):
-    assert is_finite(torch.tensor(values)) is expected
+    assert all_finite(torch.tensor(values)) is expected
 
 
 def test_latent_rank_sees_a_collapse():
