@@ -44,6 +44,7 @@ class Episode:
     privileged: Tensor  # (1, T + 1, P) normalised, what critics read beside
     own: Floats  # (T + 1, F), the environment's own observations
     probe: dict[str, NDArray[np.float64]]  # by name (T + 1,), of info["probe"]
+    terminated: bool = False  # not cut
 
     @property
     def seen(self) -> Tensor:
@@ -150,7 +151,8 @@ class Player:
             rewards.append(self._config.actor.reward_scale * float(reward))
             if terminated or truncated:
                 break
-        return self._episode(np.stack(observations), np.stack(actions), rewards, infos, np.stack(own))
+        episode = self._episode(np.stack(observations), np.stack(actions), rewards, infos, np.stack(own))
+        return dataclasses.replace(episode, terminated=bool(terminated))
 
     def close(self) -> None:
         """Close the environment."""

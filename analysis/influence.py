@@ -40,7 +40,9 @@ class Replay:
     def __init__(self, agent: Agent, episode: Episode) -> None:
         self._agent, self._episode, self.steps = agent, episode, episode.action.shape[1]
         memory, seen = remembered(agent, episode)
-        self.outputs = self._outputs(MemoryOutput(*(part[:, :-1] for part in memory)), torch.arange(self.steps))
+        before_actions = MemoryOutput(*(part[:, :-1] for part in memory))
+        self.features = agent.features(before_actions)  # (1, T, Z), what the heads read
+        self.outputs = self._outputs(before_actions, torch.arange(self.steps))
         frames = seen[0] if agent.config.impute_missing else seen[0, :, :0]
         self._states = torch.cat([memory.hidden[0], frames], 1)  # (T + 1, S) after each observation
 

@@ -21,6 +21,7 @@ from rmc.analysis import memory_picture
 from rmc.analysis.episodes import Episode, Player, remembered
 from rmc.analysis.memory_picture import Remembered, remember
 from rmc.analysis.out_file import check_writable
+from rmc.analysis.value_bias import ValueBias, value_bias
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError
@@ -121,7 +122,7 @@ def _error(predicted: Tensor, episode: Episode, horizon: int) -> tuple[Tensor, T
     return ((predicted - end).abs() * seen).sum(0), ((end - start).abs() * seen).sum(0)
 
 
-def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, Remembered]:
+def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, Remembered, ValueBias | None]:
     """Play several episodes, look at the first, and write the picture with what is remembered. Raises ConfigError."""
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError("--out", str(out), f"matplotlib is missing; {how_to_install('plot')}")
@@ -133,7 +134,7 @@ def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, Remembered]
     insight = look(agent, episodes[0], config.update.model_norm)
     memory = remember(agent, episodes, hidden)
     draw(insight, _title(config), out, memory)
-    return insight, memory
+    return insight, memory, value_bias(agent, episodes, config.update.gamma)
 
 
 def inspect_to(folder: RunFolder, checkpoint: str, out: BinaryIO) -> Insight:

@@ -106,7 +106,7 @@ def export_policy(command: run_options.Export) -> int:
 def inspect(command: run_options.Inspect) -> int:
     """Write a picture of what the world model knows and the memory holds, and say it in numbers."""
     console = terminal(max(terminal().width, memory_picture.WIDTH))
-    insight, memory = world_model_picture.inspect(command.run, command.checkpoint, command.out)
+    insight, memory, value = world_model_picture.inspect(command.run, command.checkpoint, command.out)
     ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in insight.open_loop.items())
     hardest = np.argsort(-insight.unexplained)[: world_model_picture.SHOWN]
     worst = ", ".join(f"{i} ({insight.unexplained[i]:.0%})" for i in hardest)
@@ -115,6 +115,11 @@ def inspect(command: run_options.Inspect) -> int:
         soft_wrap=True,
     )
     console.print(f"worst dimensions one step ahead: {worst}")
+    if value is not None:
+        counted = f"with the entropy's bonus, over {value.steps:,} steps"
+        console.print(
+            f"critics expect {value.expected:,.1f} on average; {value.came:,.1f} came, {counted}", soft_wrap=True
+        )
     console.print(*memory_picture.tables(memory), sep="\n")
     console.print(f"{command.out}", soft_wrap=True)
     return 0

@@ -1,0 +1,57 @@
+"""What the critics expect beside what came: too much of it, and the policy climbs errors.
+
+Shapes: T steps of an episode.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rmc.analysis.episodes import Episode
+from rmc.analysis.influence import Replay
+from rmc.common.agent import Agent, squashed_sample
+
+HORIZONS = 3.0  # of 1 / (1 - gamma) steps, left out at a cut: 5 % of a return is then the critics' own guess
+
+
+@dataclass(frozen=True)
+class ValueBias:
+    """Means over steps of deterministic episodes, in scaled rewards."""
+
+    expected: float  # Q of the action taken, mean of both critics
+    came: float  # discounted rewards and entropy bonuses, as Q counts them
+    steps: int
+
+
+@torch.no_grad()
+def value_bias(agent: Agent, episodes: list[Episode], gamma: float) -> ValueBias | None:
+    """Of all steps whose return is known; None where there is none. Curiosity is not counted."""
+    expected, came = [], []
+    for episode in episodes:
+        replay = Replay(agent, episode)
+        q = replay.outputs[1][0, :, 0]
+        known = len(q) if episode.terminated else max(0, len(q) - round(HORIZONS / (1.0 - gamma)))
+        returns = _soft_returns(episode, _bonus(agent, replay.features), q[-1], gamma)
+        expected.append(q[:known])
+        came.append(returns[:known])
+    steps = sum(map(len, expected))
+    return ValueBias(float(torch.cat(expected).mean()), float(torch.cat(came).mean()), steps) if steps else None
+
+
+def _bonus(agent: Agent, features: Tensor) -> Tensor:
+    """(1, T, Z) -> (T,) -alpha log pi of one sample of each step."""
+    mean, log_std = agent.policy(features)
+    noise = torch.randn(mean.shape, generator=torch.Generator().manual_seed(0))
+    return -agent.log_alpha.exp() * squashed_sample(mean, log_std, noise)[1][0]
+
+
+def _soft_returns(episode: Episode, bonus: Tensor, last_q: Tensor, gamma: float) -> Tensor:
+    """(T,) G_t = r_t + gamma (G_{t+1} - alpha log pi_{t+1}); at a cut, the last is what the critics expect."""
+    rewards = episode.reward.tolist()
+    after = rewards[-1] if episode.terminated else float(last_q)
+    returns = [after]
+    for reward, entropy in zip(rewards[-2::-1], bonus.tolist()[:0:-1], strict=True):
+        after = reward + gamma * (after + entropy)
+        returns.append(after)
+    return torch.tensor(returns[::-1])
