@@ -70,6 +70,7 @@ def binaries(request: pytest.FixtureRequest, sources: Path, tmp_path_factory: py
             "rmc/deploy/cluster/aws.yaml",
             "rmc/py.typed",
             "rmc/analysis/report.html",
+            "rmc/analysis/watch.html",
             "rmc/common/bus/redis_bus.py",
         } <= set(names)
         _run([*install, "--prefix", str(folder), str(wheel)], ROOT)
