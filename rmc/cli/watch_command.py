@@ -2,6 +2,7 @@
 
 import importlib.util
 import ipaddress
+import os
 import secrets
 import socket
 from contextlib import suppress
@@ -48,4 +49,5 @@ def _listening(host: str, port: int) -> socket.socket:
     except socket.gaierror as error:
         raise ConfigError("--host", host, f"{error.strerror}; give an address of this machine") from None
     except OSError as error:
-        raise ConfigError("--port", f"{host}:{port}", f"{error.strerror}; give another, or 0 for a free one") from None
+        reason = os.strerror(error.errno or 0)  # its own repeats the address
+        raise ConfigError("--port", f"{host}:{port}", f"{reason}; give another, or 0 for a free one") from None

@@ -32,6 +32,7 @@ class Page:
         self._to, self._back, self._rest, self._calls, self._session = to, back, b"", 0, {}
         target = self._call("Target.createTarget", url=url)["targetId"]
         self._session = {"sessionId": self._call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]}
+        self.seconds_until("location.href !== 'about:blank' && document.readyState === 'complete'")
 
     def js(self, expression: str) -> Any:
         """The value of an expression there."""
