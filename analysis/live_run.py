@@ -6,7 +6,6 @@ A look is a message that JSON can hold: what has changed of the state, and of cu
 import math
 import re
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from rmc.deploy.run.starts import format_start, starts
 LOOK_BYTES = 8 << 20  # of metrics at a look: a long run's past is read in several
 POINTS = 512  # most of a curve; even
 EVENTS, SAME_SECONDS = 200, 60.0  # most that are kept; within so long the same thing again is one event
-SETTLED_SECONDS = 2.0  # for which a picture or video was not written
 KINDS = ("actor", "replay", "learner", "evaluator")
 DRAWN = re.compile(r"evaluation_return|episode_return|.*_per_s|.*_loss")  # of the main metrics
 SHOWN = (
@@ -171,17 +169,16 @@ class LiveRun:
         ]
 
 
-def _event(kind: str, when: float, env_steps: int, what: str, count: float = 1) -> Event:
+def _event(kind: str, when: float, env_steps: float, what: str, count: float = 1) -> Event:
     return {"kind": kind, "time": when, "env_steps": env_steps, "what": what, "count": int(count)}
 
 
 def newest_media(run: Path) -> dict[str, Path]:
     """The newest picture and the newest video in a run's folder, as far as there are."""
     newest = {}
-    for kind, patterns in {"picture": ["*.png"], "video": ["*.mp4", "videos/*.mp4"]}.items():
-        files = [path for pattern in patterns for path in run.glob(pattern) if path.is_file() and not path.is_symlink()]
-        times = {path: path.stat().st_mtime for path in files}
-        settled = [path for path in files if time.time() - times[path] > SETTLED_SECONDS]
-        if settled:
-            newest[kind] = max(settled, key=lambda path: times[path])
+    for kind, patterns in {"picture": ["[!.]*.png"], "video": ["[!.]*.mp4", "videos/[!.]*.mp4"]}.items():
+        paths = [path for pattern in patterns for path in run.glob(pattern)]
+        files = [path for path in paths if path.is_file() and not path.is_symlink()]
+        if files:
+            newest[kind] = max(files, key=lambda path: path.stat().st_mtime)
     return newest

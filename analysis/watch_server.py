@@ -6,7 +6,6 @@ import secrets
 import socket
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import suppress
 from importlib.resources import files
 from typing import Any
 
@@ -23,7 +22,6 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from rmc.analysis.live_run import LiveRun
 
 LOOK_SECONDS = 0.5  # between looks at the runs
-PING, PING_SECONDS = b":\n\n", 15.0  # said where nothing else is for so long, to find out who has gone
 BACKLOG = 64  # looks that a page may be behind; beyond, it is told everything again
 CONNECTIONS = 512
 LOOPBACK = ["127.0.0.1", "localhost", "[::1]"]  # no other name: it could be a web page's that leads here
@@ -68,14 +66,12 @@ class Broadcast:
         yield self._everything()
         while not self._is_over:
             if told == self._count:
-                with suppress(TimeoutError):
-                    async with asyncio.timeout(PING_SECONDS):
-                        await self._next.wait()
+                await self._next.wait()
             missed, told = self._count - told, self._count
             if missed > len(self._looks):
                 yield self._everything()
-            else:
-                yield b"".join(list(self._looks)[len(self._looks) - missed :]) or PING
+            elif missed:
+                yield b"".join(list(self._looks)[-missed:])
 
     def _everything(self) -> bytes:
         return b"".join(_event(i, run.everything()) for i, run in enumerate(self._runs))

@@ -69,7 +69,7 @@ def opened(url: str, folder: Path) -> Iterator[Page]:
     """A page at a URL. Nothing may go wrong in its scripts."""
     (its_in, to), (back, its_out), log = os.pipe(), os.pipe(), folder / "browser.log"
     words = ["bash", "-c", f'exec "$@" 3<&{its_in} 4>&{its_out}', "bash"]
-    words += command(folder / "profile", "--remote-debugging-pipe")
+    words += command(folder / "profile", "--remote-debugging-pipe", "--window-size=1280,900")
     with log.open("wb") as errors:
         process = subprocess.Popen(words, pass_fds=(its_in, its_out), stdout=errors, stderr=errors)
     os.close(its_in), os.close(its_out)
