@@ -31,8 +31,6 @@ SHOWN = (
 COUNTERS = re.compile(
     r"(?:restarts|dead_letters|refused_clients)_.+|refused_(?:values|weights|priorities)|damaged_.+|broken_episodes"
 )
-
-
 Event = dict[str, Any]
 
 

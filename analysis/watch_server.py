@@ -23,7 +23,6 @@ from rmc.analysis.live_run import LiveRun
 
 LOOK_SECONDS = 0.5  # between looks at the runs
 BACKLOG = 64  # looks that a page may be behind; beyond, it is told everything again
-CONNECTIONS = 512
 LOOPBACK = ["127.0.0.1", "localhost", "[::1]"]  # no other name: it could be a web page's that leads here
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
@@ -125,7 +124,7 @@ def serve(runs: Sequence[LiveRun], listener: socket.socket, token: str) -> None:
         broadcast = Broadcast(runs)
         config = uvicorn.Config(
             application(runs, broadcast, token), lifespan="off", ws="none", log_config=None, access_log=False,
-            proxy_headers=False, server_header=False, headers=list(HEADERS.items()), limit_concurrency=CONNECTIONS,
+            proxy_headers=False, server_header=False, headers=list(HEADERS.items()),
         )  # fmt: skip
         server = uvicorn.Server(config)
         async with asyncio.TaskGroup() as tasks:
