@@ -22,6 +22,7 @@ from rmc.common.env.make import entry_point, find_spec, make_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError, EnvFault
 from rmc.common.extra import how_to_install
+from rmc.common.whole_file import written_whole
 
 VIDEOS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
 BACKENDS = ("egl", "osmesa", "glfw")  # MuJoCo's, the ones that need no screen first
@@ -71,17 +72,18 @@ def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest:
     _follow(env)
     observation, info = env.reset(seed=seed)
     frame, rate = _frame(env), env.metadata.get("render_fps") or FRAMES_PER_SECOND
-    video = write_frames(str(out), (frame.shape[1], frame.shape[0]), fps=rate, macro_block_size=1)
-    video.send(None)  # the generator's start
     total = 0.0
-    for _ in range(longest):
-        video.send(_frame(env, frame.shape).tobytes())
-        action = policy.act(observation, info.get("missing", False))
-        observation, reward, terminated, truncated, info = env.step(action)
-        total += float(reward)
-        if terminated or truncated:
-            break
-    video.close()
+    with written_whole(out) as path:
+        video = write_frames(str(path), (frame.shape[1], frame.shape[0]), fps=rate, macro_block_size=1)
+        video.send(None)  # the generator's start
+        for _ in range(longest):
+            video.send(_frame(env, frame.shape).tobytes())
+            action = policy.act(observation, info.get("missing", False))
+            observation, reward, terminated, truncated, info = env.step(action)
+            total += float(reward)
+            if terminated or truncated:
+                break
+        video.close()
     env.close()
     return total
 

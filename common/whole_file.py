@@ -1,17 +1,32 @@
-"""Small files that are there whole or not at all."""
+"""Files that are there whole or not at all. The temporary one beside each has a dot in front."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that is on the disk before it has its name. The temporary one beside it has a dot in front.
-
-    Raises OSError.
-    """
-    temporary = path.with_name(f".{path.name}")
+    """Write a small file that is on the disk before it has its name. Raises OSError."""
+    temporary = temporary_path(path)
     write_synced(temporary, content)
     temporary.rename(path)
+
+
+def temporary_path(path: Path) -> Path:
+    """Where a file is until it is whole."""
+    return path.with_name(f".{path.name}")
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Where to write a file, which has its name after that; on an error it is removed."""
+    temporary = temporary_path(path)
+    try:
+        yield temporary
+        temporary.rename(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def write_synced(path: Path, content: bytes) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite
+from rmc.common.whole_file import temporary_path
 from rmc.deploy.run.folder import RunFolder
 
 LOWEST = 19  # priority
@@ -63,4 +64,4 @@ class Films:
         if self._process is not None:
             self._process.kill()
             self._process.communicate()
-            self._film.path.unlink(missing_ok=True)
+            temporary_path(self._film.path).unlink(missing_ok=True)

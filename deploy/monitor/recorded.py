@@ -16,14 +16,19 @@ from rmc.deploy.run.state import run_state
 def recorded_status(folder: RunFolder, recent_bytes: int = RECENT_BYTES) -> RunStatus:
     """As its metrics say. Raises ConfigError where the folder is no run's or is damaged."""
     board = empty_status(folder)
+    take_state(board, folder)
+    catch_up(board, MetricsTail(folder.metrics, recent_bytes))
+    return board
+
+
+def take_state(board: RunStatus, folder: RunFolder) -> None:
+    """Take in what has become of the run. Raises ConfigError where that is damaged."""
     try:
         board.state = run_state(folder)
     except ValueError as error:
         raise ConfigError("RUN", str(folder.path), f".lock is damaged ({error}); remove that file") from None
-    catch_up(board, MetricsTail(folder.metrics, recent_bytes))
-    if board.state == "finished" and (result := folder.result()) is not None:
-        board.final_steps = int(result["env_steps"])
-    return board
+    result = folder.result() if board.state == "finished" else None
+    board.final_steps = None if result is None else int(result["env_steps"])
 
 
 def status_json(folder: RunFolder, board: RunStatus) -> dict[str, Any]:

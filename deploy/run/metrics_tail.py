@@ -19,8 +19,8 @@ class MetricsTail:
         """``read_from`` is the byte from which on records are wanted; then there are no evaluations before."""
         self._path, self._recent_bytes, self._position = path, recent_bytes, read_from
 
-    def take(self) -> list[dict[str, Any]]:
-        """Those that are new since the last call."""
+    def take(self, most_bytes: int = -1) -> list[dict[str, Any]]:
+        """Those that are new since the last call, or the first ``most_bytes`` of them."""
         with suppress(FileNotFoundError), self._path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
             before: list[dict[str, Any]] = []
@@ -28,7 +28,7 @@ class MetricsTail:
                 before, self._position = _evaluations(file, size - self._recent_bytes)
             self._position = min(self._position, size)  # it may have been cut
             file.seek(self._position)
-            text = file.read()
+            text = file.read(most_bytes)
             whole = text[: text.rfind(b"\n") + 1]
             self._position += len(whole)
             return [*before, *filter(None, map(parse_record, whole.splitlines()))]

@@ -93,12 +93,17 @@ def format_starts(folder: RunFolder) -> str:
     """In a line; empty where nothing is known."""
     all_starts = starts(folder)
     words = [f"{len(all_starts)} starts" if len(all_starts) != 1 else "1 start"] if all_starts else []
-    for start in all_starts:
-        if start.init_from is not None:
-            words.append("began with {parts} of {run}, update {checkpoint}".format(**start.init_from))
-        changes = [f"{option(path)} {_word(was)} to {_word(now)}" for path, (was, now) in start.changes.items()]
-        if changes:
-            words.append(f"from step {start.env_steps:,} {', '.join(changes)}")
+    return "; ".join([*words, *filter(None, map(format_start, all_starts))])
+
+
+def format_start(start: Start) -> str:
+    """What it began with, and what changed; empty where nothing did."""
+    words = []
+    if start.init_from is not None:
+        words.append("began with {parts} of {run}, update {checkpoint}".format(**start.init_from))
+    changes = [f"{option(path)} {_word(was)} to {_word(now)}" for path, (was, now) in start.changes.items()]
+    if changes:
+        words.append(f"from step {start.env_steps:,} {', '.join(changes)}")
     return "; ".join(words)
 
 

@@ -59,6 +59,7 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "doctor": (run_options.Doctor, Action("commands", "doctor")),
     "stats": (run_options.Stats, Action("commands", "stats")),
     "list": (run_options.List, Action("commands", "list_runs")),
+    "watch": (run_options.Watch, Action("watch_command", "watch")),
     "attach": (run_options.Attach, Action("commands", "attach")),
     "stop": (run_options.Stop, Action("commands", "stop")),
     "cluster": (run_options.Cluster, Action("commands", "cluster")),

@@ -154,6 +154,18 @@ class Report:
 
 
 @dataclass(frozen=True)
+class Watch:
+    """Show runs on a page in a browser, live; it can only be read."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Runs, folders that hold some at any depth, or quoted patterns like 'runs/*'."""
+    host: str = "127.0.0.1"
+    """The address to serve at. Any but this machine's own takes a token, which the printed URL has."""
+    port: int = 8000
+    """The port to serve at; 0 takes a free one."""
+
+
+@dataclass(frozen=True)
 class Attach:
     """Watch a run that is being trained; Ctrl-C only stops watching."""
 

@@ -17,8 +17,8 @@ from rmc.analysis.history import Evaluation, History
 from rmc.analysis.report_run import ReportRun
 from rmc.cli.main import run
 from rmc.deploy.run.folder import RunFolder
+from tests.analysis import browser
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 BROWSER_SECONDS = 60
 PROBE = """<script>
 const say = (name, value) => document.documentElement.setAttribute("data-" + name, value);
@@ -77,16 +77,13 @@ def written(out: Path, *words: str) -> str:
 
 def opened(page: Path, width: int, tmp_path: Path) -> dict[str, int]:
     """What a browser without a network says of the page: broken images, pixels too wide, videos that play."""
-    if CHROMIUM is None:
-        pytest.skip("no Chromium here: apt-get install chromium")
     probed = tmp_path / f"probed-{width}.html"
     probed.write_text(page.read_text().replace("</body>", f"{PROBE}</body>"))
-    command = [
-        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--enable-logging=stderr",
-        "--proxy-server=127.0.0.1:9", f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},900",
-        "--virtual-time-budget=5000", "--dump-dom", probed.as_uri(),
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=BROWSER_SECONDS, check=False)
+    words = browser.command(
+        tmp_path / "profile", "--proxy-server=127.0.0.1:9", f"--window-size={width},900", "--virtual-time-budget=5000",
+        "--dump-dom", probed.as_uri(),
+    )  # fmt: skip
+    done = subprocess.run(words, capture_output=True, text=True, timeout=BROWSER_SECONDS, check=False)
     assert done.returncode == 0, done.stderr
     assert "CONSOLE" not in done.stderr, done.stderr
     head = done.stdout[: done.stdout.index("<head>")]

@@ -71,6 +71,7 @@ OTHER_FLAGS = {
     ],
     "plot": ["--out", "--by", "--reference"],
     "report": ["--out", "--video"],
+    "watch": ["--host", "--port"],
     "doctor": [],
     "stats": ["--json"],
     "list": ["--json"],

@@ -25,6 +25,16 @@ def test_records_are_taken_once_and_whole(tmp_path: Path) -> None:
     assert tail.take() == []
 
 
+def test_records_are_taken_in_parts(tmp_path: Path) -> None:
+    records = [{"role": "a", "x": number} for number in range(50)]
+    path = tmp_path / "metrics.jsonl"
+    path.write_text("".join(f"{json.dumps(record)}\n" for record in records))
+    tail = MetricsTail(path)
+    parts = [tail.take(100) for _ in range(20)]
+    assert [record for part in parts for record in part] == records
+    assert max(map(len, parts)) == 4  # of 23 bytes or more
+
+
 def test_records_after_a_cut_are_taken(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_text(f"{json.dumps({'role': 'a', 'x': 'long' * 99})}\n")

@@ -2,11 +2,13 @@
 
 import json
 import re
+import signal
 import sqlite3
 import subprocess
 import sys
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
+from urllib.request import urlopen
 
 import pytest
 
@@ -26,7 +28,7 @@ def rmc(at: Path, *words: str) -> str:
 
 
 def test_a_run_is_watched(tmp_path: Path) -> None:
-    *looks, served = re.findall(r"```sh\nrmc (.*)\n```", WATCHING)
+    *looks, watch, served = re.findall(r"```sh\nrmc (.*)\n```", WATCHING)
     trained = rmc(tmp_path, *served.split(), *SHORT)
     assert "metrics on 127.0.0.1, port 9464\n" in trained
     assert re.search(r"^\d+% \| \d+ of 600 steps \| .* updates/s \| eval .* \| 0:00:\d\d$", trained, re.MULTILINE)
@@ -38,6 +40,18 @@ def test_a_run_is_watched(tmp_path: Path) -> None:
     assert re.search(r"^first +finished +600 .* 100%$", listed, re.MULTILINE)
     (one,) = json.loads(rmc(tmp_path, "list", "runs", "--json"))
     assert (one["state"], one["env_steps"]) == ("finished", 600)
+    words = [sys.executable, "-m", "rmc.cli.main", *watch.split(), "--port", "0"]
+    with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        with urlopen(f"{server.stdout.readline().strip()}events", timeout=20) as events:
+            state: dict[str, Any] = {}
+            while state.get("state") != "finished":
+                line = events.readline()
+                state |= json.loads(line[6:]) if line.startswith(b"data: ") else {}
+        server.send_signal(signal.SIGINT)
+    assert server.returncode == 0
+    assert {"updates_per_s", "model_loss"} <= state["curves"].keys()
+    assert [role["kind"] for role in state["roles"] if role["count"]] == ["actor", "replay", "learner", "evaluator"]
 
 
 def test_every_state_is_told() -> None:

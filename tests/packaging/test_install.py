@@ -72,6 +72,7 @@ def binaries(request: pytest.FixtureRequest, sources: Path, tmp_path_factory: py
             "rmc/deploy/monitor/dashboard.json",
             "rmc/py.typed",
             "rmc/analysis/report.html",
+            "rmc/analysis/watch.html",
             "rmc/common/bus/redis_bus.py",
         } <= set(names)
         _run([*install, "--prefix", str(folder), str(wheel)], ROOT)

@@ -1,0 +1,134 @@
+"""The server of ``rmc watch``: one page, its events and its pictures; reads, and only what the page shows."""
+
+import asyncio
+import json
+import secrets
+import socket
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Sequence
+from importlib.resources import files
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from rmc.analysis.live_run import LiveRun
+
+LOOK_SECONDS = 0.5  # between looks at the runs
+BACKLOG = 64  # looks that a page may be behind; beyond, it is told everything again
+LOOPBACK = ["127.0.0.1", "localhost", "[::1]"]  # no other name: it could be a web page's that leads here
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "connect-src 'self'; img-src 'self' data:; media-src 'self'; frame-ancestors 'none'; base-uri 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",  # the token is in the address
+    "Cache-Control": "no-store",
+}
+
+
+class Broadcast:
+    """What is new of the runs, to every open page. Each look is read and encoded once, however many there are."""
+
+    def __init__(self, runs: Sequence[LiveRun]) -> None:
+        self._runs, self._is_over = runs, False
+        self._looks: deque[bytes] = deque(maxlen=BACKLOG)
+        self._count = 0  # looks that found something
+        self._next = asyncio.Event()
+
+    async def follow(self, is_over: Callable[[], bool]) -> None:
+        """Look at the runs until that says so; then every stream ends."""
+        while not is_over():
+            news = [run.look() for run in self._runs]
+            if found := b"".join(_event(i, one) for i, one in enumerate(news) if one is not None):
+                self._looks.append(found)
+                self._count += 1
+                self._wake()
+            await asyncio.sleep(LOOK_SECONDS)
+        self._is_over = True
+        self._wake()
+
+    def _wake(self) -> None:
+        self._next.set()
+        self._next = asyncio.Event()
+
+    async def stream(self) -> AsyncIterator[bytes]:
+        """The events of one page: everything, then what is new."""
+        told = self._count
+        yield self._everything()
+        while not self._is_over:
+            if told == self._count:
+                await self._next.wait()
+            missed, told = self._count - told, self._count
+            if missed > len(self._looks):
+                yield self._everything()
+            elif missed:
+                yield b"".join(list(self._looks)[-missed:])
+
+    def _everything(self) -> bytes:
+        return b"".join(_event(i, run.everything()) for i, run in enumerate(self._runs))
+
+
+def _event(run: int, message: dict[str, Any]) -> bytes:
+    return f"data: {json.dumps({'run': run, **message}, separators=(',', ':'))}\n\n".encode()
+
+
+class TokenGuard:
+    """Refuses every request without the token."""
+
+    def __init__(self, app: ASGIApp, token: str) -> None:
+        self._app, self._token = app, token.encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer, or pass the request on."""
+        given = Request(scope).query_params.get("token", "")
+        if secrets.compare_digest(given.encode(), self._token):
+            await self._app(scope, receive, send)
+        else:
+            await PlainTextResponse("open the address that rmc watch has printed\n", 401)(scope, receive, send)
+
+
+def application(runs: Sequence[LiveRun], broadcast: Broadcast, token: str) -> Starlette:
+    """The page of these runs; without a ``token`` for browsers of this machine alone."""
+    page = files("rmc.analysis").joinpath("watch.html").read_text(encoding="utf-8")
+
+    async def show(_: Request) -> Response:
+        return HTMLResponse(page)
+
+    async def stream(_: Request) -> Response:
+        return StreamingResponse(broadcast.stream(), media_type="text/event-stream")
+
+    async def media(request: Request) -> Response:
+        at, kind = request.path_params["run"], request.path_params["kind"]
+        path = runs[at].media.get(kind) if at < len(runs) else None
+        if path is None or not path.is_file():
+            raise HTTPException(404)
+        return FileResponse(path)
+
+    guard = Middleware(TokenGuard, token) if token else Middleware(TrustedHostMiddleware, LOOPBACK)
+    routes = [Route("/", show), Route("/events", stream), Route("/media/{run:int}/{kind}", media)]
+    return Starlette(routes=routes, middleware=[guard])
+
+
+def serve(runs: Sequence[LiveRun], listener: socket.socket, token: str) -> None:
+    """Serve the page on a socket until Ctrl-C, which is a KeyboardInterrupt."""
+
+    async def run() -> None:
+        broadcast = Broadcast(runs)
+        config = uvicorn.Config(
+            application(runs, broadcast, token), lifespan="off", ws="none", log_config=None, access_log=False,
+            proxy_headers=False, server_header=False, headers=list(HEADERS.items()),
+        )  # fmt: skip
+        server = uvicorn.Server(config)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(broadcast.follow(lambda: server.should_exit))
+            await server.serve(sockets=[listener])
+
+    asyncio.run(run())

@@ -1,0 +1,284 @@
+"""rmc watch: a real browser and raw sockets at a real server, of runs whose lines the tests write."""
+
+import dataclasses
+import http.client
+import json
+import os
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import psutil
+import pytest
+from imageio_ffmpeg import write_frames
+from matplotlib.image import imsave
+
+from rmc.analysis.live_run import POINTS, Curve, LiveRun
+from rmc.cli import watch_command
+from rmc.cli.main import run
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.presets import debug
+from tests.analysis.browser import opened
+
+SHOWN_SECONDS, PAGES, STREAM_SECONDS = 2.0, 100, 4.0
+CONFIG = dataclasses.replace(debug(EnvConfig("InvertedPendulum-v5")), total_steps=2000)
+RESULT = {
+    "env_steps": 1500, "updates": 336, "wall_s": 21.0, "eval_return_mean": 11.5, "eval_return_std": 0.5,
+    "eval_episodes": 10, "initial_return_mean": 5.0,
+}  # fmt: skip
+Serve = Callable[..., tuple[str, psutil.Process]]
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    """Starts rmc watch and gives its URL and process. Ctrl-C ends it, with status 0 and without a word."""
+    servers = []
+
+    def start(*words: str) -> tuple[str, psutil.Process]:
+        command = [sys.executable, "-m", "rmc.cli.main", "watch", *words, "--port", "0"]
+        server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        servers.append(server)
+        assert server.stdout is not None
+        return server.stdout.readline().strip(), psutil.Process(server.pid)
+
+    yield start
+    for server in servers:
+        server.send_signal(signal.SIGINT)
+        _, errors = server.communicate(timeout=10)
+        assert (server.returncode, errors) == (0, "")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[RunFolder]:
+    """A run that begins to train: nothing is written yet."""
+    begun = open_run(CONFIG, tmp_path / "<b>run", "fail")
+    yield begun
+    begun.unlock()
+
+
+def say(folder: RunFolder, role: str, **metrics: Any) -> None:
+    with folder.metrics.open("a") as file:
+        file.write(json.dumps({"role": role, "time": time.time(), **metrics}) + "\n")
+
+
+def get(url: str, path: str, method: str = "GET", **headers: str) -> tuple[int, bytes]:
+    """Status and body; of a path that is sent as it is."""
+    connection = http.client.HTTPConnection("127.0.0.1", urlsplit(url).port, timeout=10)
+    connection.request(method, path, headers=headers)
+    answer = connection.getresponse()
+    body = answer.read() if answer.headers["content-type"] != "text/event-stream; charset=utf-8" else b""
+    connection.close()
+    return answer.status, body
+
+
+def test_a_browser_shows_each_new_line_the_end_and_a_resume(serve: Serve, folder: RunFolder, tmp_path: Path) -> None:
+    url, _ = serve(str(folder.path))
+    with opened(url, tmp_path) as page:
+
+        def shows(words: str) -> float:
+            return page.seconds_until(f"document.body.innerText.includes({json.dumps(words)})")
+
+        shows("training")
+        assert "0 of 2,000, – /s" in page.js("document.body.innerText")
+        shares = {"busy_share": 0.08, "waiting_share": 0.92}
+        say(folder, "actor-0", **shares, waiting_for="credit", refused_weights=2)
+        say(folder, "learner", env_steps=700, updates_per_s=77.25, model_loss=0.5, busy_share=1.0, waiting_share=0.0)
+        assert shows("77.25 /s") < SHOWN_SECONDS
+        assert page.js("document.querySelector('[data-wait]').dataset.wait") == "actor learner"
+        assert shows("busy 8 %, waits 92 %") + shows("model loss") < SHOWN_SECONDS
+        say(folder, "evaluator", eval_return_mean=123.5, eval_return_std=4.0, eval_update=5, eval_env_steps=600)
+        assert shows("123.5 ± 4 at step 600") < SHOWN_SECONDS
+        say(folder, "launcher", restarts=1, restarts_learner=1, wall_s=5.0)
+        assert shows("learner started again") < SHOWN_SECONDS
+        assert shows("actor-0: refused weights, 2 times") < SHOWN_SECONDS
+        folder.write_result(RESULT)
+        folder.unlock(0)
+        assert shows("finished") + shows("11.5 ± 0.5") < SHOWN_SECONDS
+        again = open_run(dataclasses.replace(CONFIG, total_steps=9000), folder.path, "resume")
+        say(folder, "learner", env_steps=1600, updates_per_s=88.5)
+        assert shows("88.5 /s") + shows("1,600 of 9,000") + shows("training") < SHOWN_SECONDS
+        assert shows("start 2 from step 700 --total-steps 2000 to 9000") < SHOWN_SECONDS
+        assert page.js("document.documentElement.scrollWidth - document.documentElement.clientWidth") == 0
+        assert page.js("document.querySelectorAll('b').length") == 0
+        again.unlock(130)
+        shows("stopped")
+
+
+def test_runs_stand_side_by_side_with_their_newest_picture_and_video(serve: Serve, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        open_run(CONFIG, tmp_path / "runs" / name, "fail").unlock(130)
+    one = tmp_path / "runs" / "one"
+    (one / "videos").mkdir()
+    imsave(one / "inspect.png", np.zeros((8, 12)))
+    video = write_frames(str(one / "videos" / "000000005.mp4"), (32, 32), macro_block_size=1)
+    video.send(None)
+    for _ in range(10):
+        video.send(bytes(32 * 32 * 3))
+    video.close()
+    (one / "video.mp4").write_bytes(b"older")
+    os.utime(one / "video.mp4", (1e9, 1e9))
+    (one / "videos" / ".000000009.mp4").write_bytes(b"being filmed")
+    url, _ = serve(str(tmp_path / "runs"), "--host", "0.0.0.0")
+    address = urlsplit(url)
+    with opened(f"http://127.0.0.1:{address.port}/?{address.query}", tmp_path) as page:
+        page.seconds_until("document.images.length && document.images[0].naturalWidth === 12")
+        page.seconds_until("document.querySelector('video').readyState >= 1")
+        page.seconds_until("document.querySelectorAll('section svg').length === 4")
+        assert page.js("new Set([...document.querySelectorAll('section')].map(one => one.offsetTop)).size") == 1
+
+
+def test_no_token_no_answer(serve: Serve, folder: RunFolder) -> None:
+    url, _ = serve(str(folder.path), "--host", "0.0.0.0")
+    right = urlsplit(url).query
+    assert len(right) > 40
+    wrong = ("", "?token=", "?token=wrong", f"?{right}x", f"?{right[:-1]}", "?token=%ff", "?token=%C3%A9")
+    for path in [place + query for place in ("/", "/events", "/media/0/picture", "/nowhere") for query in wrong]:
+        assert get(url, path)[0] == 401, path
+    assert [get(url, f"{path}?{right}")[0] for path in ("/", "/events", "/nowhere")] == [200, 200, 404]
+
+
+def test_only_this_machine_reads_and_nobody_writes(serve: Serve, folder: RunFolder) -> None:
+    url, _ = serve(str(folder.path))
+    port = urlsplit(url).port
+    assert url == f"http://127.0.0.1:{port}/"
+    for host, status in {"localhost": 200, "[::1]": 200, "rebound.example": 400}.items():
+        assert get(url, "/", Host=f"{host}:{port}")[0] == status
+    for method in ("POST", "PUT", "PATCH", "DELETE"):
+        assert [get(url, path, method)[0] for path in ("/", "/events", "/media/0/picture")] == [405] * 3
+
+
+def test_nothing_else_of_the_folder_is_served(serve: Serve, folder: RunFolder) -> None:
+    secret = folder.secret()
+    (folder.path / "picture.png").symlink_to(folder.secret_file)
+    url, _ = serve(str(folder.path))
+    folders = ("", "/media/0", "/media/0/picture", "/media", "/events", "/.")
+    names = ["secret", "config.json", "metrics.jsonl", "picture", "%00", f"{folder.path}/secret"]
+    names += [
+        "../secret",
+        "../../secret",
+        "%2e%2e/secret",
+        "..%2fsecret",
+        "..%2f..%2fsecret",
+        "....//secret",
+        "..\\secret",
+    ]
+    others = ("/media/-1/picture", "/media/1/picture", f"/media/{10**30}/picture", "/media/0x0/picture", "//etc/passwd")
+    for path in [*(f"{place}/{name}" for place in folders for name in names), *others]:
+        status, body = get(url, path)
+        assert status == 404, path
+        assert secret not in body
+
+
+def test_a_hundred_pages_cost_little(serve: Serve, folder: RunFolder) -> None:
+    """Records as a real run has them, four a second; each stream has all."""
+    url, server = serve(str(folder.path))
+    losses = {f"{name}_loss": 0.5 for name in "abcdef"}
+    say(folder, "learner", env_steps=1, **losses)
+    address, ready = ("127.0.0.1", urlsplit(url).port or 0), selectors.DefaultSelector()
+    received = {socket.create_connection(address, 10): bytearray() for _ in range(PAGES)}
+    for one in received:
+        one.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        ready.register(one, selectors.EVENT_READ)
+
+    def receive(until: float) -> None:
+        while (left := until - time.monotonic()) > 0:
+            for key, _ in ready.select(left):
+                received[key.fileobj] += key.fileobj.recv(1 << 16)  # type: ignore[index, union-attr]
+
+    receive(time.monotonic() + 1.5)
+    assert all(b"a_loss" in text for text in received.values())
+    before, began = sum(server.cpu_times()[:2]), time.monotonic()
+    for number in range(int(4 * STREAM_SECONDS)):
+        say(folder, "learner", env_steps=number, updates_per_s=number + 0.25, **losses)
+        receive(began + (number + 1) / 4)
+    cpu, seconds = sum(server.cpu_times()[:2]) - before, time.monotonic() - began
+    receive(time.monotonic() + 1.0)
+    last = f",{number + 0.25}]".encode()
+    assert all(last in text for text in received.values())
+    print(f"{PAGES} streams: {cpu:.2f} s of CPU in {seconds:.1f} s, {sum(map(len, received.values())):,} bytes")
+    assert cpu < 0.5 * seconds
+    server.send_signal(signal.SIGINT)
+    for one in received:  # Ctrl-C ends each
+        while one.recv(1 << 16):
+            pass
+        one.close()
+
+
+def test_a_curve_is_short_whole_and_the_same_at_every_page() -> None:
+    curve, page = Curve(), list[Any]()
+    assert curve.news() is None
+    for at in range(5 * POINTS + 3):  # the last is a multiple of 7
+        curve.add(at, float(at))
+        if at % 7 == 0 and (news := curve.news()) is not None:
+            page[news[0] :] = news[1]
+    assert page == curve.since(0)[1]
+    assert len(page) <= POINTS
+    assert page[0] == (4, 3.5)  # the mean of eight, steps rounded
+    assert page[-1][1] >= 5 * POINTS - 8
+    assert curve.news() is None
+
+
+def test_counters_make_events_that_do_not_repeat(folder: RunFolder) -> None:
+    watched = LiveRun("run", folder.path)
+    assert (watched.look() or {})["state"] == "training"
+
+    def events() -> list[tuple[str, str, int]]:
+        return [(one["kind"], one["what"], one["count"]) for one in (watched.look() or {})["events"]]
+
+    say(folder, "launcher", restarts=1, restarts_replay=1)
+    say(folder, "replay", dead_letters=3, dead_letters_crc=3, env_steps=50)
+    say(folder, "replay", dead_letters=5, dead_letters_crc=5, env_steps=50)
+    say(folder, "replay", dead_letters=1, dead_letters_crc=1, env_steps=50)  # it was started again
+    expected = [
+        ("start", "start 1", 1),
+        ("restart", "replay started again", 1),
+        ("refusal", "replay: dead letters crc", 6),
+    ]
+    assert events() == expected
+    say(folder, "replay", dead_letters=1, dead_letters_crc=1, env_steps=60)
+    assert "events" not in (watched.look() or {})
+    (folder.path / "config.json").rename(folder.path / "moved")
+    assert "no config.json there" in (watched.look() or {})["fault"]
+    (folder.path / "moved").rename(folder.path / "config.json")
+    assert (watched.look() or {})["fault"] == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "RUNS='': give folders of runs"),
+        (["nowhere"], "no config.json there; give the folder of a run"),
+        (["RUN", "--port", "70000"], "--port='70000': must be between 0 and 65535"),
+        (["RUN", "--port", "TAKEN"], "Address already in use; give another, or 0 for a free one"),
+        (["RUN", "--host", "no host"], "--host='no host': "),
+    ],
+)
+def test_what_it_cannot_do_is_one_line(
+    words: list[str], message: str, folder: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        values = {"RUN": str(folder.path), "TAKEN": str(taken.getsockname()[1])}
+        assert run(["watch", *(values.get(word, word) for word in words)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    there = watch_command.importlib.util.find_spec
+    monkeypatch.setattr(
+        watch_command.importlib.util, "find_spec", lambda name: None if name == "uvicorn" else there(name)
+    )
+    assert run(["watch", "nowhere"]) == 2
+    assert "uvicorn is missing; pip install -e '.[watch]'" in capsys.readouterr().err
