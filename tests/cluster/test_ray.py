@@ -79,6 +79,7 @@ def test_a_run_on_a_ray_of_its_own(tmp_path: Path) -> None:
     assert {path.name for path in (folder / "logs").iterdir()} >= {"launcher.log", "learner.log", "replay.log"}
 
 
+@pytest.mark.long
 def test_two_shards_speak_over_the_network_and_encrypted_where_redis_can(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     options = ["--replay-shards", "2", "--actors", "2", "--total-steps", "2000", *([] if lacks_tls() else ["--tls"])]
