@@ -94,7 +94,7 @@ def category(stack: list[str]) -> str:
             if f"{Path(file).name}:{name.rpartition('.')[2]}" in functions:
                 return kind
     _, file, number = frames[-1]
-    text = linecache.getline(file, int(number or 0))
+    text = linecache.getline(file, int(number)) if number.isdigit() else ""
     return next((kind for kind, calls in BY_LINE.items() if any(call in text for call in calls)), OTHER)
 
 
