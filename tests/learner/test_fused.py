@@ -28,10 +28,10 @@ def bits(values):
     return torch.tensor(values, dtype=torch.bfloat16).view(torch.uint16).numpy()
 
 
-@pytest.fixture
-def pair():
+@pytest.fixture(params=[False, True], ids=["", "critic norm"])
+def pair(request):
     torch.manual_seed(0)
-    plain = Agent(3, 2, CONFIG)
+    plain = Agent(3, 2, dataclasses.replace(CONFIG, critic_norm=request.param))
     fused = copy.deepcopy(plain)
     fuse(fused)
     return plain, fused
