@@ -132,18 +132,18 @@ class FusedTwinQ(Rounded, TwinQ):
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """(B, T, Z), (B, T, A) -> (2, B, T) in float32."""
-        if not _applies(features):
+        if self.norm or not _applies(features):
             return super().forward(features, action)
         stacks = [layer for layer in self.layers if isinstance(layer, StackedLinear)]
         parameters = [part for one in stacks for part in (one.weight, one.bias[:, 0])]
-        return _heads(features, action, self.bf16(), parameters, self.norm).squeeze(-1)
+        return _heads(features, action, self.bf16(), parameters).squeeze(-1)
 
 
-def _heads(features: Tensor, action: Tensor, low: list[Tensor], parameters: list[Tensor], norm: bool = False) -> Tensor:
-    """(..., Z), (..., A) -> (S, ..., out); with ``norm`` a LayerNorm without weights before each ReLU."""
+def _heads(features: Tensor, action: Tensor, low: list[Tensor], parameters: list[Tensor]) -> Tensor:
+    """(..., Z), (..., A) -> (S, ..., out)."""
     flat = (x.flatten(0, -2) for x in (features, action))
     with torch.autocast("cpu", enabled=False):
-        out: Tensor = _Heads.apply(*flat, low, norm, *parameters)  # type: ignore[no-untyped-call]
+        out: Tensor = _Heads.apply(*flat, low, *parameters)  # type: ignore[no-untyped-call]
     return out.reshape(out.shape[0], *features.shape[:-1], out.shape[-1])
 
 
@@ -174,12 +174,11 @@ def _fill(
     seen, before = observation.clone(), state[:, size:]
     by_step = (x.transpose(0, 1) for x in (seen, missing, prev_action.to(BF16), inputs))
     for o, was_missing, a, x in zip(*by_step, strict=True):
-        (first,) = _layer(torch.cat([low, before.to(BF16), a], 1), w1, b1)
-        (second,) = _layer(first, w2, b2)
+        second = _layer(_layer(torch.cat([low, before.to(BF16), a], 1), w1, b1), w2, b2)
         expected = torch.mm(second, w3).float().add_(b3).add_(before)
         torch.where(was_missing, expected.clamp_(-NORMALIZED_CLIP, NORMALIZED_CLIP), o, out=o)
         x[:, : agent.obs_dim] = o
-        gi, gh = torch.mm(_layer(x.contiguous(), w_embed, b_embed)[0], wi), torch.mm(low, wh)
+        gi, gh = torch.mm(_layer(x.contiguous(), w_embed, b_embed), wi), torch.mm(low, wh)
         kernels.gru_step(_bits(gi), _bits(gh), bi, bh, h, gate_cache, h, _bits(low))
         before = o
     return seen, torch.cat([torch.from_numpy(h), before], 1)
@@ -235,46 +234,35 @@ class _Heads(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, features: Tensor, action: Tensor, rounded: list[Tensor], norm: bool, *parameters: Tensor
-    ) -> Tensor:
+    def forward(ctx: Any, features: Tensor, action: Tensor, rounded: list[Tensor], *parameters: Tensor) -> Tensor:
         w1, b1, _, b2, w3, b3 = parameters
         x = torch.cat([features.to(BF16), action.to(BF16)], dim=1)
         low = rounded if len(rounded) == 3 else [*rounded, w3]  # the last layer's products may be in float32
         hidden: list[Tensor] = []
-        norms: list[Tensor] = []
         out = torch.empty(w1.shape[0], len(x), w3.shape[2])
         for net in range(w1.shape[0]):
-            first, *of_first = _layer(x, low[0][net], b1[net], norm)
-            second, *of_second = _layer(first, low[1][net], b2[net], norm)
+            first = _layer(x, low[0][net], b1[net])
+            second = _layer(first, low[1][net], b2[net])
             _last_layer(second, low[2][net], b3[net], out[net])
             hidden += [first, second]
-            norms += [*of_first, *of_second]
-        ctx.save_for_backward(x, *low, *hidden, *norms)
-        ctx.split, ctx.nets = features.shape[1], w1.shape[0]
+        ctx.save_for_backward(x, *low, *hidden)
+        ctx.split = features.shape[1]
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        x, w1, w2, w3, *rest = ctx.saved_tensors
-        hidden, norms = rest[: 2 * ctx.nets], rest[2 * ctx.nets :]
+        x, w1, w2, w3, *hidden = ctx.saved_tensors
         weight_grads = [torch.empty_like(w, dtype=torch.float32) for w in (w1, w2, w3)]
         biases = [torch.zeros(w.shape[0], w.shape[2]) for w in (w1, w2, w3)]
-        wants_features, wants_action, _, _, wants_weights, *_ = ctx.needs_input_grad
+        wants_features, wants_action, _, wants_weights, *_ = ctx.needs_input_grad
         # of the inputs only those asked for: where the policy climbs Q, that is the action alone
         columns = slice(0 if wants_features else ctx.split, x.shape[1] if wants_action else ctx.split)
         dx = torch.zeros_like(x[:, columns])
         for net, (first, second) in enumerate(zip(hidden[::2], hidden[1::2], strict=True)):
             d2 = _last_layer_back(grad[net], second, w3[net], weight_grads[2][net], biases[2][net], biases[1][net])
-            of_first, of_second = norms[4 * net : 4 * net + 2], norms[4 * net + 2 : 4 * net + 4]
-            if of_second:
-                _norm_back(d2, of_second, biases[1][net].zero_())
             d1 = torch.mm(d2, w2[net].t())
-            if of_first:
-                _norm_back(d1, of_first, biases[0][net])
-            else:
-                kernels.relu_back(_bits(d1), _bits(first), biases[0][net].numpy())
+            kernels.relu_back(_bits(d1), _bits(first), biases[0][net].numpy())
             if dx.shape[1]:
                 dx.addmm_(d1, w1[net][columns].t())
             if wants_weights:
@@ -283,11 +271,10 @@ class _Heads(torch.autograd.Function):
         of_features = dx[:, : ctx.split] if wants_features else None
         of_action = dx[:, ctx.split - x.shape[1] :] if wants_action else None
         if not wants_weights:
-            return of_features, of_action, *[None] * 8
+            return of_features, of_action, *[None] * 7
         return (
             of_features,
             of_action,
-            None,
             None,
             weight_grads[0],
             biases[0],
@@ -298,21 +285,11 @@ class _Heads(torch.autograd.Function):
         )
 
 
-def _layer(x: Tensor, w: Tensor, b: Tensor, norm: bool = False) -> list[Tensor]:
-    """ReLU(x w + b): (N, in), (in, out), (out,) -> [(N, out) in bfloat16]; with ``norm``, what its way back needs."""
+def _layer(x: Tensor, w: Tensor, b: Tensor) -> Tensor:
+    """ReLU(x w + b): (N, in), (in, out), (out,) -> (N, out) in bfloat16."""
     y = torch.mm(x, w)
-    if not norm:
-        kernels.bias_relu(_bits(y), b.detach().numpy())
-        return [y]
-    normed, scale = torch.empty_like(y), torch.empty(len(y))
-    kernels.norm_relu(_bits(y), b.detach().numpy(), _bits(normed), scale.numpy())
-    return [y, normed, scale]
-
-
-def _norm_back(grad: Tensor, norm: list[Tensor], db: Tensor) -> None:
-    """grad <- that before the norm, (N, out) in bfloat16; fills db."""
-    normed, scale = norm
-    kernels.norm_relu_back(_bits(grad), _bits(normed), scale.numpy(), db.numpy())
+    kernels.bias_relu(_bits(y), b.detach().numpy())
+    return y
 
 
 def _last_layer(x: Tensor, w: Tensor, b: Tensor, out: Tensor) -> None:

@@ -19,7 +19,6 @@ ONE, TWO, HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
 EXP_RANGE = np.float32(87.0)  # beyond it float32 overflows
 LOG2_E, LN_2 = np.float32(1.0 / np.log(2.0)), np.float32(np.log(2.0))
 TAYLOR = tuple(np.float32(x) for x in (1 / 720, 1 / 120, 1 / 24, 1 / 6, 1 / 2, 1.0, 1.0))  # of exp
-NORM_FLOOR = np.float32(1e-5)  # of a LayerNorm's variance, torch's own
 BLOCK = 1024  # elements that several loops pass over while they are in the first cache
 FAST = {"contract", "reassoc", "nsz", "arcp"}  # all of fastmath but the promise that nothing is NaN or infinite
 
@@ -140,49 +139,6 @@ def relu_back(grad: Bits, x: Bits, db: Floats) -> None:
             grad[i, j] = grad[i, j] if x[i, j] != 0 else np.uint16(0)
         for j in range(x.shape[1]):
             db[j] += _up(grad[i, j])
-
-
-@_compiled
-def norm_relu(x: Bits, bias: Floats, normed: Bits, scale: Floats) -> None:
-    """``normed`` <- LayerNorm(x + bias) and x <- its ReLU; (N, K), (K,), (N, K), and (N,) one over the deviations."""
-    work = np.empty(x.shape[1], np.float32)
-    share = ONE / np.float32(x.shape[1])
-    for i in range(x.shape[0]):
-        total, squares = np.float32(0.0), np.float32(0.0)
-        for j in range(work.size):
-            work[j] = _up(x[i, j]) + bias[j]
-        for j in range(work.size):
-            total += work[j]
-        for j in range(work.size):
-            work[j] -= total * share
-        for j in range(work.size):
-            squares += work[j] * work[j]
-        scale[i] = ONE / np.sqrt(squares * share + NORM_FLOOR)
-        for j in range(work.size):
-            work[j] *= scale[i]
-        lower(work, normed[i])
-        for j in range(work.size):
-            x[i, j] = np.uint16(0) if work[j] < np.float32(0.0) else normed[i, j]
-
-
-@_compiled
-def norm_relu_back(grad: Bits, normed: Bits, scale: Floats, db: Floats) -> None:
-    """grad <- the gradient before ``norm_relu``, added up over N into db; (N, K), (N, K), (N,), (K,)."""
-    work = np.empty(grad.shape[1], np.float32)
-    share = ONE / np.float32(grad.shape[1])
-    for i in range(grad.shape[0]):
-        total, along = np.float32(0.0), np.float32(0.0)
-        for j in range(work.size):
-            work[j] = np.float32(0.0) if _up(normed[i, j]) < np.float32(0.0) else _up(grad[i, j])
-        for j in range(work.size):
-            total += work[j]
-        for j in range(work.size):
-            along += work[j] * _up(normed[i, j])
-        for j in range(work.size):
-            work[j] = scale[i] * (work[j] - share * total - _up(normed[i, j]) * (share * along))
-        for j in range(work.size):
-            db[j] += work[j]
-        lower(work, grad[i])
 
 
 @_compiled
