@@ -195,37 +195,6 @@ class StackedLinear(nn.Module):
         return torch.baddbmm(self.bias, x, self.weight)
 
 
-def symexp(x: Tensor) -> Tensor:
-    return x.sign() * torch.expm1(x.abs())
-
-
-SYMLOG_RANGE = 8.0
-
-
-class MaskedBatchNorm(nn.Module):
-    """Of (2, N, F), each net for itself, over real steps."""
-
-    mean: Tensor
-    var: Tensor
-
-    def __init__(self, size: int) -> None:
-        super().__init__()
-        self.weight, self.bias = nn.Parameter(torch.ones(2, 1, size)), nn.Parameter(torch.zeros(2, 1, size))
-        self.register_buffer("mean", torch.zeros(2, 1, size))
-        self.register_buffer("var", torch.ones(2, 1, size))
-
-    def forward(self, x: Tensor, weight: Tensor | None) -> Tensor:
-        x = x.float()
-        mean, var = self.mean, self.var
-        if weight is not None:
-            mean = (x * weight).sum(1, keepdim=True)
-            var = ((x - mean).square() * weight).sum(1, keepdim=True)
-            with torch.no_grad():
-                self.mean.lerp_(mean, 0.01)
-                self.var.lerp_(var, 0.01)
-        return (x - mean) * (var + 1e-3).rsqrt() * self.weight + self.bias
-
-
 class TwinQ(nn.Module):
     """Eq. 9: Q_1(h, a) and Q_2(h, a), stacked. Where asked, a LayerNorm without weights before each ReLU."""
 
@@ -233,46 +202,21 @@ class TwinQ(nn.Module):
         super().__init__()
         first, second = config.heads
         self.norm = config.critic_norm
-        last = StackedLinear(second, max(1, config.critic_bins))
-        self.layers = nn.ModuleList([StackedLinear(inputs + action_dim, first), StackedLinear(first, second), last])
-        self.batch_norms = nn.ModuleList(
-            [MaskedBatchNorm(size) for size in (inputs + action_dim, first, second)] if config.critic_batch_norm else []
+        self.layers = nn.ModuleList(
+            [StackedLinear(inputs + action_dim, first), StackedLinear(first, second), StackedLinear(second, 1)]
         )
-        self.atoms: Tensor
-        atoms = symexp(torch.linspace(-SYMLOG_RANGE, SYMLOG_RANGE, config.critic_bins)) if config.critic_bins else None
-        self.register_buffer("atoms", atoms, persistent=False)
-        if config.critic_bins:
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """(B, T, Z), (B, T, A) -> (2, B, T) in float32."""
-        return self.expected(self.outputs(features, action))
-
-    def expected(self, outputs: Tensor) -> Tensor:
-        """(2, B, T, K) -> (2, B, T)."""
-        if self.atoms is None:
-            return outputs.squeeze(-1)
-        return (outputs.softmax(-1) * self.atoms).sum(-1)
-
-    def outputs(self, features: Tensor, action: Tensor, m: Tensor | None = None) -> Tensor:
-        """(B, T, Z), (B, T, A) -> (2, B, T, K) in float32; with m (B, T) batch norm by this batch."""
         x = torch.cat([features, action.to(features.dtype)], dim=-1)
         shape = x.shape[:-1]
         x = x.reshape(1, -1, x.shape[-1]).expand(2, -1, -1)
-        if self.batch_norms:
-            weight = None if m is None else (m / m.sum().clamp(min=1.0)).reshape(1, -1, 1)
-            for norm, layer in zip(self.batch_norms[:-1], self.layers[:-1], strict=True):
-                x = F.relu(layer(norm(x, weight)))
-            with torch.autocast(x.device.type, enabled=False):
-                out: Tensor = self.layers[-1](self.batch_norms[-1](x, weight))
-            return out.reshape(2, *shape, out.shape[-1])
         for layer in self.layers[:-1]:
             x = layer(x)
             x = F.relu(F.layer_norm(x, x.shape[-1:]) if self.norm else x)
         with torch.autocast(x.device.type, enabled=False):  # bfloat16 would give a Q of 300 in steps of 2
             q: Tensor = self.layers[-1](x.float())
-        return q.reshape(2, *shape, q.shape[-1])
+        return q.reshape(2, *shape)
 
 
 class Policy(nn.Module):

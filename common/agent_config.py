@@ -31,10 +31,6 @@ class AgentConfig:
     an agent without a memory."""
     critic_norm: bool = False
     """LayerNorm before the ReLUs of the critics."""
-    critic_batch_norm: bool = False
-    """Batch norm in the critics, values of now and next in one pass, without targets."""
-    critic_bins: int = 0
-    """Bins of the critics' distributions over values; 0 for a number."""
     privileged_critic: bool = False
     """The critics, and nothing else, also read the environment's info["privileged"]. Where it gives none, that is the
     observation before any option takes from it."""

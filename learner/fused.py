@@ -130,13 +130,13 @@ class FusedTwinQ(Rounded, TwinQ):
     def weights(self) -> list[Tensor]:
         return [layer.weight for layer in self.layers[:-1] if isinstance(layer, StackedLinear)]
 
-    def outputs(self, features: Tensor, action: Tensor, m: Tensor | None = None) -> Tensor:
-        """(B, T, Z), (B, T, A) -> (2, B, T, K) in float32."""
-        if self.norm or self.batch_norms or not _applies(features):
-            return super().outputs(features, action, m)
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """(B, T, Z), (B, T, A) -> (2, B, T) in float32."""
+        if self.norm or not _applies(features):
+            return super().forward(features, action)
         stacks = [layer for layer in self.layers if isinstance(layer, StackedLinear)]
         parameters = [part for one in stacks for part in (one.weight, one.bias[:, 0])]
-        return _heads(features, action, self.bf16(), parameters)
+        return _heads(features, action, self.bf16(), parameters).squeeze(-1)
 
 
 def _heads(features: Tensor, action: Tensor, low: list[Tensor], parameters: list[Tensor]) -> Tensor:

@@ -78,22 +78,6 @@ def q_loss(q: Tensor, y: Tensor, importance: Tensor, m: Tensor) -> Tensor:
     return masked_mean(importance.unsqueeze(1) * squared, m)
 
 
-def two_hot(y: Tensor, atoms: Tensor) -> Tensor:
-    """(B, T), (K,) -> (B, T, K): all of the weight on the two neighbours of y, so that their mean is y."""
-    y = y.clamp(float(atoms[0]), float(atoms[-1])).contiguous()
-    above = torch.searchsorted(atoms, y).clamp(1, len(atoms) - 1)
-    low, high = atoms[above - 1], atoms[above]
-    weight = ((y - low) / (high - low)).unsqueeze(-1)
-    hot = y.new_zeros(*y.shape, len(atoms))
-    return hot.scatter_(-1, above.unsqueeze(-1), weight).scatter_(-1, above.unsqueeze(-1) - 1, 1.0 - weight)
-
-
-def q_cross_entropy(outputs: Tensor, target: Tensor, importance: Tensor, m: Tensor) -> Tensor:
-    """outputs (2, B, T, K), target (B, T, K)."""
-    entropy = -(target * outputs.log_softmax(-1)).sum(-1).sum(0)
-    return masked_mean(importance.unsqueeze(1) * entropy, m)
-
-
 def policy_loss(log_pi: Tensor, q: Tensor, alpha: Tensor, m: Tensor) -> Tensor:
     """Eq. 11: alpha log pi(a|sg(h_t)) - Q(sg(h_t), a), (B, T) each. (The paper prints the sign the other way round.)
 

@@ -148,21 +148,11 @@ class JointUpdate:
         with self._autocast():
             mean, log_std = agent.policy(z_policy)
             pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean, batch.cut))
-            read = critic_input(z_value[:, :-1], privileged[:, :-1])
-            next_read = critic_input(model.next_z, privileged[:, 1:])
-            if agent.config.critic_batch_norm:
-                steps = a.shape[1]
-                both = torch.cat([read, next_read], 1), torch.cat([a, pi[:, 1:].detach()], 1)
-                all_outputs = agent.critic.outputs(*both, torch.cat([m, m], 1))
-                outputs, next_q = all_outputs[:, :, :steps], agent.critic.expected(all_outputs[:, :, steps:].detach())
-            else:
-                outputs = agent.critic.outputs(read, a)
-                with torch.no_grad():
-                    next_q = self.target_critic(next_read, pi[:, 1:])
-            q = agent.critic.expected(outputs)
             with torch.no_grad():
+                next_q = self.target_critic(critic_input(model.next_z, privileged[:, 1:]), pi[:, 1:])
                 next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:])
                 y = losses.td_target(r + beta * model.curiosity, c.gamma, d, next_value, m, c.n_step)
+            q = agent.critic(critic_input(z_value[:, :-1], privileged[:, :-1]), a)
             frozen = {name: value.detach() for name, value in agent.critic.named_parameters()}
             z_actor = z_policy if c.policy_through_q else z.detach()
             read = critic_input(z_actor[:, :-1], privileged[:, :-1])
@@ -171,9 +161,7 @@ class JointUpdate:
 
         log_pi, td_error = log_pi[:, :-1], (q.detach() - y).abs().mean(0)
         loss_values = {
-            "q_loss": losses.q_cross_entropy(outputs, losses.two_hot(y, agent.critic.atoms), batch.importance, m)
-            if agent.config.critic_bins
-            else losses.q_loss(q, y, batch.importance, m),
+            "q_loss": losses.q_loss(q, y, batch.importance, m),
             "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, m),
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
