@@ -332,10 +332,10 @@ class Actor:
 
     def _check_sizes(self, info: dict[str, Any]) -> None:
         """Raises EnvFault where a first reset says otherwise than the run's layout what is missing or privileged."""
-        flags, numbers = np.size(info.get("missing", False)), np.size(info.get("privileged", ()))
+        numbers = np.size(info.get("privileged", ())) if self._spec.privileged else 0  # else it is its own affair
         for name, size, sizes in (
-            ("missing", flags, (1, self._spec.missing)),
-            ("privileged", numbers, (self._spec.privileged,) if self._spec.privileged else (numbers,)),
+            ("missing", np.size(info.get("missing", False)), (1, self._spec.missing)),
+            ("privileged", numbers, (self._spec.privileged,)),
         ):
             if size not in sizes:
                 fault = f'the environment\'s info["{name}"] has {size} values, when the run began {sizes[-1]}'

@@ -166,12 +166,11 @@ def _for_critics(env: Env) -> Iterator[str]:
     watched = Privileged(env, take_observation=False)
     try:
         given = watched.reset(seed=2)[1].get("privileged")
-        if given is None:
-            return
         Played().play(watched, REPEATED_STEPS, seed=2)
     except EnvFault as fault:
         yield f"note: --privileged-critic would end in: {fault}"
-    else:
+        return
+    if given is not None:
         yield f'note: info["privileged"] has {given.size} numbers, which critics alone read with --privileged-critic'
 
 

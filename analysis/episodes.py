@@ -23,7 +23,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.describe import layout_of, shown
 from rmc.common.env.layout import Part
 from rmc.common.env.make import make_env
-from rmc.common.env.wrappers import CorruptObservation, Env, Floats, FrameStack, ObservationSlice
+from rmc.common.env.wrappers import CorruptObservation, Delay, Env, Floats, FrameStack, ObservationSlice
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
@@ -63,7 +63,8 @@ class HiddenPart:
 
     name: str
     columns: slice
-    only_missing: bool  # hidden where the frame is missing alone
+    only_missing: bool  # hidden where it is missing alone
+    flags: slice  # its own, where each number of what is seen has one
 
 
 class Record(gym.Wrapper[Floats, Floats, Floats, Floats]):
@@ -83,7 +84,7 @@ class Record(gym.Wrapper[Floats, Floats, Floats, Floats]):
 def recorded(env: Env) -> tuple[Env, Record]:
     """The environment with a Record below all that hides, disturbs or stacks what is seen, and that Record."""
     above, inner = None, env
-    while isinstance(inner, ObservationSlice | CorruptObservation | FrameStack):
+    while isinstance(inner, ObservationSlice | CorruptObservation | Delay | FrameStack):
         above, inner = inner, inner.env
     record = Record(inner)
     if above is None:
@@ -104,7 +105,8 @@ def hidden_parts(env: Env, config: EnvConfig) -> list[HiddenPart]:
         is_shown = first <= part.start and part.stop <= last
         only_missing = is_shown and not never_as_it_is and config.frame_stack == 1
         if not is_shown or never_as_it_is or partly_missing:
-            parts.append(HiddenPart(_name(part, only_missing), slice(part.start, part.stop), only_missing))
+            columns, flags = slice(part.start, part.stop), slice(part.start - first, part.stop - first)
+            parts.append(HiddenPart(_name(part, only_missing), columns, only_missing, flags))
     return parts
 
 
@@ -163,9 +165,9 @@ class Player:
     ) -> Episode:
         flags = self._policy.header.layout.missing
         missing = torch.from_numpy(np.stack([np.broadcast_to(info.get("missing", False), flags) for info in infos]))
-        beside = torch.from_numpy(np.stack([info.get("privileged", np.zeros(0, np.float32)) for info in infos]))
-        if self._agent.privileged_normalizer is None:
-            beside = beside[:, :0]  # an environment may give it to critics that do not read it
+        beside = torch.zeros(len(infos), 0)
+        if self._agent.privileged_normalizer is not None:  # an environment may give it to critics that do not read it
+            beside = torch.from_numpy(np.stack([info["privileged"] for info in infos]))
         return Episode(
             self._agent.normalizer(torch.from_numpy(observations), missing).unsqueeze(0),
             torch.from_numpy(actions).unsqueeze(0),

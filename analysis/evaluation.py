@@ -112,4 +112,5 @@ def initial_policy(config: RunConfig) -> bytes:
     spec = config.window_spec()
     torch.manual_seed(config.seed)
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
+    agent.start_gates(spec.steps)
     return safetensors.torch.save(agent.policy_weights())

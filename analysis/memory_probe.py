@@ -6,6 +6,7 @@ Shapes: N steps of several episodes, X numbers that are read from, Y numbers tha
 
 from dataclasses import dataclass
 from math import isfinite
+from statistics import fmean
 
 import numpy as np
 import torch
@@ -37,7 +38,7 @@ class Samples:
     newest: Doubles  # (N, O), the newest observation that was seen, normalised
     own: Doubles  # (N, F), the environment's own observation
     probe: dict[str, Doubles]  # (N,)
-    missing: NDArray[np.bool_]  # (N,), anything of the frame
+    missing: NDArray[np.bool_]  # (N, M)
     quarter: NDArray[np.int64]  # (N,), the same for all steps of an episode
 
 
@@ -49,7 +50,7 @@ def samples(agent: Agent, episodes: list[Episode]) -> Samples:
         np.concatenate([_newest(episode) for episode in episodes]),
         np.concatenate([episode.own for episode in episodes]).astype(np.float64),
         {name: np.concatenate([episode.probe[name] for episode in episodes]) for name in episodes[0].probe},
-        np.concatenate([episode.missing[0].any(-1).numpy() for episode in episodes]),
+        np.concatenate([episode.missing[0].numpy() for episode in episodes]),
         np.concatenate([np.full(len(h), index % QUARTERS) for index, _, h in joined]),
     )
 
@@ -66,9 +67,29 @@ def probes(agent: Agent, episodes: list[Episode], parts: list[HiddenPart]) -> li
     """Of each hidden part and of what the environment says; what never changes is left out."""
     rows = samples(agent, episodes)
     every = np.ones(len(rows.h), np.bool_)
-    wanted = [(part.name, rows.own[:, part.columns], rows.missing if part.only_missing else every) for part in parts]
-    wanted += [(name, values[:, None], every) for name, values in rows.probe.items()]
-    return [probe for name, y, at in wanted if (probe := _probe(name, rows, y, at)) is not None]
+    read = [
+        _of_part(rows, part) if part.only_missing else _probe(part.name, rows, rows.own[:, part.columns], every)
+        for part in parts
+    ]
+    read += [_probe(name, rows, values[:, None], every) for name, values in rows.probe.items()]
+    return [probe for probe in read if probe is not None]
+
+
+def _of_part(rows: Samples, part: HiddenPart) -> Probe | None:
+    """Where it is missing; where its numbers are missing one by one, the mean of each one's own."""
+    if rows.missing.shape[1] == 1:
+        return _probe(part.name, rows, rows.own[:, part.columns], rows.missing[:, 0])
+    each = [
+        _probe(part.name, rows, y[:, None], at)
+        for y, at in zip(rows.own[:, part.columns].T, rows.missing[:, part.flags].T, strict=True)
+    ]
+    found = [probe for probe in each if probe is not None]
+    if not found:
+        return None
+    return Probe(
+        part.name,
+        *(fmean(values) for values in zip(*((one.from_memory, one.from_newest) for one in found), strict=True)),
+    )
 
 
 def _probe(name: str, rows: Samples, y: Doubles, at: NDArray[np.bool_]) -> Probe | None:

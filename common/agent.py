@@ -85,7 +85,7 @@ class Memory(nn.Module):
 
     @torch.no_grad()
     def start_gates(self, steps: int) -> None:
-        """Chrono initialisation: unit i forgets over u_i steps, drawn from 1 to ``steps`` - 1.
+        """Chrono initialisation: unit i holds what it has for 1 + u_i steps, u_i from 1 to ``steps`` - 1.
 
         With z = sigmoid(b), h_t = z h_{t-1} + (1 - z) n_t keeps h for about 1 / (1 - z) = 1 + e^b steps, so b_i = log
         u_i (Tallec and Ollivier, 2018, for the GRU).
@@ -271,6 +271,11 @@ class Agent(nn.Module):
         self.log_alpha = nn.Parameter(torch.zeros(()))
         self.next_frame = ObservationImputer(obs_dim, action_dim, config) if config.impute_missing else None
         self.privileged_normalizer = Normalizer(privileged, config.normalize_observations) if privileged else None
+
+    def start_gates(self, steps: int) -> None:
+        """The memory's, as configured for windows of so many steps, before anything is learnt."""
+        if self.config.gate_init == "chrono":
+            self.memory.start_gates(steps)
 
     def features(self, remembered: MemoryOutput) -> Tensor:
         """What the heads read: h_t, what is beside it, or both."""

@@ -22,7 +22,7 @@ class AgentConfig:
     heads: tuple[int, int] = (400, 300)
     """Hidden layers of every head."""
     gate_init: Literal["uniform", "chrono"] = "uniform"
-    """How the GRU's update gates start: as PyTorch has them, or so that units hold what they have for 1 to T steps, T
+    """How the GRU's update gates start: as PyTorch has them, or so that units hold what they have for 2 to T steps, T
     those of a window (chrono initialisation)."""
     layer_norm: bool = False
     """LayerNorm between the embedding's Linear and its ReLU."""

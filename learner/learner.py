@@ -86,8 +86,7 @@ class Learner:
         torch.set_flush_denormal(True)  # into which Adam's moments of idle units decay: 13 % slower on a CPU
         torch.manual_seed(seed)  # the networks' initial weights
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent, spec.missing, spec.privileged)
-        if agent.gate_init == "chrono":
-            self.agent.memory.start_gates(spec.steps)
+        self.agent.start_gates(spec.steps)
         self.agent.to(self.device)
         bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_is_native(self.device))
         self.update = make_update(self.agent, spec.burn_in, update, seed, bf16)

@@ -23,6 +23,7 @@ from rmc.common.errors import ConfigError
 from rmc.common.window import Rows, WindowSpec
 from rmc.replay_server.commit_record import Progress, RecordPair, record_bytes
 from rmc.replay_server.former_rows import former_fingerprints, former_row_bytes
+from rmc.replay_server.row_check import row_faults
 from rmc.replay_server.row_checksum import add_checksums, whole_rows
 
 _IDENTITY = struct.Struct("<8s16sQQ")  # magic, fingerprint, capacity, row bytes; then its CRC
@@ -163,14 +164,18 @@ def _rewrite(path: Path, spec: WindowSpec, capacity: int) -> None:
     temporary = path.with_suffix(".tmp")
     try:
         reserve(temporary, file_bytes(spec, capacity), capacity)
-    except ConfigError as error:
-        raise ConfigError("--run-dir", str(path), f"it is of an older version, and rewriting it {error.fix}") from None
+    except ConfigError:
+        needed = f"{file_bytes(spec, capacity) / 2**30:.2f} GiB in {path.parent}"
+        fix = f"its ring is of an older version, and rewriting it needs {needed}; free that much and start again"
+        raise ConfigError("--run-dir", str(path), fix) from None
     _write_head(temporary, spec, capacity, progress)
     new = np.memmap(temporary, np.uint8, "r+", offset=start, shape=(capacity, spec.dtype.itemsize))  # padding, too
     for begin in range(0, capacity, REWRITTEN_ROWS):
         part = new[begin : begin + REWRITTEN_ROWS]
         part[:, :size] = old[begin : begin + REWRITTEN_ROWS]
-        add_checksums(part.view(np.ndarray).view(spec.dtype)[:, 0])
+        rows = part.view(np.ndarray).view(spec.dtype)[:, 0]
+        add_checksums(rows)
+        rows["checksum"][row_faults(rows, spec) > 0] ^= 1  # older rows have none that says whether they are whole
     new.flush()
     temporary.rename(path)
     log.info("replay ring: rewritten for this version, %d windows", progress.windows)

@@ -27,6 +27,7 @@ from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
 
 Preset = Literal["robust", "memory", "paper", "debug"]
+FLAGS = "flags of what is missing"
 LARGEST_WINDOW = 32 << 20  # bytes, half of what our Redis takes as a value
 ConfigT = TypeVar("ConfigT")
 
@@ -106,7 +107,7 @@ class RunConfig:
         spec = self.window_spec()
         whole = {"steps an episode": spec.train} if self.actor.state_strategy == "episode" else {}
         privileged = {"privileged numbers": spec.privileged} if spec.privileged else {}
-        return {"observations": spec.obs_dim, "actions": spec.action_dim, **privileged, **whole}
+        return {"observations": spec.obs_dim, "actions": spec.action_dim, FLAGS: spec.missing, **privileged, **whole}
 
     def shards(self) -> list[Shard]:
         """The replay servers."""

@@ -115,7 +115,7 @@ class RunFolder:
     def check_sizes(self, env_id: str, sizes: dict[str, int]) -> None:
         """Raises ConfigError where the environment has other ``sizes`` than when the run began."""
         try:
-            before = read_object(self.sizes_file, *sizes)
+            before = read_object(self.sizes_file)  # of an older version, some are unknown
         except (OSError, ConfigError):  # damaged, it is as none
             return
         check_sizes(env_id, before, sizes)

@@ -22,7 +22,7 @@ from rmc.common.errors import ConfigError
 from rmc.common.replay import ObservationStatistics
 from rmc.common.window import WindowSpec
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
-from rmc.deploy.run.config import RunConfig, option
+from rmc.deploy.run.config import FLAGS, RunConfig, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import InitParts
 from rmc.learner.update import JointUpdate
@@ -36,9 +36,9 @@ PARTS: dict[InitParts, tuple[str, ...]] = {  # the beginnings of what is taken
     "policy": (*POLICY_PARTS, *FILL_PARTS),
 }
 NOT_IN: dict[InitParts, set[str]] = {  # options of the networks that say nothing of these parts
-    "all": {"initial_priority"},
-    "memory+world-model": {"initial_priority", "critic_norm", "privileged_critic"},
-    "policy": {"initial_priority", "critic_norm", "privileged_critic", "grounding"},
+    "all": {"initial_priority", "gate_init"},
+    "memory+world-model": {"initial_priority", "gate_init", "critic_norm", "privileged_critic"},
+    "policy": {"initial_priority", "gate_init", "critic_norm", "privileged_critic", "grounding"},
 }
 
 
@@ -93,6 +93,9 @@ def _check_sizes(
     init_from: str, parts: InitParts, source: RunConfig, config: RunConfig, agent: dict[str, Tensor]
 ) -> None:
     sizes = {"observations": len(agent["normalizer.mean"]), "actions": len(agent["policy.net.4.bias"]) // 2}
+    if source.agent.missing_flag:
+        width = agent["memory.embed.0.weight" if source.agent.embedding else "memory.gru.weight_ih_l0"].shape[1]
+        sizes[FLAGS] = width - sizes["observations"] - sizes["actions"]
     if parts == "all" and "privileged_normalizer.mean" in agent:
         sizes["privileged numbers"] = len(agent["privileged_normalizer.mean"])
     for name, ours in config.sizes().items():

@@ -467,6 +467,19 @@ def test_a_broken_episode_is_dropped_and_training_goes_on(fault: str) -> None:
     actor.close()
 
 
+def test_what_critics_are_not_asked_to_read_is_the_environments_own_affair() -> None:
+    class Gives(gym.Wrapper[Any, Any, Any, Any]):
+        def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+            return self.env.reset(**options)[0], {"privileged": [[1.0], [1.0, 2.0]]}
+
+    bus = MemoryBus()
+    publish(bus, 0)
+    actor = Actor(0, 1, lambda: Gives(make_env(COUNTING)), SPEC, AGENT, CONFIG, bus, itertools.count().__next__)
+    play(bus, actor, Reader(bus), 60)
+    assert actor.metrics()["broken_episodes"] == 0
+    actor.close()
+
+
 def test_a_fault_is_logged_with_its_place_in_the_users_file(caplog: pytest.LogCaptureFixture) -> None:
     bus = MemoryBus()
     publish(bus, 0)

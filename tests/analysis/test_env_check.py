@@ -50,6 +50,13 @@ class Untold(Odd):
         return super().reset(**options)[0], {"privileged": [1.0, np.nan]}
 
 
+class Late(Odd):
+    """Gives what critics alone may read from its first step on, but at no reset."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return *super().step(action)[:4], {"privileged": [1.0, 2.0]}
+
+
 class Rewarded(Odd):
     """Each reward has the same size, but for every hundredth."""
 
@@ -67,6 +74,7 @@ for _name, _sizes in {
     gym.register(f"{_name}-v0", Rewarded, kwargs=dict(zip(("size", "rare"), _sizes, strict=False)))
 gym.register("Odd-v0", entry_point=Odd)
 gym.register("Untold-v0", entry_point=Untold)
+gym.register("Late-v0", entry_point=Late)
 gym.register("Unrewarded-v0", entry_point=Unrewarded)
 
 
@@ -154,6 +162,7 @@ def test_what_options_take_away_is_no_fault(capsys: pytest.CaptureFixture[str]) 
     [
         ("tests.partial_env:Partial-v0", 'info["privileged"] has 2 numbers, which critics alone read'),
         ("Untold-v0", '--privileged-critic would end in: the environment\'s info["privileged"] is not finite'),
+        ("Late-v0", '--privileged-critic would end in: the environment\'s info["privileged"] has shape (2,), at first'),
     ],
 )
 def test_what_critics_alone_may_read_is_noted(env: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from rmc.analysis import memory_picture
 from rmc.analysis.episodes import Episode, HiddenPart, Player, hidden_parts, recorded, remembered
 from rmc.analysis.influence import Replay, influence
 from rmc.analysis.memory_picture import Remembered, remember, tables
-from rmc.analysis.memory_probe import explained, probes, samples
+from rmc.analysis.memory_probe import Samples, _of_part, explained, probes, samples
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig
@@ -123,17 +123,25 @@ def test_what_is_hidden_and_when() -> None:
 
     cheetah = "HalfCheetah-v5"
     assert of(cheetah) == of("Pendulum-v1", frame_stack=2) == []
-    velocities, positions = HiddenPart("qvel", slice(8, 17), False), HiddenPart("qpos", slice(0, 8), False)
+    velocities, positions = (
+        HiddenPart("qvel", slice(8, 17), False, slice(8, 17)),
+        HiddenPart("qpos", slice(0, 8), False, slice(0, 8)),
+    )
     assert of(cheetah, hide="velocities") == [velocities]
-    assert of(cheetah, hide="positions") == [positions]
-    missing = HiddenPart("qpos, where missing", slice(0, 8), True)
+    assert of(cheetah, hide="positions") == [dataclasses.replace(positions, flags=slice(-8, 0))]
+    missing = HiddenPart("qpos, where missing", slice(0, 8), True, slice(0, 8))
+    (seen,) = (part for part in of(cheetah, hide="positions", drop_sensors=0.5) if part.only_missing)
+    assert (seen.columns, seen.flags) == (slice(8, 17), slice(0, 9))
     assert of(cheetah, hide="velocities", flicker=0.5) == [missing, velocities]
     assert of(cheetah, noise=0.1) == [positions, velocities]
-    assert of("Pendulum-v1", flicker=0.5) == [HiddenPart("observation, where missing", slice(0, 3), True)]
-    assert of("Pendulum-v1", flicker=0.5, frame_stack=2) == [HiddenPart("observation", slice(0, 3), False)]
+    assert of("Pendulum-v1", flicker=0.5) == [HiddenPart("observation, where missing", slice(0, 3), True, slice(0, 3))]
+    assert of("Pendulum-v1", flicker=0.5, frame_stack=2) == [HiddenPart("observation", slice(0, 3), False, slice(0, 3))]
 
 
-@pytest.mark.parametrize("options", [{}, {"hide": "velocities", "noise": 0.1, "flicker": 0.4, "frame_stack": 2}])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"hide": "velocities", "noise": 0.1, "flicker": 0.4, "frame_stack": 2}, {"hide": "positions", "delay": 3}],
+)
 def test_the_environments_own_observation_is_recorded_below_all_that_hides_it(options: dict[str, Any]) -> None:
     bare, (env, record) = (
         make_env(EnvConfig("HalfCheetah-v5")),
@@ -149,6 +157,17 @@ def test_the_environments_own_observation_is_recorded_below_all_that_hides_it(op
         assert options or (seen == record.newest).all()
     env.close()
     bare.close()
+
+
+def test_a_sensor_that_fails_alone_is_read_where_it_failed() -> None:
+    """White noise: nothing tells of it but the sensor itself, which the newest observation holds where it is seen."""
+    rng, rows = np.random.default_rng(0), 4_000
+    noise, missing = rng.normal(size=(rows, 3)), rng.random((rows, 3)) < 0.3
+    newest, quarter = np.where(missing, 0.0, noise), np.arange(rows) % 4
+    parts = HiddenPart("noise, where missing", slice(0, 3), True, slice(0, 3))
+    found = _of_part(Samples(newest, newest, noise, {}, missing, quarter), parts)
+    assert found is not None
+    assert max(found.from_memory, found.from_newest) < 0.02
 
 
 def test_rows_are_the_memory_beside_what_was_seen_last(tmp_path: Path) -> None:

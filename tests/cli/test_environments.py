@@ -93,6 +93,15 @@ def test_an_environment_that_has_gained_an_observation_is_named_by_every_command
     assert sorted(path.name for path in run.path.iterdir()) == before
 
 
+def test_a_run_keeps_its_number_of_flags(tmp_path: Path) -> None:
+    config = debug(EnvConfig("Pendulum-v1", drop_sensors=0.2))
+    run = open_run(config, tmp_path / "run", "fail")
+    run.unlock()
+    run.write_sizes({"observations": 3, "flags of what is missing": 1})  # and nothing of actions, as an older version
+    with pytest.raises(ConfigError, match="now has 3 flags of what is missing, the run was trained with 1"):
+        open_run(config, run.path, "resume")
+
+
 def test_a_run_of_whole_episodes_keeps_their_length(tmp_path: Path) -> None:
     config = debug(EnvConfig("InvertedPendulum-v5"))
     config = dataclasses.replace(config, actor=dataclasses.replace(config.actor, state_strategy="episode"))

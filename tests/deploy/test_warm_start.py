@@ -190,6 +190,10 @@ def test_what_does_not_fit_is_one_line_and_leaves_no_folder(
     assert not (tmp_path / "run").exists()
 
 
+def test_how_gates_would_have_started_says_nothing(source: RunFolder, tmp_path: Path) -> None:
+    begin(with_value(OTHER, "agent.gate_init", "chrono"), tmp_path / "run", source)
+
+
 def test_grounding_says_nothing_of_a_policy(source: RunFolder, tmp_path: Path) -> None:
     begin(with_value(OTHER, "agent.grounding", False), tmp_path / "run", source, "policy")
 

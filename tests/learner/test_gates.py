@@ -1,10 +1,18 @@
 """How far back the memory's gates reach before anything is learnt."""
 
+import dataclasses
+from pathlib import Path
+
 import pytest
+import safetensors.torch
 import torch
 
+from rmc.analysis.evaluation import initial_policy
 from rmc.common.agent import Memory
 from rmc.common.agent_config import AgentConfig
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.local.lockstep import Lockstep
+from rmc.deploy.run.presets import debug
 
 STEPS = 100
 
@@ -32,3 +40,12 @@ def test_chrono_initialisation_holds_what_was_seen_over_a_window() -> None:
     assert kept.min() >= 2.0
     assert kept.max() <= STEPS + 1e-3
     assert float(kept.mean()) == pytest.approx(1.0 + STEPS / 2, rel=0.2)
+
+
+def test_the_policy_before_training_is_the_one_that_the_learner_starts_from(tmp_path: Path) -> None:
+    config = debug(EnvConfig("Pendulum-v1"))
+    config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, gate_init="chrono"))
+    run = Lockstep(config, tmp_path)
+    ours, theirs = safetensors.torch.load(initial_policy(config)), run.learner.agent.policy_weights()
+    assert {name for name, value in theirs.items() if not torch.equal(ours[name], value)} == set()
+    run.close()

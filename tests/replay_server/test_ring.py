@@ -206,11 +206,22 @@ def test_a_ring_of_an_older_version_is_rewritten(tmp_path: Path, missing: str) -
         Ring(path, SPEC, capacity)
 
 
+def test_what_an_older_ring_holds_damaged_is_not_drawn(tmp_path: Path) -> None:
+    rows = make_rows(4)
+    rows["observation"][1, 0, 0], rows["last"][2] = np.nan, 99
+    write_former_ring(tmp_path / "ring", "missing", rows, 4)
+    ring, out = Ring(tmp_path / "ring", SPEC, 4), np.zeros(4, SPEC.dtype)
+    assert ring.gather(np.arange(4), out).tolist() == [True, False, False, True]
+
+
 def test_an_older_ring_without_room_to_rewrite_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_former_ring(tmp_path / "ring", "missing", make_rows(3), 5)
     before = (tmp_path / "ring").read_bytes()
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10, 10, 0))  # type: ignore[attr-defined]
-    with pytest.raises(ConfigError, match=r"--run-dir=.*older version, and rewriting it needs .* GiB in "):
+    with pytest.raises(
+        ConfigError,
+        match=r"--run-dir=.*older version, and rewriting it needs .* GiB in .*; free that much and start again$",
+    ):
         Ring(tmp_path / "ring", SPEC, 5)
     assert (tmp_path / "ring").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["ring"]
