@@ -78,7 +78,8 @@ def _shapes(blob: bytes) -> dict[str, tuple[int, ...]]:
     try:
         return {name: tuple(value.shape) for name, value in safetensors.torch.load(blob).items()}
     except (SafetensorError, ValueError, KeyError) as error:
-        raise MessageError("cut, or no safetensors file", f"{error}; copy it again") from None
+        reason = " ".join(str(error).split())  # in one line, whatever it quotes
+        raise MessageError("cut, or no safetensors file", f"{reason}; copy it again") from None
 
 
 def _facts(blob: bytes) -> Any:
@@ -116,7 +117,7 @@ def _check_shapes(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> N
         with torch.device("meta"):
             agent = Agent(header.obs_dim, header.action_dim, header.agent, header.layout.missing)
             expected = agent.policy_shapes()
-    except (RuntimeError, OverflowError, TypeError, ValueError, IndexError) as error:  # of torch, for sizes that nothing can have
+    except (RuntimeError, ArithmeticError, TypeError, ValueError, IndexError) as error:  # of torch, for sizes that nothing can have
         reason = str(error).splitlines()[0]
         raise MessageError("damaged header", f"no networks have its sizes ({reason}); copy it again") from None
     for name in sorted(expected.keys() | shapes.keys()):

@@ -5,6 +5,7 @@ Nothing else may come of it: no program, no socket, no class out of a pickle; no
 """
 
 import contextlib
+import copy
 import fcntl
 import hashlib
 import io
@@ -67,7 +68,7 @@ def odd_json(raw: bytes, rng: random.Random) -> bytes:
             case 2 if holder:
                 holder[name] = json.loads(json.dumps(rng.choice(list(_holders(value)))))
             case _ if holder:
-                holder[name] = rng.choice(ODD_VALUES)
+                holder[name] = copy.deepcopy(rng.choice(ODD_VALUES))
     if rng.random() < 0.02:
         value = rng.choice(ODD_VALUES)
     text = RAW_VALUES.sub(lambda found: RAW[found[0].strip('"')], json.dumps(value))
@@ -104,9 +105,9 @@ def odd_policy(raw: bytes, rng: random.Random) -> bytes:
     """Another header of the right length: of safetensors itself, or what RMC has written into it."""
     end = 8 + int.from_bytes(raw[:8], "little")
     header = raw[8:end]
-    if rng.random() < 0.7:
-        whole = json.loads(header)
-        facts = whole["__metadata__"]
+    whole = json.loads(header)
+    facts = whole.get("__metadata__")  # of an older run's there are none
+    if facts and rng.random() < 0.7:
         facts[METADATA_KEY] = odd_json(facts[METADATA_KEY].encode(), rng).decode(errors="replace")
         header = json.dumps(whole).encode()
     else:
@@ -196,8 +197,15 @@ def configured(run: Path) -> None:
     folder.settings()
 
 
-def write_manifest(checkpoint: Path) -> None:
+def write(file: Path, raw: bytes) -> None:
     """A stranger's checkpoint is whole, whatever it holds."""
+    file.write_bytes(raw)
+    if file.name in (POLICY, PROGRESS) and (file.parent / MANIFEST).exists():
+        write_manifest(file.parent)
+
+
+def write_manifest(checkpoint: Path) -> None:
+    """Of files as they are."""
     digests = {name: hashlib.sha256((checkpoint / name).read_bytes()).hexdigest() for name in (POLICY, PROGRESS)}
     text = json.dumps({"update": int(checkpoint.name), "sha256": digests}, indent=1)
     (checkpoint / MANIFEST).write_text(text)
@@ -205,10 +213,8 @@ def write_manifest(checkpoint: Path) -> None:
 
 def read_changed(raw: bytes, file: Path, lawful: bytes, view: Callable[[Path], None], source: Path) -> None:
     """``view`` of the ``source`` with other bytes in a file, which are lawful again then."""
-    file.write_bytes(raw)
+    write(file, raw)
     try:
-        if file.name in (POLICY, PROGRESS):
-            write_manifest(file.parent)
         with contextlib.redirect_stdout(io.StringIO()):
             view(source)
     except RmcError as error:
@@ -216,7 +222,7 @@ def read_changed(raw: bytes, file: Path, lawful: bytes, view: Callable[[Path], N
         assert len(str(error)) < LONGEST_LINE, len(str(error))
         raise
     finally:
-        file.write_bytes(lawful)
+        write(file, lawful)
 
 
 Change = Callable[[bytes, random.Random], bytes]
