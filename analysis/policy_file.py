@@ -22,7 +22,6 @@ from rmc.deploy.run.config import from_dict
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.migrations import FORMAT, migrated
 
-
 EVALUATED = ("return_mean", "return_std", "episodes")
 
 
@@ -117,7 +116,13 @@ def _check_shapes(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> N
         with torch.device("meta"):
             agent = Agent(header.obs_dim, header.action_dim, header.agent, header.layout.missing)
             expected = agent.policy_shapes()
-    except (RuntimeError, ArithmeticError, TypeError, ValueError, IndexError) as error:  # of torch, for sizes that nothing can have
+    except (
+        RuntimeError,
+        ArithmeticError,
+        TypeError,
+        ValueError,
+        IndexError,
+    ) as error:  # of torch, for sizes that nothing can have
         reason = str(error).splitlines()[0]
         raise MessageError("damaged header", f"no networks have its sizes ({reason}); copy it again") from None
     for name in sorted(expected.keys() | shapes.keys()):

@@ -13,7 +13,10 @@ import msgpack
 from rmc.common.errors import MessageError
 
 MAX_BYTES, MAX_FIELDS, MAX_TEXT, MAX_LIST = 1 << 16, 512, 200, 4096
-TEXT, LIST = ("waiting_for", "checkpoint_error", "not_running"), "observation_unexplained"  # how names of texts end, and the list's
+TEXT, LIST = (
+    ("waiting_for", "checkpoint_error", "not_running"),
+    "observation_unexplained",
+)  # how names of texts end, and the list's
 LARGEST = 2.0**63  # of a number; metrics are far below
 
 
