@@ -1,6 +1,7 @@
 """The short form of ``fuzz_files.py``, and what it has found."""
 
 import json
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -79,7 +80,5 @@ def test_a_line_that_once_was_a_traceback(finished: str, tmp_path: Path) -> None
 
 def look(file: Path, text: str, view: fuzz_files.View, source: Path) -> None:
     """Shown or refused: what else it raises fails the test."""
-    try:
+    with suppress(RmcError):
         read_changed(text.encode(), file, file.read_bytes(), view, source)
-    except RmcError as error:
-        assert str(error).count("\n") == 0
