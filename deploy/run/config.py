@@ -217,10 +217,8 @@ def _matches(kind: Any, value: Any) -> bool:
         return any(_matches(part, value) for part in get_args(kind))
     if get_origin(kind) is dict:
         return isinstance(value, dict)
-    if kind is float and type(value) is float:
-        return True
-    if kind in (int, float):  # of an int as many bits as can be counted with
-        return type(value) is int and abs(value) < LARGEST
+    if kind is float:
+        return type(value) is float or (type(value) is int and abs(value) < LARGEST)
     return type(value) is kind
 
 
