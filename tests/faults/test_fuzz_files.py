@@ -35,11 +35,6 @@ def test_changed_files_are_shown_or_refused_in_a_line() -> None:
         ("result.json", DEEP, fuzz_files.stats),
         ("metrics.jsonl", f"{DEEP}\n", fuzz_files.listed),
         ("metrics.jsonl", '{"role": "replay-0", "env_steps_per_s": "x"}\n', fuzz_files.stats),
-        (
-            "metrics.jsonl",
-            '{"role": "learner", "waiting_share": {}}\n{"role": "replay-0", "waiting_share": ""}\n',
-            fuzz_files.watched,
-        ),
         ("history.jsonl", START + '"changes": {"a": [1]}}\n', fuzz_files.stats),
         ("history.jsonl", START + '"init_from": {}}\n', fuzz_files.watched),
         ("history.jsonl", START.replace("0,", '"x",') + '"changes": {"a": [1, 2]}}\n', fuzz_files.reported),
@@ -57,7 +52,6 @@ def test_files_that_once_were_a_traceback(file: str, text: str, view: fuzz_files
     ("option", "value", "view"),
     [
         ("update.learning_rate", HUGE, fuzz_files.configured),
-        ("replay.replay_shards", "0", fuzz_files.diagnosed),
         ("env", "7", fuzz_files.acted),
     ],
 )
