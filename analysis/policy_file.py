@@ -159,7 +159,7 @@ def _of_older_run(folder: RunFolder, files: dict[str, bytes]) -> PolicyFile:
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise MessageError("damaged progress", f"{PROGRESS}: {error}") from None
     folder.check_sizes(config.env.id, config.sizes())
-    header = replace(config.policy_header(), **progress)
+    header = replace(config.policy_header(), env_steps=progress["env_steps"], updates=progress["updates"])
     _check_weights(header, files[POLICY])
     return PolicyFile(header, files[POLICY])
 
