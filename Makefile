@@ -48,7 +48,7 @@ $(VENV)-$(NEWEST)/.installed: pyproject.toml constraints.txt
 
 # The scripts of tests/faults at length, some two hours in all; each puts its rows into tests/faults/results.json.
 # Linux; disk_full wants root, clock a C compiler.
-FAULTS := fuzz broken_checkpoints kill_actor kill_replay kill_learner kill_redis kill_all nan_loss frozen disk_full clock \
+FAULTS := fuzz fuzz_files broken_checkpoints kill_actor kill_replay kill_learner kill_redis kill_all nan_loss frozen disk_full clock \
 	slow_learner soak
 
 test-faults: $(addprefix test-faults-,$(FAULTS)) docs

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import from_dict
 from rmc.deploy.run.folder import RunFolder
 
 Algorithm = Literal["sac", "td3", "ddpg", "ppo", "recurrent-ppo"]
@@ -67,10 +68,9 @@ def read(folder: RunFolder) -> BaselineConfig:
     """A baseline's config from its folder. Raises ConfigError."""
     raw = folder.settings()
     try:
-        env = EnvConfig(**raw["env"])
-        config = BaselineConfig(**{item.name: raw[item.name] for item in fields(BaselineConfig)} | {"env": env})
+        config = from_dict(BaselineConfig, {item.name: raw[item.name] for item in fields(BaselineConfig)}, "")
         validate(config)
-    except (KeyError, TypeError) as error:
+    except (KeyError, ConfigError) as error:
         fix = f"its config.json is no baseline's of this version ({error}); restore it, or train another run"
         raise ConfigError("RUN", str(folder.path), fix) from None
     return config

@@ -10,6 +10,7 @@ from rmc.analysis.vitals import Record, Vitals
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.validation import validate
 
 LEAST_SECONDS = 5.0  # of training; fewer say nothing
 Diagnosis = Callable[[Vitals, RunConfig], Finding | None]
@@ -26,7 +27,11 @@ IN_TRAINING: tuple[Diagnosis, ...] = (
 
 
 def examine(records: Sequence[Record], config: RunConfig) -> list[Finding]:
-    """All that is found, the gravest first; empty where too little was recorded to judge."""
+    """All that is found, the gravest first; empty where too little was recorded to judge.
+
+    Raises ConfigError for a config that makes no sense.
+    """
+    validate(config)
     vitals = Vitals(records)
     findings = [diagnosis(vitals, config) for diagnosis in ALWAYS]
     training = vitals.training()

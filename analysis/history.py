@@ -76,7 +76,7 @@ def objects(path: Path, *names: str) -> dict[str, dict[str, Any]]:
 def _object(line: bytes, place: str, names: Sequence[str]) -> dict[str, Any]:
     try:
         value = json.loads(line)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError("RUNS", place, f"not JSON ({error}); mend the line, or remove it") from None
     if not isinstance(value, dict) or not value.keys() >= set(names):
         raise ConfigError("RUNS", place, f"must be an object with {', '.join(names)}; mend the line, or remove it")
@@ -92,7 +92,8 @@ def _of_line(raw: dict[str, Any], place: str) -> History:
     numbers += [] if history.initial_return is None else [history.initial_return]
     numbers += [value for one in history.evaluations for value in dataclasses.astuple(one)]
     texts = history.agent, history.env, history.commit
-    if not (history.evaluations and all(map(is_finite, numbers)) and all(isinstance(text, str) for text in texts)):
+    named = all(isinstance(text, str) for text in texts) and isinstance(history.finished, bool)
+    if not (history.evaluations and all(map(is_finite, numbers)) and named):
         fix = "not a history (its evaluations, numbers and names); mend the line, or remove it"
         raise ConfigError("RUNS", place, fix)
     return history

@@ -168,7 +168,13 @@ class LiveRun:
 
 
 def _event(kind: str, when: float, env_steps: float, what: str, count: float = 1) -> Event:
-    return {"kind": kind, "time": when, "env_steps": env_steps, "what": what, "count": int(count)}
+    return {
+        "kind": kind,
+        "time": when,
+        "env_steps": env_steps,
+        "what": what,
+        "count": int(count) if is_finite(count) else 0,
+    }
 
 
 def newest_media(run: Path) -> dict[str, Path]:

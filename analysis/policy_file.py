@@ -16,10 +16,13 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.checkpoint import POLICY, PROGRESS
 from rmc.common.errors import ConfigError, MessageError
 from rmc.common.policy_header import METADATA_KEY, PolicyHeader
+from rmc.deploy.monitor.recorded import empty_status
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import from_dict
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.migrations import FORMAT, migrated
+
+EVALUATED = ("return_mean", "return_std", "episodes")
 
 
 @dataclass(frozen=True)
@@ -74,13 +77,15 @@ def _shapes(blob: bytes) -> dict[str, tuple[int, ...]]:
     try:
         return {name: tuple(value.shape) for name, value in safetensors.torch.load(blob).items()}
     except (SafetensorError, ValueError, KeyError) as error:
-        raise MessageError("cut, or no safetensors file", f"{error}; copy it again") from None
+        reason = " ".join(str(error).split())  # in one line, whatever it quotes
+        raise MessageError("cut, or no safetensors file", f"{reason}; copy it again") from None
 
 
 def _facts(blob: bytes) -> Any:
     """What the header of a whole safetensors file says, before any of it is believed; None where there is none."""
     length = int.from_bytes(blob[:8], "little")
-    text = json.loads(blob[8 : 8 + length]).get("__metadata__", {}).get(METADATA_KEY)
+    metadata = json.loads(blob[8 : 8 + length]).get("__metadata__") or {}
+    text = metadata.get(METADATA_KEY)
     try:
         return None if text is None else json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -111,7 +116,13 @@ def _check_shapes(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> N
         with torch.device("meta"):
             agent = Agent(header.obs_dim, header.action_dim, header.agent, header.layout.missing)
             expected = agent.policy_shapes()
-    except (RuntimeError, OverflowError, TypeError) as error:  # of torch, for sizes that nothing can have
+    except (
+        RuntimeError,
+        ArithmeticError,
+        TypeError,
+        ValueError,
+        IndexError,
+    ) as error:  # of torch, for sizes that nothing can have
         reason = str(error).splitlines()[0]
         raise MessageError("damaged header", f"no networks have its sizes ({reason}); copy it again") from None
     for name in sorted(expected.keys() | shapes.keys()):
@@ -129,9 +140,11 @@ def _of_run(folder: RunFolder, checkpoint: str) -> PolicyFile:
         folder.config()  # says so
     _, files = choose_checkpoint(folder, checkpoint)
     try:
+        if POLICY not in files:
+            raise MessageError("no policy", f"it holds no {POLICY}")
         has_header = _shapes(files[POLICY]) and _facts(files[POLICY]) is not None
         policy = decode(files[POLICY]) if has_header else _of_older_run(folder, files)
-        if policy.header.env.id != folder.settings()["env"]["id"]:
+        if policy.header.env.id != empty_status(folder).env:
             raise MessageError("weights", f"not a policy of this run (but of {policy.header.env.id})")
     except MessageError as error:
         raise ConfigError("--checkpoint", checkpoint, f"{error}; use another") from None
@@ -140,7 +153,11 @@ def _of_run(folder: RunFolder, checkpoint: str) -> PolicyFile:
 
 def _of_older_run(folder: RunFolder, files: dict[str, bytes]) -> PolicyFile:
     """Of one whose policies have no headers: its environment is made. Raises ConfigError, MessageError."""
-    config, progress = folder.config(), json.loads(files[PROGRESS])
+    config = folder.config()
+    try:
+        progress = {name: int(json.loads(files[PROGRESS])[name]) for name in ("env_steps", "updates")}
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        raise MessageError("damaged progress", f"{PROGRESS}: {error}") from None
     folder.check_sizes(config.env.id, config.sizes())
     header = replace(config.policy_header(), env_steps=progress["env_steps"], updates=progress["updates"])
     _check_weights(header, files[POLICY])
@@ -153,7 +170,7 @@ def _evaluated(header: PolicyHeader, folder: RunFolder) -> PolicyHeader:
     records = [result] if result is not None and result["updates"] == header.updates else []
     if not records:
         records = [record for record in folder.records() if record.get("eval_update") == header.updates]
-    if not records or not all(is_finite(records[-1].get(f"eval_{name}")) for name in ("return_mean", "return_std")):
+    if not records or not all(is_finite(records[-1].get(f"eval_{name}")) for name in EVALUATED):
         return header
-    mean, deviation, episodes = (records[-1][f"eval_{name}"] for name in ("return_mean", "return_std", "episodes"))
+    mean, deviation, episodes = (records[-1][f"eval_{name}"] for name in EVALUATED)
     return replace(header, eval_return_mean=mean, eval_return_std=deviation, eval_episodes=episodes)

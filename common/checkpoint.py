@@ -51,7 +51,7 @@ class CheckpointFolder:
 
     def numbers(self) -> list[int]:
         """Update counts of the checkpoints here, ascending; not yet verified."""
-        return sorted(int(path.name) for path in self.folder.glob("[0-9]*") if path.name.isdigit())
+        return sorted(int(path.name) for path in self.folder.glob("[0-9]*") if path.name.isdecimal())
 
     def path(self, number: int) -> Path:
         """Where a checkpoint lies."""
@@ -135,7 +135,7 @@ class CheckpointFolder:
             digests = dict(json.loads(manifest)["sha256"])
             _check_names(path, digests)
             files = {name: (path / name).read_bytes() for name in digests}
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise CheckpointError(f"checkpoint {path}: unreadable ({error})") from None
         for name, content in files.items():
             if hashlib.sha256(content).hexdigest() != digests[name]:
@@ -167,7 +167,7 @@ class CheckpointFolder:
         try:
             record = json.loads((self.folder / BEST).read_bytes())
             return int(record["update"]), float(record["eval_return_mean"])
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return None, float("-inf")
 
 

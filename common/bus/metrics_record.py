@@ -1,7 +1,7 @@
 """A metrics record as bytes: what a role says of itself now and then. Read without trust in who wrote it.
 
-Flat: names to numbers; what a role waits for (``…waiting_for``) and why it cannot save (``checkpoint_error``) is text,
-and one metric is a list of numbers.
+Flat: names to numbers; what a role waits for (``…waiting_for``), why it cannot save (``checkpoint_error``) and who is
+``not_running`` is text, and one metric is a list of numbers.
 """
 
 import math
@@ -13,7 +13,10 @@ import msgpack
 from rmc.common.errors import MessageError
 
 MAX_BYTES, MAX_FIELDS, MAX_TEXT, MAX_LIST = 1 << 16, 512, 200, 4096
-TEXT, LIST = ("waiting_for", "checkpoint_error"), "observation_unexplained"  # how names of texts end, and the list's
+TEXT, LIST = (
+    ("waiting_for", "checkpoint_error", "not_running"),
+    "observation_unexplained",
+)  # how names of texts end, and the list's
 LARGEST = 2.0**63  # of a number; metrics are far below
 
 
@@ -37,7 +40,7 @@ def decode_record(packed: bytes) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise MessageError("structure", "a record is a map")
     for name, value in record.items():
-        if not _is_plain(name) or not _fits(name, value):
+        if not _is_plain(name) or not is_metric(name, value):
             raise MessageError("structure", f"{name!r:.80} is no metric")
     return record
 
@@ -47,7 +50,8 @@ def is_finite(value: Any) -> TypeGuard[float]:
     return _is_number(value) and math.isfinite(value)
 
 
-def _fits(name: str, value: Any) -> bool:
+def is_metric(name: str, value: Any) -> bool:
+    """Whether a record may hold that: all who show one count with it."""
     if name.endswith(TEXT):
         return _is_plain(value)
     return all(map(_is_number, value)) if name == LIST and isinstance(value, list) else _is_number(value)

@@ -3,6 +3,7 @@
 Shapes: O numbers of an observation, A of an action, in the order in which the agent sees them.
 """
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from rmc.common.errors import ConfigError
 
+NUMBERS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64|128)")  # what numpy calls them
 Doubles = NDArray[np.float64]
 
 
@@ -53,6 +55,8 @@ class EnvLayout:
         for name, parts in (("observations", self.observations), ("actions", self.actions)):
             starts, stops = [part.start for part in parts], [part.stop for part in parts]
             numbers = [int(np.prod(part.shape)) for part in parts]
+            if any(min(part.shape, default=0) < 0 or not NUMBERS.fullmatch(part.dtype) for part in parts):
+                raise ConfigError(f"layout {name}", parts, "must be boxes of numbers; restore the file")
             if not parts or starts != [0, *stops[:-1]] or numbers != [part.stop - part.start for part in parts]:
                 raise ConfigError(f"layout {name}", starts, "parts must follow each other; restore the file")
         low, high = np.array(self.action_low), np.array(self.action_high)

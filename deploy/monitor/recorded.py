@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeGuard
 
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.errors import ConfigError
@@ -23,10 +23,7 @@ def recorded_status(folder: RunFolder, recent_bytes: int = RECENT_BYTES) -> RunS
 
 def take_state(board: RunStatus, folder: RunFolder) -> None:
     """Take in what has become of the run. Raises ConfigError where that is damaged."""
-    try:
-        board.state = run_state(folder)
-    except ValueError as error:
-        raise ConfigError("RUN", str(folder.path), f".lock is damaged ({error}); remove that file") from None
+    board.state = run_state(folder)
     result = folder.result() if board.state == "finished" else None
     board.final_steps = None if result is None else int(result["env_steps"])
 
@@ -67,10 +64,14 @@ def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus
     preset = settings.get("preset") or f"{settings.get('algorithm')}-{settings.get('settings')}"
     seed, total = settings.get("seed"), settings.get("total_steps")
     ratio = _part(settings, "replay").get("replay_ratio", 0.0)
-    if not (isinstance(env, str) and isinstance(seed, int) and isinstance(total, int) and is_finite(ratio)):
+    if not (isinstance(env, str) and _is_whole(seed) and _is_whole(total) and is_finite(ratio)):
         fix = "config.json has no env, seed or total_steps; restore it, or take another run"
         raise ConfigError("RUN", str(folder.path), fix)
     return RunStatus(env, str(preset), seed, total, ratio, expected)
+
+
+def _is_whole(value: Any) -> TypeGuard[int]:
+    return isinstance(value, int) and is_finite(value)
 
 
 def _part(settings: dict[str, Any], name: str) -> dict[str, Any]:

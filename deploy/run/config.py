@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.common.agent_config import AgentConfig
+from rmc.common.bus.metrics_record import LARGEST
 from rmc.common.env.config import EnvConfig, write_kwargs
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.make import env_layout
@@ -173,7 +174,7 @@ def check_sizes(env_id: str, before: dict[str, Any], sizes: dict[str, int]) -> N
 def _read(text: str | bytes) -> Any:
     try:
         return json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError("config.json", str(error), "not JSON; restore the file or start a new run") from None
 
 
@@ -218,7 +219,7 @@ def _matches(kind: Any, value: Any) -> bool:
     if get_origin(kind) is dict:
         return isinstance(value, dict)
     if kind is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
+        return type(value) is float or (type(value) is int and abs(value) < LARGEST)
     return type(value) is kind
 
 

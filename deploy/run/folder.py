@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from rmc.common.bus.metrics_record import is_finite
+from rmc.common.bus.metrics_record import is_finite, is_metric
 from rmc.common.errors import ConfigError
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import RunConfig, check_sizes, from_json, to_json
@@ -218,21 +218,26 @@ class RunFolder:
             with (self.path / ".lock").open("rb") as file:
                 word, *rest = file.read().decode().split()
                 free = _locked(file.fileno(), fcntl.LOCK_SH)
-        except (FileNotFoundError, ValueError):
+                return None if free or word != "training" else int(rest[0])
+        except (FileNotFoundError, ValueError, IndexError):
             return None
-        return None if free or word != "training" else int(rest[0])
 
     def trainer_host(self) -> str:
         """The machine whose launcher trains this run; empty where none does."""
         return " ".join((self.path / ".lock").read_text().split()[2:])
 
     def ended(self) -> int | None:
-        """The exit status of the launcher that trained it last, if that came to an end of its own."""
+        """The exit status of the launcher that trained it last, if that came to an end of its own.
+
+        Raises ConfigError where that is damaged.
+        """
         try:
             word, _, number = (self.path / ".lock").read_text().partition(" ")
+            return int(number) if word == "ended" else None
         except FileNotFoundError:
             return None
-        return int(number) if word == "ended" else None
+        except ValueError as error:
+            raise ConfigError("RUN", str(self.path), f".lock is damaged ({error}); remove that file") from None
 
 
 def _locked(handle: int, kind: int) -> bool:
@@ -247,7 +252,7 @@ def read_object(path: Path, *numbers: str) -> dict[str, Any]:
     """What a small file of JSON says, with these ``numbers``. Raises ConfigError naming it, OSError."""
     try:
         value = json.loads(path.read_bytes())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(path.name, str(path), f"not JSON ({error}); restore it, or take another run") from None
     if not isinstance(value, dict) or not all(is_finite(value.get(name)) for name in numbers):
         expected = f"an object with the numbers {', '.join(numbers)}" if numbers else "an object"
@@ -256,9 +261,9 @@ def read_object(path: Path, *numbers: str) -> dict[str, Any]:
 
 
 def parse_record(line: bytes) -> dict[str, Any] | None:
-    """A line of ``metrics.jsonl``; None where it is torn by a crash, or is no role's."""
-    with suppress(ValueError):
+    """The metrics in a line of ``metrics.jsonl``; None where it is torn by a crash, or is no role's."""
+    with suppress(ValueError, RecursionError):
         record = json.loads(line)
         if isinstance(record, dict) and isinstance(record.get("role"), str):
-            return record
+            return {name: value for name, value in record.items() if name == "role" or is_metric(name, value)}
     return None

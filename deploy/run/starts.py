@@ -14,7 +14,7 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.redis_url import has_password
 from rmc.common.checkpoint import PROGRESS
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import option
+from rmc.deploy.run.config import from_dict, option
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import Launcher, LaunchOptions
 
@@ -33,6 +33,9 @@ class Start:
     changes: dict[str, list[Any]] = field(default_factory=dict)  # what it was and is, by the option's path
     launch: dict[str, Any] = field(default_factory=dict)
     init_from: dict[str, Any] | None = None  # at the first start: run, checkpoint and parts
+
+
+DEFAULTS: dict[str, Any] = {"changes": {}, "launch": {}, "init_from": None}
 
 
 def note_start(
@@ -69,8 +72,10 @@ def starts(folder: RunFolder) -> list[Start]:
     all_starts = []
     with suppress(FileNotFoundError):
         for line in folder.history_file.read_bytes().splitlines():
-            with suppress(ValueError, TypeError):
-                all_starts.append(Start(**json.loads(line)))
+            with suppress(ValueError, TypeError, KeyError, RecursionError, ConfigError):
+                start = from_dict(Start, DEFAULTS | json.loads(line), "")
+                format_start(start)  # what cannot be shown is none
+                all_starts.append(start)
     return all_starts
 
 

@@ -9,7 +9,7 @@ STOPPED = 130  # exit status after Ctrl-C, as shells have it
 
 
 def run_state(folder: RunFolder) -> State:
-    """Lost is one whose launcher was killed: it neither trains nor has ended. Raises ConfigError, ValueError."""
+    """Lost is one whose launcher was killed: it neither trains nor has ended. Raises ConfigError."""
     if folder.trainer() is not None:
         return "training"
     if folder.result() is not None:

@@ -1,0 +1,78 @@
+"""The short form of ``fuzz_files.py``, and what it has found."""
+
+import json
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from rmc.common.errors import RmcError
+from tests.faults import fuzz_files
+from tests.faults.fuzz_files import FILES, read_changed
+
+DEEP = fuzz_files.DEEP
+HUGE = "1" + "0" * 400
+START = '{"time": 1, "version": "1", "env_steps": 0, '
+CHECKPOINT = "checkpoints/000000081"
+LAWFUL_LINE = '{"agent": "a", "env": "e", "seed": 0, "env_steps": 1, "updates": 1, "transitions": 1, "wall_s": 1.0, '
+EVALUATIONS = '"evaluations": [{"env_steps": 1, "updates": 1, "wall_s": 1.0, "return_mean": 1.0, "return_std": 0.0}], '
+
+
+@pytest.mark.filterwarnings("ignore:Initializing zero-element", "ignore:overflow", "ignore:invalid value")
+def test_changed_files_are_shown_or_refused_in_a_line() -> None:
+    rows = list(fuzz_files.fuzz(300, seed=1))
+    assert len(rows) == len(FILES)
+    for row in rows:
+        assert row.passed, row
+        assert any(name.endswith("taken") for name in row.found), row
+        assert any(name.endswith("option") for name in row.found), row
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "view"),
+    [
+        ("config.json", DEEP, fuzz_files.configured),
+        ("result.json", DEEP, fuzz_files.stats),
+        ("metrics.jsonl", f"{DEEP}\n", fuzz_files.listed),
+        ("metrics.jsonl", '{"role": "replay-0", "env_steps_per_s": "x"}\n', fuzz_files.stats),
+        ("history.jsonl", START + '"changes": {"a": [1]}}\n', fuzz_files.stats),
+        ("history.jsonl", START + '"init_from": {}}\n', fuzz_files.watched),
+        ("history.jsonl", START.replace("0,", '"x",') + '"changes": {"a": [1, 2]}}\n', fuzz_files.reported),
+        ("checkpoints/best.json", '{"update": 1e999, "eval_return_mean": 0}', fuzz_files.best),
+        (f"{CHECKPOINT}/manifest.json", DEEP, fuzz_files.acted),
+        (f"{CHECKPOINT}/manifest.json", '{\n "update": 81,\n "sha256": {}\n}', fuzz_files.acted),
+    ],
+)
+def test_files_that_once_were_a_traceback(file: str, text: str, view: fuzz_files.View, tmp_path: Path) -> None:
+    run = fuzz_files.old_run(tmp_path, "format-2")
+    look(run / file, text, view, run)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "view"),
+    [
+        ("update.learning_rate", HUGE, fuzz_files.configured),
+        ("env", "7", fuzz_files.acted),
+    ],
+)
+def test_options_that_once_were_a_traceback(option: str, value: str, view: fuzz_files.View, tmp_path: Path) -> None:
+    run = fuzz_files.old_run(tmp_path, "format-2")
+    settings = json.loads((run / "config.json").read_bytes())
+    *parts, name = option.split(".")
+    (settings[parts[0]] if parts else settings)[name] = json.loads(value)
+    look(run / "config.json", json.dumps(settings), view, run)
+
+
+@pytest.mark.parametrize("finished", ["[]", DEEP])
+def test_a_line_that_once_was_a_traceback(finished: str, tmp_path: Path) -> None:
+    lines = tmp_path / "runs.jsonl"
+    lines.write_text("")
+    look(
+        lines, f'{LAWFUL_LINE}{EVALUATIONS}"initial_return": null, "finished": {finished}}}', fuzz_files.plotted, lines
+    )
+
+
+def look(file: Path, text: str, view: fuzz_files.View, source: Path) -> None:
+    """Shown or refused: what else it raises fails the test."""
+    with suppress(RmcError):
+        read_changed(text.encode(), file, file.read_bytes(), view, source)
