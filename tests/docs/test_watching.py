@@ -55,7 +55,7 @@ def test_a_run_is_watched(tmp_path: Path) -> None:
 
 
 def test_every_state_is_told() -> None:
-    rows = re.findall(r"^\| `(\w+)` \| ", WATCHING.split("| state | says |")[1], re.MULTILINE)
+    rows = re.findall(r"^\| `(\w+)` \| ", WATCHING.split("| state | says |")[1].split("\n\n")[0], re.MULTILINE)
     assert rows == [*get_args(State), DAMAGED]
 
 
