@@ -5,7 +5,6 @@ The learner takes a checkpoint up as ever; so does the one that is started again
 
 import io
 import json
-import time
 from dataclasses import dataclass, fields
 from pathlib import Path
 from pickle import UnpicklingError
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from rmc.common.agent import Agent
 from rmc.common.agent_config import FILL_PARTS, POLICY_PARTS
-from rmc.common.checkpoint import POLICY, PROGRESS, STATE
+from rmc.common.checkpoint import PROGRESS, STATE
 from rmc.common.errors import ConfigError
 from rmc.common.replay import ObservationStatistics
 from rmc.common.window import WindowSpec
@@ -25,6 +24,7 @@ from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import FLAGS, RunConfig, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import InitParts
+from rmc.learner.learner_checkpoint import LearnerProgress, pack
 from rmc.learner.update import JointUpdate
 from rmc.learner.update_order import make_update
 
@@ -70,11 +70,9 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         fix = f"its checkpoint {number} cannot be used ({reason}); use another"
         raise ConfigError(OPTION, init_from, fix) from None
-    learnt = io.BytesIO()
-    torch.save(update.state_dict(), learnt)
     weights = {name: value.contiguous() for name, value in update.policy_weights().items()}
     policy = safetensors.torch.save(weights, config.policy_header().metadata())
-    checkpoint = {STATE: learnt.getvalue(), POLICY: policy, PROGRESS: json.dumps(progress).encode()}
+    checkpoint = pack(update.state_dict(), policy, progress)
     return InitialCheckpoint(
         checkpoint, {"asked": [init_from, parts], "run": str(folder.path), "checkpoint": number, "parts": parts}
     )
@@ -125,7 +123,7 @@ def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages:
     return update
 
 
-def _progress(spec: WindowSpec, agent: Agent, env_steps: int, parts: InitParts) -> dict[str, Any]:
+def _progress(spec: WindowSpec, agent: Agent, env_steps: int, parts: InitParts) -> LearnerProgress:
     """Of a learner that has done nothing. What normalises what it reads weighs as much as the steps it is from."""
     normalizers = [agent.normalizer, *([agent.privileged_normalizer] if agent.privileged_normalizer else [])]
     mean, std = (torch.cat([getattr(one, name) for one in normalizers]).double() for name in ("mean", "std"))
@@ -134,4 +132,4 @@ def _progress(spec: WindowSpec, agent: Agent, env_steps: int, parts: InitParts) 
         count[spec.obs_dim :] = 0  # what critics alone read is new
     total, total_square = mean * count, (std.square() + mean.square()) * count
     before = ObservationStatistics(count.numpy(), total.numpy(), total_square.numpy())
-    return {"updates": 0, "env_steps": 0, "epoch": 0, "time": time.time(), "observed_before": before.to_json()}
+    return LearnerProgress(0, 0, 0, observed_before=before)
