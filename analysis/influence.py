@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rmc.analysis.episodes import Episode, remembered
-from rmc.common.agent import Agent, MemoryOutput, critic_input
+from rmc.common.agent import Agent, MemoryOutput
+from rmc.common.critic import critic_input
 
 DELAYS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 700, 1_000)
 EPISODES = 8  # in which observations are changed

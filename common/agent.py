@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rmc.common.agent_config import CRITIC_PARTS, FILL_PARTS, LOG_STD_RANGE, NORMALIZED_CLIP, POLICY_PARTS, AgentConfig
+from rmc.common.critic import TwinQ
 
 STD_FLOOR = 1e-2  # a constant dimension is not blown up
 
@@ -182,43 +183,6 @@ class ObservationImputer(nn.Module):
         return observation + change.float()
 
 
-class StackedLinear(nn.Module):
-    """Two Linear layers side by side as one batched product: x (2, N, in) -> (2, N, out)."""
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__()
-        bound = 1.0 / math.sqrt(inputs)  # nn.Linear's own initialisation
-        self.weight = nn.Parameter(torch.empty(2, inputs, outputs).uniform_(-bound, bound))
-        self.bias = nn.Parameter(torch.empty(2, 1, outputs).uniform_(-bound, bound))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias, x, self.weight)
-
-
-class TwinQ(nn.Module):
-    """Eq. 9: Q_1(h, a) and Q_2(h, a), stacked. Where asked, a LayerNorm without weights before each ReLU."""
-
-    def __init__(self, inputs: int, action_dim: int, config: AgentConfig) -> None:
-        super().__init__()
-        first, second = config.heads
-        self.norm = config.critic_norm
-        self.layers = nn.ModuleList(
-            [StackedLinear(inputs + action_dim, first), StackedLinear(first, second), StackedLinear(second, 1)]
-        )
-
-    def forward(self, features: Tensor, action: Tensor) -> Tensor:
-        """(B, T, Z), (B, T, A) -> (2, B, T) in float32."""
-        x = torch.cat([features, action.to(features.dtype)], dim=-1)
-        shape = x.shape[:-1]
-        x = x.reshape(1, -1, x.shape[-1]).expand(2, -1, -1)
-        for layer in self.layers[:-1]:
-            x = layer(x)
-            x = F.relu(F.layer_norm(x, x.shape[-1:]) if self.norm else x)
-        with torch.autocast(x.device.type, enabled=False):  # bfloat16 would give a Q of 300 in steps of 2
-            q: Tensor = self.layers[-1](x.float())
-        return q.reshape(2, *shape)
-
-
 class Policy(nn.Module):
     """Squashed Gaussian with a state-dependent standard deviation."""
 
@@ -242,11 +206,6 @@ def squashed_sample(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tenso
     log_normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2.0 * math.pi)
     log_slope = 2.0 * (math.log(2.0) - u - F.softplus(-2.0 * u))
     return torch.tanh(u), (log_normal - log_slope).sum(-1)
-
-
-def critic_input(z: Tensor, privileged: Tensor) -> Tensor:
-    """What critics read: (B, T, Z), beside it (B, T, P) normalised."""
-    return torch.cat([z, privileged.to(z.dtype)], dim=-1) if privileged.shape[-1] else z
 
 
 class Agent(nn.Module):

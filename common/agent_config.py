@@ -29,8 +29,9 @@ class AgentConfig:
     head_input: HeadInput = "hidden"
     """What the heads read: the hidden state; beside it the current embedding, or observation; or the observation alone,
     an agent without a memory."""
-    critic_norm: bool = False
-    """LayerNorm before the ReLUs of the critics."""
+    critic_batch_norm: bool = False
+    """Batch norm before each layer of the critics. Values of now and of next then come from one pass, and there are no
+    target critics."""
     privileged_critic: bool = False
     """The critics, and nothing else, also read the environment's info["privileged"]. Where it gives none, that is the
     observation before any option takes from it."""

@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rmc.common.agent import Agent, critic_input
+from rmc.common.agent import Agent
+from rmc.common.critic import critic_input
 from rmc.common.window import BoolArray, Rows, WindowSpec
 from rmc.learner import losses
 

@@ -7,7 +7,7 @@ Without autocast, and on a GPU, they are what they were. Shapes: B batch, T time
 """
 
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from rmc.common.agent import Agent, Float32Linear, StackedLinear, TwinQ
+from rmc.common.agent import Agent, Float32Linear
 from rmc.common.agent_config import NORMALIZED_CLIP
+from rmc.common.critic import STATISTICS_SHARE, VARIANCE_FLOOR, BatchNorm, StackedLinear, TwinQ, shares
 from rmc.learner import kernels
 
 BF16 = torch.bfloat16
@@ -130,20 +131,43 @@ class FusedTwinQ(Rounded, TwinQ):
     def weights(self) -> list[Tensor]:
         return [layer.weight for layer in self.layers[:-1] if isinstance(layer, StackedLinear)]
 
-    def forward(self, features: Tensor, action: Tensor) -> Tensor:
-        """(B, T, Z), (B, T, A) -> (2, B, T) in float32."""
-        if self.norm or not _applies(features):
-            return super().forward(features, action)
+    def forward(self, features: Tensor, action: Tensor, m: Tensor | None = None) -> Tensor:
+        """(B, T, Z), (B, T, A) -> (2, B, T) in float32; given m (B, T), normalised by these steps."""
+        if not _applies(features):
+            return super().forward(features, action, m)
         stacks = [layer for layer in self.layers if isinstance(layer, StackedLinear)]
         parameters = [part for one in stacks for part in (one.weight, one.bias[:, 0])]
-        return _heads(features, action, self.bf16(), parameters).squeeze(-1)
+        norm = _Norm([norm for norm in self.norms if isinstance(norm, BatchNorm)], None if m is None else shares(m))
+        return _heads(features, action, self.bf16(), parameters, norm).squeeze(-1)
 
 
-def _heads(features: Tensor, action: Tensor, low: list[Tensor], parameters: list[Tensor]) -> Tensor:
+class _Norm(NamedTuple):
+    """Batch norm of the input and of both hidden layers, or of nothing."""
+
+    layers: list[BatchNorm]
+    share: Tensor | None = None  # (N,) of each row in the statistics, which then move the running ones
+
+    def __call__(self, depth: int, net: int, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, K) in bfloat16 -> it, normalised, and (K,) one over the deviations."""
+        layer = self.layers[depth]
+        mean, variance = running = layer.mean[net, 0], layer.variance[net, 0]
+        if self.share is not None:
+            mean, variance = torch.empty_like(mean), torch.empty_like(variance)
+            kernels.statistics(_bits(x), self.share.numpy(), mean.numpy(), variance.numpy())
+            for old, new in zip(running, (mean, variance), strict=True):
+                old.lerp_(new, STATISTICS_SHARE)
+        scale, out = (variance + VARIANCE_FLOOR).rsqrt(), torch.empty_like(x)
+        kernels.normalize(_bits(x), mean.numpy(), scale.numpy(), _bits(out))
+        return out, scale
+
+
+def _heads(
+    features: Tensor, action: Tensor, low: list[Tensor], parameters: list[Tensor], norm: _Norm | None = None
+) -> Tensor:
     """(..., Z), (..., A) -> (S, ..., out)."""
     flat = (x.flatten(0, -2) for x in (features, action))
     with torch.autocast("cpu", enabled=False):
-        out: Tensor = _Heads.apply(*flat, low, *parameters)  # type: ignore[no-untyped-call]
+        out: Tensor = _Heads.apply(*flat, low, norm or _Norm([]), *parameters)  # type: ignore[no-untyped-call]
     return out.reshape(out.shape[0], *features.shape[:-1], out.shape[-1])
 
 
@@ -234,55 +258,65 @@ class _Heads(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, features: Tensor, action: Tensor, rounded: list[Tensor], *parameters: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, features: Tensor, action: Tensor, rounded: list[Tensor], norm: _Norm, *parameters: Tensor
+    ) -> Tensor:
         w1, b1, _, b2, w3, b3 = parameters
         x = torch.cat([features.to(BF16), action.to(BF16)], dim=1)
         low = rounded if len(rounded) == 3 else [*rounded, w3]  # the last layer's products may be in float32
+        normed = [*norm(0, 0, x)] if norm.layers else []
+        x = normed[0] if normed else x
         hidden: list[Tensor] = []
         out = torch.empty(w1.shape[0], len(x), w3.shape[2])
         for net in range(w1.shape[0]):
-            first = _layer(x, low[0][net], b1[net])
-            second = _layer(first, low[1][net], b2[net])
-            _last_layer(second, low[2][net], b3[net], out[net])
-            hidden += [first, second]
-        ctx.save_for_backward(x, *low, *hidden)
-        ctx.split = features.shape[1]
+            layer = x
+            for depth, biases in ((0, b1), (1, b2)):
+                layer = torch.mm(layer, low[depth][net])
+                if norm.layers:
+                    normed += norm(depth + 1, net, layer)
+                    layer = normed[-2].clone()
+                kernels.bias_relu(_bits(layer), biases[net].detach().numpy())
+                hidden.append(layer)
+            _last_layer(layer, low[2][net], b3[net], out[net])
+        share = torch.zeros(len(x)) if norm.share is None else norm.share
+        ctx.save_for_backward(x, share, *low, *hidden, *normed)
+        ctx.split, ctx.hidden = features.shape[1], len(hidden)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        x, w1, w2, w3, *hidden = ctx.saved_tensors
+        x, share, w1, w2, w3, *kept = ctx.saved_tensors
+        hidden, normed = kept[: ctx.hidden], kept[ctx.hidden :]
         weight_grads = [torch.empty_like(w, dtype=torch.float32) for w in (w1, w2, w3)]
         biases = [torch.zeros(w.shape[0], w.shape[2]) for w in (w1, w2, w3)]
-        wants_features, wants_action, _, wants_weights, *_ = ctx.needs_input_grad
+        wants_features, wants_action, _, _, wants_weights, *_ = ctx.needs_input_grad
         # of the inputs only those asked for: where the policy climbs Q, that is the action alone
         columns = slice(0 if wants_features else ctx.split, x.shape[1] if wants_action else ctx.split)
         dx = torch.zeros_like(x[:, columns])
         for net, (first, second) in enumerate(zip(hidden[::2], hidden[1::2], strict=True)):
+            of_first, of_second = (normed[k : k + 2] for k in (4 * net + 2, 4 * net + 4))
             d2 = _last_layer_back(grad[net], second, w3[net], weight_grads[2][net], biases[2][net], biases[1][net])
+            _normalize_back(d2, of_second, share)
             d1 = torch.mm(d2, w2[net].t())
             kernels.relu_back(_bits(d1), _bits(first), biases[0][net].numpy())
+            _normalize_back(d1, of_first, share)
             if dx.shape[1]:
                 dx.addmm_(d1, w1[net][columns].t())
             if wants_weights:
                 _product(first, d2, weight_grads[1][net])
                 _product(x, d1, weight_grads[0][net])
+        _normalize_back(dx, [part[..., columns].contiguous() for part in normed[:2]], share)
         of_features = dx[:, : ctx.split] if wants_features else None
         of_action = dx[:, ctx.split - x.shape[1] :] if wants_action else None
-        if not wants_weights:
-            return of_features, of_action, *[None] * 7
-        return (
-            of_features,
-            of_action,
-            None,
-            weight_grads[0],
-            biases[0],
-            weight_grads[1],
-            biases[1],
-            weight_grads[2],
-            biases[2],
-        )
+        of_weights = [part for pair in zip(weight_grads, biases, strict=True) for part in pair]
+        return of_features, of_action, None, None, *(of_weights if wants_weights else [None] * 6)
+
+
+def _normalize_back(grad: Tensor, normed: list[Tensor], share: Tensor) -> None:
+    """grad <- that of what was ``normed`` (it, and the scale), where something was."""
+    if normed and grad.shape[1]:
+        kernels.normalize_back(_bits(grad), _bits(normed[0]), normed[1].numpy(), share.numpy())
 
 
 def _layer(x: Tensor, w: Tensor, b: Tensor) -> Tensor:

@@ -9,8 +9,9 @@ import safetensors.torch
 import torch
 from numpy.typing import NDArray
 
-from rmc.common.agent import Agent, critic_input, squashed_sample
+from rmc.common.agent import Agent, squashed_sample
 from rmc.common.agent_config import AgentConfig
+from rmc.common.critic import critic_input
 from rmc.common.errors import MessageError
 from rmc.common.window import Rows, WindowSpec
 from rmc.learner import losses

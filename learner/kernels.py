@@ -200,3 +200,43 @@ def polyak(target: Floats, w: Floats, low: Bits, weight: float) -> None:
             x[j] += share * (y[j] - x[j])
         if low.size:
             lower(x, low[begin:end])
+
+
+@_compiled
+def statistics(x: Bits, share: Floats, mean: Floats, variance: Floats) -> None:
+    """Mean and variance of each unit, a row's weight its ``share``; (N, K), (N,), and into (K,), (K,)."""
+    mean[:] = np.float32(0.0)
+    variance[:] = np.float32(0.0)
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            mean[j] += share[i] * _up(x[i, j])
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            apart = _up(x[i, j]) - mean[j]
+            variance[j] += share[i] * apart * apart
+
+
+@_compiled
+def normalize(x: Bits, mean: Floats, scale: Floats, out: Bits) -> None:
+    """out <- (x - mean) scale; (N, K), (K,), (K,), (N, K)."""
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            out[i, j] = _down((_up(x[i, j]) - mean[j]) * scale[j])
+
+
+@_compiled
+def normalize_back(grad: Bits, normed: Bits, scale: Floats, share: Floats) -> None:
+    """grad <- the gradient of what ``normalize`` read; (N, K), (N, K) what it gave, (K,), (N,).
+
+    ``share`` is that of the statistics, through which a gradient comes, too: none where they are given, all shares 0.
+    """
+    total, along = np.zeros(scale.size, np.float32), np.zeros(scale.size, np.float32)
+    for i in range(grad.shape[0]):
+        for j in range(grad.shape[1]):
+            total[j] += _up(grad[i, j])
+        for j in range(grad.shape[1]):
+            along[j] += _up(grad[i, j]) * _up(normed[i, j])
+    for i in range(grad.shape[0]):
+        for j in range(grad.shape[1]):
+            through = share[i] * (total[j] + _up(normed[i, j]) * along[j])
+            grad[i, j] = _down(scale[j] * (_up(grad[i, j]) - through))

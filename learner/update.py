@@ -15,7 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from rmc.common.agent import Agent, MemoryOutput, Prediction, critic_input, squashed_sample
+from rmc.common.agent import Agent, MemoryOutput, Prediction, squashed_sample
+from rmc.common.critic import critic_input
 from rmc.learner import losses
 from rmc.learner.batch import Batch
 from rmc.learner.config import UpdateConfig
@@ -82,7 +83,7 @@ class JointUpdate:
         if bf16 and device.type == "cpu":
             fuse(agent)
         self.agent, self.burn_in, self.config, self.bf16 = agent, burn_in, config, bf16
-        self.target_critic = _target_copy(agent.critic)
+        self.target_critic = None if agent.config.critic_batch_norm else _target_copy(agent.critic)
         self.target_memory = _target_copy(agent.memory)
         self.average = {name: value.detach().clone() for name, value in agent.acting().items()}  # theta-bar
         self._has_target_memory = "ema" in (config.latent_target, config.target_memory)
@@ -148,11 +149,11 @@ class JointUpdate:
         with self._autocast():
             mean, log_std = agent.policy(z_policy)
             pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean, batch.cut))
-            with torch.no_grad():
-                next_q = self.target_critic(critic_input(model.next_z, privileged[:, 1:]), pi[:, 1:])
-                next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:])
-                y = losses.td_target(r + beta * model.curiosity, c.gamma, d, next_value, m, c.n_step)
-            q = agent.critic(critic_input(z_value[:, :-1], privileged[:, :-1]), a)
+            now = critic_input(z_value[:, :-1], privileged[:, :-1]), a
+            after = critic_input(model.next_z, privileged[:, 1:]), pi[:, 1:].detach()
+            q, next_q = self._values(now, after, m)
+            next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:].detach())
+            y = losses.td_target(r + beta * model.curiosity, c.gamma, d, next_value, m, c.n_step)
             frozen = {name: value.detach() for name, value in agent.critic.named_parameters()}
             z_actor = z_policy if c.policy_through_q else z.detach()
             read = critic_input(z_actor[:, :-1], privileged[:, :-1])
@@ -167,6 +168,19 @@ class JointUpdate:
         }
         trace = Trace(detached(loss_values), alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m)
         return loss_values, ValuePass(losses.priority(td_error, c.eta, m), value_metrics(trace, beta))
+
+    def _values(self, now: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], m: Tensor) -> tuple[Tensor, Tensor]:
+        """Q of (h_t, a_t), and of (h_{t+1}, a') without gradient, (2, B, T) each: the latter by the target critics.
+
+        With batch norm one pass gives both, and there are no targets (CrossQ, arXiv 1902.05605).
+        """
+        if self.target_critic is not None:
+            with torch.no_grad():
+                next_q = self.target_critic(*after)
+            return self.agent.critic(*now), next_q
+        both = (torch.cat(pair, dim=1) for pair in zip(now, after, strict=True))
+        q, next_q = self.agent.critic(*both, torch.cat([m, m], dim=1)).chunk(2, dim=2)
+        return q, next_q.detach()
 
     def result(self, batch: Batch, model: ModelPass, value: ValuePass, norm: Tensor) -> UpdateResult:
         """What an update gives back of its passes; ``norm`` is the gradient's."""
@@ -253,8 +267,9 @@ class JointUpdate:
         self.imputer_turns.copy_(model.imputer_turns)
 
     def follow_value(self) -> None:
-        """What follows the critics' step: their target by Polyak."""
-        follow(self.target_critic, self.agent.critic, 1.0 - self.config.polyak)
+        """What follows the critics' step: their targets by Polyak."""
+        if self.target_critic is not None:
+            follow(self.target_critic, self.agent.critic, 1.0 - self.config.polyak)
 
     @torch.no_grad()
     def update_ema(self, updates: int, parts: tuple[str, ...] = MODEL_PARTS + VALUE_PARTS) -> None:
@@ -274,7 +289,7 @@ class JointUpdate:
         """All that an update changes, for a checkpoint."""
         return {
             "agent": self.agent.state_dict(),
-            "target_critic": self.target_critic.state_dict(),
+            "target_critic": self.target_critic.state_dict() if self.target_critic is not None else {},
             "target_memory": self.target_memory.state_dict(),
             "average": self.average,
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
@@ -286,7 +301,8 @@ class JointUpdate:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from ``state_dict``, bit for bit; with the step sizes of this run's config."""
         self.agent.load_state_dict(state["agent"])
-        self.target_critic.load_state_dict(state["target_critic"])
+        if self.target_critic is not None:
+            self.target_critic.load_state_dict(state["target_critic"])
         self.target_memory.load_state_dict(state["target_memory"])
         for name, value in self.average.items():
             value.copy_(state["average"][name])

@@ -17,8 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rmc.common.agent import Agent, critic_input
+from rmc.common.agent import Agent
 from rmc.common.checkpoint import STATE, CheckpointFolder
+from rmc.common.critic import critic_input
 from rmc.common.window import Rows
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder

@@ -37,8 +37,8 @@ PARTS: dict[InitParts, tuple[str, ...]] = {  # the beginnings of what is taken
 }
 NOT_IN: dict[InitParts, set[str]] = {  # options of the networks that say nothing of these parts
     "all": {"initial_priority", "gate_init"},
-    "memory+world-model": {"initial_priority", "gate_init", "critic_norm", "privileged_critic"},
-    "policy": {"initial_priority", "gate_init", "critic_norm", "privileged_critic", "grounding"},
+    "memory+world-model": {"initial_priority", "gate_init", "critic_batch_norm", "privileged_critic"},
+    "policy": {"initial_priority", "gate_init", "critic_batch_norm", "privileged_critic", "grounding"},
 }
 
 
@@ -115,8 +115,9 @@ def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages:
     weights = {name: value for name, value in state["agent"].items() if name.startswith(prefixes)}
     update.agent.load_state_dict(update.agent.state_dict() | weights)
     update.target_memory.load_state_dict(update.agent.memory.state_dict())
-    critic = state["target_critic"] if parts == "all" else update.agent.critic.state_dict()
-    update.target_critic.load_state_dict(critic)
+    if update.target_critic is not None:
+        critic = state["target_critic"] if parts == "all" else update.agent.critic.state_dict()
+        update.target_critic.load_state_dict(critic)
     acting = dict(update.agent.acting())
     for name, value in update.average.items():
         value.copy_(state["average"][name] if averages and name in weights else acting[name].detach())

@@ -148,6 +148,7 @@ class PlainUpdate:
         )
         sums: dict[str, list[Tensor]] = {name: [] for name in ("M", "observation", "reward", "F", "V", "P", "T")}
         errors = []  # of every window, by step
+        joint = self.joint_values(rows, noise) if agent.config.critic_batch_norm else {}
         for b, row in enumerate(rows):
             online, target = self.unroll(agent.memory, row), self.unroll(self.target_memory, row)
             latent = target if c.latent_target == "ema" else online
@@ -182,15 +183,31 @@ class PlainUpdate:
             online, target = self.unroll(agent.memory, row), self.unroll(self.target_memory, row)
             td_errors = []
             for t in range(self.burn_in, int(row["last"])):
-                y = self.target(row, t, i[b], beta, online, target, noise[b])
+                next_q = {step: values[1] for (window, step), values in joint.items() if window == b}
+                y = self.target(row, t, i[b], beta, online, target, noise[b], next_q)
                 read = self.critics_z(row, t, self.reaching("V", self.z(online[t])))
-                q = twin_q(agent.critic, read, torch.tensor(row["action"][t]))
+                q = joint[b, t][0] if joint else twin_q(agent.critic, read, torch.tensor(row["action"][t]))
                 sums["V"].append(float(importance[b]) * 0.5 * ((q[0] - y) ** 2 + (q[1] - y) ** 2))
                 td_errors.append((q.detach() - y).abs().mean().item())
             priorities.append(c.eta * max(td_errors) + (1.0 - c.eta) * sum(td_errors) / len(td_errors))
         mean = {name: torch.stack(values).mean() if values else torch.zeros(()) for name, values in sums.items()}
         mean["G"] = mean.pop("observation") + mean.pop("reward")
         return mean, priorities, variance
+
+    def joint_values(self, rows: np.ndarray, noise: Tensor) -> dict[tuple[int, int], tuple[Tensor, Tensor]]:
+        """By window and step, Q of it and of the next, all normalised together."""
+        steps, now, after = [], [], []
+        for b, row in enumerate(rows):
+            online, target = self.unroll(self.agent.memory, row), self.unroll(self.target_memory, row)
+            for t in range(self.burn_in, int(row["last"])):
+                read = self.critics_z(row, t, self.reaching("V", self.z(online[t])))
+                now.append(torch.cat([read, torch.tensor(row["action"][t])]))
+                then = self.z((target if self.c.target_memory == "ema" else online)[t + 1])
+                pi, _ = self.sample(self.z(online[t + 1]), noise[b, t + 1 - self.burn_in])
+                after.append(torch.cat([self.critics_z(row, t + 1, then), pi]).detach())
+                steps.append((b, t))
+        q, next_q = jointly_normed_q(self.agent.critic, torch.stack(now + after)).chunk(2)
+        return dict(zip(steps, zip(q, next_q.detach(), strict=True), strict=True))
 
     def reaching(self, loss: str, z: Tensor) -> Tensor:
         return z if loss in REACHES_MEMORY[self.c.scheme] else z.detach()
@@ -210,9 +227,9 @@ class PlainUpdate:
     @torch.no_grad()
     def target(
         self, row: np.void, t: int, i: dict[int, float], beta: float,
-        online: dict[int, Known], target: dict[int, Known], noise: Tensor,
+        online: dict[int, Known], target: dict[int, Known], noise: Tensor, next_q: dict[int, Tensor],
     ) -> float:  # fmt: skip
-        """r + ... for up to n steps, then the soft value of where they lead."""
+        """r + ... for up to n steps, then the soft value of where they lead; ``next_q`` has it where one pass does."""
         c, y, discount = self.c, 0.0, 1.0
         for _ in range(c.n_step):
             y += discount * (float(row["reward"][t]) + beta * i[t])
@@ -224,7 +241,7 @@ class PlainUpdate:
                 break
         pi, log_pi = self.sample(self.z(online[t]), noise[t - self.burn_in])
         reads = target if c.target_memory == "ema" else online
-        q = twin_q(self.target_critic, self.critics_z(row, t, self.z(reads[t])), pi)
+        q = next_q[t - 1] if next_q else twin_q(self.target_critic, self.critics_z(row, t, self.z(reads[t])), pi)
         return y + discount * float(q.min() - self.agent.log_alpha.exp() * log_pi)
 
 
@@ -250,9 +267,34 @@ def twin_q(critic: torch.nn.Module, z: Tensor, a: Tensor, frozen: bool = False) 
         for depth, layer in enumerate(critic.layers):
             weight, bias = layer.weight[j], layer.bias[j, 0]
             weight, bias = (weight.detach(), bias.detach()) if frozen else (weight, bias)
-            x = x @ weight + bias
-            if depth < 2 and critic.norm:
-                x = (x - x.mean()) / (x.var(correction=0) + 1e-5).sqrt()
+            x = running_normed(critic, 0, 0, x) if depth == 0 else x
+            x = running_normed(critic, depth + 1, j, x @ weight) + bias if depth < 2 else x @ weight + bias
             x = F.relu(x) if depth < 2 else x
         values.append(x[0])
     return torch.stack(values)
+
+
+def running_normed(critic: torch.nn.Module, depth: int, net: int, x: Tensor) -> Tensor:
+    if not critic.norms:
+        return x
+    norm = critic.norms[depth]
+    return (x - norm.mean[net, 0]) / (norm.variance[net, 0] + 1e-3).sqrt()
+
+
+def jointly_normed_q(critic: torch.nn.Module, inputs: Tensor) -> Tensor:
+    """(N, in) -> (N, 2), normalised by all rows, whose statistics move the running ones."""
+    read = normed_by_rows(critic.norms[0], 0, inputs)
+    values = []
+    for j in (0, 1):
+        x = read
+        for norm, layer in zip(critic.norms[1:], critic.layers[:-1], strict=True):
+            x = F.relu(normed_by_rows(norm, j, x @ layer.weight[j]) + layer.bias[j, 0])
+        values.append(x @ critic.layers[-1].weight[j, :, 0] + critic.layers[-1].bias[j, 0])
+    return torch.stack(values, 1)
+
+
+def normed_by_rows(norm: torch.nn.Module, net: int, x: Tensor) -> Tensor:
+    mean, variance = x.mean(0), x.var(0, correction=0)
+    for running, new in ((norm.mean, mean), (norm.variance, variance)):
+        running[net, 0] = 0.99 * running[net, 0] + 0.01 * new.detach()
+    return (x - mean) / (variance + 1e-3).sqrt()

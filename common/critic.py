@@ -1,0 +1,95 @@
+"""The critics: twin Q, where configured with batch norm instead of target networks.
+
+Shapes: B batch, T time, N = B T, K units, Z head input, A action, P privileged.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from rmc.common.agent_config import AgentConfig
+
+VARIANCE_FLOOR = 1e-3  # added, so that a unit that hardly moves is not blown up
+STATISTICS_SHARE = 0.01  # of a batch in the running statistics
+
+
+class StackedLinear(nn.Module):
+    """Two Linear layers side by side as one batched product: x (2, N, in) -> (2, N, out)."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        bound = 1.0 / math.sqrt(inputs)  # nn.Linear's own initialisation
+        self.weight = nn.Parameter(torch.empty(2, inputs, outputs).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(2, 1, outputs).uniform_(-bound, bound))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.baddbmm(self.bias, x.expand(2, -1, -1), self.weight)
+
+    def product(self, x: Tensor) -> Tensor:
+        """Without the bias."""
+        return torch.bmm(x.expand(2, -1, -1), self.weight)
+
+
+class BatchNorm(nn.Module):
+    """Each unit minus its mean, over its standard deviation. Gain and offset are those of the layers around it."""
+
+    mean: Tensor  # (S, 1, K), running
+    variance: Tensor
+
+    def __init__(self, nets: int, size: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(nets, 1, size))
+        self.register_buffer("variance", torch.ones(nets, 1, size))
+
+    def forward(self, x: Tensor, share: Tensor | None = None) -> Tensor:
+        """(S, N, K) -> the same in float32, by the running statistics; or by those of x, which move the running ones.
+
+        ``share`` (N,) is each row's in them; they add up to 1.
+        """
+        x = x.float()
+        if share is None:
+            return (x - self.mean) * (self.variance + VARIANCE_FLOOR).rsqrt()
+        weight = share.unsqueeze(-1)
+        mean = (weight * x).sum(1, keepdim=True)
+        variance = (weight * (x - mean).square()).sum(1, keepdim=True)
+        self.mean.lerp_(mean.detach(), STATISTICS_SHARE)
+        self.variance.lerp_(variance.detach(), STATISTICS_SHARE)
+        return (x - mean) * (variance + VARIANCE_FLOOR).rsqrt()
+
+
+class TwinQ(nn.Module):
+    """Eq. 9: Q_1(h, a) and Q_2(h, a), stacked; where configured with batch norm of the input, and before each bias."""
+
+    def __init__(self, inputs: int, action_dim: int, config: AgentConfig) -> None:
+        super().__init__()
+        sizes = inputs + action_dim, *config.heads
+        self.layers = nn.ModuleList(StackedLinear(*pair) for pair in zip(sizes, (*config.heads, 1), strict=True))
+        norms = (BatchNorm(*pair) for pair in zip((1, 2, 2), sizes, strict=True))  # both nets read the same
+        self.norms = nn.ModuleList(norms if config.critic_batch_norm else [])
+
+    def forward(self, features: Tensor, action: Tensor, m: Tensor | None = None) -> Tensor:
+        """(B, T, Z), (B, T, A) -> (2, B, T) in float32.
+
+        Given the mask m (B, T), batch norm takes the statistics of these steps, where they are real.
+        """
+        x = torch.cat([features, action.to(features.dtype)], dim=-1).flatten(0, -2).unsqueeze(0)
+        share = None if m is None else shares(m)
+        if self.norms:
+            x = self.norms[0](x, share)
+        for depth, layer in enumerate(self.layers[:-1], start=1):
+            x = F.relu(self.norms[depth](layer.product(x), share) + layer.bias if self.norms else layer(x))
+        with torch.autocast(x.device.type, enabled=False):  # bfloat16 would give a Q of 300 in steps of 2
+            q: Tensor = self.layers[-1](x.float())
+        return q.reshape(2, *features.shape[:-1])
+
+
+def shares(m: Tensor) -> Tensor:
+    """(B, T) -> (N,): what each step counts for in a mean over the real ones."""
+    return (m / m.sum().clamp(min=1.0)).flatten()
+
+
+def critic_input(z: Tensor, privileged: Tensor) -> Tensor:
+    """What critics read: (B, T, Z), beside it (B, T, P) normalised."""
+    return torch.cat([z, privileged.to(z.dtype)], dim=-1) if privileged.shape[-1] else z
