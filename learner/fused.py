@@ -147,8 +147,22 @@ class _Norm(NamedTuple):
     layers: list[BatchNorm]
     share: Tensor | None = None  # (N,) of each row in the statistics, which then move the running ones
 
-    def __call__(self, depth: int, net: int, x: Tensor) -> tuple[Tensor, Tensor]:
+    def of_input(self, x: Tensor) -> list[Tensor]:
         """(N, K) in bfloat16 -> it, normalised, and (K,) one over the deviations."""
+        mean, scale = self._mean_and_scale(0, 0, x)
+        out = torch.empty_like(x)
+        kernels.normalize(_bits(x), mean.numpy(), scale.numpy(), _bits(out))
+        return [out, scale]
+
+    def relu(self, depth: int, net: int, x: Tensor, bias: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """(N, K) in bfloat16 -> the hidden layer; beside it what ``of_input`` gives."""
+        mean, scale = self._mean_and_scale(depth, net, x)
+        normed, out = torch.empty_like(x), torch.empty_like(x)
+        of_units = mean.numpy(), scale.numpy(), bias.detach().numpy()
+        kernels.normalize_relu(_bits(x), *of_units, _bits(normed), _bits(out))
+        return out, [normed, scale]
+
+    def _mean_and_scale(self, depth: int, net: int, x: Tensor) -> tuple[Tensor, Tensor]:
         layer = self.layers[depth]
         mean, variance = running = layer.mean[net, 0], layer.variance[net, 0]
         if self.share is not None:
@@ -156,9 +170,7 @@ class _Norm(NamedTuple):
             kernels.statistics(_bits(x), self.share.numpy(), mean.numpy(), variance.numpy())
             for old, new in zip(running, (mean, variance), strict=True):
                 old.lerp_(new, STATISTICS_SHARE)
-        scale, out = (variance + VARIANCE_FLOOR).rsqrt(), torch.empty_like(x)
-        kernels.normalize(_bits(x), mean.numpy(), scale.numpy(), _bits(out))
-        return out, scale
+        return mean, (variance + VARIANCE_FLOOR).rsqrt()
 
 
 def _heads(
@@ -264,18 +276,18 @@ class _Heads(torch.autograd.Function):
         w1, b1, _, b2, w3, b3 = parameters
         x = torch.cat([features.to(BF16), action.to(BF16)], dim=1)
         low = rounded if len(rounded) == 3 else [*rounded, w3]  # the last layer's products may be in float32
-        normed = [*norm(0, 0, x)] if norm.layers else []
+        normed = norm.of_input(x) if norm.layers else []
         x = normed[0] if normed else x
         hidden: list[Tensor] = []
         out = torch.empty(w1.shape[0], len(x), w3.shape[2])
         for net in range(w1.shape[0]):
             layer = x
             for depth, biases in ((0, b1), (1, b2)):
-                layer = torch.mm(layer, low[depth][net])
                 if norm.layers:
-                    normed += norm(depth + 1, net, layer)
-                    layer = normed[-2].clone()
-                kernels.bias_relu(_bits(layer), biases[net].detach().numpy())
+                    layer, more = norm.relu(depth + 1, net, torch.mm(layer, low[depth][net]), biases[net])
+                    normed += more
+                else:
+                    layer = _layer(layer, low[depth][net], biases[net])
                 hidden.append(layer)
             _last_layer(layer, low[2][net], b3[net], out[net])
         share = torch.zeros(len(x)) if norm.share is None else norm.share

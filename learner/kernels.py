@@ -225,6 +225,16 @@ def normalize(x: Bits, mean: Floats, scale: Floats, out: Bits) -> None:
 
 
 @_compiled
+def normalize_relu(x: Bits, mean: Floats, scale: Floats, bias: Floats, normed: Bits, out: Bits) -> None:
+    """normed <- (x - mean) scale, and out <- ReLU of it and the bias; (N, K), (K,) thrice, (N, K), (N, K)."""
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            y = (_up(x[i, j]) - mean[j]) * scale[j]
+            normed[i, j] = _down(y)
+            out[i, j] = _down(np.float32(0.0) if y + bias[j] < np.float32(0.0) else y + bias[j])
+
+
+@_compiled
 def normalize_back(grad: Bits, normed: Bits, scale: Floats, share: Floats) -> None:
     """grad <- the gradient of what ``normalize`` read; (N, K), (N, K) what it gave, (K,), (N,).
 

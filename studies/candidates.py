@@ -15,7 +15,6 @@ BEFORE = {
     "n-step 3": "--batch-size 32 --n-step 3",
     "heads 256 256": "--batch-size 32 --heads 256 256",
     "memory's rate 0.1": "--batch-size 32 --memory-learning-scale 0.1",
-    "critics normalised": "--batch-size 32 --critic-norm",
     "observation beside": "--batch-size 32 --head-input hidden+observation",
     "stride 5": "--batch-size 32 --stride 5",
     "prioritized": "--batch-size 32 --priority-exponent 0.6 --importance-exponent 0.4",
@@ -34,13 +33,11 @@ BEFORE = {
     "batch 16, n-step 3": "--batch-size 16 --n-step 3",
     "batch 16, heads 256 256": "--batch-size 16 --heads 256 256",
     "batch 16, memory's rate 0.3": "--batch-size 16 --memory-learning-scale 0.3",
-    "batch 16, critics normalised": "--batch-size 16 --critic-norm",
     "batch 16, observation beside": "--batch-size 16 --head-input hidden+observation",
 }
 TODAY = {
     "RMC": "",
     "RMC, n-step 3": "--n-step 3",
-    "RMC, critics normalised": "--critic-norm",
     "RMC, observation beside": "--head-input hidden+observation",
     "RMC, memory's rate 0.3": "--memory-learning-scale 0.3",
     "RMC, first critic": "--policy-q first",

@@ -25,7 +25,12 @@ def _to_3(raw: Raw) -> None:
     _add(raw, "layout", missing=1, privileged=0)  # in a policy's file; flags were one for a whole frame
 
 
-MIGRATIONS: list[Callable[[Raw], None]] = [_to_2, _to_3]  # the first is from format 1 to 2
+def _to_4(raw: Raw) -> None:
+    _remove(raw, "agent", critic_norm=False)
+    _add(raw, "agent", critic_batch_norm=False)
+
+
+MIGRATIONS: list[Callable[[Raw], None]] = [_to_2, _to_3, _to_4]  # the first is from format 1 to 2
 FORMAT = 1 + len(MIGRATIONS)
 
 
@@ -56,3 +61,13 @@ def _add(raw: Raw, part: str, **options: Any) -> None:
 def _rename(raw: Raw, part: str, **names: str) -> None:
     if isinstance(raw.get(part), dict):
         raw[part] = {names.get(name, name): value for name, value in raw[part].items()}
+
+
+def _remove(raw: Raw, part: str, **options: Any) -> None:
+    """Options that are gone, each with the value that does what this version does. Raises ConfigError for others."""
+    settings = raw.get(part)
+    for name, value in options.items() if isinstance(settings, dict) else ():
+        if (was := settings.pop(name, value)) != value:
+            raise ConfigError(
+                f"{part}.{name}", was, "not there any more; use the version of RMC that wrote it"
+            )

@@ -35,7 +35,7 @@ TRAIN_FLAGS = """
     --config --run-dir --if-exists --launcher --device --redis-url --ray-address --all-cpus --tls
     --track --track-project --track-tags --track-video-every --metrics-port --metrics-host --dry-run
     --burn-in --trained-steps
-    --hidden --embedding --heads --gate-init --layer-norm --head-input --critic-norm --privileged-critic
+    --hidden --embedding --heads --gate-init --layer-norm --head-input --critic-batch-norm --privileged-critic
     --normalize-observations --grounding
     --missing-flag --impute-missing --initial-priority
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes

@@ -28,11 +28,11 @@ from rmc.replay_server.recovery import open_store
 
 RUNS = Path(__file__).parent / "runs"
 # Whoever changes this list raises FORMAT by a migration, and keeps a run of the version before in runs/.
-FORMAT_3 = """
+FORMAT_4 = """
     env.id env.flicker env.drop_sensors env.flicker_burst env.delay env.hide env.noise env.frame_stack
     env.action_repeat env.time_limit env.env_timeout env.env_kwargs preset seed total_steps actors
     window.burn_in window.trained_steps
-    agent.hidden agent.embedding agent.heads agent.gate_init agent.layer_norm agent.head_input agent.critic_norm
+    agent.hidden agent.embedding agent.heads agent.gate_init agent.layer_norm agent.head_input agent.critic_batch_norm
     agent.privileged_critic agent.normalize_observations agent.grounding agent.missing_flag agent.impute_missing
     agent.initial_priority
     actor.envs_per_actor actor.stride actor.state_strategy actor.reward_scale actor.refresh_steps actor.chunk_windows
@@ -47,7 +47,7 @@ FORMAT_3 = """
 """.split()  # noqa: SIM905
 
 
-@pytest.fixture(params=["format-1-a", "format-1-b", "format-2"])
+@pytest.fixture(params=["format-1-a", "format-1-b", "format-2", "format-3"])
 def old(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
     with tarfile.open(RUNS / f"{request.param}.tar.xz") as archive:
         archive.extractall(tmp_path, filter="data")
@@ -55,8 +55,8 @@ def old(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
 
 
 def test_an_option_comes_with_a_format() -> None:
-    assert sorted(flat(robust(EnvConfig("")))) == sorted(FORMAT_3)
-    assert FORMAT == 3
+    assert sorted(flat(robust(EnvConfig("")))) == sorted(FORMAT_4)
+    assert FORMAT == 4
 
 
 def test_its_options_are_read_in_the_words_of_this_version(old: RunFolder) -> None:
