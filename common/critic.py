@@ -79,6 +79,7 @@ class TwinQ(nn.Module):
         if self.norms:
             x = self.norms[0](x, share)
         for depth, layer in enumerate(self.layers[:-1], start=1):
+            assert isinstance(layer, StackedLinear)
             x = F.relu(self.norms[depth](layer.product(x), share) + layer.bias if self.norms else layer(x))
         with torch.autocast(x.device.type, enabled=False):  # bfloat16 would give a Q of 300 in steps of 2
             q: Tensor = self.layers[-1](x.float())

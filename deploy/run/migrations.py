@@ -65,9 +65,9 @@ def _rename(raw: Raw, part: str, **names: str) -> None:
 
 def _remove(raw: Raw, part: str, **options: Any) -> None:
     """Options that are gone, each with the value that does what this version does. Raises ConfigError for others."""
-    settings = raw.get(part)
-    for name, value in options.items() if isinstance(settings, dict) else ():
+    if not isinstance(settings := raw.get(part), dict):
+        return
+    for name, value in options.items():
         if (was := settings.pop(name, value)) != value:
-            raise ConfigError(
-                f"{part}.{name}", was, "not there any more; use the version of RMC that wrote it"
-            )
+            fix = "this version has no such option; use the version of RMC that wrote it"
+            raise ConfigError(f"{part}.{name}", was, fix)
