@@ -50,29 +50,30 @@ VARIANTS = [
 ]
 
 
+NORMED = dataclasses.replace(ROBUST, critic_batch_norm=True, head_input="hidden+observation", impute_missing=True)
 AGENTS = [
     PAPER,
     ROBUST,
+    NORMED,
     dataclasses.replace(ROBUST, layer_norm=True, head_input="hidden"),
-    dataclasses.replace(ROBUST, head_input="hidden+observation"),
-    dataclasses.replace(ROBUST, critic_batch_norm=True),
     dataclasses.replace(ROBUST, head_input="observation"),
     dataclasses.replace(ROBUST, head_input="hidden", impute_missing=True),
-    dataclasses.replace(ROBUST, impute_missing=True),
+    dataclasses.replace(ROBUST, head_input="hidden+observation"),
     dataclasses.replace(ROBUST, head_input="observation", impute_missing=True),
 ]
 
 
-@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("agent", [PAPER, ROBUST, NORMED], ids=["paper", "robust", "normed"])
 @pytest.mark.parametrize("options", VARIANTS, ids=lambda options: "-".join(f"{k}={v}" for k, v in options.items()))
 def test_three_updates_are_those_of_the_equations(agent: AgentConfig, options: dict[str, object]) -> None:
     assert_same_updates(SPEC, agent, options)
 
 
 @pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("sizes", [SPEC, BY_NUMBER], ids=["a frame's flag", "by number, critics see more"])
 @pytest.mark.parametrize("options", [{}, {"update_order": "alternate", "scheme": 4}, {"target_memory": "ema"}])
-def test_so_they_are_by_number_and_where_critics_see_more(agent: AgentConfig, options: dict[str, object]) -> None:
-    assert_same_updates(BY_NUMBER, agent, options)
+def test_so_they_are_for_every_agent(sizes: WindowSpec, agent: AgentConfig, options: dict[str, object]) -> None:
+    assert_same_updates(sizes, agent, options)
 
 
 def assert_same_updates(sizes: WindowSpec, agent: AgentConfig, options: dict[str, object]) -> None:
