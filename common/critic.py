@@ -27,21 +27,19 @@ class StackedLinear(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return torch.baddbmm(self.bias, x.expand(2, -1, -1), self.weight)
 
-    def product(self, x: Tensor) -> Tensor:
-        """Without the bias."""
-        return torch.bmm(x.expand(2, -1, -1), self.weight)
-
 
 class BatchNorm(nn.Module):
-    """Each unit minus its mean, over its standard deviation. Gain and offset are those of the layers around it."""
+    """Each unit minus its mean, over its standard deviation; where asked, times a gain, plus an offset."""
 
     mean: Tensor  # (S, 1, K), running
     variance: Tensor
 
-    def __init__(self, nets: int, size: int) -> None:
+    def __init__(self, nets: int, size: int, affine: bool) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(nets, 1, size))
         self.register_buffer("variance", torch.ones(nets, 1, size))
+        self.gain = nn.Parameter(torch.ones(nets, 1, size)) if affine else None
+        self.offset = nn.Parameter(torch.zeros(nets, 1, size)) if affine else None
 
     def forward(self, x: Tensor, share: Tensor | None = None) -> Tensor:
         """(S, N, K) -> the same in float32, by the running statistics; or by those of x, which move the running ones.
@@ -49,24 +47,26 @@ class BatchNorm(nn.Module):
         ``share`` (N,) is each row's in them; they add up to 1.
         """
         x = x.float()
-        if share is None:
-            return (x - self.mean) * (self.variance + VARIANCE_FLOOR).rsqrt()
-        weight = share.unsqueeze(-1)
-        mean = (weight * x).sum(1, keepdim=True)
-        variance = (weight * (x - mean).square()).sum(1, keepdim=True)
-        self.mean.lerp_(mean.detach(), STATISTICS_SHARE)
-        self.variance.lerp_(variance.detach(), STATISTICS_SHARE)
-        return (x - mean) * (variance + VARIANCE_FLOOR).rsqrt()
+        mean, variance = self.mean, self.variance
+        if share is not None:
+            weight = share.unsqueeze(-1)
+            mean = (weight * x).sum(1, keepdim=True)
+            variance = (weight * (x - mean).square()).sum(1, keepdim=True)
+            self.mean.lerp_(mean.detach(), STATISTICS_SHARE)
+            self.variance.lerp_(variance.detach(), STATISTICS_SHARE)
+        normed = (x - mean) * (variance + VARIANCE_FLOOR).rsqrt()
+        return normed if self.gain is None or self.offset is None else normed * self.gain + self.offset
 
 
 class TwinQ(nn.Module):
-    """Eq. 9: Q_1(h, a) and Q_2(h, a), stacked; where configured with batch norm of the input, and before each bias."""
+    """Eq. 9: Q_1(h, a) and Q_2(h, a), stacked; where configured with batch norm of all that a layer reads."""
 
     def __init__(self, inputs: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
         sizes = inputs + action_dim, *config.heads
         self.layers = nn.ModuleList(StackedLinear(*pair) for pair in zip(sizes, (*config.heads, 1), strict=True))
-        norms = (BatchNorm(*pair) for pair in zip((1, 2, 2), sizes, strict=True))  # both nets read the same
+        # both nets read the same input; without an offset behind the ReLUs, the last bias alone would carry Q's mean
+        norms = [BatchNorm(1, sizes[0], affine=False), *(BatchNorm(2, size, affine=True) for size in config.heads)]
         self.norms = nn.ModuleList(norms if config.critic_batch_norm else [])
 
     def forward(self, features: Tensor, action: Tensor, m: Tensor | None = None) -> Tensor:
@@ -76,14 +76,17 @@ class TwinQ(nn.Module):
         """
         x = torch.cat([features, action.to(features.dtype)], dim=-1).flatten(0, -2).unsqueeze(0)
         share = None if m is None else shares(m)
-        if self.norms:
-            x = self.norms[0](x, share)
-        for depth, layer in enumerate(self.layers[:-1], start=1):
-            assert isinstance(layer, StackedLinear)
-            x = F.relu(self.norms[depth](layer.product(x), share) + layer.bias if self.norms else layer(x))
+        for depth, layer in enumerate(self.layers[:-1]):
+            x = F.relu(layer(self._normed(x, depth, share)))
         with torch.autocast(x.device.type, enabled=False):  # bfloat16 would give a Q of 300 in steps of 2
-            q: Tensor = self.layers[-1](x.float())
+            q: Tensor = self.layers[-1](self._normed(x, -1, share).float())
         return q.reshape(2, *features.shape[:-1])
+
+    def _normed(self, x: Tensor, depth: int, share: Tensor | None) -> Tensor:
+        if not self.norms:
+            return x
+        normed: Tensor = self.norms[depth](x, share)
+        return normed
 
 
 def shares(m: Tensor) -> Tensor:

@@ -138,6 +138,7 @@ class FusedTwinQ(Rounded, TwinQ):
         stacks = [layer for layer in self.layers if isinstance(layer, StackedLinear)]
         parameters = [part for one in stacks for part in (one.weight, one.bias[:, 0])]
         norm = _Norm([norm for norm in self.norms if isinstance(norm, BatchNorm)], None if m is None else shares(m))
+        parameters += [part[:, 0] for one in norm.layers for part in (one.gain, one.offset) if part is not None]
         return _heads(features, action, self.bf16(), parameters, norm).squeeze(-1)
 
 
@@ -147,22 +148,8 @@ class _Norm(NamedTuple):
     layers: list[BatchNorm]
     share: Tensor | None = None  # (N,) of each row in the statistics, which then move the running ones
 
-    def of_input(self, x: Tensor) -> list[Tensor]:
-        """(N, K) in bfloat16 -> it, normalised, and (K,) one over the deviations."""
-        mean, scale = self._mean_and_scale(0, 0, x)
-        out = torch.empty_like(x)
-        kernels.normalize(_bits(x), mean.numpy(), scale.numpy(), _bits(out))
-        return [out, scale]
-
-    def relu(self, depth: int, net: int, x: Tensor, bias: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """(N, K) in bfloat16 -> the hidden layer; beside it what ``of_input`` gives."""
-        mean, scale = self._mean_and_scale(depth, net, x)
-        normed, out = torch.empty_like(x), torch.empty_like(x)
-        of_units = mean.numpy(), scale.numpy(), bias.detach().numpy()
-        kernels.normalize_relu(_bits(x), *of_units, _bits(normed), _bits(out))
-        return out, [normed, scale]
-
-    def _mean_and_scale(self, depth: int, net: int, x: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, depth: int, net: int, x: Tensor) -> "_Normed":
+        """(N, K) in bfloat16."""
         layer = self.layers[depth]
         mean, variance = running = layer.mean[net, 0], layer.variance[net, 0]
         if self.share is not None:
@@ -170,7 +157,22 @@ class _Norm(NamedTuple):
             kernels.statistics(_bits(x), self.share.numpy(), mean.numpy(), variance.numpy())
             for old, new in zip(running, (mean, variance), strict=True):
                 old.lerp_(new, STATISTICS_SHARE)
-        return mean, (variance + VARIANCE_FLOOR).rsqrt()
+        scale, normed = (variance + VARIANCE_FLOOR).rsqrt(), torch.empty_like(x)
+        if layer.gain is None or layer.offset is None:
+            kernels.normalize(_bits(x), mean.numpy(), scale.numpy(), _bits(normed))
+            return _Normed(normed, normed, scale)
+        out, gain, offset = torch.empty_like(x), layer.gain[net, 0].detach(), layer.offset[net, 0].detach()
+        of_units = mean.numpy(), scale.numpy(), gain.numpy(), offset.numpy()
+        kernels.normalize_scaled(_bits(x), *of_units, _bits(normed), _bits(out))
+        return _Normed(out, normed, scale * gain)
+
+
+class _Normed(NamedTuple):
+    """What became of (N, K), and what the way back takes."""
+
+    out: Tensor
+    normed: Tensor  # without gain and offset
+    scale: Tensor  # (K,), with the gain
 
 
 def _heads(
@@ -266,69 +268,87 @@ class _GRU(torch.autograd.Function):
 class _Heads(torch.autograd.Function):
     """S nets that read the same (N, Z) and (N, A): weights (S, in, out), biases (S, out) -> (S, N, out) float32.
 
-    ``rounded`` has the weights in bfloat16, but for a last layer whose products are in float32.
+    ``rounded`` has the weights in bfloat16, but for a last layer whose products are in float32. With batch norm, gains
+    and offsets (S, K) of both hidden layers stand behind them.
     """
 
     @staticmethod
     def forward(
         ctx: Any, features: Tensor, action: Tensor, rounded: list[Tensor], norm: _Norm, *parameters: Tensor
     ) -> Tensor:
-        w1, b1, _, b2, w3, b3 = parameters
+        w1, b1, _, b2, w3, b3, *_ = parameters
         x = torch.cat([features.to(BF16), action.to(BF16)], dim=1)
         low = rounded if len(rounded) == 3 else [*rounded, w3]  # the last layer's products may be in float32
-        normed = norm.of_input(x) if norm.layers else []
-        x = normed[0] if normed else x
-        hidden: list[Tensor] = []
+        kept: list[Tensor] = []
+        if norm.layers:
+            read = norm(0, 0, x)
+            x, kept = read.out, [read.normed, read.scale]
         out = torch.empty(w1.shape[0], len(x), w3.shape[2])
         for net in range(w1.shape[0]):
             layer = x
             for depth, biases in ((0, b1), (1, b2)):
+                layer = _layer(layer, low[depth][net], biases[net])
+                kept.append(layer)
                 if norm.layers:
-                    layer, more = norm.relu(depth + 1, net, torch.mm(layer, low[depth][net]), biases[net])
-                    normed += more
-                else:
-                    layer = _layer(layer, low[depth][net], biases[net])
-                hidden.append(layer)
+                    read = norm(depth + 1, net, layer)
+                    layer = read.out
+                    kept += read
             _last_layer(layer, low[2][net], b3[net], out[net])
         share = torch.zeros(len(x)) if norm.share is None else norm.share
-        ctx.save_for_backward(x, share, *low, *hidden, *normed)
-        ctx.split, ctx.hidden = features.shape[1], len(hidden)
+        ctx.save_for_backward(x, share, *low, *kept)
+        ctx.split, ctx.normed = features.shape[1], bool(norm.layers)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         x, share, w1, w2, w3, *kept = ctx.saved_tensors
-        hidden, normed = kept[: ctx.hidden], kept[ctx.hidden :]
+        input_norm, kept = (kept[:2], kept[2:]) if ctx.normed else ([], kept)
         weight_grads = [torch.empty_like(w, dtype=torch.float32) for w in (w1, w2, w3)]
         biases = [torch.zeros(w.shape[0], w.shape[2]) for w in (w1, w2, w3)]
+        affine = [torch.empty(w.shape[0], w.shape[2]) for w in (w1, w1, w2, w2)] if ctx.normed else []
         wants_features, wants_action, _, _, wants_weights, *_ = ctx.needs_input_grad
         # of the inputs only those asked for: where the policy climbs Q, that is the action alone
         columns = slice(0 if wants_features else ctx.split, x.shape[1] if wants_action else ctx.split)
-        dx = torch.zeros_like(x[:, columns])
-        for net, (first, second) in enumerate(zip(hidden[::2], hidden[1::2], strict=True)):
-            of_first, of_second = (normed[k : k + 2] for k in (4 * net + 2, 4 * net + 4))
-            d2 = _last_layer_back(grad[net], second, w3[net], weight_grads[2][net], biases[2][net], biases[1][net])
-            _normalize_back(d2, of_second, share)
+        dx, size = torch.zeros_like(x[:, columns]), len(kept) // w1.shape[0]
+        for net in range(w1.shape[0]):
+            layers = kept[size * net : size * (net + 1)]
+            (first, *normed1), (second, *normed2) = layers[: size // 2], layers[size // 2 :]
+            if ctx.normed:
+                d2 = _normed_last_layer_back(grad[net], normed2[0], w3[net], weight_grads[2][net], biases[2][net])
+                _normalize_back(d2, normed2[1:], share, [part[net] for part in affine[2:]])
+                kernels.relu_back(_bits(d2), _bits(second), biases[1][net].numpy())
+            else:
+                d2 = _last_layer_back(grad[net], second, w3[net], weight_grads[2][net], biases[2][net], biases[1][net])
             d1 = torch.mm(d2, w2[net].t())
+            if ctx.normed:
+                _normalize_back(d1, normed1[1:], share, [part[net] for part in affine[:2]])
             kernels.relu_back(_bits(d1), _bits(first), biases[0][net].numpy())
-            _normalize_back(d1, of_first, share)
             if dx.shape[1]:
                 dx.addmm_(d1, w1[net][columns].t())
             if wants_weights:
-                _product(first, d2, weight_grads[1][net])
+                _product(normed1[0] if ctx.normed else first, d2, weight_grads[1][net])
                 _product(x, d1, weight_grads[0][net])
-        _normalize_back(dx, [part[..., columns].contiguous() for part in normed[:2]], share)
+        if ctx.normed and dx.shape[1]:
+            _normalize_back(dx, [part[..., columns].contiguous() for part in input_norm], share)
         of_features = dx[:, : ctx.split] if wants_features else None
         of_action = dx[:, ctx.split - x.shape[1] :] if wants_action else None
-        of_weights = [part for pair in zip(weight_grads, biases, strict=True) for part in pair]
-        return of_features, of_action, None, None, *(of_weights if wants_weights else [None] * 6)
+        of_weights = [part for pair in zip(weight_grads, biases, strict=True) for part in pair] + affine
+        return of_features, of_action, None, None, *(of_weights if wants_weights else [None] * len(of_weights))
 
 
-def _normalize_back(grad: Tensor, normed: list[Tensor], share: Tensor) -> None:
-    """grad <- that of what was ``normed`` (it, and the scale), where something was."""
-    if normed and grad.shape[1]:
-        kernels.normalize_back(_bits(grad), _bits(normed[0]), normed[1].numpy(), share.numpy())
+def _normalize_back(grad: Tensor, normed: list[Tensor], share: Tensor, affine: list[Tensor] | None = None) -> None:
+    """grad <- that of what was normalised into ``normed`` (and the scale); into the gain's and offset's own."""
+    x, scale = normed
+    of_gain, of_offset = affine or [torch.empty_like(scale) for _ in range(2)]
+    kernels.normalize_back(_bits(grad), _bits(x), scale.numpy(), share.numpy(), of_gain.numpy(), of_offset.numpy())
+
+
+def _normed_last_layer_back(grad: Tensor, x: Tensor, w: Tensor, dw: Tensor, db: Tensor) -> Tensor:
+    """The gradient of x, (N, in) in bfloat16; fills those of w (in, 1) and b (1,)."""
+    torch.sum(grad, 0, out=db)
+    torch.mm(x.float().t(), grad, out=dw)
+    return torch.mm(grad, w.t()).to(BF16)
 
 
 def _layer(x: Tensor, w: Tensor, b: Tensor) -> Tensor:

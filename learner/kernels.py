@@ -225,28 +225,32 @@ def normalize(x: Bits, mean: Floats, scale: Floats, out: Bits) -> None:
 
 
 @_compiled
-def normalize_relu(x: Bits, mean: Floats, scale: Floats, bias: Floats, normed: Bits, out: Bits) -> None:
-    """normed <- (x - mean) scale, and out <- ReLU of it and the bias; (N, K), (K,) thrice, (N, K), (N, K)."""
+def normalize_scaled(
+    x: Bits, mean: Floats, scale: Floats, gain: Floats, offset: Floats, normed: Bits, out: Bits
+) -> None:  # fmt: skip
+    """normed <- (x - mean) scale, and out <- normed gain + offset; (N, K), (K,) four times, (N, K), (N, K)."""
     for i in range(x.shape[0]):
         for j in range(x.shape[1]):
             y = (_up(x[i, j]) - mean[j]) * scale[j]
             normed[i, j] = _down(y)
-            out[i, j] = _down(np.float32(0.0) if y + bias[j] < np.float32(0.0) else y + bias[j])
+            out[i, j] = _down(y * gain[j] + offset[j])
 
 
 @_compiled
-def normalize_back(grad: Bits, normed: Bits, scale: Floats, share: Floats) -> None:
-    """grad <- the gradient of what ``normalize`` read; (N, K), (N, K) what it gave, (K,), (N,).
+def normalize_back(grad: Bits, normed: Bits, scale: Floats, share: Floats, dgain: Floats, doffset: Floats) -> None:
+    """grad <- the gradient of what was normalised; (N, K), (N, K) what it became, (K,), (N,), and into (K,), (K,).
 
-    ``share`` is that of the statistics, through which a gradient comes, too: none where they are given, all shares 0.
+    ``scale`` has the gain in it. ``share`` is that of the statistics, through which a gradient comes, too: none where
+    they are given, all shares 0.
     """
-    total, along = np.zeros(scale.size, np.float32), np.zeros(scale.size, np.float32)
+    dgain[:] = np.float32(0.0)
+    doffset[:] = np.float32(0.0)
     for i in range(grad.shape[0]):
         for j in range(grad.shape[1]):
-            total[j] += _up(grad[i, j])
+            doffset[j] += _up(grad[i, j])
         for j in range(grad.shape[1]):
-            along[j] += _up(grad[i, j]) * _up(normed[i, j])
+            dgain[j] += _up(grad[i, j]) * _up(normed[i, j])
     for i in range(grad.shape[0]):
         for j in range(grad.shape[1]):
-            through = share[i] * (total[j] + _up(normed[i, j]) * along[j])
+            through = share[i] * (doffset[j] + _up(normed[i, j]) * dgain[j])
             grad[i, j] = _down(scale[j] * (_up(grad[i, j]) - through))

@@ -12,7 +12,7 @@ from docs import fault_table
 from docs.generate import page
 from rmc.cli import main
 from rmc.cli.parser import COMMANDS
-from rmc.common import agent
+from rmc.common import agent, critic
 from rmc.common.env import missing
 from rmc.learner import diagnostics, losses, update, update_order
 
@@ -43,8 +43,8 @@ def test_the_faults_that_were_run_are_in_their_page() -> None:
 def test_every_equation_leads_to_its_code_and_back() -> None:
     """What the docs' table names is there, and its docstring names the equation."""
     modules = {
-        "losses": losses, "agent": agent, "update": update, "update_order": update_order, "missing": missing,
-        "diagnostics": diagnostics,
+        "losses": losses, "agent": agent, "critic": critic, "update": update, "update_order": update_order,
+        "missing": missing, "diagnostics": diagnostics,
     }  # fmt: skip
     table = (ROOT / "docs" / "algorithm.md").read_text().split("## From the paper to the code")[1].split("\n\n")[1]
     seen = set()

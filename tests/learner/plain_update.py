@@ -267,18 +267,19 @@ def twin_q(critic: torch.nn.Module, z: Tensor, a: Tensor, frozen: bool = False) 
         for depth, layer in enumerate(critic.layers):
             weight, bias = layer.weight[j], layer.bias[j, 0]
             weight, bias = (weight.detach(), bias.detach()) if frozen else (weight, bias)
-            x = running_normed(critic, 0, 0, x) if depth == 0 else x
-            x = running_normed(critic, depth + 1, j, x @ weight) + bias if depth < 2 else x @ weight + bias
+            x = running_normed(critic, depth, j if depth else 0, x, frozen) @ weight + bias
             x = F.relu(x) if depth < 2 else x
         values.append(x[0])
     return torch.stack(values)
 
 
-def running_normed(critic: torch.nn.Module, depth: int, net: int, x: Tensor) -> Tensor:
+def running_normed(critic: torch.nn.Module, depth: int, net: int, x: Tensor, frozen: bool) -> Tensor:
     if not critic.norms:
         return x
     norm = critic.norms[depth]
-    return (x - norm.mean[net, 0]) / (norm.variance[net, 0] + 1e-3).sqrt()
+    x = (x - norm.mean[net, 0]) / (norm.variance[net, 0] + 1e-3).sqrt()
+    gain, offset = gain_and_offset(norm, net)
+    return x * gain.detach() + offset.detach() if frozen else x * gain + offset
 
 
 def jointly_normed_q(critic: torch.nn.Module, inputs: Tensor) -> Tensor:
@@ -288,7 +289,7 @@ def jointly_normed_q(critic: torch.nn.Module, inputs: Tensor) -> Tensor:
     for j in (0, 1):
         x = read
         for norm, layer in zip(critic.norms[1:], critic.layers[:-1], strict=True):
-            x = F.relu(normed_by_rows(norm, j, x @ layer.weight[j]) + layer.bias[j, 0])
+            x = normed_by_rows(norm, j, F.relu(x @ layer.weight[j] + layer.bias[j, 0]))
         values.append(x @ critic.layers[-1].weight[j, :, 0] + critic.layers[-1].bias[j, 0])
     return torch.stack(values, 1)
 
@@ -297,4 +298,11 @@ def normed_by_rows(norm: torch.nn.Module, net: int, x: Tensor) -> Tensor:
     mean, variance = x.mean(0), x.var(0, correction=0)
     for running, new in ((norm.mean, mean), (norm.variance, variance)):
         running[net, 0] = 0.99 * running[net, 0] + 0.01 * new.detach()
-    return (x - mean) / (variance + 1e-3).sqrt()
+    gain, offset = gain_and_offset(norm, net)
+    return (x - mean) / (variance + 1e-3).sqrt() * gain + offset
+
+
+def gain_and_offset(norm: torch.nn.Module, net: int) -> tuple[Tensor, Tensor]:
+    if norm.gain is None:
+        return torch.ones(()), torch.zeros(())
+    return norm.gain[net, 0], norm.offset[net, 0]

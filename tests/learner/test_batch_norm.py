@@ -33,6 +33,9 @@ def agent() -> Agent:
     made = Agent(3, A, CONFIG)
     features, action, mask, _ = inputs()
     with torch.no_grad():
+        for norm in made.critic.norms[1:]:
+            norm.gain.uniform_(0.5, 1.5)
+            norm.offset.uniform_(-0.5, 0.5)
         for _ in range(200):
             made.critic(3.0 * features + 1.0, action, mask)
     return made
@@ -56,7 +59,10 @@ def distance(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> dict[str
 
 def test_where_all_rows_are_real_it_is_torchs_batch_norm() -> None:
     x = torch.randn(1, 30, 4).mul(3.0).add(1.0).requires_grad_()
-    ours, theirs = BatchNorm(1, 4), torch.nn.BatchNorm1d(4, eps=VARIANCE_FLOOR, momentum=0.01, affine=False)
+    ours, theirs = (
+        BatchNorm(1, 4, affine=False),
+        torch.nn.BatchNorm1d(4, eps=VARIANCE_FLOOR, momentum=0.01, affine=False),
+    )
     expected, actual = theirs(x[0]), ours(x, torch.full((30,), 1 / 30))
     torch.testing.assert_close(actual[0], expected)
     for out in (expected, actual[0]):
@@ -87,11 +93,12 @@ def test_what_is_not_real_counts_for_nothing(low: bool) -> None:
 
 def test_running_statistics_move_with_the_critics_own_pass_alone() -> None:
     made, (features, action, mask, _) = agent(), inputs()
-    before = copy.deepcopy(made.critic.norms.state_dict())
+    running = dict(made.critic.norms.named_buffers())
+    before = copy.deepcopy(running)
     made.critic(features, action)
-    assert all(torch.equal(value, before[name]) for name, value in made.critic.norms.state_dict().items())
+    assert all(torch.equal(value, before[name]) for name, value in running.items())
     made.critic(features, action, mask)
-    assert not any(torch.equal(value, before[name]) for name, value in made.critic.norms.state_dict().items())
+    assert not any(torch.equal(value, before[name]) for name, value in running.items())
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["these steps'", "running"])
