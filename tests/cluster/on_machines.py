@@ -29,6 +29,7 @@ ANEW_SECONDS = 60.0  # after a node that was given up is back: every role on it 
 SHOWN = os.environ.get("RMC_CLUSTER_RESULTS")  # a file for the figures
 RMC = f"cd {PROJECT} && {PYTHON}/python -P -m rmc.cli.main"
 RAY = "RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0"
+WORKER = f"{PROJECT}/deploy/cluster/worker.sh {PYTHON}/ray"  # keeps Ray there
 ON_A_WORKER = 3  # actors, where the learner is not
 # As Ray is told: the learner's group takes two of one worker's.
 CPUS = {"head": 0, "alpha": ON_A_WORKER, "beta": ON_A_WORKER}
@@ -65,7 +66,9 @@ class Site:
         config["file_mounts"].pop("~/rmc")
         config["setup_commands"] = ["chmod 600 ~/.ray/auth_token"]
         for name in ("head_start_ray_commands", "worker_start_ray_commands"):
-            commands = [command.replace("~/rmc-env/bin", str(PYTHON)) for command in config[name]]
+            commands = [
+                command.replace("~/rmc-env/bin", str(PYTHON)).replace("~/rmc", str(PROJECT)) for command in config[name]
+            ]
             cpus = CPUS["head" if name.startswith("head") else "alpha"]
             config[name] = [*commands[:-1], f"{commands[-1]} --num-cpus={cpus} --object-store-memory=100000000"]
         return config
@@ -75,8 +78,7 @@ class Site:
         token = self.head.run("cat ~/.ray/auth_token").stdout.strip()
         machine.run(f"umask 077; mkdir -p ~/.ray; echo {token} > ~/.ray/auth_token")
         machine.run(
-            f"{RAY} {PYTHON}/ray start --address={self.head.ip}:6379 --node-ip-address={machine.ip} "
-            f"--num-cpus={CPUS.get(machine.name, 1)} "
+            f"{RAY} {WORKER} start --address={self.head.ip}:6379 --node-ip-address={machine.ip} --num-cpus=1 "
             "--object-store-memory=100000000"
         )
 
@@ -266,8 +268,6 @@ def test_a_killed_raylet_costs_no_acknowledged_window(endless: Run) -> None:
     before, epochs = endless.newest("replay", "env_steps"), endless.epochs()
     worker.kill("raylet/raylet")
     ended = endless.wait_for(lambda: not worker.processes("rmc.cli.main role actor"))
-    endless.wait_for_updates(20)
-    site.join(worker)
     back = endless.wait_for(lambda: len(worker.processes("rmc.cli.main role actor")) >= ON_A_WORKER)
     endless.wait_for(lambda: endless.newest("replay", "env_steps") > before + 500)
     endless.check_counters()
@@ -329,7 +329,7 @@ def test_the_learners_node_is_lost(endless: Run) -> None:
     site, lost = endless.site, where(endless, "learner")
     steps, updates = endless.newest("replay", "env_steps"), endless.newest("learner", "updates")
     checkpoint = int(site.head.run(f"ls {endless.folder}/checkpoints | grep -E '^[0-9]+$' | tail -n 1").stdout)
-    lost.kill("raylet/raylet")
+    lost.run(f"{RAY} {WORKER} stop --force")
     away = endless.wait_for(lambda: not lost.processes("rmc.cli.main role learner"))
     back = endless.wait_for(
         lambda: any(m.processes("rmc.cli.main role learner") for m in site.machines.machines if m is not lost),
