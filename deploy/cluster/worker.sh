@@ -5,7 +5,7 @@
 #   worker.sh RAY start --address=HEAD:PORT OPTIONS...   start and keep it; changes nothing where it is kept so already
 #   worker.sh RAY stop --force                           keep it no longer, and stop it
 #
-# It is also kept no longer once the head has not answered for an hour.
+# It is also kept no longer once it could not be started for an hour.
 set -u
 PATIENCE_SECONDS=3600
 STATE=~/.ray/rmc-worker # what keeps Ray locks it; in it are its process and its words
@@ -18,16 +18,15 @@ head_answers() {
 }
 
 keep() { # HEAD:PORT OPTIONS...
-  local raylet away_since head=$1
-  while true; do
-    raylet=$(pgrep -n -f "raylet .*=$head")
-    while kill -0 "$raylet"; do sleep 1; done
-    "$ray" stop --force # what else is left of it
-    away_since=$SECONDS
-    until head_answers "$head"; do
-      ((SECONDS - away_since < PATIENCE_SECONDS)) || exit
-      sleep 0.5
+  local raylet head=$1 ran_at=$SECONDS
+  while ((SECONDS - ran_at < PATIENCE_SECONDS)); do
+    raylet=$(pgrep -n -f "^[^ ]*/raylet .*--gcs-address=$head( |$)")
+    while kill -0 "$raylet"; do
+      ran_at=$SECONDS
+      sleep 1
     done
+    "$ray" stop --force # what else is left of it
+    until head_answers "$head" || ((SECONDS - ran_at >= PATIENCE_SECONDS)); do sleep 0.5; done
     "$ray" start "${@:2}"
   done
 }
@@ -41,7 +40,7 @@ exec 9>> "$STATE"
 if ! flock -n 9; then
   [ "$action" = start ] && [ "$(tail -n +2 "$STATE")" = "$ray $*" ] && exit
   kill -- "-$(head -n 1 "$STATE")"
-  flock -w 10 9
+  flock -w 10 9 || exit
 fi
 "$ray" stop --force 9>&-
 [ "$action" = start ] || exit 0

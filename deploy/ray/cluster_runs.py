@@ -23,8 +23,8 @@ def summaries() -> dict[str, RunSummary | None]:
 def stop(run: str) -> RunSummary:
     """End a run in order, and wait until it has; how far it was. Raises ConfigError."""
     name = _full_name(run)
-    summary = _asked(_launchers()[name].summary, AWAY_SECONDS)
-    seconds = _asked(_launchers()[name].end, AWAY_SECONDS)
+    summary: RunSummary | None = _asked(_launchers()[name].summary, AWAY_SECONDS)
+    seconds: float | None = _asked(_launchers()[name].end, AWAY_SECONDS)
     if summary is None or seconds is None:
         raise ConfigError("RUN", run, f"its launcher does not answer for {AWAY_SECONDS:.0f} s; try again")
     deadline = time.monotonic() + seconds
@@ -54,7 +54,7 @@ def _full_name(run: str) -> str:
     if len(meant) == 1:
         return meant[0]
     there = ", ".join(sorted(meant or names)) or "none"
-    problem = "is the name of several; give one of" if meant else "is not trained on this cluster; its runs:"
+    problem = "is the name of several; give one of:" if meant else "is not trained on this cluster; its runs:"
     raise ConfigError("RUN", run, f"{problem} {there}")
 
 

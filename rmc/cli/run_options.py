@@ -130,7 +130,7 @@ class List:
     folder: Positional[Path] = Path("runs")
     """Where to look."""
     ray_address: str | None = None
-    """Look at a Ray cluster in its place, from any of its nodes: auto finds the one that this machine is in."""
+    """Instead, the runs of a Ray cluster, asked from any of its nodes: auto finds the one that this machine is in."""
     json: bool = False
     """Print one line of JSON."""
 
@@ -182,7 +182,7 @@ class Stop:
     run: Positional[Path]
     """The run's folder; with --ray-address its name, as rmc list shows it."""
     ray_address: str | None = None
-    """Stop a run of a Ray cluster, from any of its nodes: auto finds the one that this machine is in."""
+    """End a run of a Ray cluster, from any of its nodes: auto finds the one that this machine is in."""
 
 
 @dataclass(frozen=True)

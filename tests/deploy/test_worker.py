@@ -21,13 +21,12 @@ SCRIPT = Path(deploy.__file__).parent / "cluster" / "worker.sh"
 RAY = """#!/bin/bash
 echo "$*" >> {folder}/calls
 if [ $1 = start ]; then
-  setsid {folder}/raylet 600 --gcs-address=$HEAD < /dev/null > /dev/null 2>&1 &
+  setsid bash -c 'exec -a {folder}/raylet bash -c "read < {folder}/never" raylet --gcs-address=$HEAD' &> /dev/null &
 else
-  pkill -9 -f "{folder}/raylet "
+  pkill -9 -f "^{folder}/raylet "
 fi
 exit ${{STATUS:-0}}
 """
-RAYLET = "#!/bin/bash\nwhile sleep 0.1; do :; done\n"
 
 
 class Worker:
@@ -35,9 +34,9 @@ class Worker:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        for name, text in (("ray", RAY.format(folder=folder)), ("raylet", RAYLET)):
-            (folder / name).write_text(text)
-            (folder / name).chmod(0o755)
+        (folder / "ray").write_text(RAY.format(folder=folder))
+        (folder / "ray").chmod(0o755)
+        os.mkfifo(folder / "never")
         self.head = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self.head.getsockname()[1]}"
 
@@ -53,7 +52,7 @@ class Worker:
         found = []
         for process in psutil.process_iter(["cmdline"]):
             words = " ".join(process.info["cmdline"] or [])
-            if name in words and str(self.folder) in words and "bash" in words:
+            if name in words and str(self.folder) in words:
                 found.append(process.pid)
         return found
 
@@ -79,7 +78,7 @@ def worker(tmp_path: Path) -> Iterator[Worker]:
 
 def test_it_is_started_again_once_the_head_answers(worker: Worker) -> None:
     assert worker.start() == 0
-    (raylet,) = worker.processes("raylet")
+    (raylet,) = worker.processes("--gcs-address")
     worker.head.close()
     os.kill(raylet, signal.SIGKILL)
     wait_for(lambda: worker.calls("stop") == 2)  # once before the start
@@ -87,17 +86,17 @@ def test_it_is_started_again_once_the_head_answers(worker: Worker) -> None:
     assert worker.calls("start") == 1
     worker.head = socket.create_server(("127.0.0.1", int(worker.address.rpartition(":")[2])))
     wait_for(lambda: worker.calls("start") == 2)
-    wait_for(lambda: len(worker.processes("raylet")) == 1)
+    wait_for(lambda: len(worker.processes("--gcs-address")) == 1)
 
 
 def test_what_is_kept_is_left_alone_but_with_other_options(worker: Worker) -> None:
     worker.start("--num-cpus=1")
-    raylets = worker.processes("raylet")
+    raylets = worker.processes("--gcs-address")
     worker.start("--num-cpus=1")
-    assert worker.processes("raylet") == raylets
+    assert worker.processes("--gcs-address") == raylets
     worker.start("--num-cpus=2")
-    assert len(worker.processes("raylet")) == 1
-    assert worker.processes("raylet") != raylets
+    assert len(worker.processes("--gcs-address")) == 1
+    assert worker.processes("--gcs-address") != raylets
     assert len(worker.processes("worker.sh")) == 1
 
 
