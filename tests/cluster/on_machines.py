@@ -169,8 +169,8 @@ class Run:
         assert steps == sorted(steps)
         assert self.newest("replay", "entry_gaps") == self.newest("replay", "dead_letters") == 0
 
-    def stop(self) -> str:
-        output = self.site.head.run(f"{RMC} stop {self.folder}").stdout
+    def stop(self, words: str = "", machine: Machine | None = None) -> str:
+        output = (machine or self.site.head).run(f"{RMC} stop {words or self.folder}").stdout
         self.process.wait(60)
         assert self.process.stdout is not None
         self.process.stdout.close()
@@ -282,7 +282,7 @@ def test_a_cut_network_heals(endless: Run, seconds: int) -> None:
     worker.cut()
     time.sleep(seconds)
     worker.heal()
-    given_up = seconds >= 90  # by Ray, whose autoscaler starts it again there
+    given_up = seconds >= 90  # by Ray, which worker.sh starts again there
     healed = time.monotonic()
     if given_up:  # those there find out, and end
         endless.wait_for(lambda: not worker.processes("rmc.cli.main role actor"))
@@ -344,9 +344,14 @@ def test_the_learners_node_is_lost(endless: Run) -> None:
     note(test="learner's node lost", away_s=away, back_s=back, updates_before=updates, checkpoint=checkpoint)
 
 
-def test_the_run_ends_and_nothing_is_left(endless: Run) -> None:
+def test_the_run_is_stopped_from_a_worker_and_nothing_is_left(endless: Run) -> None:
     site = endless.site
-    endless.stop()
+    worker = next(machine for machine in (site.alpha, site.beta) if machine.processes("raylet/raylet"))
+    (listed,) = json.loads(worker.run(f"{RMC} list --ray-address auto --json").stdout)
+    assert (listed["folder"], listed["learner"]) == (endless.folder, where(endless, "learner").ip)
+    assert f"its folder is {endless.folder} on head" in endless.stop("endless --ray-address auto", worker)
+    newest = site.head.run(f"cat $(ls -d {endless.folder}/checkpoints/[0-9]* | tail -n 1)/progress.json").stdout
+    assert json.loads(newest)["env_steps"] >= listed["env_steps"]  # saved in the end
     for machine in site.machines.machines:
         assert not machine.processes("rmc.cli.main"), machine.name
     began = time.monotonic()

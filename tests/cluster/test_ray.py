@@ -126,10 +126,12 @@ def test_more_than_the_cluster_holds_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def nodes() -> Iterator[Cluster]:
-    """A head with room for all but the actors, and two nodes with room for one each."""
+def nodes(request: pytest.FixtureRequest) -> Iterator[Cluster]:
+    """A head with room for all but the actors, unless the test says other CPUs."""
     os.environ["RAY_AUTH_MODE"] = "disabled"  # cluster_utils makes no token
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False})
+    cluster = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": getattr(request, "param", 2), "include_dashboard": False}
+    )
     try:
         yield cluster
     finally:
@@ -203,6 +205,7 @@ def rmc(*words: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.long
 @pytest.mark.timeout(400)
+@pytest.mark.parametrize("nodes", [0], indirect=True)
 def test_freed_cpus_go_to_the_learner_that_lost_its_node(nodes: Cluster, tmp_path: Path) -> None:
     """Though another run's actors wait for them. Both runs are listed and stopped by their names."""
     for host in (2, 3):
@@ -237,9 +240,12 @@ def test_freed_cpus_go_to_the_learner_that_lost_its_node(nodes: Cluster, tmp_pat
 def _check_list_and_stop(address: str, one: Training, other: Training) -> None:
     names = [RunFolder(run.folder).name for run in (one, other)]
     listed = json.loads(rmc("list", "--ray-address", address, "--json").stdout)
-    assert {line["run"]: line["folder"] for line in listed} == dict(zip(names, map(str, (one.folder, other.folder))))
+    assert {line["run"]: line["folder"] for line in listed} == {
+        name: str(run.folder) for name, run in zip(names, (one, other), strict=True)
+    }
     first = next(line for line in listed if line["run"] == names[0])
-    assert (first["env"], first["total_steps"], first["learner"]) == ("InvertedPendulum-v5", 10_000_000, "127.0.0.3")
+    assert (first["env"], first["total_steps"]) == ("InvertedPendulum-v5", 10_000_000)
+    assert first["learner"] in ("127.0.0.2", "127.0.0.3")
     assert one.newest("replay", "env_steps") >= first["env_steps"] > 0
     assert "run" in rmc("list", "--ray-address", address).stdout
     for name, problem in (
