@@ -84,8 +84,8 @@ class LauncherActor(RoleActor):
         folder = RunFolder(self._folder)
         board, past_starts = recorded_status(folder, RECENT_BYTES), starts(folder)
         heard = set(board.roles) - set(board.silent())
-        at = self._claim.read_text().split()[0] if "learner" in heard else ""
-        address = next((node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] == at), None)
+        at = self._claim.read_text().split()[:1] if "learner" in heard else []
+        address = next((node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] in at), None)
         actors = sum(role.startswith("actor-") for role in heard)
         since = past_starts[-1].time if past_starts else None
         place = socket.gethostname(), str(folder.path)
