@@ -46,5 +46,6 @@ fi
 [ "$action" = start ] || exit 0
 "$ray" start "$@" 9>&- || exit
 head=$(grep -oP -m 1 -- '--address=\K\S+' <<< "$*")
+trap '' HUP # of the terminal that closes now
 setsid "$0" "$ray" keep "$head" "$@" < /dev/null &> "$STATE.log" &
 printf '%s\n' $! "$ray $*" > "$STATE"
