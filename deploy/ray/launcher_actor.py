@@ -1,7 +1,11 @@
 """``LauncherActor``: the Ray actor that runs a run's launcher on the head."""
 
+import os
+import signal
+import socket
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import ray
@@ -9,7 +13,31 @@ from ray.util.placement_group import remove_placement_group
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.local.supervisor import QUICK_DEATHS, QUICK_SECONDS
+from rmc.deploy.monitor import attach
+from rmc.deploy.monitor.recorded import recorded_status
 from rmc.deploy.ray.role_actor import NAMESPACE, RoleActor, Task, actor_name
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.starts import starts
+
+RECENT_BYTES = 1 << 18  # of a run's metrics
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """A run that is trained on a cluster, as ``rmc list`` shows it."""
+
+    env: str
+    env_steps: int
+    total_steps: int
+    learner: str | None
+    """The address of its node; None where it has none."""
+    actors: int
+    """That play now."""
+    since: float | None
+    """When it was started last, in seconds since the epoch."""
+    host: str
+    """The head's name, where ``folder`` is."""
+    folder: str
 
 
 class LauncherActor(RoleActor):
@@ -50,6 +78,25 @@ class LauncherActor(RoleActor):
             with suppress(ValueError):
                 remove_placement_group(ray.util.get_placement_group(name))
         ray.kill(own, no_restart=True)
+
+    def summary(self) -> RunSummary:
+        """How the run is. Raises ConfigError where its folder is damaged."""
+        folder = RunFolder(self._folder)
+        board, past_starts = recorded_status(folder, RECENT_BYTES), starts(folder)
+        heard = set(board.roles) - set(board.silent())
+        at = self._claim.read_text().split()[:1] if "learner" in heard else []
+        address = next((node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] in at), None)
+        actors = sum(role.startswith("actor-") for role in heard)
+        since = past_starts[-1].time if past_starts else None
+        place = socket.gethostname(), str(folder.path)
+        return RunSummary(board.env, board.env_steps, board.total_steps, address, actors, since, *place)
+
+    def end(self) -> float:
+        """Ask the run's launcher to end it in order; the seconds that this may take."""
+        if self._role.pid is not None:
+            with suppress(ProcessLookupError):  # it has just ended
+                os.kill(self._role.pid, signal.SIGTERM)
+        return attach.STOP_SECONDS + self._checkpoints.patience(0.0)
 
     def claim(self, incarnation: str, node: str) -> bool:
         """Be the host of the learner: no other's checkpoints are taken from now on. Whether the last was there, too."""

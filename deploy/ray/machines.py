@@ -21,8 +21,8 @@ TOKEN = Path("~/.ray/auth_token")
 COUNT = (
     "import ray; ray.init(address='auto', logging_level='ERROR'); print('alive', sum(n['Alive'] for n in ray.nodes()))"
 )
-# how many processes of Ray are on a machine, once they have had 10 s to end
-_RAYS = "[r]aylet/raylet|[g]cs_server|[r]ay::|/[r]ay/(dashboard|autoscaler|_private)/"
+# how many processes of Ray, or that keep it, are on a machine, once they have had 10 s to end
+_RAYS = "[r]aylet/raylet|[g]cs_server|[r]ay::|/[r]ay/(dashboard|autoscaler|_private)/|[c]luster/worker.sh"
 LEFT = f"for i in $(seq 20); do n=$(pgrep -fc '{_RAYS}'); [ $n = 0 ] && break; sleep 0.5; done; echo $n"
 
 
@@ -122,9 +122,9 @@ def _alive(path: Path) -> int:
 
 
 def _stop_command(config: dict[str, Any]) -> str:
-    """As the file itself stops Ray before it starts it."""
-    commands = [line for line in config.get("worker_start_ray_commands", []) if "ray stop" in line]
-    return str(commands[0]) if commands else "ray stop --force"
+    """By the program that starts Ray on the workers."""
+    commands = [line for line in config.get("worker_start_ray_commands", []) if "ray start" in line]
+    return f"{commands[0].partition('ray start')[0] if commands else ''}ray stop --force"
 
 
 def _ssh(config: dict[str, Any], address: str, command: str) -> str:

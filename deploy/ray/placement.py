@@ -6,6 +6,7 @@ from math import ceil
 from typing import Any
 
 import ray
+from ray._private.state import available_resources_per_node
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.role_command import (
@@ -17,6 +18,7 @@ from rmc.deploy.local.role_command import (
 )
 from rmc.deploy.ray.learner_actor import LearnerActor
 from rmc.deploy.ray.role_actor import RoleActor
+from rmc.deploy.ray.role_handle import RoleHandle
 from rmc.deploy.run.config import RunConfig
 
 REPLAY_CPUS = EVALUATOR_CPUS = 0.5  # beside the learner
@@ -74,6 +76,22 @@ def actors_that_fit(config: RunConfig) -> int:
 def free_cpus() -> int:
     """CPUs that nothing on the cluster has taken."""
     return int(ray.available_resources().get("CPU", 0.0))
+
+
+def free_resources() -> list[tuple[dict[str, Any], dict[str, float]]]:
+    """Every node that is alive, with what nothing has taken of it."""
+    free = available_resources_per_node()
+    return [(node, free.get(node["NodeID"], {})) for node in ray.nodes() if node["Alive"]]
+
+
+def actors_in_the_way(
+    need: dict[str, float], node: dict[str, Any], free: dict[str, float], actors: list[RoleHandle]
+) -> list[RoleHandle] | None:
+    """The last of a node's ``actors``, as many as end for ``need`` to fit there; None where all are too few."""
+    there = [one for one in actors if one.running and one.node == node["NodeManagerAddress"]]
+    short = max(0, ceil(need["CPU"] - free.get("CPU", 0.0)))
+    fits = all(free.get(name, 0.0) >= amount for name, amount in need.items() if name != "CPU")
+    return there[len(there) - short :] if fits and short <= len(there) else None
 
 
 def whole_shares(actors: int, config: RunConfig) -> int:

@@ -12,12 +12,11 @@ import socket
 import time
 import zlib
 from contextlib import ExitStack, suppress
-from math import ceil
 from typing import Any
 
 try:
     import ray
-    from ray.util.placement_group import placement_group, placement_group_table, remove_placement_group
+    from ray.util.placement_group import placement_group, remove_placement_group
     from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 except ImportError as missing:
     from rmc.common.errors import ConfigError
@@ -37,10 +36,11 @@ from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.ray.placement import (
     SHARD_CPUS,
     RolePlacement,
+    actors_in_the_way,
     bundle,
     cpus,
     free_cpus,
-    holds,
+    free_resources,
     places,
     reserved_cpus,
     whole_shares,
@@ -48,6 +48,7 @@ from rmc.deploy.ray.placement import (
 from rmc.deploy.ray.ring_nodes import RingLocations
 from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name
 from rmc.deploy.ray.role_handle import RoleHandle
+from rmc.deploy.ray.waiting_learners import WaitingLearners, learner_group
 from rmc.deploy.redis.connect import PATIENCE_VARIABLE, connect
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.server import Port, RedisServer
@@ -58,6 +59,7 @@ from rmc.deploy.run.folder import RunFolder
 
 NODES_SECONDS = 2.0  # between looks for nodes that came
 HOMELESS_SECONDS = 8.0  # without a node for the learner, after which actors make room
+GIVE_WAY_SECONDS = 300.0  # without a node for another run's learner, after which actors are placed all the same
 LOST_SECONDS = 120.0  # within which a role's host may be lost for good twice
 STOP_SECONDS = 20.0  # for all roles to end in order and for the last checkpoint to reach the head
 PATIENCE_SECONDS = 120.0  # of a role that starts while launcher and Redis are being started again
@@ -93,7 +95,7 @@ class ClusterRun:
         self._bundles: dict[str, int] = {}  # of the replay servers' group
         self._lost: dict[str, list[float]] = {}  # when hosts died for good, by role
         self._look_at = 0.0
-        self._homeless_since: float | None = None
+        self._learners = WaitingLearners()
 
     def _users(self) -> RedisUsers:
         return RedisUsers(self._folder.name, self._folder.secret(), self.config.roles())
@@ -184,19 +186,24 @@ class ClusterRun:
             raise RoleDied(f"the host of {role_handle.name} could not be held:\n{role_handle.dead}")
 
     def _look_at_nodes(self) -> None:
-        if not self._at_home():
-            return
-        if self._all_cpus and not self.waiting():
-            self._grow()
-        self._place_all()
-        self._keep_low_actors()
+        waiting, own = self._learners.look(), learner_group(self._folder.name)
+        first = [seconds for name, seconds in waiting.items() if name == own or seconds < GIVE_WAY_SECONDS]
+        if not first:
+            self._place_all()
+            if self._all_cpus and not self.waiting():
+                self._grow()
+            self._keep_low_actors()
+        elif max(first) >= NODES_SECONDS:  # it has not only begun
+            self._end_waiting_actors()
+            if waiting.get(own, 0.0) >= HOMELESS_SECONDS:
+                self._learners.count_anew(own)
+                self._make_room()
 
     def _keep_low_actors(self) -> None:
         """Where CPUs are lost for good, it is the highest actors that wait: the run's last steps go to the lowest."""
         if cpus() >= reserved_cpus(self.config) + self.config.actors:  # they are only being started again
             return
-        actors = [self._hosts[name] for name in self._hosts if name.startswith("actor-")]
-        actors.sort(key=lambda role_handle: int(role_handle.name.removeprefix("actor-")))
+        actors = self._actors()
         waiting = [one for one in actors if not one.running and time.monotonic() > one.waits_since + HOMELESS_SECONDS]
         if waiting and actors[-1].running:
             log.warning("%s waits for a CPU; %s gives it its own", waiting[0].name, actors[-1].name)
@@ -206,42 +213,30 @@ class ClusterRun:
         ray.kill(role_handle.handle, no_restart=True)
         self._hosts.pop(role_handle.name)
 
-    def _at_home(self) -> bool:
-        """Whether the learner has a node; where it has none for long, actors make room for it."""
-        if placement_group_table(self._groups["learner"])["state"] == "CREATED":
-            self._homeless_since = None
-            return True
-        self._homeless_since = self._homeless_since or time.monotonic()
-        if time.monotonic() >= self._homeless_since + HOMELESS_SECONDS:
-            self._make_room()
-        return False
+    def _end_waiting_actors(self) -> None:
+        """They would take the CPUs that become free for a learner, of this run or another."""
+        waiting = [one for one in self._actors() if not one.running]
+        for one in waiting:
+            self._end_host(one)
+        if waiting:
+            log.warning("a learner has no node; ended until it has: %s", ", ".join(one.name for one in waiting))
 
     def _make_room(self) -> None:
-        """End the actors that wait for a CPU, which would take what becomes free, and enough on the largest node."""
-        self._homeless_since = time.monotonic()
-        need = bundle(self.config, self._device)
-        node = max(
-            (node for node in ray.nodes() if node["Alive"] and holds(node, need)),
-            key=lambda node: float(node["Resources"]["CPU"]),
-            default=None,
-        )
-        if node is None:
-            log.warning("no node is large enough for the learner, which needs %s", need)
-            return
+        """End as few running actors as let the learner fit on a node; none where all of them are too few."""
+        actors, need = self._actors(), bundle(self.config, self._device)
+        plans = [actors_in_the_way(need, node, free, actors) for node, free in free_resources()]
+        going = min((plan for plan in plans if plan is not None), key=len, default=None)
+        if going is None:
+            fix = "start a node, or stop another run"
+            log.warning("no node has room for the learner, even without actors of this run; it needs %s; %s", need, fix)
+        for one in going or []:
+            log.warning("no node has room for the learner; %s is ended for it", one.name)
+            self._end_host(one)
+
+    def _actors(self) -> list[RoleHandle]:
+        """Those with the lowest numbers first."""
         actors = [role_handle for name, role_handle in self._hosts.items() if name.startswith("actor-")]
-        there = [
-            role_handle
-            for role_handle in actors
-            if role_handle.running and role_handle.node == node["NodeManagerAddress"]
-        ]
-        used = sum(one.cpus for one in self._hosts.values() if one.running and one.node == node["NodeManagerAddress"])
-        short = need["CPU"] - (node["Resources"]["CPU"] - used)
-        going = [role_handle for role_handle in actors if not role_handle.running] + (
-            there[-ceil(short) :] if short > 0 else []
-        )
-        for role_handle in going:
-            self._end_host(role_handle)
-        log.warning("no node has room for the learner; ended for it: %s", ", ".join(one.name for one in going))
+        return sorted(actors, key=lambda role_handle: int(role_handle.name.removeprefix("actor-")))
 
     def _grow(self) -> None:
         """Give CPUs that came an actor each; the replay servers start again to know of them."""
@@ -260,6 +255,7 @@ class ClusterRun:
         for name, role_handle in self._hosts.items():
             if name.startswith("replay"):
                 role_handle.handle.restart.remote()
+        self._place_all()
 
     def restarts(self) -> dict[str, int]:
         """How often each role was started again."""

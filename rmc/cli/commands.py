@@ -48,7 +48,11 @@ def stats(command: run_options.Stats) -> int:
 
 
 def list_runs(command: run_options.List) -> int:
-    """Print a table of the runs in a folder."""
+    """Print a table of the runs in a folder, or on a Ray cluster."""
+    if command.ray_address is not None:
+        from rmc.cli import cluster_commands  # needs what only the extra "ray" installs
+
+        return cluster_commands.list_runs(command.ray_address, command.json)
     console, summaries = terminal(), run_list.runs(command.folder)
     if command.json:
         console.print(json.dumps([dataclasses.asdict(one) for one in summaries]), soft_wrap=True)
@@ -86,6 +90,10 @@ def attach(command: run_options.Attach) -> int:
 
 def stop(command: run_options.Stop) -> int:
     """End a run in order."""
+    if command.ray_address is not None:
+        from rmc.cli import cluster_commands  # needs what only the extra "ray" installs
+
+        return cluster_commands.stop(str(command.run), command.ray_address)
     folder = RunFolder(command.run)
     attachment.stop(folder)
     if folder.is_baseline():  # its own terminal says how

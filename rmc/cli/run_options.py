@@ -125,10 +125,12 @@ class Stats:
 
 @dataclass(frozen=True)
 class List:
-    """List the runs in a folder and below: state, steps, return."""
+    """List the runs in a folder and below: state, steps, return. Or those that are trained on a Ray cluster."""
 
     folder: Positional[Path] = Path("runs")
     """Where to look."""
+    ray_address: str | None = None
+    """Instead, the runs of a Ray cluster, asked from any of its nodes: auto finds the one that this machine is in."""
     json: bool = False
     """Print one line of JSON."""
 
@@ -178,7 +180,9 @@ class Stop:
     """End a run in order; rmc resume goes on with it."""
 
     run: Positional[Path]
-    """The run's folder."""
+    """The run's folder; with --ray-address its name, as rmc list shows it."""
+    ray_address: str | None = None
+    """End a run of a Ray cluster, from any of its nodes: auto finds the one that this machine is in."""
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ ANEW_SECONDS = 60.0  # after a node that was given up is back: every role on it 
 SHOWN = os.environ.get("RMC_CLUSTER_RESULTS")  # a file for the figures
 RMC = f"cd {PROJECT} && {PYTHON}/python -P -m rmc.cli.main"
 RAY = "RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0"
+WORKER = f"{PROJECT}/deploy/cluster/worker.sh {PYTHON}/ray"  # keeps Ray there
 ON_A_WORKER = 3  # actors, where the learner is not
 # As Ray is told: the learner's group takes two of one worker's.
 CPUS = {"head": 0, "alpha": ON_A_WORKER, "beta": ON_A_WORKER}
@@ -65,7 +66,9 @@ class Site:
         config["file_mounts"].pop("~/rmc")
         config["setup_commands"] = ["chmod 600 ~/.ray/auth_token"]
         for name in ("head_start_ray_commands", "worker_start_ray_commands"):
-            commands = [command.replace("~/rmc-env/bin", str(PYTHON)) for command in config[name]]
+            commands = [
+                command.replace("~/rmc-env/bin", str(PYTHON)).replace("~/rmc", str(PROJECT)) for command in config[name]
+            ]
             cpus = CPUS["head" if name.startswith("head") else "alpha"]
             config[name] = [*commands[:-1], f"{commands[-1]} --num-cpus={cpus} --object-store-memory=100000000"]
         return config
@@ -75,8 +78,7 @@ class Site:
         token = self.head.run("cat ~/.ray/auth_token").stdout.strip()
         machine.run(f"umask 077; mkdir -p ~/.ray; echo {token} > ~/.ray/auth_token")
         machine.run(
-            f"{RAY} {PYTHON}/ray start --address={self.head.ip}:6379 --node-ip-address={machine.ip} "
-            f"--num-cpus={CPUS.get(machine.name, 1)} "
+            f"{RAY} {WORKER} start --address={self.head.ip}:6379 --node-ip-address={machine.ip} --num-cpus=1 "
             "--object-store-memory=100000000"
         )
 
@@ -167,8 +169,8 @@ class Run:
         assert steps == sorted(steps)
         assert self.newest("replay", "entry_gaps") == self.newest("replay", "dead_letters") == 0
 
-    def stop(self) -> str:
-        output = self.site.head.run(f"{RMC} stop {self.folder}").stdout
+    def stop(self, words: str = "", machine: Machine | None = None) -> str:
+        output = (machine or self.site.head).run(f"{RMC} stop {words or self.folder}").stdout
         self.process.wait(60)
         assert self.process.stdout is not None
         self.process.stdout.close()
@@ -266,8 +268,6 @@ def test_a_killed_raylet_costs_no_acknowledged_window(endless: Run) -> None:
     before, epochs = endless.newest("replay", "env_steps"), endless.epochs()
     worker.kill("raylet/raylet")
     ended = endless.wait_for(lambda: not worker.processes("rmc.cli.main role actor"))
-    endless.wait_for_updates(20)
-    site.join(worker)
     back = endless.wait_for(lambda: len(worker.processes("rmc.cli.main role actor")) >= ON_A_WORKER)
     endless.wait_for(lambda: endless.newest("replay", "env_steps") > before + 500)
     endless.check_counters()
@@ -282,7 +282,7 @@ def test_a_cut_network_heals(endless: Run, seconds: int) -> None:
     worker.cut()
     time.sleep(seconds)
     worker.heal()
-    given_up = seconds >= 90  # by Ray, whose autoscaler starts it again there
+    given_up = seconds >= 90  # by Ray, which worker.sh starts again there
     healed = time.monotonic()
     if given_up:  # those there find out, and end
         endless.wait_for(lambda: not worker.processes("rmc.cli.main role actor"))
@@ -329,7 +329,7 @@ def test_the_learners_node_is_lost(endless: Run) -> None:
     site, lost = endless.site, where(endless, "learner")
     steps, updates = endless.newest("replay", "env_steps"), endless.newest("learner", "updates")
     checkpoint = int(site.head.run(f"ls {endless.folder}/checkpoints | grep -E '^[0-9]+$' | tail -n 1").stdout)
-    lost.kill("raylet/raylet")
+    lost.run(f"{RAY} {WORKER} stop --force")
     away = endless.wait_for(lambda: not lost.processes("rmc.cli.main role learner"))
     back = endless.wait_for(
         lambda: any(m.processes("rmc.cli.main role learner") for m in site.machines.machines if m is not lost),
@@ -344,9 +344,14 @@ def test_the_learners_node_is_lost(endless: Run) -> None:
     note(test="learner's node lost", away_s=away, back_s=back, updates_before=updates, checkpoint=checkpoint)
 
 
-def test_the_run_ends_and_nothing_is_left(endless: Run) -> None:
+def test_the_run_is_stopped_from_a_worker_and_nothing_is_left(endless: Run) -> None:
     site = endless.site
-    endless.stop()
+    worker = next(machine for machine in (site.alpha, site.beta) if machine.processes("raylet/raylet"))
+    (listed,) = json.loads(worker.run(f"{RMC} list --ray-address auto --json").stdout)
+    assert (listed["folder"], listed["learner"]) == (endless.folder, where(endless, "learner").ip)
+    assert f"its folder is {endless.folder} on head" in endless.stop("endless --ray-address auto", worker)
+    newest = site.head.run(f"cat $(ls -d {endless.folder}/checkpoints/[0-9]* | tail -n 1)/progress.json").stdout
+    assert json.loads(newest)["env_steps"] >= listed["env_steps"]  # saved in the end
     for machine in site.machines.machines:
         assert not machine.processes("rmc.cli.main"), machine.name
     began = time.monotonic()

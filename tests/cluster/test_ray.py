@@ -126,10 +126,12 @@ def test_more_than_the_cluster_holds_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def nodes() -> Iterator[Cluster]:
-    """A head with room for all but the actors, and two nodes with room for one each."""
+def nodes(request: pytest.FixtureRequest) -> Iterator[Cluster]:
+    """A head with room for all but the actors, unless the test says other CPUs."""
     os.environ["RAY_AUTH_MODE"] = "disabled"  # cluster_utils makes no token
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False})
+    cluster = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": getattr(request, "param", 2), "include_dashboard": False}
+    )
     try:
         yield cluster
     finally:
@@ -193,3 +195,73 @@ def test_a_killed_launcher_and_a_role_that_somebody_ended_come_back(nodes: Clust
         training.interrupt()
     assert training.process.returncode == 130
     assert ring(folder.path).exists()  # it may go on from there
+
+
+def rmc(*words: str) -> subprocess.CompletedProcess[str]:
+    """A command beside the runs."""
+    command = [sys.executable, "-m", "rmc.cli.main", *words]
+    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize("nodes", [0], indirect=True)
+def test_freed_cpus_go_to_the_learner_that_lost_its_node(nodes: Cluster, tmp_path: Path) -> None:
+    """Though another run's actors wait for them. Both runs are listed and stopped by their names."""
+    for host in (2, 3):
+        nodes.add_node(num_cpus=2, node_ip_address=f"127.0.0.{host}")
+    on_ray = ("--launcher", "ray", "--ray-address", nodes.address)
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+    with Training(tmp_path / "a" / "run", *ENDLESS, *on_ray, "--actors", "2") as one:
+        one.wait_for_updates(50)  # its learner has one node, its two actors have the other
+        nodes.add_node(num_cpus=3, node_ip_address="127.0.0.4")
+        with Training(tmp_path / "b" / "run", *ENDLESS, *on_ray, "--actors", "3") as other:
+            other.wait_for_updates(50)
+            assert other.newest("launcher", "not_running") == "actor-1 actor-2"
+
+            before = _learner_node(one)
+            lost = next(node for node in nodes.worker_nodes if node.node_id in before)
+            gone = time.time()
+            nodes.remove_node(lost, allow_graceful=False)
+            one.wait_for(lambda: _learner_node(one) not in ([], before))
+            one.wait_for(lambda: one.newest("learner", "time") > gone + 5.0)
+            one.wait_for_updates(50)
+            other.wait_for_updates(50)
+            logs = [(run.folder / "logs" / "launcher.log").read_text() for run in (one, other)]
+            assert "actor-0 is ended for it" in logs[0]
+            assert "a learner has no node; ended until it has: actor-1, actor-2" in logs[1]
+
+            _check_list_and_stop(nodes.address, one, other)
+            assert other.finish(60) == 130
+        assert one.finish(60) == 130
+
+
+def _learner_node(run: Training) -> list[str]:
+    """Ray's id of it; none while that is being written."""
+    return (run.folder / "learner-at").read_text().split()[:1]
+
+
+def _check_list_and_stop(address: str, one: Training, other: Training) -> None:
+    names = [RunFolder(run.folder).name for run in (one, other)]
+    listed = json.loads(rmc("list", "--ray-address", address, "--json").stdout)
+    assert {line["run"]: line["folder"] for line in listed} == {
+        name: str(run.folder) for name, run in zip(names, (one, other), strict=True)
+    }
+    first = next(line for line in listed if line["run"] == names[0])
+    assert (first["env"], first["total_steps"]) == ("InvertedPendulum-v5", 10_000_000)
+    assert first["learner"] in ("127.0.0.2", "127.0.0.3")
+    assert one.newest("replay", "env_steps") >= first["env_steps"] > 0
+    assert "run" in rmc("list", "--ray-address", address).stdout
+    for name, problem in (
+        ("none", "is not trained on this cluster; its runs: "),
+        ("run", "is the name of several; give one of: "),
+    ):
+        refused = rmc("stop", name, "--ray-address", address)
+        assert refused.returncode == 2
+        assert refused.stderr == f"rmc: RUN='{name}': {problem}{', '.join(sorted(names))}\n"
+    for run, name in ((one, names[0]), (other, "run")):  # of the second there is only one then
+        done = rmc("stop", name, "--ray-address", address)
+        assert done.returncode == 0, done.stderr
+        assert f"{name} has ended; its folder is {run.folder} on " in done.stdout
+        assert max(RunFolder(run.folder).checkpoints.glob("[0-9]*")).is_dir()

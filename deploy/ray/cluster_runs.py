@@ -1,0 +1,71 @@
+"""The runs that are trained on a cluster, listed and stopped from any of its nodes: their launchers are asked."""
+
+import time
+from contextlib import suppress
+from typing import Any
+
+import ray
+
+from rmc.common.errors import ConfigError
+from rmc.deploy.ray.launcher_actor import RunSummary
+from rmc.deploy.ray.role_actor import NAMESPACE
+
+ANSWER_SECONDS = 10.0  # of a launcher, which may be taking in a checkpoint
+AWAY_SECONDS = 30.0  # a launcher that was killed begins again within that
+LOOK_SECONDS = 0.5
+
+
+def summaries() -> dict[str, RunSummary | None]:
+    """Of every run by its name; None where its launcher does not answer."""
+    return {name: _asked(launcher.summary, ANSWER_SECONDS) for name, launcher in sorted(_launchers().items())}
+
+
+def stop(run: str) -> RunSummary:
+    """End a run in order, and wait until it has; how far it was. Raises ConfigError."""
+    name = _full_name(run)
+    summary: RunSummary | None = _asked(_launchers()[name].summary, AWAY_SECONDS)
+    seconds: float | None = _asked(_launchers()[name].end, AWAY_SECONDS)
+    if summary is None or seconds is None:
+        raise ConfigError("RUN", run, f"its launcher does not answer for {AWAY_SECONDS:.0f} s; try again")
+    deadline = time.monotonic() + seconds
+    while name in _launchers():
+        if time.monotonic() > deadline:
+            fix = f"did not end within {seconds:.0f} s; see {summary.folder}/logs on {summary.host}"
+            raise ConfigError("RUN", run, fix)
+        time.sleep(LOOK_SECONDS)
+    return summary
+
+
+def _launchers() -> dict[str, Any]:
+    """Of all runs, by the run's name."""
+    handles = {}
+    for actor in ray.util.list_named_actors(all_namespaces=True):
+        run, _, role = actor["name"].rpartition(":")
+        if actor["namespace"] == NAMESPACE and role == "launcher":
+            with suppress(ValueError):  # it has just ended
+                handles[run] = ray.get_actor(actor["name"], NAMESPACE)
+    return handles
+
+
+def _full_name(run: str) -> str:
+    """A run's name by itself, or by that of its folder where only one has such. Raises ConfigError."""
+    names = list(_launchers())
+    meant = [run] if run in names else [name for name in names if name.rpartition("-")[0] == run]
+    if len(meant) == 1:
+        return meant[0]
+    there = ", ".join(sorted(meant or names)) or "none"
+    problem = "is the name of several; give one of:" if meant else "is not trained on this cluster; its runs:"
+    raise ConfigError("RUN", run, f"{problem} {there}")
+
+
+def _asked(question: Any, seconds: float) -> Any:
+    """What a launcher answers to it; None where there is no answer."""
+    deadline = time.monotonic() + seconds
+    while (left := deadline - time.monotonic()) > 0:
+        try:
+            return ray.get(question.remote(), timeout=left)
+        except ray.exceptions.ActorDiedError:
+            return None
+        except ray.exceptions.RayError:  # it is being started again
+            time.sleep(LOOK_SECONDS)
+    return None

@@ -1,0 +1,48 @@
+"""``rmc list`` and ``rmc stop`` with ``--ray-address``: the runs that are trained on a Ray cluster."""
+
+import json
+import time
+from dataclasses import asdict
+
+from rich.table import Table
+
+from rmc.deploy.monitor.figures import duration, number
+from rmc.deploy.monitor.view import terminal
+from rmc.deploy.ray import cluster_runs, launcher
+from rmc.deploy.ray.launcher_actor import RunSummary
+
+
+def list_runs(address: str, as_json: bool) -> int:
+    """Print a table of the runs that are trained on a cluster."""
+    with launcher.joined(address):
+        summaries = cluster_runs.summaries()
+    if as_json:
+        lines = [{"run": name} | (asdict(one) if one else {}) for name, one in summaries.items()]
+        terminal().print(json.dumps(lines), soft_wrap=True)
+    else:
+        terminal().print(_table(summaries) if summaries else "no run is trained on this cluster")
+    return 0
+
+
+def stop(run: str, address: str) -> int:
+    """End a run of a cluster in order."""
+    with launcher.joined(address):
+        summary = cluster_runs.stop(run)
+    terminal().print(f"{run} has ended; its folder is {summary.folder} on {summary.host}", soft_wrap=True)
+    return 0
+
+
+def _table(summaries: dict[str, RunSummary | None]) -> Table:
+    drawn = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    for name in ("run", "env", "steps", "learner", "actors", "time", "folder"):
+        right = name in ("steps", "actors", "time")
+        drawn.add_column(name, justify="right" if right else "left", no_wrap=right, overflow="fold")
+    for name, one in summaries.items():
+        drawn.add_row(name, *(_cells(one) if one else ["its launcher does not answer"]))
+    return drawn
+
+
+def _cells(one: RunSummary) -> list[str]:
+    trained_s = None if one.since is None else time.time() - one.since
+    steps = number(one.env_steps, ",")
+    return [one.env, steps, one.learner or "none", str(one.actors), duration(trained_s), f"{one.host}:{one.folder}"]
