@@ -36,21 +36,13 @@ class Training:
         env: str = "InvertedPendulum-v5",
         preset: str = "debug",
         environment: Mapping[str, str] = MappingProxyType({}),
+        command: tuple[str, ...] = (),
     ) -> None:
+        """``command`` goes in the place of ``train`` and all of its options."""
         self.folder = folder
         self.output = folder.parent / f"{folder.name}.out"
-        words = [
-            sys.executable,
-            "-m",
-            "rmc.cli.main",
-            "train",
-            env,
-            "--preset",
-            preset,
-            "--run-dir",
-            str(folder),
-            *options,
-        ]
+        train = ("train", env, "--preset", preset, "--run-dir", str(folder), *options)
+        words = [sys.executable, "-m", "rmc.cli.main", *(command or train)]
         with self.output.open("ab") as output:
             self.process = subprocess.Popen(
                 words, stdout=output, stderr=output, stdin=subprocess.DEVNULL, env={**ENVIRONMENT, **environment},
