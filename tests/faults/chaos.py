@@ -60,7 +60,7 @@ class Chaos:
         self.looks: dict[str, Looks] = {role: [] for role in (LAUNCHER, *ROLES)}
         self.launchers: list[int] = []
         self.redis_proxy, self.replay_proxy = tcp_proxy(redis.socket), Interposed(self._replay_socket)
-        self._redis, self._disks, self._log = redis, disks, log.open("a")
+        self._redis, self._disks, self._log = redis, disks, log.open("w")
         self._undo: list[tuple[float, int, Callable[[], None]]] = []
         self._number, self._full = count(), set[str]()
         self._redis_at = self._launch_at = self._look_at = 0.0  # no sooner than then
