@@ -38,7 +38,7 @@ TICK_SECONDS, LOOK_SECONDS, SETTLED_SECONDS = 0.02, 5.0, 20.0  # SETTLED: a life
 PATIENCE, AGAIN_SECONDS = 600.0, 1.0  # for what must come; until who did not come up is started again
 WHOLE_BESIDE = 2  # whole checkpoints beside one that is damaged
 DAMAGED_ROWS, CUT_BYTES = 3, 200
-REFUSED = r"rmc: (--redis-url=|.*No space left)"  # a start amid such a fault: one line, and nothing has happened
+REFUSED = r"rmc: (--redis-url=|--capacity=.* make room|.*No space left)"  # a start amid a fault: nothing has happened
 WEATHERS = {
     "late": Weather(late=0.1),
     "hangs": Weather(late=5.0),  # longer than a call waits for Redis
@@ -80,10 +80,10 @@ class Chaos:
         self.witness.start(RedisBus(self._redis.url, run.name))
 
     def suffer(self, faults: Iterable[Fault], seconds: float) -> None:
-        """Each in its time, all over after so long."""
+        """Each in its time, or later where this machine has none left; all are over after so long."""
         began, rest = time.monotonic(), iter(faults)
         fault = next(rest, None)
-        while (now := time.monotonic() - began) < seconds:
+        while (now := time.monotonic() - began) < seconds or fault is not None:
             while fault is not None and fault.at <= now:
                 self.happen(fault, now)
                 fault = next(rest, None)
@@ -285,6 +285,7 @@ class Chaos:
             return "nobody there"
         self._killed, self._launch_at = True, time.monotonic() + fault.seconds
         self._command = ("resume", str(self.folder))
+        self._share_memory(fault.chance < 0.5)
         if self._redis.process.poll() is None:
             self._redis.kill()
         self._run.kill_all()

@@ -81,10 +81,16 @@ class Loaded(Training):
 
     def process_of(self, role: str) -> psutil.Process:
         """The process of a role, once it is there: see ``find``."""
-        found: list[psutil.Process | None] = []
-        self.wait_for(lambda: found.append(self.find(role)) or found[-1])
-        assert found[-1] is not None
-        return found[-1]
+        found: psutil.Process | None = None
+
+        def there() -> bool:
+            nonlocal found
+            found = self.find(role)
+            return found is not None
+
+        self.wait_for(there)
+        assert found is not None
+        return found
 
     def find(self, role: str) -> psutil.Process | None:
         """The process of ``actor-1``, ``learner``, ``replay``, ``redis``, the ``fork server`` or the ``launcher``."""

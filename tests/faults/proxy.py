@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-LOOK_SECONDS = 0.005
+LOOK_SECONDS = 0.01
 RESET = struct.pack("ii", 1, 0)  # SO_LINGER: TCP's reset in place of an orderly end
 MOST_BYTES, MOST_DESCRIPTORS = 65_536, 4
 
