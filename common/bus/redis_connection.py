@@ -56,7 +56,7 @@ class RedisConnection:
 
     @contextmanager
     def repeated(self, repeat: Callable[[Callable[[], Any]], Any]) -> Iterator[None]:
-        """Within it ``repeat`` makes every call, perhaps more than once: not for ``commit``, which trims a full Redis."""
+        """Within it ``repeat`` makes every call, perhaps again: not for ``commit``, which trims a full Redis."""
         self._repeat = repeat
         try:
             yield
