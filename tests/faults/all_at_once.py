@@ -26,6 +26,7 @@ from tests.faults.loaded import ENDLESS
 from tests.faults.row import Row
 from tests.faults.schedule import EACH_ACTOR, schedule
 from tests.faults.soak import RATIO_TOLERANCE, files_growth, memory_growth
+from tests.faults.witness import went_back
 from tests.integration.running import Training, alive
 
 GAP_SECONDS = 3.5  # between the beginnings of faults, on average
@@ -50,13 +51,15 @@ def chaos(place: Path, log: Path, megabytes: int) -> Iterator[Chaos]:
 
 def judged(one: Chaos, name: str, back: float) -> Row:
     """Of a run that has ended. ``back``: seconds from its last fault until all went on."""
-    verdict, ledger = judge_rows(one.ledger.rows(), one.witness.acks, full=False), one.ledger
+    ledger = one.ledger
+    ledger.look()
+    verdict = judge_rows(ledger.rows(), one.witness.acks, full=False)
     never = {
         "windows_out_of_order": ledger.disordered(),
         "windows_not_seen": ledger.missed,
         "replay_epochs_went_back": ledger.epochs_went_back,
         "acks_went_back": one.witness.acks_went_back,
-        "weights_went_back": one.weights_went_back,
+        "weights_went_back": one.weights_went_back + went_back(one.witness.versions),
         "ended_unexpectedly": len(one.unexpected),
         "left_behind": len(left_behind(one)),
     }

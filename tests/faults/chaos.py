@@ -29,7 +29,7 @@ from tests.faults.proxy import CALM, Interposed, Weather, tcp_proxy
 from tests.faults.schedule import ACTORS, LAUNCHER, LEARNER, REDIS, ROLES, Fault
 from tests.faults.soak import Looks
 from tests.faults.witness import Witness, went_back
-from tests.integration.test_learning import DATA, FAST, SMALL
+from tests.integration.running import DATA, FAST, SMALL
 
 ENV, RATIO = "tests.memory_env:Memory12-v0", 8.0
 SIZES = ("--actors", str(ACTORS), "--capacity", "500", "--checkpoint-steps", "1000", "--threads", "1")
@@ -124,8 +124,6 @@ class Chaos:
         self._wait(lambda: last.process.poll() is not None, 3600.0)
         if last.process.returncode != 0:
             self.unexpected.append(f"status {last.process.returncode}: {self._last_words()}")
-        self.ledger.look()
-        self.weights_went_back += went_back(self.witness.versions)
         return steps
 
     def close(self) -> None:

@@ -17,6 +17,12 @@ from typing import Any, Self
 import psutil
 
 START_SECONDS = 120.0  # five processes import torch on two cores that other tests may use
+SMALL = (
+    "--hidden", "64", "--embedding", "64", "--heads", "128", "128", "--head-input", "hidden+embedding",
+    "--normalize-observations",
+)  # fmt: skip
+FAST = ("--learning-rate", "5e-4", "--polyak", "0.99", "--target-memory", "ema", "--batch-size", "16")
+DATA = ("--capacity", "5000", "--warmup-steps", "1000", "--priority-exponent", "0", "--episodes", "10")
 ENVIRONMENT = {**os.environ, "RMC_SECRET": "", "COLUMNS": "200"}
 
 
