@@ -43,7 +43,7 @@ WEATHERS = {
     "late": Weather(late=0.1),
     "hangs": Weather(late=5.0),  # longer than a call waits for Redis
     "bytes": Weather(piece=1),
-    "cut": Weather(cut=50_000),
+    "cut": Weather(cut=5_000),
 }
 
 

@@ -154,13 +154,24 @@ class Interposed:
 
     def __init__(self, place: Callable[[], Path | None]) -> None:
         """``place``: where that socket is now, if there is one."""
-        self.placed = self.connections = self.cuts = 0  # how often so; of proxies before the present one
+        self.placed = 0  # how often so
+        self._connections = self._cuts = 0  # of proxies before the present one
         self._place, self._weather = place, CALM
         self._proxy: Proxy | None = None
         self._ours = -1
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
+
+    @property
+    def connections(self) -> int:
+        """So far."""
+        return self._connections + (self._proxy.connections if self._proxy is not None else 0)
+
+    @property
+    def cuts(self) -> int:
+        """Connections that it has reset."""
+        return self._cuts + (self._proxy.cuts if self._proxy is not None else 0)
 
     def change(self, weather: Weather) -> None:
         """From now on."""
@@ -191,8 +202,7 @@ class Interposed:
     def _end_proxy(self) -> None:
         if self._proxy is not None:
             self._proxy.close()
-            self.connections += self._proxy.connections
-            self.cuts += self._proxy.cuts
+            self._connections, self._cuts = self.connections, self.cuts
             self._proxy = None
 
     def close(self) -> None:
