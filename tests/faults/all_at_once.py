@@ -119,15 +119,15 @@ def flat(one: Chaos) -> tuple[bool, dict[str, float]]:
     return max(grew.values(), default=0.0) < MOST_GROWTH and facts["files grew"] <= CONNECTIONS, facts
 
 
-def learnt(folder: Path) -> float:
-    """The return of the policy that a run ended with."""
+def learnt(folder: Path) -> tuple[float, int]:
+    """The return of the policy that a run ended with, and its updates."""
     result = RunFolder(folder).result()
     assert result is not None
-    return round(float(result["eval_return_mean"]), 2)
+    return round(float(result["eval_return_mean"]), 2), int(result["updates"])
 
 
-def without_faults(folder: Path, steps: int) -> float:
-    """The return of a run of the same options that trains as long."""
+def without_faults(folder: Path, steps: int) -> tuple[float, int]:
+    """The same of a run of the same options that trains as long."""
     with Training(folder, *ENDLESS, *OPTIONS, "--total-steps", str(steps), env=ENV) as run:
         assert run.finish(6 * 3600.0) == 0, run.text()
     return learnt(folder)
@@ -153,12 +153,13 @@ def main() -> None:
             steps = one.end(CALM_SHARE)
             row = judged(one, name, back)
             is_flat, growth = flat(one)
-            returned = learnt(one.folder)
-            print(row, growth, returned, file=sys.stderr, flush=True)
-        calm = without_faults(place / "calm", steps)
+            returned, updates = learnt(one.folder)
+            print(row, growth, returned, updates, file=sys.stderr, flush=True)
+        calm, all_updates = without_faults(place / "calm", steps)
     passed = row.passed and is_flat and returned >= LEAST_RETURN * calm
     returns = {"steps": steps, "return": returned, "return without faults": calm}
-    dataclasses.replace(row, passed=passed, found={**row.found, **growth, **returns}).keep()
+    kept = {"updates": updates, "updates without faults": all_updates}
+    dataclasses.replace(row, passed=passed, found={**row.found, **growth, **returns, **kept}).keep()
     sys.exit(0 if passed else 1)
 
 
