@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo wheel site guard test test-failed test-faults test-long test-cluster test-container test-dm-control test-pybullet test-newest lint docs bench peers clean
+.PHONY: env demo wheel site guard test test-failed test-faults chaos test-long test-cluster test-container test-dm-control test-pybullet test-newest lint docs bench peers clean
 
 env: $(STAMP)
 
@@ -55,6 +55,14 @@ test-faults: $(addprefix test-faults-,$(FAULTS)) docs
 
 test-faults-%: $(STAMP)
 	$(BIN)/python -m tests.faults.$*
+
+# All faults on top of each other, for so many hours, by a schedule that follows from the seed. Linux and root.
+HOURS ?= 1
+SEED ?= 0
+
+chaos: $(STAMP)
+	$(BIN)/python -m tests.faults.all_at_once --hours $(HOURS) --seed $(SEED)
+	$(BIN)/python -m docs.fault_table
 
 # The tests that take most of a minute or more, some ten minutes in all.
 test-long: $(STAMP)

@@ -3,7 +3,9 @@
 import re
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from typing import Any, TypeVar
 
 import redis
@@ -45,14 +47,30 @@ class RedisConnection:
             raise ConfigError("--redis-url", shown(url), "its options are no good; mend what follows ?") from None
         self.url, self.prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
+        self._repeat: Callable[[Callable[[], Any]], Any] | None = None
         self._rests_until = 0.0  # by the monotonic clock: a Redis that hangs is left alone for as long as it took
 
     def key(self, *parts: object) -> str:
         """A key of the run."""
         return ":".join([self.prefix, *map(str, parts)])
 
+    @contextmanager
+    def repeated(self, repeat: Callable[[Callable[[], Any]], Any]) -> Iterator[None]:
+        """Within it ``repeat`` makes every call, perhaps again: not for ``commit``, which trims a full Redis."""
+        self._repeat = repeat
+        try:
+            yield
+        finally:
+            self._repeat = None
+
     def call(self, action: Callable[..., T], *args: Any) -> T:
         """What the action gives. Raises BusUnavailable, BusFull, and ConfigError for an answer that does not pass."""
+        if self._repeat is None:
+            return self._call_once(action, *args)
+        answer: T = self._repeat(partial(self._call_once, action, *args))
+        return answer
+
+    def _call_once(self, action: Callable[..., T], *args: Any) -> T:
         if time.monotonic() < self._rests_until:
             raise BusUnavailable("Redis did not answer in time")
         try:

@@ -9,7 +9,7 @@ from rmc.actors.actor import Actor
 from rmc.actors.evaluator import Evaluator
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import run_role
-from rmc.deploy.local.role_process import Process, RunConnection, wait_for_room
+from rmc.deploy.local.role_process import Process, RunConnection
 from rmc.deploy.run.config import RunConfig
 from rmc.learner.initial_priority import InitialPriority
 
@@ -24,11 +24,12 @@ def run_actor(place: RunConnection, index: int) -> None:
     config = process.config
     if not 0 <= index < config.actors:
         raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
-    wait_for_room(process.bus, f"actor-{index}", process.stop)
     torch.set_num_threads(1)
     spec, priority_fn = config.window_spec(), initial_priority(config, index)
     make_env = partial(process.make_env, config.agent.privileged_critic)
-    actor = Actor(index, config.seed, make_env, spec, config.agent, config.actor, process.bus, priority_fn=priority_fn)
+    with process.starting(f"actor-{index}"):
+        bus, rate = process.bus, priority_fn
+        actor = Actor(index, config.seed, make_env, spec, config.agent, config.actor, bus, priority_fn=rate)
     run_role(actor, process.bus, process.stop, idle_seconds=ACTOR_IDLE_SECONDS)
 
 
@@ -43,9 +44,10 @@ def run_evaluator(place: RunConnection) -> None:
     """The evaluator's process."""
     process = Process(place)
     config = process.config
-    wait_for_room(process.bus, "evaluator", process.stop)
     torch.set_num_threads(1)
     os.nice(EVALUATOR_NICENESS)
     missing = config.layout.missing
-    evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, process.bus, missing=missing)
+    with process.starting("evaluator"):
+        bus = process.bus
+        evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, bus, missing=missing)
     run_role(evaluator, process.bus, process.stop, idle_seconds=EVALUATOR_IDLE_SECONDS)

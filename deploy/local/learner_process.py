@@ -3,15 +3,17 @@
 import ssl
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import torch
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.process.role import run_role
 from rmc.common.shard import Shard
-from rmc.deploy.local.role_process import Process, RunConnection, until_taken, wait_for_room
+from rmc.deploy.local.role_process import Process, RunConnection, until_taken
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.preflight import check_device, cores, thread_choices, two_processes
@@ -26,22 +28,23 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
     config, spec, bus = process.config, process.config.window_spec(), process.bus
     torch.set_num_threads(1)  # until it is known whether the model's half has a process, and what is fastest
     check_device(device)
-    wait_for_room(bus, Learner.name, process.stop)
     pinned, batch = device.startswith("cuda"), config.learner.batch_size
     context = tls.client_context(place.tls_folder) if place.tls_folder is not None else None
     clients = replay_clients(config, bus, secret, pinned, context)
     replay = clients[0] if len(clients) == 1 else ShardedReplay(clients, spec, batch, config.seed, pinned)
     checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
-    learner = Learner(
-        spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device,
-        config.policy_header(), thread_choices(config, cores(), device), two_processes(config, cores(), device),
-    )  # fmt: skip
+    with process.starting(Learner.name):
+        learner = Learner(
+            spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device,
+            config.policy_header(), thread_choices(config, cores(), device), two_processes(config, cores(), device),
+        )  # fmt: skip
     run_role(learner, bus, process.stop, lambda: learner.finished)
     for client in clients:
         client.close()
     if learner.finished:
         last = {"time": time.time(), **learner.metrics(), "finished": 1}
-        until_taken(lambda: bus.emit(learner.name, last), learner.name, process.stop)  # its launcher waits for it
+        with suppress(BusUnavailable, BusFull):  # its launcher waits for it, unless all is to stop
+            until_taken(lambda: bus.emit(learner.name, last), learner.name, process.stop)
 
 
 def replay_clients(

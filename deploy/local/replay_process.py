@@ -5,7 +5,7 @@ from pathlib import Path
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import run_role
 from rmc.common.shard import Shard
-from rmc.deploy.local.role_process import Process, RunConnection, wait_for_room
+from rmc.deploy.local.role_process import Process, RunConnection
 from rmc.deploy.run import tls
 from rmc.replay_server.process import ReplayProcess
 from rmc.replay_server.server import ReplayServer
@@ -19,12 +19,12 @@ def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> N
     shard = Shard(index, config.replay.replay_shards)
     if not 0 <= index < shard.count:
         raise ConfigError("--shard", index, f"the run has replay servers 0 to {shard.count - 1}")
-    wait_for_room(process.bus, shard.role, process.stop)
-    server = ReplayServer(
-        spec, config.replay, folder, config.seed, config.total_steps, config.actors, config.slack_steps(), process.bus,
-        shard,
-    )  # fmt: skip
     context = tls.server_context(place.tls_folder) if place.tls_folder is not None else None
-    sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size, context)
-    process.bus.announce_replay(server.owner, sockets.address)
+    with process.starting(shard.role):
+        server = ReplayServer(
+            spec, config.replay, folder, config.seed, config.total_steps, config.actors, config.slack_steps(),
+            process.bus, shard,
+        )  # fmt: skip
+        sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size, context)
+        process.bus.announce_replay(server.owner, sockets.address)
     run_role(ReplayProcess(server, sockets), process.bus, process.stop, idle_seconds=0.0)

@@ -4,12 +4,12 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
-from rmc.common.bus.protocol import Bus
 from rmc.common.env.make import make_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError
@@ -20,6 +20,7 @@ from rmc.deploy.redis.connect import PATIENCE_SECONDS, PATIENCE_VARIABLE, Deadli
 from rmc.deploy.run.config import RunConfig, check_sizes, env_sizes, from_registration
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,13 @@ class Process:
             if not waits.wait(f"run {run} to be registered in that Redis"):
                 raise ConfigError("--run", run, "no run of this name is registered in that Redis; start it first")
 
+    @contextmanager
+    def starting(self, role: str) -> Iterator[None]:
+        """Within it the role is made, once Redis takes what it writes. Outages are waited out, as when it runs."""
+        with self.bus.repeated(lambda call: until_taken(call, role, self.stop)):
+            self.bus.check_room(role)
+            yield
+
     def make_env(self, privileged: bool = False) -> Env:
         """A new environment of the run, as ``make_env``. Raises ConfigError where its sizes are not the launcher's."""
         env = make_env(self.config.env, privileged=privileged)
@@ -77,23 +85,17 @@ class Process:
         return env
 
 
-def wait_for_room(bus: Bus, role: str, stop: StopSignal) -> None:
-    """Until Redis takes what this role writes, or it is stopped: one that begins amid an outage waits as others do."""
-    if not stop.requested:
-        until_taken(lambda: bus.check_room(role), role, stop)
-
-
-def until_taken(write: Callable[[], None], role: str, stop: StopSignal) -> None:
-    """Write until Redis takes it, once at least, or the role is stopped."""
+def until_taken(call: Callable[[], T], role: str, stop: StopSignal) -> T:
+    """Make a call of Redis until it is taken. Raises BusUnavailable, BusFull once the role is to stop."""
     outage = OutageLog(role)
     while True:
         try:
-            write()
+            answer = call()
         except (BusUnavailable, BusFull) as error:
+            if stop.requested:
+                raise
             outage.begin(error)
+            time.sleep(RECONNECT_SLEEP)
         else:
             outage.end()
-            return
-        if stop.requested:
-            return
-        time.sleep(RECONNECT_SLEEP)
+            return answer

@@ -13,9 +13,9 @@ import redis
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
-from rmc.common.errors import ConfigError
+from rmc.common.errors import BusFull, ConfigError
 from rmc.common.process.role import StopSignal
-from rmc.deploy.local.role_process import Process, RunConnection, wait_for_room
+from rmc.deploy.local.role_process import Process, RunConnection, until_taken
 from rmc.deploy.redis.connect import Deadline, connect
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.server import RedisServer
@@ -95,17 +95,33 @@ def test_a_file_that_holds_no_url_is_named_in_one_line(short: Path, content: byt
     assert "hush" not in str(raised.value)
 
 
+@pytest.mark.usefixtures("handlers")
+def test_a_role_that_is_being_made_waits_for_redis(short: Path, run_name: str, tmp_path: Path) -> None:
+    config, server = debug(EnvConfig("Pendulum-v1")), RedisServer(short)
+    with server:
+        bus = RedisBus(server.url(), run_name)
+        Registration(config, RunFolder(tmp_path), bus)
+        process = Process(RunConnection(run_name, server.url()))
+        with process.starting("learner"), ThreadPoolExecutor(1) as pool:  # with whose thread the server ends
+            server.close()
+            later = pool.submit(lambda: (time.sleep(1.0), server.start()))
+            assert process.bus.take_epoch("learner") == 1
+            later.result()
+            assert bus.current_epoch("learner") == 1
+
+
 def test_without_room_it_waits(short: Path, caplog: pytest.LogCaptureFixture) -> None:
     with RedisServer(short) as server, redis.Redis.from_url(server.url()) as client:
         client.config_set("maxmemory", 1)
         stop = StopSignal()
         stop.request()
         bus = connect(server.url(), "run")
-        wait_for_room(bus, "learner", stop)  # it is stopped, so it does not wait
+        with pytest.raises(BusFull):
+            until_taken(lambda: bus.check_room("learner"), "learner", stop)  # it is stopped, so it does not wait
         roomy = f"import redis, time; time.sleep(1); redis.Redis.from_url({server.url()!r}).config_set('maxmemory', 0)"
         later = subprocess.Popen([sys.executable, "-c", roomy])
         began = time.monotonic()
-        wait_for_room(bus, "learner", StopSignal())
+        until_taken(lambda: bus.check_room("learner"), "learner", StopSignal())
         assert later.wait(10) == 0
         assert time.monotonic() - began > 0.9
         assert bus.current_epoch("learner") == 0  # nothing was taken meanwhile

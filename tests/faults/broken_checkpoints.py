@@ -30,7 +30,7 @@ def spoil_each(tries: int, place: CheckpointFolder, copy: Path) -> Row:
     cuts = tries // CUT_SHARE
     for number in range(tries + cuts):
         how = "flipped" if number < tries else "cut"
-        _spoil(chance.choice(sorted(place.path(newest).iterdir())), how, chance)
+        spoil(chance.choice(sorted(place.path(newest).iterdir())), how, chance)
         lines = len(warnings.lines)
         used = place.latest()
         counts[how] += used is None or used[0] != newest
@@ -44,7 +44,8 @@ def spoil_each(tries: int, place: CheckpointFolder, copy: Path) -> Row:
     return Row("checkpoints with a flipped bit, or cut short", tries + cuts, passed, found={**counts})
 
 
-def _spoil(path: Path, how: str, chance: random.Random) -> None:
+def spoil(path: Path, how: str, chance: random.Random) -> None:
+    """Flip a bit of it, or have it ``cut`` short."""
     content = bytearray(path.read_bytes())
     place = chance.randrange(len(content))
     if how == "cut":

@@ -9,8 +9,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.faults.loaded import Loaded, went_back
+from tests.faults.loaded import Loaded
 from tests.faults.row import Row, at_length
+from tests.faults.witness import went_back
 
 SOURCE = Path(__file__).with_name("clock.c")
 HOUR, HOURS, SECONDS = 3600, (1, -1, 0), 3.0  # seconds of one, where to, and how long between moves
@@ -32,7 +33,7 @@ def move_clock(tries: int, folder: Path) -> Iterator[Row]:
     facts = {
         "moves_seen_by_the_roles": sum(hour != 0 for hour in hours),
         "restarts": restarts,
-        "weights_went_back": went_back(run.versions),
+        "weights_went_back": went_back(run.witness.versions),
     }
     passed = not (verdict.lost or verdict.duplicated or restarts or facts["weights_went_back"])
     passed = passed and hours == [*HOURS] * tries

@@ -4,10 +4,11 @@ It is a small tmpfs; to mount one needs root.
 """
 
 import os
+import shutil
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from rmc.common.checkpoint import CheckpointFolder
@@ -36,11 +37,12 @@ def filled(disk: Path) -> Iterator[None]:
     """No room there for so long."""
     ballast = disk / "ballast"
     with ballast.open("wb", buffering=0) as file:
-        try:
+        with suppress(OSError):
+            os.posix_fallocate(file.fileno(), 0, shutil.disk_usage(disk).free)  # nearly all of it, at once
+        file.seek(0, os.SEEK_END)
+        with suppress(OSError):
             while True:
                 file.write(bytes(1 << 16))
-        except OSError:
-            pass
     try:
         yield
     finally:

@@ -17,8 +17,9 @@ from pathlib import Path
 import psutil
 
 from rmc.deploy.local.role_environment import URL_VARIABLE
-from tests.faults.loaded import ROOMY, Loaded, went_back
+from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.row import Row, at_length
+from tests.faults.witness import went_back
 from tests.integration.running import alive
 
 ENDS_S = 10.0
@@ -47,18 +48,18 @@ def freeze(run: Loaded, role: str, tries: int, seconds: float) -> Row:
             run.until(lambda epoch=epoch: run.bus.current_epoch(role) > epoch)
             run.until_all_go_on()
             time.sleep(seconds)
-            before = run.acks.get((0, epoch), 0)
+            before = run.witness.acks.get((0, epoch), 0)
             old.resume()
             slowest = max(slowest, run.until(lambda old=old: not _runs(old)))
-            accepted += run.acks.get((0, epoch), 0) - before if role == "actor-0" else 0
+            accepted += run.witness.acks.get((0, epoch), 0) - before if role == "actor-0" else 0
             run.until(lambda epoch=epoch: run.bus.current_epoch(role) > epoch + 1)  # the supervisor's next
         run.until_all_go_on()
     silent = tries - (_says_replaced(run, role) - replaced)
     facts = {
         "ended_for_another_cause": silent,
         "entries_accepted": accepted,
-        "acks_went_back": run.acks_went_back,
-        "weights_went_back": went_back(run.versions),
+        "acks_went_back": run.witness.acks_went_back,
+        "weights_went_back": went_back(run.witness.versions),
     }
     return Row(
         f"SIGSTOP for {seconds:.0f} s, another in its place: {role}", tries,

@@ -14,6 +14,8 @@ from rmc.common.window import Rows
 from rmc.deploy.run.folder import RunFolder
 from rmc.replay_server.recovery import open_store
 
+Acks = dict[tuple[int, int], int]
+
 
 @dataclasses.dataclass(frozen=True)
 class Judgement:
@@ -25,7 +27,7 @@ class Judgement:
     acted_on_older: int  # windows of older weights than the same environment's before; only one learner's can be told
 
 
-def judge(folder: Path, acks: dict[tuple[int, int], int]) -> Judgement:
+def judge(folder: Path, acks: Acks) -> Judgement:
     """``acks``: the largest number of an entry that was acknowledged, by actor and epoch. Raises ConfigError."""
     run = RunFolder(folder)
     config = run.config()
@@ -36,10 +38,14 @@ def judge(folder: Path, acks: dict[tuple[int, int], int]) -> Judgement:
         rows = store.ring.rows[serials % capacity].copy()
     finally:
         store.close()
-    full = progress.valid_from > 0
+    return judge_rows(rows, acks, full=progress.valid_from > 0)
+
+
+def judge_rows(rows: Rows, acks: Acks, full: bool) -> Judgement:
+    """Of (n,) windows in the order of their serials; ``full``: older ones are gone by age."""
     lost = sum(_lost(_of(rows, *life), acks.get(life, 0), full) for life in _lives(rows) | set(acks))
     older = sum(_older(_of(rows, *life)) for life in _lives(rows))
-    return Judgement(progress.next_serial, lost, _doubled(rows), older)
+    return Judgement(int(rows["serial"][-1]) + 1 if len(rows) else 0, lost, _doubled(rows), older)
 
 
 def _lives(rows: Rows) -> set[tuple[int, int]]:
@@ -81,7 +87,7 @@ def _gaps(windows: Rows) -> int:
     return int((~follows & (windows["episode_step"][1:] != 0)).sum())
 
 
-def newest(acks: dict[tuple[int, int], int], actor: int, entry: EntryId) -> None:
+def newest(acks: Acks, actor: int, entry: EntryId) -> None:
     """Take an ack into ``acks``."""
     life = actor, entry.epoch
     acks[life] = max(acks.get(life, 0), entry.seq)

@@ -10,9 +10,10 @@ import numpy as np
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.run.folder import RunFolder
 from rmc.replay_server.recovery import open_store
-from tests.faults.judge import judge
-from tests.faults.loaded import ROOMY, Acks, Loaded, went_back
+from tests.faults.judge import Acks, judge
+from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.row import Row, at_length
+from tests.faults.witness import went_back
 
 RECOVERY_S = 30.0  # from ``rmc train`` on; a run's own start
 OFTEN = (*ROOMY, "--checkpoint-steps", "500")
@@ -29,7 +30,7 @@ def kill_everything(tries: int, folder: Path) -> Iterator[Row]:
     for _ in range(tries + 1):
         began = time.monotonic()
         with Loaded(place, *OFTEN) as run:
-            run.acks = acks  # of all lives
+            run.witness.acks = acks  # of all lives
             run.begin()
             run.until_all_go_on()
             slowest = max(slowest, time.monotonic() - began)
@@ -37,7 +38,7 @@ def kill_everything(tries: int, folder: Path) -> Iterator[Row]:
             time.sleep(chance.uniform(1.0, 3.0))
             reported = {name: run.newest("replay", name) for name in COUNTED}
             run.kill_all()
-        versions += run.versions
+        versions += run.witness.versions
         before, left = left, on_disk(place)
         less += sum(left[name] < reported[name] for name in reported) + sum(
             left[name] < before[name] for name in before

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rmc.common.checkpoint import CheckpointFolder
-from tests.faults.loaded import ROOMY, Loaded, went_back
+from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.row import Row, at_length
+from tests.faults.witness import went_back
 
 RECOVERY_S = 15.0
 POINTS = ("half-a-checkpoint", "synchronised", "saved")
@@ -30,7 +31,7 @@ def kill_learners(tries: int, folder: Path) -> Iterator[Row]:
     facts = {
         "resumed": len(resumed),
         "state_differs": sum(not one["same"] for one in resumed),
-        "weights_went_back": went_back(run.versions),
+        "weights_went_back": went_back(run.witness.versions),
     }
     passed = not (verdict.lost or verdict.duplicated or facts["state_differs"] or facts["weights_went_back"])
     passed = passed and len(resumed) >= tries and slowest < RECOVERY_S

@@ -11,8 +11,9 @@ from pathlib import Path
 import redis
 
 from rmc.deploy.redis.server import server_binary
-from tests.faults.loaded import Loaded, went_back
+from tests.faults.loaded import Loaded
 from tests.faults.row import Row, at_length
+from tests.faults.witness import went_back
 
 RECOVERY_S = 5.0
 
@@ -23,18 +24,23 @@ class LoggedRedis:
     def __init__(self, folder: Path, log: Path) -> None:
         """Its append-only file lies in ``folder``; ``log`` is where it tells what it does."""
         folder.mkdir(parents=True, exist_ok=True)
-        self.url = f"unix://{folder}/own.sock"
+        self.folder, self.socket = folder, folder / "own.sock"
+        self.url = f"unix://{self.socket}"
         self._words = [
-            server_binary(), "--port", "0", "--unixsocket", f"{folder}/own.sock", "--dir", str(folder), "--save", "",
+            server_binary(), "--port", "0", "--unixsocket", str(self.socket), "--dir", str(folder), "--save", "",
             "--appendonly", "yes", "--appendfsync", "everysec",
         ]  # fmt: skip
         self._log = log
         self.start()
 
-    def start(self) -> None:
-        """Begin with what the log holds; returns once it answers."""
+    def launch(self) -> None:
+        """Begin with what the log holds."""
         with self._log.open("ab") as log:
             self.process = subprocess.Popen(self._words, stdout=log, stderr=log)
+
+    def start(self) -> None:
+        """The same; returns once it answers."""
+        self.launch()
         client = redis.Redis.from_url(self.url)
         deadline = time.monotonic() + 20.0
         while True:
@@ -102,7 +108,10 @@ def kill_embedded(tries: int, folder: Path) -> Iterator[Row]:
 def _row(fault: str, run: Loaded, tries: int, slowest: float) -> Row:
     verdict = run.end()
     passed = not (verdict.lost or verdict.duplicated or verdict.acted_on_older) and slowest < RECOVERY_S
-    facts = {"acted_on_older_weights": verdict.acted_on_older, "its_log_lacked_weights": went_back(run.versions)}
+    facts = {
+        "acted_on_older_weights": verdict.acted_on_older,
+        "its_log_lacked_weights": went_back(run.witness.versions),
+    }
     return Row(fault, tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated, round(slowest, 2), facts)
 
 

@@ -4,23 +4,23 @@ import json
 import os
 import re
 import signal
-import threading
 import time
 from collections.abc import Callable, Mapping
-from itertools import pairwise
+from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import psutil
 
-from rmc.common.bus.protocol import EntryId, Version
+from rmc.common.bus.protocol import Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusUnavailable
 from rmc.deploy.redis.users import LAUNCHER, RedisUsers
 from rmc.deploy.run.config import from_json
 from rmc.deploy.run.folder import RunFolder
-from tests.faults.judge import Judgement, judge, newest
+from tests.faults.judge import Acks, Judgement, judge
+from tests.faults.witness import Witness
 from tests.integration.running import START_SECONDS, Training
 
 ACTORS = 2
@@ -29,7 +29,6 @@ ROOMY = ("--capacity", "100000")  # windows: none is evicted before all are judg
 WRAPPING = ("--capacity", "2000")  # full within a minute
 FILL_SECONDS = 200.0
 HOOKS = Path(__file__).parent / "hooks"
-Acks = dict[tuple[int, int], int]
 NO_WEIGHTS = Version(0, 0)
 
 
@@ -41,20 +40,20 @@ class Loaded(Training):
         folder: Path,
         *options: str,
         redis_url: str = "",
+        env: str = "InvertedPendulum-v5",
         environment: Mapping[str, str] = MappingProxyType({}),
+        command: tuple[str, ...] = (),
     ) -> None:
+        """``command`` goes in the place of ``train`` and all of its options."""
         self.armed = folder.parent / f"{folder.name}-armed"
         self.armed.mkdir(exist_ok=True)
         path = os.pathsep.join([str(HOOKS), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
         hooks = {"PYTHONPATH": path, "RMC_FAULTS": str(self.armed)}
         place = ("--redis-url", redis_url) if redis_url else ()
-        super().__init__(folder, *ENDLESS, *(options or ROOMY), *place, environment={**hooks, **environment})
-        self.acks: Acks = {}
-        self.versions: list[Version] = []  # of the weights, as they were seen
-        self.acks_went_back = 0
+        words = (*ENDLESS, *(options or ROOMY), *place)
+        super().__init__(folder, *words, env=env, environment={**hooks, **environment}, command=command)
         self._redis_url = redis_url
-        self._over = threading.Event()
-        self._watch = threading.Thread(target=self._note, daemon=True)
+        self.witness = Witness(ACTORS)
 
     def begin(self) -> None:
         """Wait for the first updates."""
@@ -62,7 +61,7 @@ class Loaded(Training):
         run = RunFolder(self.folder)
         self._users = RedisUsers(run.name, run.secret(), from_json((run.path / "config.json").read_bytes()).roles())
         self.bus = self.make_bus()
-        self._watch.start()
+        self.witness.start(self.make_bus())
 
     def make_bus(self, user: str = LAUNCHER) -> RedisBus:
         """The run's bus, for one thread."""
@@ -80,38 +79,27 @@ class Loaded(Training):
         """The run's, in Redis."""
         return self._users.run
 
-    def _note(self) -> None:
-        bus, before = self.make_bus(), [EntryId(0, 0)] * ACTORS
-        while not self._over.is_set():
-            try:
-                for actor in range(ACTORS):
-                    ack = bus.ack(actor)
-                    if ack is not None:
-                        self.acks_went_back += ack.id < before[actor]
-                        before[actor] = ack.id
-                        newest(self.acks, actor, ack.id)
-                version = bus.latest_version()
-                if version is not None and [version] != self.versions[-1:]:
-                    self.versions.append(version)
-            except BusUnavailable:
-                pass
-            time.sleep(0.005)
-
     def process_of(self, role: str) -> psutil.Process:
-        """The process of ``actor-1``, ``learner``, ``replay``, ``redis``, the ``fork_server`` or the ``launcher``."""
+        """The process of a role, once it is there: see ``find``."""
+        found: psutil.Process | None = None
+
+        def there() -> bool:
+            nonlocal found
+            found = self.find(role)
+            return found is not None
+
+        self.wait_for(there)
+        assert found is not None
+        return found
+
+    def find(self, role: str) -> psutil.Process | None:
+        """The process of ``actor-1``, ``learner``, ``replay``, ``redis``, the ``fork server`` or the ``launcher``."""
         if role == "launcher":
             return self.launcher
         word, _, index = role.partition("-")
         others = {"redis": "unixsocket", "fork server": r"rmc\.cli\.fork_server"}
         pattern = others.get(role, rf"rmc\.cli\.main role {word} .*{f'--index {index}' if index else ''}")
-        processes: list[psutil.Process] = []
-
-        def there() -> bool:
-            processes[:] = [one for one in self.launcher.children(recursive=True) if _matches(one, pattern)]
-            return bool(processes)
-
-        self.wait_for(there)
-        return processes[0]
+        return next((one for one in self.launcher.children(recursive=True) if _matches(one, pattern)), None)
 
     def kill(self, role: str) -> float:
         """kill -9; how long it takes until it is back in a new epoch."""
@@ -156,47 +144,44 @@ class Loaded(Training):
 
     def until_all_go_on(self) -> float:
         """Wait for acks of every actor, and weights, newer than all up to now; how long that took."""
-        acks, before = self.acks.copy(), max(self.versions, default=NO_WEIGHTS)
-        return self.until(lambda: _all_moved(acks, self.acks.copy()) and max(self.versions, default=before) > before)
+        seen = self.witness
+        acks, before = seen.acks.copy(), max(seen.versions, default=NO_WEIGHTS)
+        return self.until(lambda: _all_moved(acks, seen.acks.copy()) and max(seen.versions, default=before) > before)
 
     def held(self) -> dict[str, tuple[float, int]]:
         """Of each process, and of an embedded Redis: memory that is no file's, so not the ring's, in MB; open files."""
         roles = ["launcher", "fork server", "replay", "learner", "evaluator"]
         roles += [f"actor-{actor}" for actor in range(ACTORS)] + ["redis"] * (not self._redis_url)
         processes = {role: self.process_of(role) for role in roles}
-        return {role: (_anonymous_mb(process.pid), process.num_fds()) for role, process in processes.items()}
+        return {role: (anonymous_mb(process.pid), process.num_fds()) for role, process in processes.items()}
 
     def kill_all(self) -> None:
         """Every process at once, the launcher first."""
         everyone = [self.launcher, *self.launcher.children(recursive=True)]
-        self._over.set()
+        self.witness.stop()
         for process in everyone:
-            process.send_signal(signal.SIGKILL)
+            with suppress(psutil.NoSuchProcess):  # it has ended with the launcher
+                process.send_signal(signal.SIGKILL)
         self.process.wait()
         psutil.wait_procs(everyone[1:], 10)
 
     def close(self) -> None:
         """Kill what is left, and look no more."""
-        self._over.set()
+        self.witness.stop()
         super().close()
 
     def end(self) -> Judgement:
         """Stop it in order, and judge what its ring holds."""
-        self._over.set()
-        self._watch.join()
+        self.witness.stop()
         self.interrupt()
-        return judge(self.folder, self.acks)
+        return judge(self.folder, self.witness.acks)
 
 
-def _anonymous_mb(pid: int) -> float:
+def anonymous_mb(pid: int) -> float:
+    """Its memory that is no file's."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     (kilobytes,) = (line.split()[1] for line in lines if line.startswith("Anonymous:"))
     return int(kilobytes) / 1e3
-
-
-def went_back(versions: list[Version]) -> int:
-    """How often weights were older than those seen before."""
-    return sum(later < earlier for earlier, later in pairwise(versions))
 
 
 def _all_moved(before: Acks, now: Acks) -> bool:

@@ -10,8 +10,9 @@ import torch
 from rmc.common.checkpoint import STATE, CheckpointFolder
 from rmc.deploy.local.supervisor import QUICK_DEATHS
 from tests.faults.judge import judge
-from tests.faults.loaded import ROOMY, Loaded, went_back
+from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.row import Row, at_length
+from tests.faults.witness import went_back
 
 RECOVERY_S = 15.0
 CAUSE = "training has diverged, weights are not finite"
@@ -33,11 +34,11 @@ def force_nan(tries: int, folder: Path) -> Iterator[Row]:
             run.arm("nan")
             status = run.process.wait(60)
             text = run.text()
-        verdict = judge(run.folder, run.acks)
+        verdict = judge(run.folder, run.witness.acks)
         log = (run.folder / "logs" / "learner.log").read_text()
         facts["causes_said"] += log.count(CAUSE) // QUICK_DEATHS + (status == 1 and CAUSE in text)
         facts["checkpoints_spoilt"] += sum(not _sound(checkpoints.load(one)) for one in checkpoints.numbers())
-        facts["weights_went_back"] += went_back(run.versions)
+        facts["weights_went_back"] += went_back(run.witness.versions)
         acknowledged, lost, doubled = (
             acknowledged + verdict.acknowledged,
             lost + verdict.lost,

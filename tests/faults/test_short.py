@@ -20,9 +20,10 @@ from tests.faults.disk_full import cannot_log, filled, goes_on_unsaved, small_di
 from tests.faults.frozen import freeze
 from tests.faults.kill_redis import LoggedRedis, logged_redis
 from tests.faults.kill_replay import strike_everywhere, tree_is_its_rebuild
-from tests.faults.loaded import ROOMY, Loaded, went_back
+from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.slow_learner import SLOWER, judged
 from tests.faults.soak import soaked
+from tests.faults.witness import went_back
 
 OPTIONS = (*ROOMY, "--checkpoint-steps", "1000")  # none is evicted before all is judged
 FULL = ("--capacity", "300")  # windows
@@ -109,7 +110,7 @@ def test_redis_is_killed(place: RunConnection, run: Loaded) -> None:
     place.redis.kill()
     place.redis.start()
     run.until_all_go_on()
-    run.versions[:] = [max(run.versions)]  # its log may lack the last second's, which are then published anew
+    run.witness.redis_came_back()  # its log may lack the last second's weights, which are then published anew
 
 
 @compiler
@@ -167,14 +168,14 @@ def test_all_are_killed_at_once_and_nothing_was_ever_lost(place: RunConnection, 
     run.kill_all()
     reported = {name: run.newest("replay", name) for name in ("env_steps", "windows", "drawn_steps", "draws")}
     with place.start() as again:
-        again.acks = run.acks
+        again.witness.acks = run.witness.acks
         again.begin()
         again.until_all_go_on()
         assert all(again.newest("replay", name) >= value for name, value in reported.items())
         verdict = again.end()
     assert again.process.returncode == 130
     assert all(one["same"] for one in again.events("resumed"))
-    assert went_back(run.versions + again.versions) == run.acks_went_back == 0
+    assert went_back(run.witness.versions + again.witness.versions) == run.witness.acks_went_back == 0
     assert (verdict.lost, verdict.duplicated) == (0, 0)
     assert verdict.acknowledged > 300
 
@@ -220,5 +221,5 @@ def test_the_replay_server_stands_still_and_is_replaced(full: Loaded) -> None:
 def test_of_a_full_ring_nothing_was_lost_but_by_age(full: Loaded) -> None:
     full.until(lambda: full.newest("replay", "ring_fill") == 1.0)
     verdict = full.end()
-    assert (verdict.lost, verdict.duplicated, full.acks_went_back) == (0, 0, 0)
+    assert (verdict.lost, verdict.duplicated, full.witness.acks_went_back) == (0, 0, 0)
     assert verdict.acknowledged > 600  # it went round

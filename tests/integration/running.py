@@ -17,6 +17,12 @@ from typing import Any, Self
 import psutil
 
 START_SECONDS = 120.0  # five processes import torch on two cores that other tests may use
+SMALL = (
+    "--hidden", "64", "--embedding", "64", "--heads", "128", "128", "--head-input", "hidden+embedding",
+    "--normalize-observations",
+)  # fmt: skip
+FAST = ("--learning-rate", "5e-4", "--polyak", "0.99", "--target-memory", "ema", "--batch-size", "16")
+DATA = ("--capacity", "5000", "--warmup-steps", "1000", "--priority-exponent", "0", "--episodes", "10")
 ENVIRONMENT = {**os.environ, "RMC_SECRET": "", "COLUMNS": "200"}
 
 
@@ -36,21 +42,13 @@ class Training:
         env: str = "InvertedPendulum-v5",
         preset: str = "debug",
         environment: Mapping[str, str] = MappingProxyType({}),
+        command: tuple[str, ...] = (),
     ) -> None:
+        """``command`` goes in the place of ``train`` and all of its options."""
         self.folder = folder
         self.output = folder.parent / f"{folder.name}.out"
-        words = [
-            sys.executable,
-            "-m",
-            "rmc.cli.main",
-            "train",
-            env,
-            "--preset",
-            preset,
-            "--run-dir",
-            str(folder),
-            *options,
-        ]
+        train = ("train", env, "--preset", preset, "--run-dir", str(folder), *options)
+        words = [sys.executable, "-m", "rmc.cli.main", *(command or train)]
         with self.output.open("ab") as output:
             self.process = subprocess.Popen(
                 words, stdout=output, stderr=output, stdin=subprocess.DEVNULL, env={**ENVIRONMENT, **environment},

@@ -8,24 +8,10 @@ import pytest
 from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.policy_file import read_policy
 from rmc.deploy.run.folder import RunFolder
-from tests.integration.running import Training
+from tests.integration.running import DATA, FAST, SMALL, Training
 from tests.memory_env import SOLVED_RETURN
 
 SECONDS = 600.0
-SMALL = [
-    "--hidden",
-    "64",
-    "--embedding",
-    "64",
-    "--heads",
-    "128",
-    "128",
-    "--head-input",
-    "hidden+embedding",
-    "--normalize-observations",
-]
-FAST = ["--learning-rate", "5e-4", "--polyak", "0.99", "--target-memory", "ema", "--batch-size", "16"]
-DATA = ["--capacity", "5000", "--warmup-steps", "1000", "--priority-exponent", "0", "--episodes", "10"]
 pytestmark = pytest.mark.timeout(SECONDS + 30)
 
 

@@ -122,7 +122,9 @@ def replay_server() -> None:
 
 
 def learner() -> None:
-    """Amid saving; what it resumes from; a loss that is no number; slow updates."""
+    """Amid saving; what it resumes from; a loss that is no number; slow updates; no memory to share."""
+    if (FOLDER / "no-shared-memory").exists():
+        del os.memfd_create
     import torch
 
     from rmc.common import checkpoint
