@@ -226,6 +226,7 @@ def test_freed_cpus_go_to_the_learner_that_lost_its_node(nodes: Cluster, tmp_pat
             nodes.remove_node(lost, allow_graceful=False)
             one.wait_for(lambda: _learner_node(one) not in ([], before))
             one.wait_for(lambda: one.newest("learner", "time") > gone + 5.0)
+            nodes.add_node(num_cpus=4, node_ip_address="127.0.0.5")  # of actors, there is one left
             one.wait_for_updates(50)
             other.wait_for_updates(50)
             logs = [(run.folder / "logs" / "launcher.log").read_text() for run in (one, other)]
