@@ -36,7 +36,8 @@ FAULTS = (
 
 @root
 @linux
-def test_nothing_is_lost_where_faults_overlap(tmp_path: Path) -> None:
+def test_faults_overlap(tmp_path: Path) -> None:
+    """And nothing is lost. (The name is short, for Redis has a socket below a folder of that name.)"""
     with chaos(tmp_path, tmp_path / "log.jsonl", DISK_MB) as one:
         one.suffer(FAULTS, SECONDS)
         back = one.until_all_go_on()

@@ -131,6 +131,7 @@ def test_an_actor_stands_still_and_is_replaced(run: Loaded) -> None:
 
 
 @root
+@pytest.mark.long  # chaos at length has it, too
 def test_the_log_of_redis_has_no_room(place: RunConnection, run: Loaded) -> None:
     with filled(place.disks["log"]):
         cannot_log(run, place.redis)
