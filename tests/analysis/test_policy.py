@@ -85,6 +85,7 @@ def test_a_loop_of_ones_own_gives_what_an_evaluation_gives(run: RunFolder) -> No
     assert np.mean(returns) == result["eval_return_mean"]
 
 
+@pytest.mark.long
 def test_an_evaluation_is_the_same_with_any_number_of_threads(tmp_path: Path) -> None:
     run = make_run(
         tmp_path / "run", AgentConfig(normalize_observations=True, impute_missing=True), "HalfCheetah-v5", 0.5

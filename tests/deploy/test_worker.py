@@ -60,7 +60,7 @@ class Worker:
         return sum(line.startswith(action) for line in (self.folder / "calls").read_text().splitlines())
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 10.0) -> None:
+def wait_for(condition: Callable[[], object], seconds: float = 30.0) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline

@@ -139,6 +139,7 @@ def test_the_log_of_redis_has_no_room(place: RunConnection, run: Loaded) -> None
 
 
 @root
+@pytest.mark.long
 def test_a_checkpoint_has_no_room(place: RunConnection, run: Loaded) -> None:
     checkpoints = CheckpointFolder(run.folder / "checkpoints")
     with filled(place.disks["run"]):
