@@ -77,8 +77,8 @@ WHEN = {
     "head_input": "`observation`, with `--scheme 2 --no-grounding --hidden 8 --embedding 0`, where all is seen and "
     "time counts: [level by 60 000 steps, far behind by 300 000](results.md); the embedding beside it cost return in "
     "a trial (`studies/notebook.md`)",
-    "critic_batch_norm": "where episodes end early or observations are large: with `--head-input hidden+observation` "
-    "ahead on [Humanoid-v5](results.md#what-falls-short) and Walker2d-v5, behind on HalfCheetah-v5",
+    "critic_batch_norm": "on trial: forms of it were ahead on Humanoid-v5 and Walker2d-v5, behind on HalfCheetah-v5 "
+    "(`studies/notebook.md`)",
     "privileged_critic": "where the simulator knows what sensors do not see: "
     "[an environment of your own](custom-environments.md#seen-in-part)",
     "normalize_observations": "off, with `--no-impute-missing`, where they are scaled and their statistics keep moving",

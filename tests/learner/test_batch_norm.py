@@ -91,13 +91,17 @@ def test_what_is_not_real_counts_for_nothing(low: bool) -> None:
         assert all(map(torch.equal, made.state_dict().values(), spoilt.state_dict().values()))
 
 
-def test_running_statistics_move_with_the_critics_own_pass_alone() -> None:
+@pytest.mark.parametrize("low", [False, True])
+def test_running_statistics_move_with_the_critics_own_pass_alone(low: bool) -> None:
     made, (features, action, mask, _) = agent(), inputs()
+    if low:
+        fuse(made)
     running = dict(made.critic.norms.named_buffers())
     before = copy.deepcopy(running)
-    made.critic(features, action)
-    assert all(torch.equal(value, before[name]) for name, value in running.items())
-    made.critic(features, action, mask)
+    with torch.autocast("cpu", torch.bfloat16, enabled=low):
+        made.critic(features, action)
+        assert all(torch.equal(value, before[name]) for name, value in running.items())
+        made.critic(features, action, mask)
     assert not any(torch.equal(value, before[name]) for name, value in running.items())
 
 
