@@ -5,6 +5,8 @@
 Batches lie ready in pinned memory; both take priorities back to the host. Ends at once where there is no GPU.
 """
 
+import itertools
+
 import torch
 
 from benchmarks.harness import Row, argument_parser, compare, random_rows, save, speed
@@ -33,18 +35,18 @@ def measure(run: RunConfig, batch_size: int, seconds: float, rounds: int) -> lis
     raw = torch.from_numpy(random_rows(spec, batch_size).view("u1").reshape(batch_size, -1)).pin_memory()
     importance = torch.ones(batch_size).pin_memory()
     plain, graphed = _update(run), DeviceUpdate(_update(run), spec, batch_size)
-    beta = torch.zeros((), device="cuda")
+    beta, numbers = torch.zeros((), device="cuda"), itertools.count(1)
 
     def one_by_one() -> int:
         for _ in range(CHUNK):
-            batch = view_batch(raw.to("cuda", non_blocking=True), importance.to("cuda", non_blocking=True), spec)
-            plain(batch, beta).priorities.cpu()
+            there = raw.to("cuda", non_blocking=True), importance.to("cuda", non_blocking=True)
+            plain(view_batch(*there, spec, plain.plan(raw, spec, next(numbers))), beta).priorities.cpu()
         return CHUNK
 
     def as_graph() -> int:
         before = None
         for _ in range(CHUNK):
-            updated = graphed(raw, importance, 0.0)
+            (updated,) = graphed(raw, importance, 0.0, next(numbers))
             if before is not None:
                 before.wait()
             before = HostCopy(updated.priorities)

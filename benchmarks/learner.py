@@ -43,7 +43,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.window import WindowSpec
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.presets import robust
-from rmc.learner.batch import clear_padding, longest_steps, view_batch
+from rmc.learner.batch import clear_padding, view_batch
 from rmc.learner.learner import Learner, bf16_is_native
 from rmc.learner.replay_client import ReplayClient
 from rmc.learner.update_order import make_update
@@ -87,7 +87,8 @@ def _bare(run: RunConfig, batch_size: int, precision: Precision, seconds: float)
     agent = Agent(spec.obs_dim, spec.action_dim, run.agent)
     update, beta = make_update(agent, spec.burn_in, run.update, 0, precision == "bf16"), torch.zeros(())
     rows = random_rows(spec, batch_size)
-    batch = view_batch(torch.from_numpy(rows.view("u1").reshape(batch_size, -1)), torch.ones(batch_size), spec)
+    raw = torch.from_numpy(rows.view("u1").reshape(batch_size, -1))
+    batch = view_batch(raw, torch.ones(batch_size), spec, update.plan(raw, spec, 2))
 
     def work() -> int:
         parts, *_ = update.forward(batch, beta)
@@ -130,20 +131,24 @@ def cut(run: RunConfig, longest: int, seconds: float, rounds: int) -> list[Row]:
     clear_padding(rows, spec)
     raw, beta = torch.from_numpy(rows.view("u1").reshape(count, -1)), torch.zeros(())
 
-    def measured(steps: int) -> Measure:
+    def measured(is_cut: bool) -> Measure:
         agent = Agent(spec.obs_dim, spec.action_dim, run.agent)
         update = make_update(agent, spec.burn_in, run.update, 0, bf16_is_native(torch.device("cpu")))
 
+        plan = update.plan(raw, spec, 2)
+        if not is_cut:
+            plan = plan._replace(steps=spec.steps)
+
         def work() -> int:
-            update(view_batch(raw, torch.ones(count), spec, steps), beta)
+            update(view_batch(raw, torch.ones(count), spec, plan), beta)
             return 1
 
         speed(work, 1.0)
         return lambda: speed(work, seconds)
 
     name = f"learner, {run.env.id}, windows of {LONG_WINDOW} steps, {longest} real at most"
-    whole: dict[str, Measure | None] = {"whole windows": measured(spec.steps)}
-    return compare(name, "updates/s", measured(longest_steps(raw, spec)), whole, rounds=rounds)
+    whole: dict[str, Measure | None] = {"whole windows": measured(False)}
+    return compare(name, "updates/s", measured(True), whole, rounds=rounds)
 
 
 def _sac(stack: ExitStack, spec: WindowSpec, threads: int, seconds: float) -> Measure | None:

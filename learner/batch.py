@@ -5,6 +5,7 @@ Shapes: B batch, T steps, O observation, A action, S state, M flags of what is m
 
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,6 +15,14 @@ from torch import Tensor
 from rmc.common.window import Rows, WindowSpec
 
 SHORTEST_CUT = 16  # trained steps down to which windows are cut: below, an update costs what its weights do
+
+
+class Plan(NamedTuple):
+    """What the host decides of an update before it runs, so that no device has to be asked."""
+
+    steps: int  # of each window, L_b and up to L_t
+    fills: bool  # whether a frame may be missing
+    trains_imputer: bool
 
 
 @dataclass(frozen=True)
@@ -33,6 +42,8 @@ class Batch:
     burned_in: Tensor  # (B,) bool: the burn-in is real
     importance: Tensor  # (B,)
     cut: int  # steps of padding that all its windows have after the T
+    fills: bool  # as the plan says
+    trains_imputer: bool
 
 
 def importance_weights(
@@ -89,18 +100,28 @@ def update_steps(raw: Tensor, spec: WindowSpec, number: int) -> int:
     return spec.steps if number == 1 else longest_steps(raw, spec)
 
 
-def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec, steps: int | None = None) -> Batch:
+def has_missing(raw: Tensor, spec: WindowSpec) -> bool:
+    """Whether a frame of (B, row bytes) on the host is missing."""
+    return bool(_field(raw, spec, "missing").any())
+
+
+def _field(items: Tensor, spec: WindowSpec, name: str) -> Tensor:
+    """(B, row bytes), seen as items of that field's type, to (B, ...): a view."""
+    shape, strides, offset = _places(spec)[name]
+    return items.as_strided((len(items), *shape), (items.stride(0), *strides), items.storage_offset() + offset)
+
+
+def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec, plan: Plan | None = None) -> Batch:
     """(B, row bytes) uint8 and (B,) float32, on any device, to a Batch; static shapes, no host sync.
 
-    The rows' padding must be zero: see ``clear_padding``. The batch ends after ``steps``: see ``longest_steps``.
+    The rows' padding must be zero: see ``clear_padding``. Without a plan, all steps, and nothing is left out.
     """
     assert raw.shape[1] == spec.dtype.itemsize, (raw.shape, spec.dtype.itemsize)
-    steps = spec.steps if steps is None else steps
-    places, floats, integers = _places(spec), raw.view(torch.float32), raw.view(torch.int32)
+    steps, fills, trains_imputer = plan or Plan(spec.steps, True, True)
+    floats, integers = raw.view(torch.float32), raw.view(torch.int32)
 
     def field(items: Tensor, name: str) -> Tensor:
-        shape, strides, offset = places[name]
-        return items.as_strided((len(raw), *shape), (items.stride(0), *strides), items.storage_offset() + offset)
+        return _field(items, spec, name)
 
     first, last = field(integers, "first"), field(integers, "last").unsqueeze(1)
     action, prev = field(floats, "action")[:, :steps], field(floats, "prev_action")
@@ -124,4 +145,6 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec, steps: int | N
         burned_in=first == 0,
         importance=importance,
         cut=spec.steps - steps,
+        fills=fills,
+        trains_imputer=trains_imputer,
     )

@@ -5,13 +5,14 @@ are recorded as one CUDA graph, and copies go beside it. A CPU takes the same wa
 """
 
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from functools import partial
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from rmc.common.window import WindowSpec
-from rmc.learner.batch import update_steps, view_batch
+from rmc.learner.batch import Plan, view_batch
 from rmc.learner.update import JointUpdate, UpdateResult
 
 T = TypeVar("T")
@@ -21,9 +22,12 @@ WARM_UP = 3  # calls as they are, in which libraries choose their kernels and Ad
 class CudaGraph(Generic[T]):
     """A function of tensors that stay where they are: recorded once, after some calls as it is, and replayed."""
 
-    def __init__(self, work: Callable[[], T], generator: torch.Generator) -> None:
-        """``generator`` gives ``work`` its random numbers; a replay takes those after the last one's."""
-        self._work, self._generator, self._warm_up = work, generator, WARM_UP
+    def __init__(self, work: Callable[[], T], generator: torch.Generator, pool: Any) -> None:
+        """``generator`` gives ``work`` its random numbers; a replay takes those after the last one's.
+
+        Graphs of one ``pool`` of memory overwrite each other's results.
+        """
+        self._work, self._generator, self._pool, self._warm_up = work, generator, pool, WARM_UP
         self._graph: torch.cuda.CUDAGraph | None = None
         self._recorded: T | None = None
         self._stream = torch.cuda.Stream(generator.device)  # type: ignore[no-untyped-call]  # the default one cannot be recorded
@@ -52,7 +56,7 @@ class CudaGraph(Generic[T]):
         """Nothing is computed yet: the first replay does that."""
         self._graph = torch.cuda.CUDAGraph()
         self._graph.register_generator_state(self._generator)
-        with torch.cuda.graph(self._graph, stream=self._stream):
+        with torch.cuda.graph(self._graph, self._pool, self._stream):
             self._recorded = self._work()
 
 
@@ -102,15 +106,15 @@ class DeviceUpdate:
 
     def __init__(self, update: JointUpdate, spec: WindowSpec, batch_size: int) -> None:
         device = update.agent.log_alpha.device
-        self._update, self._spec, self._steps = update, spec, spec.steps
+        self._update, self._spec = update, spec
         self._raw = torch.zeros(batch_size, spec.dtype.itemsize, dtype=torch.uint8, device=device)
         self._importance, self._beta = torch.ones(batch_size, device=device), torch.zeros((), device=device)
-        self._work, self._copy, self.in_flight = self._once, self._copy_now, 0
-        self._cuts = device.type != "cuda"  # a graph has one shape
-        if not self._cuts:
-            self._work = CudaGraph(self._once, update.generator)
-            self._copy = CopiesAhead([self._raw, self._importance])
-            self.in_flight = 1
+        self._work: Callable[[Plan], UpdateResult] = self._once
+        self._copy, self.in_flight = self._copy_now, 0
+        if device.type == "cuda":
+            self._graphs: dict[Plan, CudaGraph[UpdateResult]] = {}
+            self._pool, self._beside = torch.cuda.graph_pool_handle(), torch.cuda.Stream(device)
+            self._work, self._copy, self.in_flight = self._replay, CopiesAhead([self._raw, self._importance]), 1
 
     def __call__(self, raw: Tensor, importance: Tensor, beta: float, number: int) -> list[UpdateResult]:
         """(B, row bytes) uint8 without padding, (B,) float32, and the update's number; its result, which the next call
@@ -120,9 +124,7 @@ class DeviceUpdate:
         """
         self._copy([raw, importance])
         self._beta.fill_(beta)
-        if self._cuts:
-            self._steps = update_steps(raw, self._spec, number)
-        result = self._work()
+        result = self._work(self._update.plan(raw, self._spec, number))
         self._update.update_ema(number)
         return [result]
 
@@ -137,8 +139,33 @@ class DeviceUpdate:
     def close(self) -> None:
         """Nothing is to be ended."""
 
-    def _once(self) -> UpdateResult:
-        return self._update(view_batch(self._raw, self._importance, self._spec, self._steps), self._beta)
+    def _once(self, plan: Plan) -> UpdateResult:
+        return self._update(view_batch(self._raw, self._importance, self._spec, plan), self._beta)
+
+    def _halves_at_once(self, plan: Plan) -> UpdateResult:
+        """Where nothing flows back to memory and world model, their way back goes beside critics and policy.
+
+        What both streams read is held until they meet: memory that one gave up would go to the other.
+        """
+        update, batch = self._update, view_batch(self._raw, self._importance, self._spec, plan)
+        current = torch.cuda.current_stream(self._raw.device)
+        model_losses, model = update.model_pass(batch)
+        self._beside.wait_stream(current)
+        with torch.cuda.stream(self._beside):
+            value_losses, value = update.value_pass(batch, model, self._beta)
+            value_norm = update.step(update.optimizers[1:], value_losses.values())
+            update.follow_value()
+        model_norm = update.step(update.optimizers[:1], model_losses.values())
+        update.follow_model(model)
+        current.wait_stream(self._beside)
+        return update.result(batch, model, value, torch.hypot(model_norm, value_norm))
+
+    def _replay(self, plan: Plan) -> UpdateResult:
+        """Each plan has a graph of its own."""
+        if plan not in self._graphs:
+            work = self._halves_at_once if self._update.config.halves_are_apart() else self._once
+            self._graphs[plan] = CudaGraph(partial(work, plan), self._update.generator, self._pool)
+        return self._graphs[plan]()
 
     def _copy_now(self, tensors: list[Tensor]) -> None:
         for place, tensor in zip((self._raw, self._importance), tensors, strict=True):

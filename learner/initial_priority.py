@@ -15,7 +15,7 @@ from rmc.common.critic import critic_input
 from rmc.common.errors import MessageError
 from rmc.common.window import Rows, WindowSpec
 from rmc.learner import losses
-from rmc.learner.batch import longest_steps, view_batch
+from rmc.learner.batch import Plan, has_missing, longest_steps, view_batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.unroll import impute, unroll
 
@@ -41,7 +41,8 @@ class InitialPriority:
         """Windows (B,) -> (B,)."""
         agent, steps = self._agent, slice(self._spec.burn_in, None)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
-        batch = view_batch(raw, torch.ones(len(rows)), self._spec, longest_steps(raw, self._spec))
+        plan = Plan(longest_steps(raw, self._spec), has_missing(raw, self._spec), trains_imputer=False)
+        batch = view_batch(raw, torch.ones(len(rows)), self._spec, plan)
         m = batch.step_valid[:, steps].float()
         o = agent.normalizer(batch.observation, batch.missing)
         o = impute(agent, o, batch, self._spec.burn_in)

@@ -38,9 +38,9 @@ LOOK_SECONDS = 5.0  # between looks, while waiting, whether Redis still has the 
 
 
 def bf16_is_native(device: torch.device) -> bool:
-    """Whether bfloat16 products are faster than float32 there (AMX or AVX-512 BF16 on a CPU)."""
+    """Whether bfloat16 products are faster there: on a CPU with AMX or AVX-512 BF16; a GPU's TensorFloat-32 is."""
     if device.type == "cuda":
-        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+        return False
     return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
 
 
@@ -89,6 +89,7 @@ class Learner:
         self.agent.start_gates(spec.steps)
         self.agent.to(self.device)
         bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_is_native(self.device))
+        torch.backends.cuda.matmul.allow_tf32 = config.precision == "auto"
         self.update = make_update(self.agent, spec.burn_in, update, seed, bf16)
         self._updated: DeviceUpdate | PipelinedUpdate = (
             PipelinedUpdate(self.update, spec, config.batch_size)

@@ -26,7 +26,7 @@ from torch import Tensor
 from rmc.common.errors import RmcError
 from rmc.common.process.parent_death import exit_with_parent
 from rmc.common.window import WindowSpec
-from rmc.learner.batch import Batch, update_steps, view_batch
+from rmc.learner.batch import Batch, Plan, view_batch
 from rmc.learner.config import MODEL_PROCESS
 from rmc.learner.optimizers import begin_moments
 from rmc.learner.update import (
@@ -38,7 +38,7 @@ from rmc.learner.update import (
 )
 
 AHEAD = 2  # batches that the model's half may be ahead
-REQUEST = struct.Struct("qq")  # an update's number, and the threads that it takes
+REQUEST = struct.Struct("qqq??")  # an update's number, the threads that it takes, its plan
 ENDED = "the process of memory and world model has ended; the lines above say why"
 ALIGNMENT = 64  # bytes, a cache line
 
@@ -78,7 +78,7 @@ class PipelinedUpdate:
     def __init__(self, update: JointUpdate, spec: WindowSpec, batch_size: int) -> None:
         self._update, self._spec, self._batch_size = update, spec, batch_size
         self._threads = 1  # of each half
-        self._pending: deque[tuple[Slot, int]] = deque()
+        self._pending: deque[tuple[Slot, int, Plan]] = deque()
         self._number = 0  # of batches handed in
         self._slots: list[Slot] = []
         self._child = 0
@@ -101,8 +101,9 @@ class PipelinedUpdate:
         slot.importance.copy_(importance)
         slot.beta.fill_(beta)
         self._number += 1
-        self._send(number)
-        self._pending.append((slot, number))
+        plan = self._update.plan(raw, self._spec, number)
+        self._send(number, plan)
+        self._pending.append((slot, number, plan))
         return [self._finish()] if len(self._pending) > AHEAD else []
 
     def use_threads(self, number: int) -> None:
@@ -122,10 +123,10 @@ class PipelinedUpdate:
             os.waitpid(self._child, 0)
             self._pipe = None
 
-    def _send(self, number: int) -> None:
+    def _send(self, number: int, plan: Plan) -> None:
         assert self._pipe is not None
         try:
-            self._pipe.sendall(REQUEST.pack(number, self._threads))
+            self._pipe.sendall(REQUEST.pack(number, self._threads, *plan))
         except OSError:
             raise RmcError(ENDED) from None
 
@@ -140,17 +141,14 @@ class PipelinedUpdate:
 
     def _finish(self) -> UpdateResult:
         self._await_answer()
-        (slot, number), update = self._pending.popleft(), self._update
-        batch = self._batch(slot, number)
+        (slot, number, plan), update = self._pending.popleft(), self._update
+        batch = view_batch(slot.raw, slot.importance, self._spec, plan)
         model = slot.model_of(batch)
         loss_values, value = update.value_pass(batch, model, slot.beta)
         norm = update.step(update.optimizers[1:], loss_values.values())
         update.follow_value()
         update.update_ema(number, VALUE_PARTS)
         return update.result(batch, model, value, torch.hypot(norm, slot.norm))
-
-    def _batch(self, slot: Slot, number: int) -> Batch:
-        return view_batch(slot.raw, slot.importance, self._spec, update_steps(slot.raw, self._spec, number))
 
     def _start(self) -> None:
         """Share what both halves touch, and fork; before it, nothing may have run on several threads."""
@@ -167,7 +165,7 @@ class PipelinedUpdate:
                 *averages,
                 *update.agent.normalizer.buffers(),
                 update.curiosity_variance,
-                update.imputer_turns,
+                update.fill_loss,
             ]
         )
         self._slots = [self._make_slot() for _ in range(AHEAD + 1)]
@@ -198,9 +196,9 @@ class PipelinedUpdate:
             _close_all_but(requests.fileno())
             slots = cycle(self._slots)
             while request := requests.recv(REQUEST.size, socket.MSG_WAITALL):
-                number, threads = REQUEST.unpack(request)
+                number, threads, *plan = REQUEST.unpack(request)
                 torch.set_num_threads(threads)
-                self._model_half(next(slots), number)
+                self._model_half(next(slots), number, Plan(*plan))
                 requests.sendall(b"\0")
         except BrokenPipeError:
             pass
@@ -210,8 +208,8 @@ class PipelinedUpdate:
             os._exit(1)
         os._exit(0)
 
-    def _model_half(self, slot: Slot, number: int) -> None:
-        update, batch = self._update, self._batch(slot, number)
+    def _model_half(self, slot: Slot, number: int, plan: Plan) -> None:
+        update, batch = self._update, view_batch(slot.raw, slot.importance, self._spec, plan)
         loss_values, model = update.model_pass(batch)
         norm = update.step(update.optimizers[:1], loss_values.values())
         update.follow_model(model)

@@ -30,7 +30,7 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
 
 def impute(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
     """(B, L + 1, O) with missing frames filled where configured, along the states that ``unroll`` goes through."""
-    if not agent.fills(batch.missing):
+    if agent.next_frame is None or not batch.fills:
         return o
 
     def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,7 @@ Nothing here waits for the host: no ``.item()``, no branch on a tensor, static s
 
 import copy
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple, TypeVar
 
@@ -17,8 +17,9 @@ from torch.func import functional_call
 
 from rmc.common.agent import Agent, MemoryOutput, Prediction, squashed_sample
 from rmc.common.critic import critic_input
+from rmc.common.window import WindowSpec
 from rmc.learner import losses
-from rmc.learner.batch import Batch
+from rmc.learner.batch import Batch, Plan, has_missing, update_steps
 from rmc.learner.config import UpdateConfig
 from rmc.learner.diagnostics import Trace, model_metrics, unexplained_change, value_metrics
 from rmc.learner.fused import fuse
@@ -47,7 +48,7 @@ class ModelPass(NamedTuple):
     next_z: Tensor  # (B, L_t, Z), what the target reads, without gradient
     curiosity: Tensor  # (B, L_t), scaled where configured
     curiosity_variance: Tensor  # (2,), as it is after this batch
-    imputer_turns: Tensor  # (3,), as they are after this batch
+    fill_loss: Tensor  # scalar, the imputer's last
     hidden: Tensor  # (B, L_t + 1, H), for the latent's rank
     observation_unexplained: Tensor  # (O,), see ``diagnostics.unexplained_change``; (0,) without grounding
     metrics: dict[str, Tensor]  # scalars
@@ -76,8 +77,6 @@ Losses = dict[str, Tensor]
 class JointUpdate:
     """Agent, targets and optimiser, and the update that moves them together."""
 
-    imputer_updates = IMPUTER_UPDATES
-
     def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> None:
         device = agent.log_alpha.device
         if bf16 and device.type == "cpu":
@@ -90,7 +89,8 @@ class JointUpdate:
         self.optimizers = self._make_optimizers()
         self.generator = torch.Generator(device).manual_seed(seed)
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
-        self.imputer_turns = torch.zeros(3, device=device)  # updates, whether a frame was ever missing, the last loss
+        self.was_missing = torch.zeros((), dtype=torch.bool)  # whether a frame ever was, on the host
+        self.fill_loss = torch.zeros((), device=device)  # the imputer's last
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
         return [adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, VALUE_PARTS)]
@@ -130,14 +130,15 @@ class JointUpdate:
             i, curiosity_variance = self._scaled(losses.curiosity(error, d, m), m)
             next_z = (self._to_bf16(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:].detach()
         loss_values = {"model_loss": losses.model_loss(error, d, m)}
-        fill_loss, turns = self._fill_loss(o, memory, batch, m)
+        fill_losses = self._fill_losses(o, memory, batch, m)
         grounding_loss, unexplained = self._grounding_loss(o, prediction, batch, m)
-        loss_values |= fill_loss | grounding_loss
+        loss_values |= fill_losses | grounding_loss
         metrics = model_metrics(detached(loss_values), change, i, d, m, c.model_norm)
+        fill_loss = detached(fill_losses).get("fill_loss", self.fill_loss)
         if agent.next_frame is not None:
-            metrics["fill_loss"] = turns[2]
+            metrics["fill_loss"] = fill_loss
         hidden = memory.hidden.detach()
-        return loss_values, ModelPass(z, next_z, i, curiosity_variance, turns, hidden, unexplained, metrics)
+        return loss_values, ModelPass(z, next_z, i, curiosity_variance, fill_loss, hidden, unexplained, metrics)
 
     def value_pass(self, batch: Batch, model: ModelPass, beta: Tensor) -> tuple[Losses, ValuePass]:
         """Intuition: one policy sample for every step serves both the target and the policy loss."""
@@ -188,25 +189,24 @@ class JointUpdate:
         observed = batch.observation_valid[:, self.burn_in :]
         return UpdateResult(value.priorities, metrics, model.hidden, observed, model.observation_unexplained)
 
-    def _fill_loss(self, o: Tensor, memory: MemoryOutput, batch: Batch, m: Tensor) -> tuple[Losses, Tensor]:
-        """The loss of what imputes, where it is configured and its turn, and ``imputer_turns`` after this batch."""
+    def plan(self, raw: Tensor, spec: WindowSpec, number: int) -> Plan:
+        """Of update ``number``, from its (B, row bytes) on the host.
+
+        What imputes is trained at every ``IMPUTER_UPDATES``-th until a frame was missing.
+        """
+        fills = has_missing(raw, spec)
+        self.was_missing |= fills
+        return Plan(update_steps(raw, spec, number), fills, bool(self.was_missing) or number % IMPUTER_UPDATES == 1)
+
+    def _fill_losses(self, o: Tensor, memory: MemoryOutput, batch: Batch, m: Tensor) -> Losses:
+        """The loss of what imputes, where it is configured and its turn."""
         imputer, steps = self.agent.next_frame, slice(self.burn_in, None)
-        if imputer is None:
-            return {}, self.imputer_turns
-        updates, was_missing, loss = self.imputer_turns.unbind()
-        was_missing = torch.maximum(was_missing, batch.missing.any().float())
-        if not self._trains_imputer(was_missing):
-            return {}, torch.stack([updates + 1, was_missing, loss])
+        if imputer is None or not batch.trains_imputer:
+            return {}
         with self._autocast():
             now, after, a = o[:, steps][:, :-1], o[:, steps][:, 1:], batch.action[:, steps]
             expected = imputer(self._to_bf16(memory.hidden.detach()[:, :-1]), now, a)
-        loss = losses.fill_loss(expected, after, _seen(batch)[:, steps][:, 1:], m)
-        return {"fill_loss": loss}, torch.stack([updates + 1, was_missing, loss.detach()])
-
-    def _trains_imputer(self, was_missing: Tensor) -> bool:
-        """A GPU would have to wait to be asked, so there it is always trained."""
-        on_cpu, period = was_missing.device.type == "cpu", self.imputer_updates
-        return not on_cpu or bool(was_missing) or int(self.imputer_turns[0]) % period == 0
+        return {"fill_loss": losses.fill_loss(expected, after, _seen(batch)[:, steps][:, 1:], m)}
 
     def _grounding_loss(self, o: Tensor, prediction: Prediction, batch: Batch, m: Tensor) -> tuple[Losses, Tensor]:
         """The loss of predicted observations, where configured, and what the world model leaves unexplained."""
@@ -245,9 +245,9 @@ class JointUpdate:
         running, weight = moved.unbind()
         return i / (running / weight).sqrt().clamp(min=1e-6), moved
 
-    def step(self, optimizers: Iterable[torch.optim.Adam], loss_values: Iterable[Tensor]) -> Tensor:
-        """Backward from the losses' sum, clip, Adam; returns the gradient's norm before clipping."""
-        parameters = list(self.agent.parameters())
+    def step(self, optimizers: Sequence[torch.optim.Adam], loss_values: Iterable[Tensor]) -> Tensor:
+        """Backward from the losses' sum, clip, Adam; returns the norm of what they move by, before clipping."""
+        parameters = [parameter for one in optimizers for group in one.param_groups for parameter in group["params"]]
         for parameter in parameters:
             parameter.grad = None
         sum(loss_values, torch.zeros_like(self.agent.log_alpha)).backward()  # type: ignore[no-untyped-call]
@@ -260,11 +260,11 @@ class JointUpdate:
         return norm.detach()
 
     def follow_model(self, model: ModelPass) -> None:
-        """What follows the memory's step: its target by Polyak, the running variance, the imputer's turns."""
+        """What follows the memory's step: its target by Polyak, the running variance, the imputer's last loss."""
         if self._has_target_memory:
             follow(self.target_memory, self.agent.memory, 1.0 - self.config.polyak)
         self.curiosity_variance.copy_(model.curiosity_variance)
-        self.imputer_turns.copy_(model.imputer_turns)
+        self.fill_loss.copy_(model.fill_loss)
 
     def follow_value(self) -> None:
         """What follows the critics' step: their targets by Polyak."""
@@ -294,7 +294,8 @@ class JointUpdate:
             "average": self.average,
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "curiosity_variance": self.curiosity_variance,
-            "imputer_turns": self.imputer_turns,
+            "was_missing": self.was_missing,
+            "fill_loss": self.fill_loss,
             "generator": self.generator.get_state(),
         }
 
@@ -312,7 +313,9 @@ class JointUpdate:
             for group, ours in zip(optimizer.param_groups, own, strict=True):
                 group.update(ours)  # of this config and this device, whatever wrote the checkpoint
         self.curiosity_variance.copy_(state["curiosity_variance"])
-        self.imputer_turns.copy_(state.get("imputer_turns", torch.zeros(3)))  # version 0.1.0 trained it at every update
+        _, was_missing, fill_loss = state.get("imputer_turns", torch.zeros(3))  # of older checkpoints
+        self.was_missing.copy_(state.get("was_missing", was_missing > 0))
+        self.fill_loss.copy_(state.get("fill_loss", fill_loss))
         self._resume_noise(state["generator"].cpu())
 
     def _resume_noise(self, state: Tensor) -> None:

@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 
 from rmc.common.agent import Agent
-from rmc.learner.batch import Batch
+from rmc.common.window import WindowSpec
+from rmc.learner.batch import Batch, Plan
 from rmc.learner.config import UpdateConfig
 from rmc.learner.optimizers import adam
 from rmc.learner.update import JointUpdate, UpdateResult, detached
@@ -16,7 +17,6 @@ class AlternateUpdate(JointUpdate):
     Each has an optimiser of its own, so that a memory that several losses train is moved by several.
     """
 
-    imputer_updates = 1  # it has a stage of its own
     _STAGES = (
         ("world_model", ("model_loss", "grounding_loss")),
         ("next_frame", ("fill_loss",)),
@@ -30,6 +30,10 @@ class AlternateUpdate(JointUpdate):
 
     def _stages(self) -> list[tuple[str, tuple[str, ...]]]:
         return [(part, names) for part, names in self._STAGES if getattr(self.agent, part) is not None]
+
+    def plan(self, raw: Tensor, spec: WindowSpec, number: int) -> Plan:
+        """Of update ``number``: what imputes has a stage of its own, in each."""
+        return super().plan(raw, spec, number)._replace(trains_imputer=True)
 
     def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
         """One round from a Batch. Each metric is from its own stage's forward; priorities from the critics'."""

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from rmc.learner.batch import clear_padding, importance_weights, longest_steps, update_steps, view_batch
+from rmc.learner.batch import (
+    Plan,
+    clear_padding,
+    has_missing,
+    importance_weights,
+    longest_steps,
+    update_steps,
+    view_batch,
+)
 from tests.learner.rows import BY_NUMBER, LONG, SPEC, random_rows, spoil_padding, to_batch
 
 
@@ -91,10 +99,19 @@ def test_a_cut_batch_is_the_whole_one_without_padding() -> None:
     rows = random_rows(6, spec=LONG, longest=20)
     whole, raw = to_batch(rows, LONG), torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
     steps = longest_steps(raw, LONG)
-    cut = view_batch(raw, torch.ones(len(rows)), LONG, steps)
+    cut = view_batch(raw, torch.ones(len(rows)), LONG, Plan(steps, True, True))
     assert (cut.cut, whole.cut) == (LONG.steps - steps, 0)
     for name, value in vars(cut).items():
-        if name != "cut":
-            of_whole = getattr(whole, name)
+        of_whole = getattr(whole, name)
+        if isinstance(value, torch.Tensor):
             assert torch.equal(value, of_whole[:, : value.shape[1]] if value.ndim > 1 else of_whole), name
     assert not whole.observation_valid[:, steps + 1 :].any()
+
+
+@pytest.mark.parametrize("window", [None, 0, 4])
+def test_one_missing_frame_is_seen(window: int | None) -> None:
+    rows = random_rows(5)
+    rows["missing"] = 0
+    if window is not None:
+        rows["missing"][window, rows["first"][window]] = 1
+    assert has_missing(torch.from_numpy(rows.view("u1").reshape(5, -1)), SPEC) == (window is not None)

@@ -3,6 +3,7 @@
 A CUDA stream, event and graph can't be had here: they are mocks with the signatures of the real ones.
 """
 
+import dataclasses
 from contextlib import nullcontext
 from unittest.mock import MagicMock, call, create_autospec
 
@@ -13,6 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from rmc.common.agent import Agent
+from rmc.common.agent_config import AgentConfig
 from rmc.common.window import WindowSpec
 from rmc.learner.batch import clear_padding, view_batch
 from rmc.learner.config import UpdateConfig
@@ -23,15 +25,16 @@ from tests.learner.agents import ROBUST
 from tests.learner.rows import LONG, SPEC, random_rows
 
 BATCH = 8
+IMPUTING = dataclasses.replace(ROBUST, hidden=SPEC.state - SPEC.obs_dim, impute_missing=True)
 
 
-def make(order: str = "joint", device: str = "cpu", bf16: bool = False) -> JointUpdate:
+def make(order: str = "joint", device: str = "cpu", bf16: bool = False, config: AgentConfig = ROBUST) -> JointUpdate:
     torch.manual_seed(0)
-    config = UpdateConfig(
+    update = UpdateConfig(
         update_order=order, latent_target="ema", target_memory="ema", curiosity=0.1, curiosity_scale="std", n_step=2
     )  # type: ignore[arg-type]
-    agent = Agent(SPEC.obs_dim, SPEC.action_dim, ROBUST).to(device)
-    return make_update(agent, SPEC.burn_in, config, 3, bf16)
+    agent = Agent(SPEC.obs_dim, SPEC.action_dim, config).to(device)
+    return make_update(agent, SPEC.burn_in, update, 3, bf16)
 
 
 def host_batch(
@@ -97,7 +100,7 @@ def test_nothing_in_an_update_waits_for_the_host(order, monkeypatch):
     for module in (update.agent, update.target_critic, update.target_memory):
         module.to("meta")
     update.curiosity_variance = update.curiosity_variance.to("meta")
-    update.imputer_turns = update.imputer_turns.to("meta")
+    update.fill_loss = update.fill_loss.to("meta")
     raw = torch.empty(BATCH, SPEC.dtype.itemsize, dtype=torch.uint8, device="meta")
     importance, beta = torch.empty(BATCH, device="meta"), torch.empty((), device="meta")
     view_batch(raw, importance, SPEC)  # makes its constants
@@ -122,21 +125,23 @@ def cuda(monkeypatch):
         monkeypatch.setattr(torch.cuda, name, lambda *_, double=double: double)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda _: calls.current)
     monkeypatch.setattr(torch.cuda, "stream", lambda _: nullcontext())
-    monkeypatch.setattr(torch.cuda, "graph", lambda graph, stream: nullcontext(calls.recording(graph, stream)))
+    monkeypatch.setattr(
+        torch.cuda, "graph", lambda graph, pool, stream: nullcontext(calls.recording(graph, pool, stream))
+    )
     return calls
 
 
 def test_a_graph_is_recorded_once_after_the_warm_up_and_replayed(cuda):
     cuda.CUDAGraph.register_generator_state = MagicMock()
     work, generator = MagicMock(return_value="result"), torch.Generator()
-    graph = CudaGraph(work, generator)
+    graph = CudaGraph(work, generator, (0, 1))
     for _ in range(WARM_UP):
         assert graph() == "result"
     cuda.recording.assert_not_called()
     for _ in range(3):
         assert graph() == "result"
     assert work.call_count == WARM_UP + 1
-    cuda.recording.assert_called_once_with(cuda.CUDAGraph, cuda.Stream)
+    cuda.recording.assert_called_once_with(cuda.CUDAGraph, (0, 1), cuda.Stream)
     cuda.CUDAGraph.register_generator_state.assert_called_once_with(generator)
     assert cuda.CUDAGraph.replay.call_count == 3
 
@@ -181,13 +186,14 @@ def test_a_tensor_on_the_host_is_there_at_once():
 @pytest.mark.parametrize("bf16", [False, True], ids=["fp32", "bf16"])
 @pytest.mark.parametrize("order", ["joint", "alternate"])
 def test_a_graph_trains_as_the_updates_one_by_one(order, bf16):
-    """100 updates; equal losses to 1e-3."""
-    plain, update = make(order, "cuda", bf16), make(order, "cuda", bf16)
-    static = DeviceUpdate(update, SPEC, BATCH)
-    for step in range(100):
-        raw, importance = host_batch(step, pinned=True)
-        expected = plain(view_batch(raw.cuda(), importance.cuda(), SPEC), torch.tensor(0.1, device="cuda"))
-        (result,) = static(raw, importance, 0.1, 1)
+    """100 updates, each plan several times; equal losses to 1e-3."""
+    plain, update = make(order, "cuda", bf16, IMPUTING), make(order, "cuda", bf16, IMPUTING)
+    static = DeviceUpdate(update, LONG, BATCH)
+    for number in range(1, 101):
+        raw, importance = host_batch(number, pinned=True, missing=number > 50, spec=LONG, longest=(20, 60)[number % 2])
+        plan = plain.plan(raw, LONG, number)
+        expected = plain(view_batch(raw.cuda(), importance.cuda(), LONG, plan), torch.tensor(0.1, device="cuda"))
+        (result,) = static(raw, importance, 0.1, number)
         torch.testing.assert_close(result.metrics, expected.metrics, rtol=1e-3, atol=1e-3)
         priorities = HostCopy(result.priorities).wait()
         torch.testing.assert_close(priorities, expected.priorities.cpu(), rtol=1e-3, atol=1e-3)

@@ -11,9 +11,10 @@ from torch import Tensor
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.learner import losses
+from rmc.learner.batch import clear_padding, view_batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.unroll import unroll
-from rmc.learner.update import TRAINS_MEMORY, JointUpdate
+from rmc.learner.update import TRAINS_MEMORY, JointUpdate, UpdateResult
 from rmc.learner.update_order import make_update
 from tests.learner.agents import PAPER, ROBUST
 from tests.learner.rows import SPEC, observation_valid, random_rows, spoil_padding, to_batch
@@ -313,32 +314,51 @@ IMPUTING = dataclasses.replace(ROBUST, impute_missing=True)
 WITH_FRAMES = dataclasses.replace(SPEC, state=IMPUTING.state_size(SPEC.obs_dim))
 
 
-def moves_of_the_imputer(update: JointUpdate, updates: int, missing_from: int, begin: int = 0) -> list[int]:
+def update_of(update: JointUpdate, number: int, is_missing: bool) -> UpdateResult:
+    """Update ``number``, planned, of a batch in which frames are missing or none is."""
+    rows = random_rows(8, number, WITH_FRAMES)
+    rows["missing"] *= is_missing
+    clear_padding(rows, WITH_FRAMES)
+    raw = torch.from_numpy(rows.view("u1").reshape(8, -1))
+    plan = update.plan(raw, WITH_FRAMES, number)
+    assert plan.fills == is_missing
+    return update(view_batch(raw, torch.ones(8), WITH_FRAMES, plan), BETA)
+
+
+def moves_of_the_imputer(update: JointUpdate, updates: int, missing_from: int, begin: int = 1) -> list[int]:
     """The updates at which it moves; frames are missing in batches from ``missing_from`` on, for one batch."""
     moves, weight = [], update.agent.next_frame.net[0].weight  # type: ignore[union-attr]
     for number in range(begin, begin + updates):
-        rows, before = random_rows(8, number, WITH_FRAMES), weight.detach().clone()
-        rows["missing"] *= number == missing_from
-        update(to_batch(rows, WITH_FRAMES), BETA)
+        before = weight.detach().clone()
+        update_of(update, number, number == missing_from)
         moves += [number] if not torch.equal(weight, before) else []
     return moves
 
 
 def test_what_imputes_is_trained_seldom_until_a_frame_is_missing():
     update = make(IMPUTING)
-    assert moves_of_the_imputer(update, 30, missing_from=19) == [0, 8, 16, *range(19, 30)]
-    assert moves_of_the_imputer(make(IMPUTING, update_order="alternate"), 4, missing_from=99) == [0, 1, 2, 3]
+    assert moves_of_the_imputer(update, 30, missing_from=20) == [1, 9, 17, *range(20, 31)]
+    assert moves_of_the_imputer(make(IMPUTING, update_order="alternate"), 4, missing_from=99) == [1, 2, 3, 4]
 
 
 def test_its_turns_go_on_from_a_checkpoint_and_it_says_its_last_loss():
     before, after = make(IMPUTING), make(IMPUTING)
-    assert moves_of_the_imputer(before, 5, missing_from=99) == [0]
-    rows = random_rows(8, 4, WITH_FRAMES)
-    rows["missing"] = 0
-    batch = to_batch(rows, WITH_FRAMES)
-    after.load_state_dict(before.state_dict())
-    assert moves_of_the_imputer(after, 8, missing_from=99, begin=5) == [8]
-    assert after(batch, BETA).metrics["fill_loss"] == after(batch, BETA).metrics["fill_loss"] > 0
-    older = {name: value for name, value in before.state_dict().items() if name != "imputer_turns"}
-    after.load_state_dict(older)  # as of a version that trained it at every update
-    assert moves_of_the_imputer(after, 2, missing_from=99, begin=5) == [5]
+    assert moves_of_the_imputer(before, 5, missing_from=99) == [1]
+    state = before.state_dict()
+    loss = state["fill_loss"].item()
+    after.load_state_dict(state)
+    assert update_of(after, 6, False).metrics["fill_loss"] == loss > 0
+    assert moves_of_the_imputer(after, 4, missing_from=8, begin=7) == [8, 9, 10]
+    after.load_state_dict(after.state_dict())
+    assert moves_of_the_imputer(after, 2, missing_from=99, begin=11) == [11, 12]
+
+
+@pytest.mark.parametrize(("was_missing", "moves"), [(0.0, []), (1.0, [2, 3])])
+def test_an_older_checkpoint_says_whether_a_frame_was_missing(was_missing, moves):
+    update = make(IMPUTING)
+    older = {name: value for name, value in update.state_dict().items() if name not in ("was_missing", "fill_loss")}
+    update.load_state_dict(older | {"imputer_turns": torch.tensor([1.0, was_missing, 0.5])})
+    assert update_of(update, 2, False).metrics["fill_loss"] == 0.5 or moves
+    assert moves_of_the_imputer(update, 2, missing_from=99, begin=2) == moves
+    update.load_state_dict(older)  # of version 0.1.0
+    assert moves_of_the_imputer(update, 2, missing_from=99, begin=2) == []
