@@ -113,7 +113,8 @@ class DeviceUpdate:
         self._copy, self.in_flight = self._copy_now, 0
         if device.type == "cuda":
             self._graphs: dict[Plan, CudaGraph[UpdateResult]] = {}
-            self._pool, self._beside = torch.cuda.graph_pool_handle(), torch.cuda.Stream(device)
+            self._pool = torch.cuda.graph_pool_handle()
+            self._beside = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
             self._work, self._copy, self.in_flight = self._replay, CopiesAhead([self._raw, self._importance]), 1
 
     def __call__(self, raw: Tensor, importance: Tensor, beta: float, number: int) -> list[UpdateResult]:

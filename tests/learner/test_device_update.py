@@ -5,6 +5,7 @@ A CUDA stream, event and graph can't be had here: they are mocks with the signat
 
 import dataclasses
 from contextlib import nullcontext
+from types import SimpleNamespace
 from unittest.mock import MagicMock, call, create_autospec
 
 import numpy as np
@@ -101,6 +102,8 @@ def test_nothing_in_an_update_waits_for_the_host(order, monkeypatch):
         module.to("meta")
     update.curiosity_variance = update.curiosity_variance.to("meta")
     update.fill_loss = update.fill_loss.to("meta")
+    moved = SimpleNamespace(param_groups=[{"params": list(update.agent.parameters())}], step=lambda: None)
+    update.optimizers = [moved] * len(update.optimizers)  # torch's Adam knows no "meta"
     raw = torch.empty(BATCH, SPEC.dtype.itemsize, dtype=torch.uint8, device="meta")
     importance, beta = torch.empty(BATCH, device="meta"), torch.empty((), device="meta")
     view_batch(raw, importance, SPEC)  # makes its constants
