@@ -5,7 +5,7 @@
 Batches lie ready in pinned memory; both take priorities back to the host. Ends at once where there is no GPU.
 """
 
-import itertools
+from itertools import count, product
 
 import torch
 
@@ -15,27 +15,30 @@ from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.presets import robust
 from rmc.learner.batch import view_batch
+from rmc.learner.config import Precision
 from rmc.learner.device_update import DeviceUpdate, HostCopy
-from rmc.learner.learner import bf16_is_native
+from rmc.learner.precision import set_precision
 from rmc.learner.update import JointUpdate
 from rmc.learner.update_order import make_update
 
+PRECISIONS: tuple[Precision, ...] = ("auto", "bf16", "fp32")
 CHUNK = 10  # updates between looks at the clock
 
 
-def _update(run: RunConfig) -> JointUpdate:
+def _update(run: RunConfig, precision: Precision) -> JointUpdate:
     spec, device = run.window_spec(), torch.device("cuda")
     agent = Agent(spec.obs_dim, spec.action_dim, run.agent).to(device)
-    return make_update(agent, spec.burn_in, run.update, 0, bf16_is_native(device))
+    return make_update(agent, spec.burn_in, run.update, 0, set_precision(precision, device))
 
 
-def measure(run: RunConfig, batch_size: int, seconds: float, rounds: int) -> list[Row]:
-    """One batch size."""
+def measure(run: RunConfig, batch_size: int, precision: Precision, seconds: float, rounds: int) -> list[Row]:
+    """One batch size in one precision."""
     spec = run.window_spec()
     raw = torch.from_numpy(random_rows(spec, batch_size).view("u1").reshape(batch_size, -1)).pin_memory()
     importance = torch.ones(batch_size).pin_memory()
-    plain, graphed = _update(run), DeviceUpdate(_update(run), spec, batch_size)
-    beta, numbers = torch.zeros((), device="cuda"), itertools.count(1)
+    plain, graphed = (_update(run, precision) for _ in range(2))
+    at_once = DeviceUpdate(graphed, spec, batch_size)
+    beta, numbers = torch.zeros((), device="cuda"), count(1)
 
     def one_by_one() -> int:
         for _ in range(CHUNK):
@@ -46,14 +49,14 @@ def measure(run: RunConfig, batch_size: int, seconds: float, rounds: int) -> lis
     def as_graph() -> int:
         before = None
         for _ in range(CHUNK):
-            (updated,) = graphed(raw, importance, 0.0, next(numbers))
+            (updated,) = at_once(raw, importance, 0.0, next(numbers))
             if before is not None:
                 before.wait()
             before = HostCopy(updated.priorities)
         torch.cuda.synchronize()
         return CHUNK
 
-    name = f"update on a GPU, {run.env.id}, batch {batch_size}"
+    name = f"update on a GPU, {run.env.id}, batch {batch_size}, {'tf32' if precision == 'auto' else precision}"
     peers = {"launched kernel by kernel": lambda: speed(one_by_one, seconds)}
     for work in (one_by_one, as_graph):
         speed(work, 1.0)
@@ -69,7 +72,10 @@ def main() -> None:
         print("PyTorch sees no CUDA device: nothing was measured")
         return
     run = robust(EnvConfig(options.env))
-    save([row for size in options.batches for row in measure(run, size, options.seconds, options.rounds)])
+    rows: list[Row] = []
+    for size, precision in product(options.batches, PRECISIONS):
+        rows += measure(run, size, precision, options.seconds, options.rounds)
+    save(rows)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -44,12 +43,13 @@ from rmc.common.window import WindowSpec
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.presets import robust
 from rmc.learner.batch import clear_padding, view_batch
-from rmc.learner.learner import Learner, bf16_is_native
+from rmc.learner.config import Precision
+from rmc.learner.learner import Learner
+from rmc.learner.precision import has_fast_bf16
 from rmc.learner.replay_client import ReplayClient
 from rmc.learner.update_order import make_update
 from rmc.replay_server.config import ReplayConfig
 
-Precision = Literal["auto", "bf16", "fp32"]
 PRECISIONS: tuple[Precision, ...] = ("bf16", "fp32")
 WINDOWS = 4800  # in the ring
 SAC_BATCH = 256
@@ -133,7 +133,7 @@ def cut(run: RunConfig, longest: int, seconds: float, rounds: int) -> list[Row]:
 
     def measured(is_cut: bool) -> Measure:
         agent = Agent(spec.obs_dim, spec.action_dim, run.agent)
-        update = make_update(agent, spec.burn_in, run.update, 0, bf16_is_native(torch.device("cpu")))
+        update = make_update(agent, spec.burn_in, run.update, 0, has_fast_bf16(torch.device("cpu")))
 
         plan = update.plan(raw, spec, 2)
         if not is_cut:

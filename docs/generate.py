@@ -44,7 +44,7 @@ WHEN = {
     "init_from": "to begin with what another run has [learnt](warm-start.md); for a new run alone",
     "init_parts": "`memory+world-model` for another reward, `policy` to begin with what acts",
     "launcher": "`ray` for several machines, `lockstep` for the same bits again, `manual` to start the roles yourself",
-    "device": "`cuda` where there is a GPU; not tried on one yet, see [performance](performance.md)",
+    "device": "`cuda` where there is a GPU: see [On a GPU](gpu.md)",
     "redis_url": "with `--launcher manual`, or to keep a run in a Redis of yours",
     "ray_address": "`local` to try Ray on one machine",
     "all_cpus": "on a cluster that is there for this run",

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+Precision = Literal["auto", "bf16", "fp32"]
 MODEL_PROCESS = "rmc learner: memory and world model"  # the title of the process that has this half of an update
 
 
@@ -78,8 +79,9 @@ class LearnerConfig:
     """Environment steps between checkpoints, each of which the evaluator plays."""
     keep_checkpoints: int = 3
     """Newest checkpoints kept, beside the best."""
-    precision: Literal["auto", "bf16", "fp32"] = "auto"
-    """Matrix products in bfloat16 (auto: where this CPU or GPU has instructions for it) or float32."""
+    precision: Precision = "auto"
+    """Matrix products in bfloat16 or float32; auto: bfloat16 where the CPU has instructions for it, TensorFloat-32 on a
+    GPU."""
     threads: int = 0
     """CPU threads of the learner. 0 tries 1, 2, 4 … and keeps the fastest; one on Ray and in lockstep. From 2 on, or 0
     with two cores, memory and world model of scheme 3 train in a process of their own."""

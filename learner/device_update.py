@@ -1,7 +1,7 @@
 """The update on its device: rows in, priorities out, the batch always in the same memory.
 
-A GPU must never wait for the host: an update launches more than a thousand kernels of some microseconds each, so they
-are recorded as one CUDA graph, and copies go beside it. A CPU takes the same way, without a graph. Shapes: B batch.
+A GPU must never wait for the host: an update launches some 500 kernels of some microseconds each, so they are recorded
+as one CUDA graph for each plan, and copies go beside it. A CPU takes the same way, without a graph. Shapes: B batch.
 """
 
 from collections.abc import Callable

@@ -27,6 +27,7 @@ from rmc.learner.device_update import DeviceUpdate, HostCopy
 from rmc.learner.learner_checkpoint import NOT_OURS, LearnerProgress, all_finite, pack, take_up
 from rmc.learner.learner_metrics import Drawn, LearnerMetrics, needs_weights
 from rmc.learner.pipelined_update import PipelinedUpdate
+from rmc.learner.precision import set_precision
 from rmc.learner.thread_trial import ThreadTrial
 from rmc.learner.update import UpdateResult
 from rmc.learner.update_order import make_update
@@ -35,13 +36,6 @@ log = logging.getLogger(__name__)
 LARGE_REWARD = 1e4  # a step's, from which it is the likely cause of a divergence
 SAVE_AGAIN_SECONDS = 10.0  # after a checkpoint that could not be written
 LOOK_SECONDS = 5.0  # between looks, while waiting, whether Redis still has the weights
-
-
-def bf16_is_native(device: torch.device) -> bool:
-    """Whether bfloat16 products are faster there: on a CPU with AMX or AVX-512 BF16; a GPU's TensorFloat-32 is."""
-    if device.type == "cuda":
-        return False
-    return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
 
 
 class Learner:
@@ -88,8 +82,7 @@ class Learner:
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent, spec.missing, spec.privileged)
         self.agent.start_gates(spec.steps)
         self.agent.to(self.device)
-        bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_is_native(self.device))
-        torch.backends.cuda.matmul.allow_tf32 = config.precision == "auto"
+        bf16 = set_precision(config.precision, self.device)
         self.update = make_update(self.agent, spec.burn_in, update, seed, bf16)
         self._updated: DeviceUpdate | PipelinedUpdate = (
             PipelinedUpdate(self.update, spec, config.batch_size)
