@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo wheel site guard test test-failed test-faults chaos test-long test-cluster test-container test-dm-control test-pybullet test-newest lint docs bench peers clean
+.PHONY: env demo wheel site guard test test-failed test-faults chaos test-long test-cluster test-container test-dm-control test-pybullet test-newest lint docs results-page bench peers clean
 
 env: $(STAMP)
 
@@ -115,6 +115,10 @@ site: $(STAMP)
 docs: $(STAMP)
 	$(BIN)/python -m docs.generate
 	$(BIN)/python -m docs.fault_table
+
+# The tables and the picture of returns, from the lines in studies/results/ that docs/results.toml names.
+results-page: $(STAMP)
+	$(BIN)/python -m docs.results_page
 
 # Short trainings beside the committed lines of earlier ones, for every change of a default: some 20 minutes, two quiet cores.
 guard: $(STAMP)

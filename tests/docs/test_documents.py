@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from docs import fault_table
+from docs import fault_table, results_page
 from docs.generate import page
 from rmc.cli import main
 from rmc.cli.parser import COMMANDS
@@ -38,6 +38,11 @@ def test_the_faults_that_were_run_are_in_their_page() -> None:
     faults = {row["fault"] for row in json.loads(fault_table.RESULTS.read_text())}
     assert all(f"| {fault} |" in fault_table.page() for fault in faults)
     assert len(faults) >= 10
+
+
+@pytest.mark.parametrize("path", results_page.HEAD, ids=lambda path: path.name)
+def test_the_returns_in_it_are_those_of_the_lines(path: Path) -> None:
+    assert results_page.page(path) == path.read_text(), "run make results-page"
 
 
 def test_every_equation_leads_to_its_code_and_back() -> None:

@@ -1,0 +1,159 @@
+"""Puts the returns that ``results.toml`` names into results.md and README.md, and draws returns.png.
+
+``make results-page``; a test sees to the tables. Published figures are means of 10 seeds on ``-v4``, from SimbaV2's
+results/baseline/sac.csv.
+"""
+
+import re
+import statistics
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from rmc.analysis import history
+from rmc.analysis.history import Evaluation, History
+
+HERE = Path(__file__).parent
+LINES = HERE.parent / "studies" / "results"
+README, RESULTS, PICTURE = HERE.parent / "README.md", HERE / "results.md", HERE / "returns.png"
+BEGIN, END = "<!-- returns: begin -->\n", "<!-- returns: end -->"
+HEAD = {
+    RESULTS: "| environment | agent | steps | return | each seed | wall time, s | public SAC (`-v4`) |",
+    README: "| agent | return | wall time |",
+}
+IN_README = {"`robust`": "RMC, preset `robust`", "SAC": "SAC of stable-baselines3, heads of 400 and 300 units"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table: runs that count together, at some environment steps."""
+
+    env: str
+    agent: str
+    steps: int
+    runs: tuple[tuple[History, str], ...]  # and the mark of each
+    public: int | None = None  # SAC's return there
+
+    @classmethod
+    def of(cls, raw: dict[str, Any]) -> "Row":
+        """Raises KeyError where a seed has no line."""
+        runs: list[tuple[History, str]] = []
+        for file, agent, seeds, *mark in raw["runs"]:
+            by_seed = {one.seed: one for one in _lines(file) if (one.env, one.agent) == (raw["env"], agent)}
+            runs += [(by_seed[seed], "".join(mark)) for seed in seeds]
+        return cls(**raw | {"runs": tuple(runs)})
+
+    def evaluations(self) -> list[Evaluation]:
+        """Each run's, nearest to those steps."""
+        return [min(run.evaluations, key=lambda one: abs(one.env_steps - self.steps)) for run, _ in self.runs]
+
+    def mean(self) -> float:
+        """Over seeds."""
+        return statistics.mean(one.return_mean for one in self.evaluations())
+
+
+@cache
+def _lines(file: str) -> list[History]:
+    return history.read(LINES / f"{file}.jsonl")
+
+
+@cache
+def rows(table: str) -> list[Row]:
+    """Of a table, in its order."""
+    return [Row.of(raw) for raw in tomllib.loads((HERE / "results.toml").read_text())[table]]
+
+
+def page(path: Path) -> str:
+    """The page with its table as it should be."""
+    before, _, rest = path.read_text().partition(BEGIN)
+    body = {RESULTS: _results, README: _readme}[path]()
+    return (
+        before
+        + BEGIN
+        + "\n".join([HEAD[path], "|---" * (HEAD[path].count("|") - 1) + "|", *body])
+        + "\n"
+        + END
+        + rest.partition(END)[2]
+    )
+
+
+def _results() -> Iterator[str]:
+    for env, own in groupby(rows("returns"), key=lambda row: row.env):
+        for number, row in enumerate(own):
+            each = ", ".join(
+                f"{_number(one.return_mean)}{mark}" for one, (_, mark) in zip(row.evaluations(), row.runs, strict=True)
+            )
+            cells = [env if number == 0 else "", row.agent, _number(row.steps), _return(row), each, _seconds(row)]
+            yield re.sub(r" +\|", " |", f"| {' | '.join(cells)} | {_number(row.public)} |")
+
+
+def _readme() -> Iterator[str]:
+    long = [row for row in rows("returns") if (row.env, row.steps) == ("HalfCheetah-v5", 300_000)]
+    for row in long:
+        if row.agent in IN_README:
+            minutes = [round(one.wall_s / 60) for one in row.evaluations()]
+            yield f"| {IN_README[row.agent]} | {_return(row)} | {min(minutes)} to {max(minutes)} minutes |"
+    public = next(row.public for row in long if row.public is not None)
+    yield f"| public SAC on HalfCheetah-v4, mean of 10 seeds | {_number(public)} | – |"
+
+
+def _return(row: Row) -> str:
+    """Its mean, and deviation over seeds; bold where it is the highest of several rows of several seeds."""
+    if len(row.runs) == 1:
+        return _number(row.mean())
+    deviation = statistics.stdev(one.return_mean for one in row.evaluations())
+    beside = [one for one in rows("returns") if (one.env, one.steps) == (row.env, row.steps) and len(one.runs) > 1]
+    text = f"{_number(row.mean())} ± {_number(deviation)}"
+    return f"**{text}**" if len(beside) > 1 and row is max(beside, key=Row.mean) else text
+
+
+def _seconds(row: Row) -> str:
+    seconds = [one.wall_s for one in row.evaluations()]
+    return " to ".join(dict.fromkeys((_number(min(seconds)), _number(max(seconds)))))
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:,.0f}".replace(",", " ").replace("-", "\u2212")
+
+
+def draw() -> None:
+    """A panel an environment, a line a seed; published figures are crosses."""
+    from matplotlib.figure import Figure
+
+    long = [row for table in ("returns", "half_blank") for row in rows(table) if row.steps >= 300_000]
+    panels = {env: list(own) for env, own in groupby(long, key=lambda row: row.env)}
+    figure = Figure(figsize=(3.6 * len(panels), 3.8), layout="constrained")
+    handles: dict[str, Any] = {}
+    for axes, (env, own) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+        for row in own:
+            _draw_row(axes, row, handles)
+        marks = [(row.steps, row.public) for row in rows("returns") if row.env == env and row.public is not None]
+        if marks:
+            (handles["public SAC, on -v4"],) = axes.plot(*zip(*marks, strict=True), "x", color="black", markersize=8)
+        axes.set(title=env, xlabel="environment steps", ylabel="return")
+        axes.locator_params(axis="x", nbins=4)
+        axes.grid(alpha=0.3)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, frameon=False)
+    figure.savefig(PICTURE, dpi=110)
+
+
+def _draw_row(axes: Any, row: Row, handles: dict[str, Any]) -> None:
+    name = row.agent.replace("`", "").rstrip("ⁿ")
+    colour = handles[name].get_color() if name in handles else f"C{len(handles)}"
+    for run, _ in row.runs:
+        points = [(one.env_steps, one.return_mean) for one in run.evaluations]
+        (handles[name],) = axes.plot(*zip(*points, strict=True), color=colour, linewidth=1.2, alpha=0.8)
+
+
+def main() -> None:
+    for path in HEAD:
+        path.write_text(page(path))
+    draw()
+
+
+if __name__ == "__main__":
+    main()
