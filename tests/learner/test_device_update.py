@@ -3,6 +3,7 @@
 A CUDA stream, event and graph can't be had here: they are mocks with the signatures of the real ones.
 """
 
+import copy
 import dataclasses
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -147,6 +148,48 @@ def test_a_graph_is_recorded_once_after_the_warm_up_and_replayed(cuda):
     cuda.recording.assert_called_once_with(cuda.CUDAGraph, (0, 1), cuda.Stream)
     cuda.CUDAGraph.register_generator_state.assert_called_once_with(generator)
     assert cuda.CUDAGraph.replay.call_count == 3
+
+
+def test_each_plan_has_a_graph_of_its_own(monkeypatch):
+    """Here the graphs are doubles that run as they are; a GPU's test is below."""
+    made = []
+
+    class Double:
+        def __init__(self, work, generator, pool):
+            made.append(work)
+            self._work = work
+
+        def __call__(self):
+            return self._work()
+
+    monkeypatch.setattr("rmc.learner.device_update.CudaGraph", Double)
+    plain, update = make(config=IMPUTING), make(config=IMPUTING)
+    apart = DeviceUpdate(update, SPEC, BATCH)
+    apart._work, apart._graphs, apart._pool = apart._replay, {}, (0, 1)
+    for number in range(1, 20):
+        raw, importance = host_batch(number, missing=number == 12)
+        expected = plain(view_batch(raw, importance, SPEC, plain.plan(raw, SPEC, number)), torch.tensor(0.1))
+        (result,) = apart(raw, importance, 0.1, number)
+        assert torch.equal(result.priorities, expected.priorities)
+    assert [tuple(work.args[0])[1:] for work in made] == [(False, True), (False, False), (True, True)]
+    assert all(map(torch.equal, update.agent.state_dict().values(), plain.agent.state_dict().values()))
+
+
+def test_halves_at_once_are_the_update(cuda):
+    """On a GPU in two streams, which meet before the result is read."""
+    config = UpdateConfig(scheme=3, curiosity=0.1, curiosity_scale="std")
+    torch.manual_seed(0)
+    agent = Agent(SPEC.obs_dim, SPEC.action_dim, IMPUTING)
+    plain, update = (make_update(copy.deepcopy(agent), SPEC.burn_in, config, 3) for _ in range(2))
+    one_by_one, at_once = (DeviceUpdate(one, SPEC, BATCH) for one in (plain, update))
+    at_once._beside, at_once._work = cuda.beside, at_once._halves_at_once
+    for number in range(1, 6):
+        raw, importance = host_batch(number, missing=number > 3)
+        (expected,), (result,) = (one(raw, importance, 0.1, number) for one in (one_by_one, at_once))
+        assert torch.equal(result.priorities, expected.priorities)
+        torch.testing.assert_close(result.metrics, expected.metrics)
+        assert cuda.mock_calls[-2:] == [call.beside.wait_stream(cuda.current), call.current.wait_stream(cuda.beside)]
+    assert all(map(torch.equal, update.agent.state_dict().values(), plain.agent.state_dict().values()))
 
 
 def test_a_copy_waits_until_the_last_was_taken_and_is_waited_for(cuda):
