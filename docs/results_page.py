@@ -37,6 +37,7 @@ class Row:
     steps: int
     runs: tuple[tuple[History, str], ...]  # and the mark of each
     public: int | None = None  # SAC's return there
+    beside: str = ""  # what else ran meanwhile
 
     @classmethod
     def of(cls, raw: dict[str, Any]) -> "Row":
@@ -102,18 +103,20 @@ def _readme() -> Iterator[str]:
 
 
 def _return(row: Row) -> str:
-    """Its mean, and deviation over seeds; bold where it is the highest of several rows of several seeds."""
+    """Its mean, and deviation over seeds; bold where an agent's first row of several seeds is ahead of others' first."""
     if len(row.runs) == 1:
         return _number(row.mean())
     deviation = statistics.stdev(one.return_mean for one in row.evaluations())
     beside = [one for one in rows("returns") if (one.env, one.steps) == (row.env, row.steps) and len(one.runs) > 1]
+    first = {one.agent.split(",")[0].rstrip("ⁿ"): one for one in reversed(beside)}
     text = f"{_number(row.mean())} ± {_number(deviation)}"
-    return f"**{text}**" if len(beside) > 1 and row is max(beside, key=Row.mean) else text
+    return f"**{text}**" if len(first) > 1 and row is max(first.values(), key=Row.mean) else text
 
 
 def _seconds(row: Row) -> str:
     seconds = [one.wall_s for one in row.evaluations()]
-    return " to ".join(dict.fromkeys((_number(min(seconds)), _number(max(seconds)))))
+    span = " to ".join(dict.fromkeys((_number(min(seconds)), _number(max(seconds)))))
+    return span + (f", beside {row.beside}" if row.beside else "")
 
 
 def _number(value: float | None) -> str:

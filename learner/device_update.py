@@ -6,7 +6,7 @@ as one CUDA graph for each plan, and copies go beside it. A CPU takes the same w
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,18 +19,28 @@ T = TypeVar("T")
 WARM_UP = 3  # calls as they are, in which libraries choose their kernels and Adam makes its moments
 
 
+class GraphPlace(NamedTuple):
+    """Where graphs are recorded, one after the other."""
+
+    stream: torch.cuda.Stream  # the default one cannot be recorded
+    pool: Any  # of memory
+
+    @classmethod
+    def on(cls, device: torch.device) -> "GraphPlace":
+        return cls(torch.cuda.Stream(device), torch.cuda.graph_pool_handle())  # type: ignore[no-untyped-call]
+
+
 class CudaGraph(Generic[T]):
     """A function of tensors that stay where they are: recorded once, after some calls as it is, and replayed."""
 
-    def __init__(self, work: Callable[[], T], generator: torch.Generator, pool: Any) -> None:
+    def __init__(self, work: Callable[[], T], generator: torch.Generator, place: "GraphPlace") -> None:
         """``generator`` gives ``work`` its random numbers; a replay takes those after the last one's.
 
-        Graphs of one ``pool`` of memory overwrite each other's results.
+        Graphs of one ``place`` overwrite each other's results.
         """
-        self._work, self._generator, self._pool, self._warm_up = work, generator, pool, WARM_UP
+        self._work, self._generator, self._place, self._warm_up = work, generator, place, WARM_UP
         self._graph: torch.cuda.CUDAGraph | None = None
         self._recorded: T | None = None
-        self._stream = torch.cuda.Stream(generator.device)  # type: ignore[no-untyped-call]  # the default one cannot be recorded
 
     def __call__(self) -> T:
         """What ``work`` returns; the next call overwrites it."""
@@ -46,17 +56,18 @@ class CudaGraph(Generic[T]):
 
     def _as_it_is(self) -> T:
         current = torch.cuda.current_stream(self._generator.device)
-        self._stream.wait_stream(current)
-        with torch.cuda.stream(self._stream):
+        stream = self._place.stream
+        stream.wait_stream(current)
+        with torch.cuda.stream(stream):
             result = self._work()
-        current.wait_stream(self._stream)
+        current.wait_stream(stream)
         return result
 
     def _record(self) -> None:
         """Nothing is computed yet: the first replay does that."""
         self._graph = torch.cuda.CUDAGraph()
         self._graph.register_generator_state(self._generator)
-        with torch.cuda.graph(self._graph, self._pool, self._stream):
+        with torch.cuda.graph(self._graph, self._place.pool, self._place.stream):
             self._recorded = self._work()
 
 
@@ -113,7 +124,7 @@ class DeviceUpdate:
         self._copy, self.in_flight = self._copy_now, 0
         if device.type == "cuda":
             self._graphs: dict[Plan, CudaGraph[UpdateResult]] = {}
-            self._pool = torch.cuda.graph_pool_handle()
+            self._place = GraphPlace.on(device)
             self._beside = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
             self._work, self._copy, self.in_flight = self._replay, CopiesAhead([self._raw, self._importance]), 1
 
@@ -165,7 +176,7 @@ class DeviceUpdate:
         """Each plan has a graph of its own."""
         if plan not in self._graphs:
             work = self._halves_at_once if self._update.config.halves_are_apart() else self._once
-            self._graphs[plan] = CudaGraph(partial(work, plan), self._update.generator, self._pool)
+            self._graphs[plan] = CudaGraph(partial(work, plan), self._update.generator, self._place)
         return self._graphs[plan]()
 
     def _copy_now(self, tensors: list[Tensor]) -> None:

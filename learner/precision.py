@@ -6,11 +6,11 @@ from rmc.learner.config import Precision
 
 
 def set_precision(precision: Precision, device: torch.device) -> bool:
-    """Whether products there are in bfloat16, by autocast; those of a GPU's float32 are set here.
+    """Whether products there are in bfloat16, by autocast; those of a GPU's float32, the GRU's too, are set here.
 
     "auto" is what is fast: bfloat16 on a CPU that has it, TensorFloat-32 on a GPU, where bfloat16's casts cost kernels.
     """
-    torch.backends.cuda.matmul.allow_tf32 = precision == "auto"
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = precision == "auto"
     return precision == "bf16" or (precision == "auto" and has_fast_bf16(device))
 
 

@@ -194,9 +194,12 @@ class JointUpdate:
 
         What imputes is trained at every ``IMPUTER_UPDATES``-th until a frame was missing.
         """
+        steps = update_steps(raw, spec, number)
+        if self.agent.next_frame is None:
+            return Plan(steps, False, False)
         fills = has_missing(raw, spec)
         self.was_missing |= fills
-        return Plan(update_steps(raw, spec, number), fills, bool(self.was_missing) or number % IMPUTER_UPDATES == 1)
+        return Plan(steps, fills, bool(self.was_missing) or number % IMPUTER_UPDATES == 1)
 
     def _fill_losses(self, o: Tensor, memory: MemoryOutput, batch: Batch, m: Tensor) -> Losses:
         """The loss of what imputes, where it is configured and its turn."""

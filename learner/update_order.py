@@ -33,7 +33,7 @@ class AlternateUpdate(JointUpdate):
 
     def plan(self, raw: Tensor, spec: WindowSpec, number: int) -> Plan:
         """Of update ``number``: what imputes has a stage of its own, in each."""
-        return super().plan(raw, spec, number)._replace(trains_imputer=True)
+        return super().plan(raw, spec, number)._replace(trains_imputer=self.agent.next_frame is not None)
 
     def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
         """One round from a Batch. Each metric is from its own stage's forward; priorities from the critics'."""

@@ -3,7 +3,6 @@
 A CUDA stream, event and graph can't be had here: they are mocks with the signatures of the real ones.
 """
 
-import copy
 import dataclasses
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -20,7 +19,7 @@ from rmc.common.agent_config import AgentConfig
 from rmc.common.window import WindowSpec
 from rmc.learner.batch import clear_padding, view_batch
 from rmc.learner.config import UpdateConfig
-from rmc.learner.device_update import WARM_UP, CopiesAhead, CudaGraph, DeviceUpdate, HostCopy
+from rmc.learner.device_update import WARM_UP, CopiesAhead, CudaGraph, DeviceUpdate, GraphPlace, HostCopy
 from rmc.learner.update import JointUpdate
 from rmc.learner.update_order import make_update
 from tests.learner.agents import ROBUST
@@ -31,10 +30,11 @@ IMPUTING = dataclasses.replace(ROBUST, hidden=SPEC.state - SPEC.obs_dim, impute_
 
 
 def make(order: str = "joint", device: str = "cpu", bf16: bool = False, config: AgentConfig = ROBUST) -> JointUpdate:
+    """In that order, or "apart": its halves may go at once."""
     torch.manual_seed(0)
-    update = UpdateConfig(
-        update_order=order, latent_target="ema", target_memory="ema", curiosity=0.1, curiosity_scale="std", n_step=2
-    )  # type: ignore[arg-type]
+    update = UpdateConfig(curiosity=0.1, curiosity_scale="std", n_step=2, scheme=3)
+    if order != "apart":
+        update = dataclasses.replace(update, update_order=order, latent_target="ema", target_memory="ema", scheme=1)  # type: ignore[arg-type]
     agent = Agent(SPEC.obs_dim, SPEC.action_dim, config).to(device)
     return make_update(agent, SPEC.burn_in, update, 3, bf16)
 
@@ -94,11 +94,12 @@ class OnDevice(TorchDispatchMode):
         return result
 
 
+@pytest.mark.parametrize("config", [ROBUST, IMPUTING], ids=["robust", "imputing"])
 @pytest.mark.parametrize("order", ["joint", "alternate"])
-def test_nothing_in_an_update_waits_for_the_host(order, monkeypatch):
+def test_nothing_in_an_update_waits_for_the_host(order, config, monkeypatch):
     """On the device "meta", which has no values: whatever asks for one fails."""
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # meta has none
-    update = make(order)
+    update = make(order, config=config)
     for module in (update.agent, update.target_critic, update.target_memory):
         module.to("meta")
     update.curiosity_variance = update.curiosity_variance.to("meta")
@@ -138,7 +139,7 @@ def cuda(monkeypatch):
 def test_a_graph_is_recorded_once_after_the_warm_up_and_replayed(cuda):
     cuda.CUDAGraph.register_generator_state = MagicMock()
     work, generator = MagicMock(return_value="result"), torch.Generator()
-    graph = CudaGraph(work, generator, (0, 1))
+    graph = CudaGraph(work, generator, GraphPlace(cuda.Stream, (0, 1)))
     for _ in range(WARM_UP):
         assert graph() == "result"
     cuda.recording.assert_not_called()
@@ -155,7 +156,7 @@ def test_each_plan_has_a_graph_of_its_own(monkeypatch):
     made = []
 
     class Double:
-        def __init__(self, work, generator, pool):
+        def __init__(self, work, generator, place):
             made.append(work)
             self._work = work
 
@@ -165,30 +166,48 @@ def test_each_plan_has_a_graph_of_its_own(monkeypatch):
     monkeypatch.setattr("rmc.learner.device_update.CudaGraph", Double)
     plain, update = make(config=IMPUTING), make(config=IMPUTING)
     apart = DeviceUpdate(update, SPEC, BATCH)
-    apart._work, apart._graphs, apart._pool = apart._replay, {}, (0, 1)
+    apart._work, apart._graphs, apart._place = apart._replay, {}, None
     for number in range(1, 20):
         raw, importance = host_batch(number, missing=number == 12)
         expected = plain(view_batch(raw, importance, SPEC, plain.plan(raw, SPEC, number)), torch.tensor(0.1))
         (result,) = apart(raw, importance, 0.1, number)
         assert torch.equal(result.priorities, expected.priorities)
-    assert [tuple(work.args[0])[1:] for work in made] == [(False, True), (False, False), (True, True)]
+    assert [(work.func.__name__, *work.args[0][1:]) for work in made] == [
+        ("_once", False, True),
+        ("_once", False, False),
+        ("_once", True, True),
+    ]
     assert all(map(torch.equal, update.agent.state_dict().values(), plain.agent.state_dict().values()))
 
 
-def test_halves_at_once_are_the_update(cuda):
+def noted(work, note):
+    """What it does, once ``note`` was called."""
+
+    def noting(*given):
+        note()
+        return work(*given)
+
+    return noting
+
+
+def test_halves_at_once_are_the_update(cuda, monkeypatch):
     """On a GPU in two streams, which meet before the result is read."""
-    config = UpdateConfig(scheme=3, curiosity=0.1, curiosity_scale="std")
-    torch.manual_seed(0)
-    agent = Agent(SPEC.obs_dim, SPEC.action_dim, IMPUTING)
-    plain, update = (make_update(copy.deepcopy(agent), SPEC.burn_in, config, 3) for _ in range(2))
+    plain, update = (make("apart", config=IMPUTING) for _ in range(2))
+    for name in ("model_pass", "value_pass", "step"):
+        monkeypatch.setattr(update, name, noted(getattr(update, name), getattr(cuda, name)))
     one_by_one, at_once = (DeviceUpdate(one, SPEC, BATCH) for one in (plain, update))
     at_once._beside, at_once._work = cuda.beside, at_once._halves_at_once
     for number in range(1, 6):
         raw, importance = host_batch(number, missing=number > 3)
-        (expected,), (result,) = (one(raw, importance, 0.1, number) for one in (one_by_one, at_once))
+        (expected,) = one_by_one(raw, importance, 0.1, number)
+        cuda.reset_mock()
+        (result,) = at_once(raw, importance, 0.1, number)
         assert torch.equal(result.priorities, expected.priorities)
         torch.testing.assert_close(result.metrics, expected.metrics)
-        assert cuda.mock_calls[-2:] == [call.beside.wait_stream(cuda.current), call.current.wait_stream(cuda.beside)]
+        assert cuda.mock_calls == [
+            call.model_pass(), call.beside.wait_stream(cuda.current), call.value_pass(), call.step(), call.step(),
+            call.current.wait_stream(cuda.beside),
+        ]  # fmt: skip
     assert all(map(torch.equal, update.agent.state_dict().values(), plain.agent.state_dict().values()))
 
 
@@ -230,7 +249,7 @@ def test_a_tensor_on_the_host_is_there_at_once():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("bf16", [False, True], ids=["fp32", "bf16"])
-@pytest.mark.parametrize("order", ["joint", "alternate"])
+@pytest.mark.parametrize("order", ["joint", "alternate", "apart"])
 def test_a_graph_trains_as_the_updates_one_by_one(order, bf16):
     """100 updates, each plan several times; equal losses to 1e-3."""
     plain, update = make(order, "cuda", bf16, IMPUTING), make(order, "cuda", bf16, IMPUTING)
@@ -243,3 +262,6 @@ def test_a_graph_trains_as_the_updates_one_by_one(order, bf16):
         torch.testing.assert_close(result.metrics, expected.metrics, rtol=1e-3, atol=1e-3)
         priorities = HostCopy(result.priorities).wait()
         torch.testing.assert_close(priorities, expected.priorities.cpu(), rtol=1e-3, atol=1e-3)
+    assert {graph._work.func.__name__ for graph in static._graphs.values()} == {
+        "_halves_at_once" if order == "apart" else "_once"
+    }
