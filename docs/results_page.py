@@ -103,7 +103,7 @@ def _readme() -> Iterator[str]:
 
 
 def _return(row: Row) -> str:
-    """Its mean, and deviation over seeds; bold where an agent's first row of several seeds is ahead of others' first."""
+    """Its mean, and deviation over seeds; bold where the first row of an agent is ahead of others' first."""
     if len(row.runs) == 1:
         return _number(row.mean())
     deviation = statistics.stdev(one.return_mean for one in row.evaluations())
