@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_STEPS ?= 60000
 
-.PHONY: env demo wheel site guard test test-failed test-faults chaos test-long test-cluster test-container test-dm-control test-pybullet test-newest lint docs results-page bench peers clean
+.PHONY: env env-newest demo wheel site guard test test-failed test-faults chaos test-long test-cluster test-container test-dm-control test-pybullet test-newest lint docs results-page bench peers clean
 
 env: $(STAMP)
 
@@ -35,14 +35,20 @@ NEEDS_TORCH := common/test_process_state.py common/test_wire.py replay_server/te
 	replay_server/test_socket_server.py
 WITHOUT_TORCH := import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; print(*(one for one in project["dependencies"] if not one.startswith("torch")), sep="\n")
 
+env-newest: $(VENV)-$(NEWEST)/.packages
+
 test-newest: $(VENV)-$(NEWEST)/.installed
 	$(VENV)-$(NEWEST)/bin/python -m pytest -q -n 2 tests/common tests/cli/test_startup.py tests/replay_server $(addprefix --ignore tests/,$(NEEDS_TORCH))
 
-$(VENV)-$(NEWEST)/.installed: pyproject.toml constraints.txt
+$(VENV)-$(NEWEST)/.packages: pyproject.toml constraints.txt
 	test -n "$(NEWEST_PYTHON)" || { echo "no Python $(NEWEST) here: make test-newest NEWEST_PYTHON=/path/to/python$(NEWEST)"; exit 1; }
 	test -x $(@D)/bin/python || $(NEWEST_PYTHON) -m venv $(@D)
 	$(NEWEST_PYTHON) -c '$(WITHOUT_TORCH)' > $(@D)/requirements.txt
 	$(@D)/bin/python -m pip install --quiet -r $(@D)/requirements.txt pytest pytest-timeout pytest-xdist hypothesis -c constraints.txt
+	@touch $@
+
+# A step of its own: two that install the checkout at once would write the same files in it.
+$(VENV)-$(NEWEST)/.installed: $(VENV)-$(NEWEST)/.packages
 	$(@D)/bin/python -m pip install --quiet --no-deps -e .
 	@touch $@
 

@@ -1,5 +1,6 @@
 """Adam for parts of an agent, its saved states, and Polyak's average; on a CPU in one pass over memory each."""
 
+import inspect
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -18,6 +19,11 @@ NOT_ROUNDED = np.empty(0, np.uint16)
 
 class CompiledAdam(torch.optim.Adam):
     """torch's Adam by ``learner/kernels.py``, which rounds weights for the next products in the same pass."""
+
+    # torch's own, without the decorator that imports its compiler, 1.5 s, only to keep the compiler off them
+    add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
+    state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
+    load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
 
     def __init__(self, groups: list[dict[str, Any]], rounded: Mapping[Tensor, Tensor]) -> None:
         """``rounded`` has, by weight, its bfloat16 copy, which a step writes, too."""

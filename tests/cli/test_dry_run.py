@@ -14,6 +14,8 @@ import psutil
 import pytest
 
 from rmc.analysis.needs import Need, duration, megabytes, needs, speed
+from rmc.cli import dry_run as cli_dry_run
+from rmc.cli import main
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.trial import RoleUse, Trial, trial_config
@@ -148,11 +150,18 @@ def test_estimates_are_what_a_real_run_takes(tmp_path: Path) -> None:
     assert bytes_of(output.stdout, "disk, 5 checkpoints") / 5 == pytest.approx(each, rel=DISK_TOLERANCE)
 
 
-def test_a_ring_that_is_too_large_is_marked_and_the_status_is_1(tmp_path: Path) -> None:
-    output = dry_run(tmp_path / "run", "--capacity", "1000000000000")
-    assert (output.returncode, output.stderr) == (1, ""), output.stdout + output.stderr
-    assert re.search(r"^memory, all .* DOES NOT FIT$", output.stdout, re.MULTILINE)
-    assert output.stdout.splitlines()[-1] == "does not fit: memory, all, disk, all"
+def test_a_ring_that_is_too_large_is_marked_and_the_status_is_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As trials, those of docs/memory.md and docs/doctor.md are real."""
+    measured = Trial({"learner": RoleUse(300 << 20, 20, 4)}, records(), 2_000_000, 1_000.0)
+    monkeypatch.setattr(cli_dry_run, "run_trial", lambda config, device, stop: measured)
+    words = [*COMMAND[3:], "--dry-run", "--run-dir", str(tmp_path / "run"), "--capacity", "1000000000000"]
+    assert main.run(words) == 1
+    output, errors = capsys.readouterr()
+    assert errors == ""
+    assert re.search(r"^memory, all .* DOES NOT FIT$", output, re.MULTILINE)
+    assert output.splitlines()[-1] == "does not fit: memory, all, disk, all"
     assert not (tmp_path / "run").exists()
 
 

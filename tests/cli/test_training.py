@@ -2,6 +2,8 @@
 
 import io
 import json
+import subprocess
+import sys
 import time
 from dataclasses import replace
 
@@ -15,6 +17,16 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from tests.analysis.test_policy import AGENTS, make_run
 from tests.counting_env import CountingEnv
+
+TRAINS_AND_GOES_ON = """
+import sys
+from rmc.cli import main
+
+words = "train InvertedPendulum-v5 --preset debug --launcher lockstep --warmup-steps 100 --run-dir run --total-steps"
+assert [main.run([*words.split(), steps]) for steps in ("150", "200")] == [0, 0]
+assert "torch" in sys.modules
+assert "torch._dynamo" not in sys.modules
+"""
 
 
 class Endless(CountingEnv):
@@ -94,3 +106,10 @@ def test_an_evaluation_without_end_shows_that_it_goes_on_and_is_cut(tmp_path, mo
     assert f"{folder.path}: episode 1 of 10, " in captured.err.replace("\n", "")
     assert main.run(["evaluate", str(folder.path), "--seconds", "nan"]) == 2
     assert "--seconds=nan: take 0 or more" in capsys.readouterr().err
+
+
+def test_it_imports_torch_without_its_compiler(tmp_path):
+    """Which takes more than a second, of each learner that starts."""
+    command = [sys.executable, "-c", TRAINS_AND_GOES_ON]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr

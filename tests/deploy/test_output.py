@@ -103,10 +103,13 @@ def test_help_is_shown_where_there_is_only_ascii() -> None:
     assert "--total-steps" in done.stdout
 
 
-@pytest.mark.parametrize("away", ["| head -c 1 >&2", "> /dev/full", ">&- 2>&-"])
-def test_a_run_whose_output_goes_away_has_its_result(away: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("away", "launcher"),
+    [("| head -c 1 >&2", "lockstep"), ("> /dev/full", "lockstep"), (">&- 2>&-", "local")],  # whose roles inherit files
+)
+def test_a_run_whose_output_goes_away_has_its_result(away: str, launcher: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    words = f"{RMC} train InvertedPendulum-v5 --preset debug --total-steps 600 --run-dir {run}"
+    words = f"{RMC} train InvertedPendulum-v5 --preset debug --total-steps 600 --run-dir {run} --launcher {launcher}"
     done = shell(f"({words}; echo $? > {tmp_path}/status) {away}", PYTHONIOENCODING="ascii")
     assert (tmp_path / "status").read_text() == "0\n", done.stderr
     assert (run / "result.json").exists()

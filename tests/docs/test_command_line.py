@@ -2,24 +2,20 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from rmc.cli import main
+from tests.docs.running import DOCS, LOCKSTEP, commands, ran
 
-PAGE = (Path(__file__).parents[2] / "docs" / "command-line.md").read_text()
+PAGE = (DOCS / "command-line.md").read_text()
 
 
 def test_a_file_of_options_trains(tmp_path: Path) -> None:
     (tmp_path / "agent.toml").write_text(PAGE.split("```toml\n")[1].split("```")[0])
-    commands = re.findall(r"```sh\nrmc (.*)\n```", PAGE)
-    for command in commands:
-        words = [sys.executable, "-m", "rmc.cli.main", *command.split(), "--launcher", "lockstep"]
-        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=150, check=False)
-        assert done.returncode == 0, done.stderr
+    for words in commands(PAGE):
+        ran(tmp_path, *words, *LOCKSTEP)
     files = (tmp_path / "runs" / name / "config.json" for name in ("from-file", "seed-1"))
     first, second = (json.loads(file.read_bytes()) for file in files)
     assert (first["total_steps"], first["agent"]["heads"], first["env"]["env_kwargs"]) == (

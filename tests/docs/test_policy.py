@@ -11,16 +11,11 @@ import pytest
 
 from rmc.analysis.policy import load_policy
 from tests.analysis.hub_stub import TOKEN, Hub
+from tests.docs.running import DOCS, LOCKSTEP, commands, ran
 
-DOCS = Path(__file__).parents[2] / "docs"
 POLICY, HUB = (DOCS / "policy.md").read_text(), (DOCS / "hub.md").read_text()
 ALONE = "import sys\nsys.modules |= dict.fromkeys(['torch', 'rmc', 'gymnasium', 'safetensors'])\n"
-SHORTER = ["--total-steps", "1000", "--launcher", "lockstep", "--episodes", "1"]
-
-
-def commands(page: str) -> list[list[str]]:
-    blocks = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
-    return [line.split()[1:] for block in blocks for line in block.splitlines()]
+SHORTER = ["--total-steps", "1000", *LOCKSTEP, "--episodes", "1"]
 
 
 def python(*words: str, folder: Path, **more: str) -> str:
@@ -35,7 +30,7 @@ def python(*words: str, folder: Path, **more: str) -> str:
 def test_the_pages_run(tmp_path: Path) -> None:
     for command in commands(POLICY):
         shorter = SHORTER * (command[0] == "train")
-        python("-m", "rmc.cli.main", *command, *shorter, folder=tmp_path)
+        ran(tmp_path, *command, *shorter)
     loop, batch, alone = re.findall(r"```python\n(.*?)```", POLICY, re.DOTALL)
     shown = "print(action.dtype, abs(action) <= 2, actions.shape, policy.header.eval_episodes)"
     assert python("-c", f"{loop}\n{batch}\n{shown}", folder=tmp_path) == "float32 [ True] (3, 1) 10\n"

@@ -2,36 +2,28 @@
 
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from rmc.analysis import doctor, run_faults
 from rmc.analysis.bottleneck import IDLE, SATURATED
+from rmc.deploy.local import trial
+from tests.docs.running import DOCS, commands, ran
 
-DOCS = Path(__file__).parents[2] / "docs"
 REPORT, DOCTOR = ((DOCS / name).read_text() for name in ("report.md", "doctor.md"))
 
 
-def ran(command: str, folder: Path) -> str:
-    words = [sys.executable, "-m", "rmc.cli.main", *command.split()[1:]]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=150, check=False)
-    assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
-    return done.stdout
+TRAIN = "train InvertedPendulum-v5 --preset debug --total-steps 2000 --replay-ratio 64 --run-dir runs/first"
 
 
-@pytest.mark.timeout(400)
-def test_their_commands_run(tmp_path: Path) -> None:
-    ran(
-        "rmc train InvertedPendulum-v5 --preset debug --total-steps 2000 --replay-ratio 64 --run-dir runs/first",
-        tmp_path,
-    )
+def test_their_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trial, "TRAINED_SECONDS", 2.0)
+    ran(tmp_path, *TRAIN.split())
     shutil.copytree(tmp_path / "runs" / "first", tmp_path / "runs" / "second")
-    commands = [command for page in (REPORT, DOCTOR) for command in re.findall(r"```sh\n(rmc .*)\n```", page)]
-    assert [command.split()[1] for command in commands] == ["report", "report", "doctor", "train"]
-    outputs = [ran(command, tmp_path) for command in commands]
+    printed = [*commands(REPORT), *commands(DOCTOR)]
+    assert [words[0] for words in printed] == ["report", "report", "doctor", "train"]
+    outputs = [ran(tmp_path, *words) for words in printed]
     assert outputs[0].startswith("report.html: 1 run, ")
     assert outputs[1].startswith("both.html: 2 runs, ")
     assert "learner-bound: actors waited " in outputs[2]

@@ -1,42 +1,36 @@
 """The commands of docs/resume.md and docs/warm-start.md run as they are printed, and their tables are the code's."""
 
+import dataclasses
+import functools
 import json
 import re
-import shlex
-import subprocess
-import sys
 from pathlib import Path
 from typing import get_args
 
 import pytest
 
+import rmc
+from rmc import presets
 from rmc.analysis.baselines import MAY_CHANGE as BASELINES_MAY_CHANGE
 from rmc.deploy.run.config import option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import InitParts
 from rmc.deploy.run.opening import MAY_CHANGE
 from rmc.deploy.run.starts import format_starts, starts
+from tests.docs.running import DOCS, LOCKSTEP, commands, ran
 
-DOCS = Path(__file__).parents[2] / "docs"
 RESUME, WARM = ((DOCS / name).read_text() for name in ("resume.md", "warm-start.md"))
 
 
-def execute(page: str, folder: Path) -> list[str]:
-    """Its commands, in order; what each printed."""
-    outputs = []
-    for command in re.findall(r"```sh\n(rmc .*?)\n```", page, re.DOTALL):
-        words = shlex.split(command.replace("\\\n", ""))[1:]
-        done = subprocess.run(
-            [sys.executable, "-m", "rmc.cli.main", *words], cwd=folder, capture_output=True, text=True, timeout=150
-        )
-        assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
-        outputs.append(done.stdout)
-    return outputs
+def execute(page: str, folder: Path) -> int:
+    """Its commands, in order; how many they are."""
+    for words in commands(page):
+        ran(folder, *words, *(LOCKSTEP if words[0] == "train" else ()))
+    return len(commands(page))
 
 
-@pytest.mark.timeout(500)
 def test_a_run_is_resumed(tmp_path: Path) -> None:
-    assert len(execute(RESUME, tmp_path)) == 3
+    assert execute(RESUME, tmp_path) == 3
     run = RunFolder(tmp_path / "runs" / "first")
     result = run.result()
     assert result is not None
@@ -54,12 +48,14 @@ def test_the_options_that_may_change_are_in_the_table() -> None:
     assert set(re.findall(r"`(--[a-z-]+)`", line)) == {option(path) for path in BASELINES_MAY_CHANGE}
 
 
-@pytest.mark.timeout(600)
-def test_runs_begin_with_anothers_networks(tmp_path: Path) -> None:
-    assert len(execute(WARM, tmp_path)) == 3
+def test_runs_begin_with_anothers_networks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert execute(WARM, tmp_path) == 3
     (code,) = re.findall(r"```python\n(.*?)```", WARM, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=200)
-    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    debug = presets.debug
+    monkeypatch.setattr(presets, "debug", lambda env: dataclasses.replace(debug(env), total_steps=600))
+    monkeypatch.setattr(rmc, "train", functools.partial(rmc.train, launcher="lockstep"))
+    monkeypatch.chdir(tmp_path)
+    exec(code, {})
     parts = {}
     for name in ("warm", "model", "policy"):
         began = starts(RunFolder(tmp_path / "runs" / name))[0].init_from

@@ -14,33 +14,26 @@ import pytest
 
 from rmc.analysis.run_list import DAMAGED
 from rmc.deploy.run.state import State
+from tests.docs.running import DOCS, LOCKSTEP, commands, ran
 
-DOCS = Path(__file__).parents[2] / "docs"
 WATCHING, TRACKERS = ((DOCS / f"{name}.md").read_text() for name in ("watching", "trackers"))
-SHORT = ("--launcher", "lockstep", "--total-steps", "600")
-
-
-def rmc(at: Path, *words: str) -> str:
-    command = [sys.executable, "-m", "rmc.cli.main", *words]
-    done = subprocess.run(command, cwd=at, capture_output=True, text=True, timeout=150, check=False)
-    assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
-    return done.stdout
+SHORT = (*LOCKSTEP, "--total-steps", "600")
 
 
 def test_a_run_is_watched(tmp_path: Path) -> None:
-    *looks, watch, served = re.findall(r"```sh\nrmc (.*)\n```", WATCHING)
-    trained = rmc(tmp_path, *served.split(), *SHORT)
+    *looks, watch, served = commands(WATCHING)
+    trained = ran(tmp_path, *served, *SHORT)
     assert "metrics on 127.0.0.1, port 9464\n" in trained
     assert re.search(r"^\d+% \| \d+ of 600 steps \| .* updates/s \| eval .* \| 0:00:\d\d$", trained, re.MULTILINE)
-    stats, as_json, listed = (rmc(tmp_path, *words.split()) for words in looks)
+    stats, as_json, listed = (ran(tmp_path, *words) for words in looks)
     assert "InvertedPendulum-v5 · debug · seed 0 · finished" in stats
     assert "600 of 600" in stats
     assert "latent rank" in stats
     assert json.loads(as_json)["state"] == "finished"
     assert re.search(r"^first +finished +600 .* 100%$", listed, re.MULTILINE)
-    (one,) = json.loads(rmc(tmp_path, "list", "runs", "--json"))
+    (one,) = json.loads(ran(tmp_path, "list", "runs", "--json"))
     assert (one["state"], one["env_steps"]) == ("finished", 600)
-    words = [sys.executable, "-m", "rmc.cli.main", *watch.split(), "--port", "0"]
+    words = [sys.executable, "-m", "rmc.cli.main", *watch, "--port", "0"]
     with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         with urlopen(f"{server.stdout.readline().strip()}events", timeout=20) as events:
@@ -63,8 +56,8 @@ def test_every_state_is_told() -> None:
 def test_runs_are_tracked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
-    for words in re.findall(r"```sh\nrmc (.*)\n```", TRACKERS):
-        assert "no video" not in rmc(tmp_path, *words.split(), *SHORT)
+    for words in commands(TRACKERS):
+        assert "no video" not in ran(tmp_path, *words, *SHORT)
     assert len(list(tmp_path.glob("runs/tracked/wandb/offline-run-*/*.wandb"))) == 1
     assert len(list(tmp_path.glob("runs/tracked/wandb/offline-run-*/files/media/videos/*.mp4"))) == 1
     assert results(tmp_path / "trackio" / "pendulum.db", "here-") == [600]

@@ -12,6 +12,7 @@ import pytest
 import redis
 
 from rmc.analysis.policy_file import decode
+from tests.docs.running import ran
 from tests.integration.running import Training
 
 MANUAL = Path(__file__).parents[2] / "docs" / "manual.md"
@@ -22,15 +23,32 @@ RESULT_KEYS = {
 }  # fmt: skip
 
 
-def rmc(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "rmc.cli.main", *words], capture_output=True, text=True, timeout=100)
-
-
-def test_train_evaluate_stats_and_resume(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    with Training(folder, "--total-steps", "1500", "--checkpoint-steps", "500") as training:
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Training:
+    """A run that has ended; the tests below use it in their order."""
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    options = ("--total-steps", "1500", "--checkpoint-steps", "500", "--curiosity", "0.1")
+    with Training(folder, *options) as training:
+        training.wait_for(lambda: training.role("replay") and training.newest("replay", "windows") > 0)
+        replay = training.role("replay")
+        assert replay is not None
+        assert "libtorch" not in Path(f"/proc/{replay.pid}/maps").read_text()  # it is not forked from what has torch
         assert training.finish(170) == 0, training.text() + training.logs()
-        restarts = training.newest("launcher", "restarts")
+    return training
+
+
+def test_every_metric_is_in_the_glossary(finished: Training) -> None:
+    glossary = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text()
+    explained = set(re.findall(r"`([a-z_]+)`", glossary))
+    records = [json.loads(line) for line in (finished.folder / "metrics.jsonl").read_text().splitlines()]
+    names = {name for record in records for name in record} - {"role", "time"}
+    unexplained = {name for name in names - explained if not name.startswith(("restarts_", "dead_letters_"))}
+    assert not unexplained
+
+
+def test_train_evaluate_stats_and_resume(finished: Training) -> None:
+    training, folder = finished, finished.folder
+    restarts = training.newest("launcher", "restarts")
     result = json.loads((folder / "result.json").read_bytes())
     assert result.keys() >= RESULT_KEYS
     assert (result["env"], result["preset"], result["seed"]) == ("InvertedPendulum-v5", "debug", 0)
@@ -49,13 +67,9 @@ def test_train_evaluate_stats_and_resume(tmp_path: Path) -> None:
     header = decode(newest.read_bytes()).header
     assert (header.env.id, header.env_steps, header.updates) == (result["env"], 1500, result["updates"])
 
-    played = rmc("evaluate", str(folder), "--json")
-    assert played.returncode == 0, played.stderr
-    evaluation = json.loads(played.stdout)
+    evaluation = json.loads(ran(folder.parent, "evaluate", str(folder), "--json"))
     assert evaluation["eval_return_mean"] == result["eval_return_mean"]  # the same path, the same starts
-    shown = rmc("stats", str(folder))
-    assert shown.returncode == 0, shown.stderr
-    assert "InvertedPendulum-v5 · debug · seed 0 · finished" in shown.stdout
+    assert "InvertedPendulum-v5 · debug · seed 0 · finished" in ran(folder.parent, "stats", str(folder))
 
     with Training(folder, "--total-steps", "2000", "--checkpoint-steps", "500") as resumed:
         assert resumed.finish(170) == 0, resumed.text() + resumed.logs()
@@ -65,27 +79,25 @@ def test_train_evaluate_stats_and_resume(tmp_path: Path) -> None:
     assert longer["wall_s"] > result["wall_s"]
 
 
-@pytest.mark.parametrize("passed_by", ["words", "environment"])
-def test_roles_by_hand_over_tcp(passed_by: str, redis_url: str, run_name: str, tmp_path: Path) -> None:
-    """As docs/manual.md says it, from files that the command lines name or from the environment."""
+def test_roles_by_hand_over_tcp(redis_url: str, run_name: str, tmp_path: Path) -> None:
+    """As docs/manual.md says it, from files that the command lines name; the learner from the environment."""
     folder = tmp_path / run_name
     (tmp_path / "redis-url").write_text(redis_url + "\n")
     begin, *commands = re.findall(r"^rmc (.*)$", MANUAL.read_text(), re.MULTILINE)
     options = ("--launcher", "manual", "--redis-url", f"file:{tmp_path}/redis-url")
     assert " ".join(options[:3]) in begin
     assert [command.split()[1] for command in commands] == ["replay", "learner", "actor", "evaluator"]
-    environment, hidden = dict(os.environ), r"$^"
     with ExitStack() as stack:
         training = stack.enter_context(Training(folder, "--total-steps", "1200", "--checkpoint-steps", "600", *options))
         training.wait_for(lambda: "start the roles with" in training.text())
         name = training.text().partition("--run ")[2].split()[0]
-        if passed_by == "environment":
-            environment |= {"RMC_SECRET": (folder / "secret").read_text().strip(), "RMC_REDIS_URL": redis_url}
-            hidden = r" --(secret-file|redis-url) \S+"
+        told = {"RMC_SECRET": (folder / "secret").read_text().strip(), "RMC_REDIS_URL": redis_url}
         places = {"NAME": name, "file:redis-url": options[-1], "runs/by-hand": str(folder)}
         roles = []
         for command in commands:
-            words = re.sub(hidden, "", command)
+            by_environment = command.startswith("role learner ")
+            words = re.sub(r" --(secret-file|redis-url) \S+", "", command) if by_environment else command
+            environment = os.environ | told if by_environment else os.environ
             for word, place in places.items():
                 words = words.replace(word, place)
             log = stack.enter_context((tmp_path / f"{words.split()[1]}.log").open("wb"))
@@ -104,19 +116,3 @@ def test_roles_by_hand_over_tcp(passed_by: str, redis_url: str, run_name: str, t
     keys = [key for key in left.scan_iter() if key.startswith(f"rmc:{name}:".encode())]
     assert keys
     assert all(0 < left.ttl(key) <= 3600 for key in keys)
-
-
-def test_every_metric_is_in_the_glossary(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    with Training(folder, "--total-steps", "1200", "--checkpoint-steps", "600", "--curiosity", "0.1") as training:
-        training.wait_for(lambda: training.role("replay") and training.newest("replay", "windows") > 0)
-        replay = training.role("replay")
-        assert replay is not None
-        assert "libtorch" not in Path(f"/proc/{replay.pid}/maps").read_text()  # it is not forked from what has torch
-        assert training.finish(170) == 0, training.text() + training.logs()
-    glossary = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text()
-    explained = set(re.findall(r"`([a-z_]+)`", glossary))
-    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    names = {name for record in records for name in record} - {"role", "time"}
-    unexplained = {name for name in names - explained if not name.startswith(("restarts_", "dead_letters_"))}
-    assert not unexplained

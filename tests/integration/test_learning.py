@@ -22,7 +22,7 @@ def test_one_actor_and_one_learner_balance_the_pendulum(tmp_path: Path) -> None:
 
 
 def test_a_cue_is_remembered_over_twelve_steps(tmp_path: Path) -> None:
-    pace = ["--total-steps", "8000", "--replay-ratio", "32", "--alpha-learning-rate", "5e-3"]
+    pace = ["--total-steps", "8000", "--replay-ratio", "32", "--alpha-learning-rate", "5e-3", "--launcher", "lockstep"]
     assert best_return(tmp_path / "run", "tests.memory_env:Memory12-v0", pace, SOLVED_RETURN + 0.2) > SOLVED_RETURN
 
 

@@ -16,6 +16,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.starts import starts
 from rmc.replay_server.recovery import open_store
+from tests.docs.running import ran
 from tests.integration.running import ENVIRONMENT, Training
 
 SIZES = "--hidden 16 --embedding 16 --heads 16 16 --total-steps 8000 --actors 2 --replay-ratio 8".split()  # noqa: SIM905
@@ -63,14 +64,13 @@ def test_a_changed_ratio_and_rate_count_from_there(tmp_path):
     folder = tmp_path / "run"
     start = f"rmc train InvertedPendulum-v5 --preset debug --launcher lockstep --run-dir {folder} --total-steps 1500"
     drawn = []
-    for words in (
+    for command in (
         f"{start} --replay-ratio 32 --hidden 16 --embedding 16 --heads 16 16",
         f"rmc resume {folder} --total-steps 2500 --replay-ratio 4 --learning-rate 1e-5",
         f"rmc resume {folder} --total-steps 3500",
         f"rmc train --run-dir {folder} --total-steps 4500 --replay-ratio 16",
     ):
-        done = rmc(words, tmp_path)
-        assert done.returncode == 0, done.stdout + done.stderr
+        ran(tmp_path, *shlex.split(command)[1:])
         drawn.append(drawn_steps(RunFolder(folder)))
     config = RunFolder(folder).config()
     assert (config.total_steps, config.replay.replay_ratio, config.update.learning_rate) == (4_500, 16.0, 1e-5)
@@ -83,7 +83,7 @@ def test_a_changed_ratio_and_rate_count_from_there(tmp_path):
     state = torch.load(folder / "state", weights_only=True)
     rates = [group["lr"] for optimizer in state["optimizers"] for group in optimizer["param_groups"]]
     assert rates == [1e-5, 1e-5, 1e-5, 3e-4]  # memory, world model; critics and policy, temperature
-    output = rmc(f"rmc stats {folder}", tmp_path).stdout
+    output = ran(tmp_path, "stats", str(folder))
     assert "4 starts; from step 1,5" in output
     assert "--replay-ratio 32 to 4, --learning-rate 0.0003 to 1e-05" in output
     assert json.loads((folder / "config.json").read_text())["format"] == FORMAT

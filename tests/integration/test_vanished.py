@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.presets import debug
 from tests.integration.running import Training, alive
 
 
@@ -41,6 +45,19 @@ def emptied(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("vanish", [shutil.rmtree, replaced, emptied])
+def test_each_way_is_seen(vanish: Callable[[Path], None], tmp_path: Path) -> None:
+    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    assert folder.secret()
+    folder.check_there()
+    vanish(folder.path)
+    with pytest.raises(ConfigError, match="was deleted or moved while it was trained"):
+        folder.check_there()
+    folder.unlock()
+
+
+@pytest.mark.parametrize(
+    "vanish", [shutil.rmtree, *(pytest.param(one, marks=pytest.mark.long) for one in (replaced, emptied))]
+)
 def test_a_runs_folder_that_vanishes_ends_it_in_one_line(vanish: Callable[[Path], None], tmp_path: Path) -> None:
     """Also where a role dies before that is noticed."""
     with Training(tmp_path / "run", "--total-steps", "100000000") as training:
