@@ -12,7 +12,7 @@ import grpc
 import pytest
 from ray.util import get_node_ip_address
 
-from rmc.cli import main
+from rmc.cli import cluster_commands, main
 from rmc.deploy.ray import head
 
 QUICK_SECONDS = 4.0
@@ -131,3 +131,18 @@ def test_without_ray_it_is_said_how_to_install_it(
     monkeypatch.setitem(sys.modules, "ray", None)  # as Python keeps what cannot be imported
     said = refusal(capsys, *words, "--ray-address", "auto")
     assert said.startswith("rmc: --ray-address='auto': Ray is not installed; pip install ")
+
+
+def test_what_ray_says_is_not_among_the_json(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextmanager
+    def joined(address: str) -> Iterator[None]:
+        print("(raylet) Raylet is terminated.")
+        yield
+
+    monkeypatch.setattr(cluster_commands.launcher, "joined", joined)
+    monkeypatch.setattr(cluster_commands.cluster_runs, "summaries", lambda: {"run": None})
+    assert main.run(["list", "--ray-address", "auto", "--json"]) == 0
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ('[{"run": "run"}]\n', "(raylet) Raylet is terminated.\n")
