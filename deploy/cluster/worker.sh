@@ -9,6 +9,7 @@
 set -u
 PATIENCE_SECONDS=3600
 STOP_SECONDS=5
+TRIES=3 # of the first start: on a busy machine Ray's own processes may wait for each other in vain
 export RAY_gcs_rpc_server_reconnect_timeout_s=300 # the roles play on meanwhile: longer than the head waits for the node
 STATE=~/.ray/rmc-worker # what keeps Ray locks it; in it are its process and its words
 
@@ -56,9 +57,11 @@ if ! flock -n 9; then
   flock -w 10 9 || exit
 fi
 head=$(grep -oP -m 1 -- '--address=\K\S+' "$STATE") && leave "$head"
-"$ray" stop --force 9>&-
-[ "$action" = start ] || exit 0
-"$ray" start "$@" 9>&- || exit
+for _ in $(seq "$TRIES"); do
+  "$ray" stop --force 9>&-
+  [ "$action" = start ] || exit 0
+  "$ray" start "$@" 9>&- && break
+done || exit
 head=$(grep -oP -m 1 -- '--address=\K\S+' <<< "$*")
 trap '' HUP # of the terminal that closes now
 setsid "$0" "$ray" keep "$head" "$@" < /dev/null &> "$STATE.log" &

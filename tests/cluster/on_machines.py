@@ -196,7 +196,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     try:
         began = time.monotonic()
         environment = f"{RAY} HOME=/root"
-        up = site_of_module.head.run(f"{environment} {RMC} cluster up {site_of_module.config}", seconds=180)
+        up = site_of_module.head.run(f"{environment} {RMC} cluster up {site_of_module.config}", seconds=400)
         note(test="up", seconds=time.monotonic() - began)
         assert "3 nodes are up" in up.stdout
         yield site_of_module

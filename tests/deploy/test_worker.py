@@ -120,4 +120,5 @@ def test_stop_ends_all_and_the_raylet_in_order(worker: Worker) -> None:
 
 def test_what_cannot_start_is_not_kept(worker: Worker) -> None:
     assert worker.start(status=3) == 3
+    assert worker.calls("start") == 3
     assert worker.processes("worker.sh") == []
