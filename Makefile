@@ -76,7 +76,7 @@ test-long: $(STAMP)
 
 # Real ray up on three machines that are namespaces of this one: Linux, root, openssh-server, rsync, iproute2.
 ROUNDS ?= 5
-CUTS ?= 5 30 90
+CUTS ?= 5 30 90 240
 ONLY ?= test
 
 test-cluster: $(STAMP)

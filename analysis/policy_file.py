@@ -95,7 +95,8 @@ def _facts(blob: bytes) -> Any:
 def _header(facts: Any) -> PolicyHeader:
     if not isinstance(facts, dict):
         raise MessageError("damaged header", f"{facts!r} is no object; copy it again")
-    number, sizes, wrote = facts.get("format"), facts.pop("sizes", None), facts.get("rmc")
+    number, sizes = facts.get("format"), facts.pop("sizes", None)
+    wrote = " ".join(str(facts.get("rmc")).split())  # in one line, whatever it is
     if type(number) is not int or number < 1:
         raise MessageError("damaged header", f"its format is {number!r}; copy it again")
     if number > FORMAT:
@@ -106,7 +107,7 @@ def _header(facts: Any) -> PolicyHeader:
     except ConfigError as error:
         raise MessageError("header of another version", f"RMC {wrote} wrote it; {error}") from None
     if header.sizes() != sizes:
-        raise MessageError("damaged header", f"its sizes are {sizes}, its parts make {header.sizes()}; copy it again")
+        raise MessageError("damaged header", f"its sizes are {sizes!r}, its parts make {header.sizes()}; copy it again")
     return header
 
 

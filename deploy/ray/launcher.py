@@ -18,6 +18,7 @@ except ImportError as missing:
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.role_command import launcher_command
+from rmc.deploy.ray.head import check_head
 from rmc.deploy.ray.launcher_actor import LauncherActor
 from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, last_line
 from rmc.deploy.run import tls
@@ -39,8 +40,9 @@ def joined(address: str, cpus: int | None = None) -> Iterator[None]:
         if address == "local":
             ray.init(address="local", num_cpus=cpus, include_dashboard=False, **quiet)
         else:
+            check_head(address)
             ray.init(address=address, **quiet)
-    except (ConnectionError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
+    except (OSError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         fix = f"no Ray cluster answers ({reason}); start one with ray start --head, or take local"
         raise ConfigError("--ray-address", address, fix) from None

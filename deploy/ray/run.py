@@ -14,15 +14,9 @@ import zlib
 from contextlib import ExitStack, suppress
 from typing import Any
 
-try:
-    import ray
-    from ray.util.placement_group import placement_group, remove_placement_group
-    from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
-except ImportError as missing:
-    from rmc.common.errors import ConfigError
-    from rmc.common.extra import how_to_install
-
-    raise ConfigError("--launcher", "ray", f"Ray is not installed; {how_to_install('ray')}") from missing
+import ray
+from ray.util.placement_group import placement_group, remove_placement_group
+from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RoleDied

@@ -167,7 +167,7 @@ def check_sizes(env_id: str, before: dict[str, Any], sizes: dict[str, int]) -> N
     """Raises ConfigError where the environment has other ``sizes`` than ``before``, when the run began."""
     for name, now in sizes.items():
         if before.get(name, now) != now:
-            fault = f"the environment now has {now} {name}, the run was trained with {before[name]}"
+            fault = f"the environment now has {now} {name}, the run was trained with {before[name]!r}"
             raise ConfigError("ENV", env_id, f"{fault}; undo that, or train another run")
 
 

@@ -1,7 +1,10 @@
 """``rmc list`` and ``rmc stop`` with ``--ray-address``: the runs that are trained on a Ray cluster."""
 
 import json
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import asdict
 
 from rich.table import Table
@@ -14,7 +17,7 @@ from rmc.deploy.ray.launcher_actor import RunSummary
 
 def list_runs(address: str, as_json: bool) -> int:
     """Print a table of the runs that are trained on a cluster."""
-    with launcher.joined(address):
+    with _joined(address):
         summaries = cluster_runs.summaries()
     if as_json:
         lines = [{"run": name} | (asdict(one) if one else {}) for name, one in summaries.items()]
@@ -26,10 +29,17 @@ def list_runs(address: str, as_json: bool) -> int:
 
 def stop(run: str, address: str) -> int:
     """End a run of a cluster in order."""
-    with launcher.joined(address):
+    with _joined(address):
         summary = cluster_runs.stop(run)
     terminal().print(f"{run} has ended; its folder is {summary.folder} on {summary.host}", soft_wrap=True)
     return 0
+
+
+@contextmanager
+def _joined(address: str) -> Iterator[None]:
+    """Ray tells every driver on standard output what goes wrong in its cluster: none of it is ours, or JSON."""
+    with redirect_stdout(sys.stderr), launcher.joined(address):
+        yield
 
 
 def _table(summaries: dict[str, RunSummary | None]) -> Table:

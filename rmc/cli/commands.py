@@ -1,6 +1,7 @@
 """What each command of the command line does."""
 
 import dataclasses
+import importlib.util
 import json
 import logging
 
@@ -11,6 +12,7 @@ from rmc.cli.dry_run import dry_run
 from rmc.cli.ending import say_end
 from rmc.cli.redis_password import warn_of_password
 from rmc.common.errors import ConfigError
+from rmc.common.extra import how_to_install
 from rmc.deploy.monitor import attach as attachment
 from rmc.deploy.monitor.recorded import recorded_status, status_json
 from rmc.deploy.monitor.table import table
@@ -50,7 +52,8 @@ def stats(command: run_options.Stats) -> int:
 def list_runs(command: run_options.List) -> int:
     """Print a table of the runs in a folder, or on a Ray cluster."""
     if command.ray_address is not None:
-        from rmc.cli import cluster_commands  # needs what only the extra "ray" installs
+        _check_ray(command.ray_address)
+        from rmc.cli import cluster_commands
 
         return cluster_commands.list_runs(command.ray_address, command.json)
     console, summaries = terminal(), run_list.runs(command.folder)
@@ -62,6 +65,11 @@ def list_runs(command: run_options.List) -> int:
         if one.fault is not None:
             console.print(one.fault, soft_wrap=True)
     return 0
+
+
+def _check_ray(address: str) -> None:
+    if importlib.util.find_spec("ray") is None:
+        raise ConfigError("--ray-address", address, f"Ray is not installed; {how_to_install('ray')}")
 
 
 def doctor(command: run_options.Doctor) -> int:
@@ -91,7 +99,8 @@ def attach(command: run_options.Attach) -> int:
 def stop(command: run_options.Stop) -> int:
     """End a run in order."""
     if command.ray_address is not None:
-        from rmc.cli import cluster_commands  # needs what only the extra "ray" installs
+        _check_ray(command.ray_address)
+        from rmc.cli import cluster_commands
 
         return cluster_commands.stop(str(command.run), command.ray_address)
     folder = RunFolder(command.run)

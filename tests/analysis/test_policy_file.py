@@ -218,6 +218,8 @@ def _set(*path: Any, value: Any) -> Callable[[dict[str, Any]], None]:
     ("change", "says"),
     [
         (_set("format", value=99), "newer policy: RMC 0.1.0 wrote format 99, this one reads up to "),
+        (lambda facts: facts | {"format": 99, "rmc": "a\nb"}, "newer policy: RMC a b wrote format 99, this one reads"),
+        (_set("sizes", value="a\nb"), r"damaged header: its sizes are 'a\nb', "),
         (_set("format", value=0), "damaged header: its format is 0"),
         (_set("format", value="1"), "damaged header: its format is '1'"),
         (_set("agent", "hidden", value=32), "damaged header: its sizes are"),

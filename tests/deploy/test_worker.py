@@ -1,7 +1,7 @@
 """``deploy/cluster/worker.sh``, which keeps Ray on a worker. ``make test-cluster`` tries it with Ray itself.
 
 Ray's own ``ray stop`` would end every Ray of this machine, others' too: here ``ray`` is a script that starts and ends
-one process, which looks as a raylet does.
+two processes, which look as a raylet and its agent do.
 """
 
 import os
@@ -21,12 +21,19 @@ SCRIPT = Path(deploy.__file__).parent / "cluster" / "worker.sh"
 RAY = """#!/bin/bash
 echo "$*" >> {folder}/calls
 if [ $1 = start ]; then
-  setsid bash -c 'exec -a {folder}/raylet bash -c "read < {folder}/never" raylet --gcs-address=$HEAD' &> /dev/null &
+  for name in raylet python3; do
+    setsid bash -c 'exec -a $0 bash {folder}/life --gcs-address=$HEAD' {folder}/$name &> /dev/null &
+  done
+  until [ $(pgrep -fc "^{folder}/(raylet|python3) ") = 2 ]; do sleep 0.05; done
 else
-  pkill -9 -f "^{folder}/raylet "
+  pkill -9 -f "^{folder}/(raylet|python3) "
 fi
 exit ${{STATUS:-0}}
 """
+LIFE = """trap 'echo >> {folder}/ended-in-order; exit' TERM
+exec 3<> {folder}/never
+while true; do read -t 0.1 <&3; done
+"""  # without a process of its own, which would look as it does
 
 
 class Worker:
@@ -37,6 +44,7 @@ class Worker:
         (folder / "ray").write_text(RAY.format(folder=folder))
         (folder / "ray").chmod(0o755)
         os.mkfifo(folder / "never")
+        (folder / "life").write_text(LIFE.format(folder=folder))
         self.head = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self.head.getsockname()[1]}"
 
@@ -78,15 +86,16 @@ def worker(tmp_path: Path) -> Iterator[Worker]:
 
 def test_it_is_started_again_once_the_head_answers(worker: Worker) -> None:
     assert worker.start() == 0
-    (raylet,) = worker.processes("--gcs-address")
+    (raylet,) = worker.processes("/raylet ")
     worker.head.close()
     os.kill(raylet, signal.SIGKILL)
-    wait_for(lambda: worker.calls("stop") == 2)  # once before the start
+    wait_for(lambda: not worker.processes("--gcs-address"))  # what it left is ended, too
     time.sleep(1.0)
     assert worker.calls("start") == 1
     worker.head = socket.create_server(("127.0.0.1", int(worker.address.rpartition(":")[2])))
     wait_for(lambda: worker.calls("start") == 2)
-    wait_for(lambda: len(worker.processes("--gcs-address")) == 1)
+    wait_for(lambda: len(worker.processes("--gcs-address")) == 2)
+    assert not (worker.folder / "ended-in-order").exists()
 
 
 def test_what_is_kept_is_left_alone_but_with_other_options(worker: Worker) -> None:
@@ -95,14 +104,15 @@ def test_what_is_kept_is_left_alone_but_with_other_options(worker: Worker) -> No
     worker.start("--num-cpus=1")
     assert worker.processes("--gcs-address") == raylets
     worker.start("--num-cpus=2")
-    assert len(worker.processes("--gcs-address")) == 1
-    assert worker.processes("--gcs-address") != raylets
-    assert len(worker.processes("worker.sh")) == 1
+    assert len(worker.processes("--gcs-address")) == 2
+    assert not set(raylets).intersection(worker.processes("--gcs-address"))
+    wait_for(lambda: len(worker.processes("worker.sh")) == 1)  # it looks by a process of its own
 
 
-def test_stop_ends_all(worker: Worker) -> None:
+def test_stop_ends_all_and_the_raylet_in_order(worker: Worker) -> None:
     worker.start()
     worker.run("stop", "--force")
+    assert (worker.folder / "ended-in-order").read_text() == "\n"
     assert worker.processes("") == []
     time.sleep(1.5)
     assert worker.calls("start") == 1
@@ -110,4 +120,5 @@ def test_stop_ends_all(worker: Worker) -> None:
 
 def test_what_cannot_start_is_not_kept(worker: Worker) -> None:
     assert worker.start(status=3) == 3
+    assert worker.calls("start") == 3
     assert worker.processes("worker.sh") == []

@@ -140,7 +140,15 @@ def test_the_docs_name_options_that_exist(capsys: pytest.CaptureFixture[str]) ->
     for command in [*COMMANDS, *roles, "hub push", "hub pull"]:
         assert main.run([*command.split(), "--help-all"]) == 0
     there = set(re.findall(r"--[a-z][a-z-]*[a-z]", capsys.readouterr().out))
-    there |= {"--no-restart", "--node-ip-address", "--generate", "--logdir", "--user", "--shm-size"}  # of others
+    there |= {
+        "--no-restart",
+        "--node-ip-address",
+        "--generate",
+        "--logdir",
+        "--user",
+        "--shm-size",
+        "--exclude",
+    }  # of others
     there |= {"--alone", "--scale", "--seeds", "--only", "--env", "--play", "--draw"}  # of benchmarks and studies
     for text in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
         named = set(re.findall(r"`[^`\n]*?(--[a-z][a-z-]*[a-z])", text.read_text()))

@@ -39,6 +39,7 @@ def test_changed_files_are_shown_or_refused_in_a_line() -> None:
         ("history.jsonl", START + '"init_from": {}}\n', fuzz_files.watched),
         ("history.jsonl", START.replace("0,", '"x",') + '"changes": {"a": [1, 2]}}\n', fuzz_files.reported),
         ("checkpoints/best.json", '{"update": 1e999, "eval_return_mean": 0}', fuzz_files.best),
+        ("sizes.json", '{"observations": "a\\nb"}', fuzz_files.resumed),
         (f"{CHECKPOINT}/manifest.json", DEEP, fuzz_files.acted),
         (f"{CHECKPOINT}/manifest.json", '{\n "update": 81,\n "sha256": {}\n}', fuzz_files.acted),
     ],
