@@ -176,6 +176,7 @@ def test_a_node_is_lost_and_another_comes(nodes: Cluster, tmp_path: Path) -> Non
     assert max(RunFolder(folder).checkpoints.glob("[0-9]*")).is_dir()
 
 
+@pytest.mark.long
 def test_a_killed_launcher_and_a_role_that_somebody_ended_come_back(nodes: Cluster, tmp_path: Path) -> None:
     nodes.add_node(num_cpus=1)
     folder = RunFolder(tmp_path / "run")

@@ -86,6 +86,7 @@ def test_a_run_is_watched_and_stopped_from_another_terminal(tmp_path: Path) -> N
     assert "nobody trains it now" in done.stderr
 
 
+@pytest.mark.long  # docs/trackers.md's commands run in tests/docs/test_watching.py
 def test_a_tracked_run_ends_with_its_tracker(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     offline = {"WANDB_MODE": "offline"}

@@ -27,6 +27,7 @@ def halves(training: Training) -> list[psutil.Process]:
     return metrics
 
 
+@pytest.mark.long  # tests/learner/test_pipelined_update.py has what a half does whose other one ends
 def test_it_survives_the_death_of_each_half_and_goes_on(tmp_path: Path) -> None:
     options = ("--scheme", "3", "--checkpoint-steps", "300")
     with Training(tmp_path / "run", "--total-steps", "100000", *options) as training:

@@ -40,7 +40,7 @@ def drawn_steps(folder: RunFolder) -> int:
 
 
 @pytest.mark.timeout(400)
-@pytest.mark.parametrize("launcher", ["local", "lockstep"])
+@pytest.mark.parametrize("launcher", [pytest.param("local", marks=pytest.mark.long), "lockstep"])
 def test_the_printed_command_goes_on(launcher, tmp_path):
     folder = tmp_path / "a run"
     with Training(folder, *SIZES, "--launcher", launcher) as training:
