@@ -32,10 +32,9 @@ leave() { # HEAD:PORT
 }
 
 keep() { # HEAD:PORT OPTIONS...
-  local raylet head=$1 ran_at=$SECONDS
+  local head=$1 ran_at=$SECONDS
   while ((SECONDS - ran_at < PATIENCE_SECONDS)); do
-    raylet=$(raylet_of "$head")
-    while kill -0 "$raylet"; do
+    while raylet_of "$head" > /dev/null; do # not by its number: where nobody reaps it, that stays
       ran_at=$SECONDS
       sleep 1
     done
