@@ -64,7 +64,11 @@ class TwinQ(nn.Module):
     def __init__(self, inputs: int, action_dim: int, config: AgentConfig) -> None:
         super().__init__()
         sizes = inputs + action_dim, *config.heads
-        self.layers = nn.ModuleList(StackedLinear(*pair) for pair in zip(sizes, (*config.heads, 1), strict=True))
+        layers = [StackedLinear(*pair) for pair in zip(sizes, (*config.heads, 1), strict=True)]
+        if config.critic_batch_norm:  # few actions among many states, all of one size, would be learnt of last
+            with torch.no_grad():
+                layers[0].weight[:, inputs:] *= math.sqrt(inputs / action_dim)
+        self.layers = nn.ModuleList(layers)
         # both nets read the same input; without an offset behind the ReLUs, the last bias alone would carry Q's mean
         norms = [BatchNorm(1, sizes[0], affine=False), *(BatchNorm(2, size, affine=True) for size in config.heads)]
         self.norms = nn.ModuleList(norms if config.critic_batch_norm else [])

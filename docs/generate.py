@@ -77,8 +77,7 @@ WHEN = {
     "head_input": "`observation`, with `--scheme 2 --no-grounding --hidden 8 --embedding 0`, where all is seen and "
     "time counts: [level by 60 000 steps, far behind by 300 000](results.md); the embedding beside it cost return in "
     "a trial (`studies/notebook.md`)",
-    "critic_batch_norm": "on trial: with `--batch-size 16 --replay-ratio 96` level on HalfCheetah-v5, far ahead on "
-    "Walker2d-v5, one seed each (`studies/notebook.md`); 8 windows are too few; on a GPU see [there](gpu.md)",
+    "critic_batch_norm": "off for target critics, and with batches below 16: [what it is worth](results.md)",
     "privileged_critic": "where the simulator knows what sensors do not see: "
     "[an environment of your own](custom-environments.md#seen-in-part)",
     "normalize_observations": "off, with `--no-impute-missing`, where they are scaled and their statistics keep moving",

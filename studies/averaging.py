@@ -17,13 +17,14 @@ from rmc.analysis.world_model_picture import load_agent
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.run.folder import RunFolder
 from rmc.sweep.job import Job
-from studies.study import Play, Scale, Study
+from studies.study import Play, Scale, Study, before
 
 EPISODES = 10
 STUDY = Study(
     "averaging",
     {
         "RMC": "train ENV --keep-checkpoints 1000",
+        "RMC, target critics": before("--keep-checkpoints 1000"),
         "over 500 updates": "train ENV --keep-checkpoints 1000 --policy-ema-updates 500",
         "over 8 000 updates": "train ENV --keep-checkpoints 1000 --policy-ema-updates 8000",
     },

@@ -1,10 +1,10 @@
 """What one update is worth: one change at a time, at 60 000 steps.
 
 BEFORE changes 32 windows a batch, with scheme 1, clipped at 40 and not averaged, which were the default then; what
-names no batch has 32. TODAY changes what is the default now.
+names no batch has 32. TARGETS changes what was the default before batch norm.
 """
 
-from studies.study import Scale, Study
+from studies.study import Scale, Study, before
 
 BEFORE = {
     "batch 32": "--batch-size 32",
@@ -35,7 +35,7 @@ BEFORE = {
     "batch 16, memory's rate 0.3": "--batch-size 16 --memory-learning-scale 0.3",
     "batch 16, observation beside": "--batch-size 16 --head-input hidden+observation",
 }
-TODAY = {
+TARGETS = {
     "RMC": "",
     "RMC, n-step 3": "--n-step 3",
     "RMC, observation beside": "--head-input hidden+observation",
@@ -55,8 +55,8 @@ TODAY = {
 }
 STUDY = Study(
     "candidates",
-    {name: f"train ENV --scheme 1 --clip-norm 40 --policy-ema-updates 0 {words}" for name, words in BEFORE.items()}
-    | {name: f"train ENV {words}" for name, words in TODAY.items()},
+    {name: before(f"--scheme 1 --clip-norm 40 --policy-ema-updates 0 {words}") for name, words in BEFORE.items()}
+    | {name: before(words) for name, words in TARGETS.items()},
     small=Scale(60_000, (1, 2)),
 )
 

@@ -3,13 +3,14 @@
 What each makes of full observation is the ceiling.
 """
 
-from studies.study import Scale, Study
+from studies.study import Scale, Study, before
 
 ENVS = ("Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Walker2d-v5", "HumanoidStandup-v5")
 STUDY = Study(
     "flicker",
     {
         "RMC": "train ENV --flicker 0.5",
+        "RMC, target critics": before("--flicker 0.5"),
         "SAC, 4 frames": "baseline sac ENV --flicker 0.5 --frame-stack 4",
         "RecurrentPPO": "baseline recurrent-ppo ENV --flicker 0.5",
         "RecurrentPPO zoo": "baseline recurrent-ppo ENV --flicker 0.5 --settings zoo",

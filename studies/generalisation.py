@@ -20,7 +20,7 @@ from rmc.analysis.statistics import ENOUGH_SEEDS, interquartile_mean, interval
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
 from rmc.sweep.job import Job
-from studies.study import Play, Scale, Study
+from studies.study import Play, Scale, Study, before
 
 ENVS = ("HalfCheetah-v5", "Walker2d-v5", "Ant-v5")
 PROBABILITIES = tuple(round(0.1 * tenths, 1) for tenths in range(11))
@@ -31,9 +31,10 @@ STUDY = Study(
     {
         "RMC": "train ENV",
         "RMC, not filling": "train ENV --no-impute-missing",
-        "RMC, not averaged": "train ENV --policy-ema-updates 0",
-        "RMC, clipped": "train ENV --clip-norm 40 --policy-ema-updates 0",
-        "RMC, scheme 1": "train ENV --scheme 1 --clip-norm 40 --policy-ema-updates 0",
+        "RMC, target critics": before(),
+        "RMC, not averaged": before("--policy-ema-updates 0"),
+        "RMC, clipped": before("--clip-norm 40 --policy-ema-updates 0"),
+        "RMC, scheme 1": before("--scheme 1 --clip-norm 40 --policy-ema-updates 0"),
         "SAC": "baseline sac ENV",
     },
     small=Scale(100_000, (1, 2, 3)),

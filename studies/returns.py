@@ -1,11 +1,12 @@
 """Figures (a) to (e) of the paper: returns where everything is seen, beside DDPG, PPO, TD3 and SAC."""
 
-from studies.study import Scale, Study
+from studies.study import Scale, Study, before
 
 ENVS = ("Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Walker2d-v5", "HumanoidStandup-v5")
 OURS = {
     "RMC": "train ENV",
-    "RMC, not averaged": "train ENV --policy-ema-updates 0",
+    "RMC, target critics": before(),
+    "RMC, not averaged": before("--policy-ema-updates 0"),
     "RMC paper": "train ENV --preset paper",
 }
 THEIRS = {name: f"baseline {name.lower()} ENV" for name in ("SAC", "TD3", "DDPG", "PPO")}

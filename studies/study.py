@@ -36,6 +36,13 @@ TINY = "--checkpoint-steps 300 --episodes 1"  # at the scale smoke
 TINY_OURS = f"{TINY} --hidden 16 --embedding 16 --heads 16 16 --warmup-steps 200 --batch-size 6 --replay-ratio 4"
 
 
+def before(words: str = "") -> str:
+    """Words of ``robust`` as it was before batch norm, and these: target critics, 8 windows, a replay ratio of 48."""
+    sizes = {"--batch-size": "8", "--replay-ratio": "48"}
+    unsaid = [f"{option} {value}" for option, value in sizes.items() if option not in words]
+    return " ".join(["train ENV --no-critic-batch-norm", *unsaid, words])
+
+
 @dataclasses.dataclass(frozen=True)
 class Scale:
     """How much of it."""

@@ -53,7 +53,7 @@ def test_the_learner_holds_the_actors_back() -> None:
     )
     assert str(finding) == (
         "learner-bound: actors waited 97% of the time for credit, the learner was busy 99%; more actors will not help; "
-        "a GPU (--device cuda) or a faster one, or --replay-ratio 24, would: "
+        "a GPU (--device cuda) or a faster one, or --replay-ratio 48, would: "
         "the latter takes half the updates for each step, 2.0 times the steps a second"
     )
 
@@ -63,7 +63,8 @@ def test_the_actors_hold_the_learner_back() -> None:
     finding = bottleneck(vitals(**slow, launcher=HOST), CONFIG)
     assert finding is not None
     assert (finding.name, finding.advice) == (
-        "actor-bound", "--actors 2 would help; with what there is, --replay-ratio 96 would use the learner's idle time",
+        "actor-bound",
+        "--actors 2 would help; with what there is, --replay-ratio 192 would use the learner's idle time",
     )  # fmt: skip
     assert "learner waited 50%" in finding.measured
     full = bottleneck(vitals(**slow, launcher=HOST | {"host_idle_share": 0.02}), CONFIG)

@@ -97,7 +97,7 @@ def test_numbers_are_told_in_units_that_suit_them() -> None:
 def test_a_trial_keeps_all_but_its_ring_and_warm_up() -> None:
     config = robust(EnvConfig("HalfCheetah-v5"))
     shorter = trial_config(config)
-    assert (shorter.replay.capacity, shorter.replay.warmup_steps) == (1_000, 8 * 15)
+    assert (shorter.replay.capacity, shorter.replay.warmup_steps) == (1_000, 16 * 15)
     assert dataclasses.replace(shorter, replay=config.replay) == config
 
 

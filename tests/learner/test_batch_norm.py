@@ -1,6 +1,7 @@
 """Batch norm in the critics: its numbers beside torch's, padding, running statistics, the fused way."""
 
 import copy
+from collections import Counter
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from torch import Tensor
 
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
-from rmc.common.critic import VARIANCE_FLOOR, BatchNorm
+from rmc.common.critic import VARIANCE_FLOOR, BatchNorm, TwinQ
 from rmc.learner.config import UpdateConfig
 from rmc.learner.fused import fuse
 from rmc.learner.update_order import make_update
@@ -27,9 +28,9 @@ def inputs() -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return features, torch.randn(B, T, A, generator=generator), mask, weight
 
 
-def agent() -> Agent:
+def agent(seed: int = 0) -> Agent:
     """Some updates old: its running statistics have moved."""
-    torch.manual_seed(0)
+    torch.manual_seed(seed)
     made = Agent(3, A, CONFIG)
     features, action, mask, _ = inputs()
     with torch.no_grad():
@@ -107,15 +108,30 @@ def test_running_statistics_move_with_the_critics_own_pass_alone(low: bool) -> N
 
 @pytest.mark.parametrize("given", [True, False], ids=["these steps'", "running"])
 def test_the_fused_way_is_as_near_to_float32_as_plain_bfloat16(given: bool) -> None:
-    exact, usual, actual = agent(), agent(), agent()
-    fuse(actual)
-    expected = values_and_gradients(exact, given, low=False)
-    far = distance(values_and_gradients(actual, given, low=True), expected)
-    plain = distance(values_and_gradients(usual, given, low=True), expected)
-    assert all(value < 1.5 * plain[name] + 5e-3 for name, value in far.items()), (far, plain)
+    far, plain = Counter[str](), Counter[str]()  # over several agents: in one, few ReLUs decide
+    for seed in range(4):
+        exact, usual, actual = agent(seed), agent(seed), agent(seed)
+        fuse(actual)
+        expected = values_and_gradients(exact, given, low=False)
+        far.update(distance(values_and_gradients(actual, given, low=True), expected))
+        plain.update(distance(values_and_gradients(usual, given, low=True), expected))
+        for ours, theirs in zip(actual.critic.norms.buffers(), exact.critic.norms.buffers(), strict=True):
+            torch.testing.assert_close(ours, theirs, atol=2e-3, rtol=2e-2)
+    assert all(value < 1.5 * plain[name] + 2e-2 for name, value in far.items()), (far, plain)
     assert max(far.values()) > 1e-5  # it is bfloat16
-    for ours, theirs in zip(actual.critic.norms.buffers(), exact.critic.norms.buffers(), strict=True):
-        torch.testing.assert_close(ours, theirs, atol=2e-3, rtol=2e-2)
+
+
+@pytest.mark.parametrize("normed", [True, False])
+def test_normalised_critics_begin_with_as_much_of_the_action_as_of_the_state(normed: bool) -> None:
+    torch.manual_seed(0)
+    critic = TwinQ(256, 8, AgentConfig(critic_batch_norm=normed))
+    state, action = torch.randn(2_000, 256), torch.randn(2_000, 8)
+    with torch.no_grad():
+        weight = critic.layers[0].weight
+        of_state, of_action = (
+            float((x @ part).std()) for x, part in ((state, weight[:, :256]), (action, weight[:, 256:]))
+        )
+    assert of_action / of_state == pytest.approx(1.0 if normed else (8 / 256) ** 0.5, rel=0.1)
 
 
 def test_a_batch_without_a_real_step_leaves_numbers() -> None:
