@@ -119,7 +119,7 @@ WHEN = {
     "curiosity_steps": "as long as exploration should last",
     "policy_ema_updates": "0 to evaluate and save what acts; up where evaluations swing",
     "eta": "rarely; only with prioritized replay",
-    "batch_size": "up for steadier updates; at the same replay ratio, more and smaller ones learn sooner",
+    "batch_size": "up for steadier updates, and on a GPU; below 16 take `--no-critic-batch-norm`, too",
     "publish_updates": "rarely",
     "checkpoint_steps": "down to see more evaluations",
     "keep_checkpoints": "up to go back further; the best is always kept",

@@ -25,7 +25,11 @@ HEAD = {
     RESULTS: "| environment | agent | steps | return | each seed | wall time, s | public SAC (`-v4`) |",
     README: "| agent | return | wall time |",
 }
-IN_README = {"`robust`": "RMC, preset `robust`", "SAC": "SAC of stable-baselines3, heads of 400 and 300 units"}
+IN_README = {
+    "`robust`": "RMC, preset `robust`",
+    "`robust`ᵗ": "RMC, preset `robust` before batch norm",
+    "SAC": "SAC of stable-baselines3, heads of 400 and 300 units",
+}
 
 
 @dataclass(frozen=True)
