@@ -43,7 +43,7 @@ EVALUATIONS = 3  # the last ones, of which the return is the mean
 WARM = 1_000  # updates before speeds count
 RETURN_TOLERANCE = 0.2  # of the least return that a line has: few seeds leave much to chance
 SPEED_TOLERANCE = 0.9  # of the lines' median
-PRODUCT = 120, 274, 300  # rows, inputs, outputs: a layer of robust's heads
+PRODUCT = 240, 400, 300  # rows, inputs, outputs: a layer of robust's heads
 PRODUCT_SECONDS = 3.0
 
 

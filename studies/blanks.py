@@ -1,6 +1,6 @@
-"""Half of the frames blank: what helps a memory to see through it?"""
+"""Half of the frames blank: what helps a memory to see through it, from ``robust`` as it was before batch norm."""
 
-from studies.study import Study
+from studies.study import Study, before
 
 WAYS = {
     "RMC": "",
@@ -16,7 +16,7 @@ WAYS = {
     "clipped": "--clip-norm 40 --policy-ema-updates 0",
     "scheme 1": "--scheme 1 --clip-norm 40 --policy-ema-updates 0",
 }
-STUDY = Study("blanks", {name: f"train ENV --flicker 0.5 {words}" for name, words in WAYS.items()})
+STUDY = Study("blanks", {name: before(f"--flicker 0.5 {words}") for name, words in WAYS.items()})
 
 if __name__ == "__main__":
     STUDY.main()

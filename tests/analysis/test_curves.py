@@ -57,7 +57,7 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     assert past.env == "Hopper-v5, flicker 0.5"
     assert (past.seed, past.finished, past.initial_return) == (3, False, None)
     assert past.evaluations == [Evaluation(500, 50, 5.0, 7.0, 1.0), Evaluation(900, 90, 15.0, 9.0, 1.0)]
-    assert past.transitions == 90 * 8 * 15
+    assert past.transitions == 90 * 16 * 15
     result = {"updates": 100, "env_steps": 1000, "wall_s": 21.0, "eval_return_mean": 11.0, "eval_return_std": 2.0}
     result["eval_episodes"] = 10
     (tmp_path / "result.json").write_text(json.dumps({**result, "initial_return_mean": -1.0}))
@@ -73,7 +73,7 @@ def test_a_window_that_is_an_episode_counts_with_its_length(tmp_path):
     config = robust(EnvConfig("HalfCheetah-v5"))
     actor = dataclasses.replace(config.actor, state_strategy="episode")
     (tmp_path / "config.json").write_text(to_json(dataclasses.replace(config, actor=actor)))
-    assert history.describe(tmp_path).transitions_per_update == 8 * 1000
+    assert history.describe(tmp_path).transitions_per_update == 16 * 1000
 
 
 def odd(**fields) -> str:
