@@ -85,6 +85,7 @@ def draw_until(client: ReplayClient, end: float, rng: np.random.Generator) -> in
     return draws
 
 
+@pytest.mark.long  # tests/faults/test_short.py kills it at every commit point
 def test_killed_again_and_again_amid_inserts(redis_url: str, run_name: str, tmp_path: Path) -> None:
     bus, rng, chance = RedisBus(redis_url, run_name), np.random.default_rng(0), random.Random(0)
     senders = [Sender(bus, actor) for actor in range(ACTORS)]

@@ -62,6 +62,7 @@ def test_a_grid_is_run_once_and_told(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "--learning-rate 0.001" in output
 
 
+@pytest.mark.long
 def test_a_killed_run_is_told_the_other_goes_on_and_the_same_command_resumes(tmp_path: Path) -> None:
     """A longer one resumes finished runs, too; without their ring, which it says."""
     spec, folder = write_spec(tmp_path, seeds=SEEDS, total_steps=2500), tmp_path / "sweep"
