@@ -25,8 +25,8 @@ STUDY = Study(
     {
         "RMC": "train ENV --keep-checkpoints 1000",
         "RMC, target critics": before("--keep-checkpoints 1000"),
-        "over 500 updates": "train ENV --keep-checkpoints 1000 --policy-ema-updates 500",
-        "over 8 000 updates": "train ENV --keep-checkpoints 1000 --policy-ema-updates 8000",
+        "over 500 updates": before("--keep-checkpoints 1000 --policy-ema-updates 500"),
+        "over 8 000 updates": before("--keep-checkpoints 1000 --policy-ema-updates 8000"),
     },
     small=Scale(300_000, (1, 2, 3), ("Hopper-v5", "Walker2d-v5", "HalfCheetah-v5")),
 )

@@ -25,8 +25,8 @@ RUNGS = {
     "the model's loss": before(f"{BARE} --scheme 1"),
     "grounding": before("--scheme 1"),
     "no value in the memory, robust": before(),
-    "batch norm": "train ENV",
     "curiosity": before("--curiosity 0.1 --curiosity-scale std"),
+    "batch norm, no curiosity": "train ENV",
 }
 STUDY = Study("ladder", RUNGS, small=Scale(60_000, (1, 2)))
 
