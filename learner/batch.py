@@ -23,6 +23,7 @@ class Plan(NamedTuple):
     steps: int  # of each window, L_b and up to L_t
     fills: bool  # whether a frame may be missing
     trains_imputer: bool
+    trains_policy: bool
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class Batch:
     cut: int  # steps of padding that all its windows have after the T
     fills: bool  # as the plan says
     trains_imputer: bool
+    trains_policy: bool
 
 
 def importance_weights(
@@ -117,7 +119,7 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec, plan: Plan | N
     The rows' padding must be zero: see ``clear_padding``. Without a plan, all steps, and nothing is left out.
     """
     assert raw.shape[1] == spec.dtype.itemsize, (raw.shape, spec.dtype.itemsize)
-    steps, fills, trains_imputer = plan or Plan(spec.steps, True, True)
+    steps, fills, trains_imputer, trains_policy = plan or Plan(spec.steps, True, True, True)
     floats, integers = raw.view(torch.float32), raw.view(torch.int32)
 
     def field(items: Tensor, name: str) -> Tensor:
@@ -147,4 +149,5 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec, plan: Plan | N
         cut=spec.steps - steps,
         fills=fills,
         trains_imputer=trains_imputer,
+        trains_policy=trains_policy,
     )

@@ -46,6 +46,8 @@ class UpdateConfig:
     what the one before left, with an optimiser of its own (algorithm 1 as printed)."""
     model_norm: Literal["l1", "l2"] = "l1"
     """How the world model's error is measured, as loss and as curiosity."""
+    policy_delay: int = 1
+    """Updates of the critics, and of the temperature, for one of the policy."""
     n_step: int = 1
     """Steps of reward in a target before it bootstraps; 1 is the paper."""
     eta: float = 0.9

@@ -166,7 +166,7 @@ class DeviceUpdate:
         with torch.cuda.stream(self._beside):
             value_losses, value = update.value_pass(batch, model, self._beta)
             value_norm = update.step(update.optimizers[1:], value_losses.values())
-            update.follow_value()
+            update.follow_value(value)
         model_norm = update.step(update.optimizers[:1], model_losses.values())
         update.follow_model(model)
         current.wait_stream(self._beside)

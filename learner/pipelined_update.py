@@ -38,7 +38,7 @@ from rmc.learner.update import (
 )
 
 AHEAD = 2  # batches that the model's half may be ahead
-REQUEST = struct.Struct("qqq??")  # an update's number, the threads that it takes, its plan
+REQUEST = struct.Struct("qqq???")  # an update's number, the threads that it takes, its plan
 ENDED = "the process of memory and world model has ended; the lines above say why"
 ALIGNMENT = 64  # bytes, a cache line
 
@@ -146,7 +146,7 @@ class PipelinedUpdate:
         model = slot.model_of(batch)
         loss_values, value = update.value_pass(batch, model, slot.beta)
         norm = update.step(update.optimizers[1:], loss_values.values())
-        update.follow_value()
+        update.follow_value(value)
         update.update_ema(number, VALUE_PARTS)
         return update.result(batch, model, value, torch.hypot(norm, slot.norm))
 

@@ -91,6 +91,7 @@ class JointUpdate:
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
         self.was_missing = torch.zeros((), dtype=torch.bool)  # whether a frame ever was, on the host
         self.fill_loss = torch.zeros((), device=device)  # the imputer's last
+        self.policy_loss = torch.zeros((), device=device)  # the policy's last
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
         return [adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, VALUE_PARTS)]
@@ -100,7 +101,7 @@ class JointUpdate:
         loss_values, model, value = self.forward(batch, beta)
         norm = self.step(self.optimizers, loss_values.values())
         self.follow_model(model)
-        self.follow_value()
+        self.follow_value(value)
         return self.result(batch, model, value, norm)
 
     def forward(self, batch: Batch, beta: Tensor) -> tuple[Losses, ModelPass, ValuePass]:
@@ -148,26 +149,26 @@ class JointUpdate:
         alpha = agent.log_alpha.exp().detach()
         z_value, z_policy = (z if loss in TRAINS_MEMORY[c.scheme] else z.detach() for loss in ("value", "policy"))
         with self._autocast():
-            mean, log_std = agent.policy(z_policy)
-            pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean, batch.cut))
+            with torch.set_grad_enabled(batch.trains_policy):
+                mean, log_std = agent.policy(z_policy)
+                pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean, batch.cut))
             now = critic_input(z_value[:, :-1], privileged[:, :-1]), a
             after = critic_input(model.next_z, privileged[:, 1:]), pi[:, 1:].detach()
             q, next_q = self._values(now, after, m)
             next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:].detach())
             y = losses.td_target(r + beta * model.curiosity, c.gamma, d, next_value, m, c.n_step)
-            frozen = {name: value.detach() for name, value in agent.critic.named_parameters()}
             z_actor = z_policy if c.policy_through_q else z.detach()
-            read = critic_input(z_actor[:, :-1], privileged[:, :-1])
-            q_pi = functional_call(agent.critic, frozen, (read, pi[:, :-1]))
-            q_pi = q_pi[0] if c.policy_q == "first" else q_pi.min(0).values
+            climbed = critic_input(z_actor[:, :-1], privileged[:, :-1]), pi[:, :-1]
 
         log_pi, td_error = log_pi[:, :-1], (q.detach() - y).abs().mean(0)
         loss_values = {
             "q_loss": losses.q_loss(q, y, batch.importance, m),
-            "policy_loss": losses.policy_loss(log_pi, q_pi, alpha, m),
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
-        trace = Trace(detached(loss_values), alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m)
+        if batch.trains_policy:
+            loss_values["policy_loss"] = losses.policy_loss(log_pi, self._frozen_q(*climbed), alpha, m)
+        reported = {"policy_loss": self.policy_loss.clone()} | detached(loss_values)
+        trace = Trace(reported, alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m)
         return loss_values, ValuePass(losses.priority(td_error, c.eta, m), value_metrics(trace, beta))
 
     def _values(self, now: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], m: Tensor) -> tuple[Tensor, Tensor]:
@@ -183,6 +184,13 @@ class JointUpdate:
         q, next_q = self.agent.critic(*both, torch.cat([m, m], dim=1)).chunk(2, dim=2)
         return q, next_q.detach()
 
+    def _frozen_q(self, read: Tensor, action: Tensor) -> Tensor:
+        """(B, L_t) Q that the policy climbs, by parameters without gradient."""
+        frozen = {name: value.detach() for name, value in self.agent.critic.named_parameters()}
+        with self._autocast():
+            q = functional_call(self.agent.critic, frozen, (read, action))
+        return q[0] if self.config.policy_q == "first" else q.min(0).values
+
     def result(self, batch: Batch, model: ModelPass, value: ValuePass, norm: Tensor) -> UpdateResult:
         """What an update gives back of its passes; ``norm`` is the gradient's."""
         metrics = model.metrics | value.metrics | {"grad_norm": norm}
@@ -194,12 +202,12 @@ class JointUpdate:
 
         What imputes is trained at every ``IMPUTER_UPDATES``-th until a frame was missing.
         """
-        steps = update_steps(raw, spec, number)
+        steps, trains_policy = update_steps(raw, spec, number), number % self.config.policy_delay == 0
         if self.agent.next_frame is None:
-            return Plan(steps, False, False)
+            return Plan(steps, False, False, trains_policy)
         fills = has_missing(raw, spec)
         self.was_missing |= fills
-        return Plan(steps, fills, bool(self.was_missing) or number % IMPUTER_UPDATES == 1)
+        return Plan(steps, fills, bool(self.was_missing) or number % IMPUTER_UPDATES == 1, trains_policy)
 
     def _fill_losses(self, o: Tensor, memory: MemoryOutput, batch: Batch, m: Tensor) -> Losses:
         """The loss of what imputes, where it is configured and its turn."""
@@ -269,8 +277,9 @@ class JointUpdate:
         self.curiosity_variance.copy_(model.curiosity_variance)
         self.fill_loss.copy_(model.fill_loss)
 
-    def follow_value(self) -> None:
-        """What follows the critics' step: their targets by Polyak."""
+    def follow_value(self, value: ValuePass) -> None:
+        """What follows the critics' step: their targets by Polyak, the policy's last loss."""
+        self.policy_loss.copy_(value.metrics["policy_loss"])
         if self.target_critic is not None:
             follow(self.target_critic, self.agent.critic, 1.0 - self.config.polyak)
 
@@ -299,6 +308,7 @@ class JointUpdate:
             "curiosity_variance": self.curiosity_variance,
             "was_missing": self.was_missing,
             "fill_loss": self.fill_loss,
+            "policy_loss": self.policy_loss,
             "generator": self.generator.get_state(),
         }
 
@@ -319,6 +329,7 @@ class JointUpdate:
         _, was_missing, fill_loss = state.get("imputer_turns", torch.zeros(3))  # of older checkpoints
         self.was_missing.copy_(state.get("was_missing", was_missing > 0))
         self.fill_loss.copy_(state.get("fill_loss", fill_loss))
+        self.policy_loss.copy_(state.get("policy_loss", self.policy_loss))
         self._resume_noise(state["generator"].cpu())
 
     def _resume_noise(self, state: Tensor) -> None:

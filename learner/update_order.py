@@ -41,16 +41,17 @@ class AlternateUpdate(JointUpdate):
         norms = []
         for optimizer, (part, names) in zip(self.optimizers, self._stages(), strict=True):
             loss_values, model, value = self.forward(batch, beta)
-            stage_losses = {name: loss for name, loss in loss_values.items() if name in names}
+            if not (stage_losses := {name: loss for name, loss in loss_values.items() if name in names}):
+                continue  # not the policy's turn
             norms.append(self.step([optimizer], stage_losses.values()))
             metrics |= detached(stage_losses)
             if part == "critic":
                 of_critics = model, value
         model, value = of_critics
+        value = value._replace(metrics=value.metrics | metrics)
         self.follow_model(model)
-        self.follow_value()
-        updated = self.result(batch, model, value, torch.stack(norms).norm())
-        return updated._replace(metrics=updated.metrics | metrics)
+        self.follow_value(value)
+        return self.result(batch, model, value, torch.stack(norms).norm())
 
 
 def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:

@@ -44,6 +44,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
     "update.curiosity": (0, 1e12),
     "update.curiosity_steps": (1, 2**53),
     "update.scheme": (1, 6),
+    "update.policy_delay": (1, 1_000),
     "update.n_step": (1, 10_000),
     "update.eta": (0, 1),
     "update.policy_ema_updates": (0, 2**31),

@@ -99,7 +99,7 @@ def test_a_cut_batch_is_the_whole_one_without_padding() -> None:
     rows = random_rows(6, spec=LONG, longest=20)
     whole, raw = to_batch(rows, LONG), torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
     steps = longest_steps(raw, LONG)
-    cut = view_batch(raw, torch.ones(len(rows)), LONG, Plan(steps, True, True))
+    cut = view_batch(raw, torch.ones(len(rows)), LONG, Plan(steps, True, True, True))
     assert (cut.cut, whole.cut) == (LONG.steps - steps, 0)
     for name, value in vars(cut).items():
         of_whole = getattr(whole, name)

@@ -19,7 +19,7 @@ from rmc.learner.update_order import make_update
 from tests.learner.rows import BY_NUMBER, LONG, SPEC
 from tests.learner.test_device_update import BATCH, host_batch
 
-ROBUST = UpdateConfig(scheme=3, curiosity=0.1, curiosity_scale="std", policy_ema_updates=100)
+ROBUST = UpdateConfig(scheme=3, curiosity=0.1, curiosity_scale="std", policy_ema_updates=100, policy_delay=2)
 AGENTS = {
     "robust": AgentConfig(hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden"),
     "embedding beside": AgentConfig(

@@ -362,3 +362,31 @@ def test_an_older_checkpoint_says_whether_a_frame_was_missing(was_missing, moves
     assert moves_of_the_imputer(update, 2, missing_from=99, begin=2) == moves
     update.load_state_dict(older)  # of version 0.1.0
     assert moves_of_the_imputer(update, 2, missing_from=99, begin=2) == []
+
+
+@pytest.mark.parametrize("order", ["joint", "alternate"])
+def test_the_policy_waits_for_its_turn_and_nothing_else_does(order):
+    update = make(ROBUST, update_order=order, scheme=3, policy_delay=3)
+    raw = torch.from_numpy(random_rows(8).view("u1").reshape(8, -1))
+    moves, said = [], []
+    for number in range(1, 7):
+        before = copy.deepcopy(update.agent.state_dict())
+        plan = update.plan(raw, SPEC, number)
+        updated = update(view_batch(raw, torch.ones(8), SPEC, plan), BETA)
+        moved = {name for name, value in update.agent.state_dict().items() if not torch.equal(value, before[name])}
+        assert plan.trains_policy == (part(update, "policy.") <= moved)
+        assert moved >= part(update, "memory.", "critic.", "world_model.", "log_alpha")
+        moves += [number] if part(update, "policy.") & moved else []
+        said.append(updated.metrics["policy_loss"].item())
+    assert moves == [3, 6]
+    assert said[:2] == [0.0, 0.0]  # there was none yet
+    assert said[2] == said[3] == said[4] != said[5]
+
+
+def test_an_update_without_the_policys_turn_is_the_update_without_its_loss():
+    without, whole = make(ROBUST, scheme=3, policy_delay=2), make(ROBUST, scheme=3)
+    raw = torch.from_numpy(random_rows(8).view("u1").reshape(8, -1))
+    for update in (without, whole):
+        update(view_batch(raw, torch.ones(8), SPEC, update.plan(raw, SPEC, 1)), BETA)
+    for name, value in whole.agent.named_parameters():
+        assert torch.equal(value, dict(without.agent.named_parameters())[name]) == (not name.startswith("policy."))
