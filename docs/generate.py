@@ -110,6 +110,7 @@ WHEN = {
     "update_order": "`alternate` for algorithm 1 as printed, at five times the forwards "
     "(four with `--no-impute-missing`)",
     "model_norm": "to repeat the paper's comparison",
+    "policy_delay": "up where the learner is what a run waits for",
     "n_step": "up where rewards are rare; it is biased by old data",
     "latent_target": "`ema` where the latent rank in the metrics falls; it cost return (`studies/notebook.md`)",
     "target_memory": "`ema` for slower targets; it cost return in a trial (`studies/notebook.md`)",

@@ -41,6 +41,7 @@ MAY_CHANGE = SAME_AGENT | {  # that, and what is read afresh at every start: no 
     "update.gamma",
     "update.polyak",
     "update.clip_norm",
+    "update.policy_delay",
     "update.n_step",
     "update.eta",
     "update.curiosity",

@@ -42,7 +42,7 @@ TRAIN_FLAGS = """
     --capacity --replay-shards --replay-ratio --warmup-steps --priority-exponent --importance-exponent
     --learning-rate --memory-learning-scale
     --alpha-learning-rate --gamma --polyak --clip-norm --policy-ema-updates --latent-target --target-memory --policy-q
-    --scheme --policy-through-q --update-order --model-norm --n-step --state-strategy
+    --scheme --policy-through-q --update-order --model-norm --policy-delay --n-step --state-strategy
     --curiosity --curiosity-scale --curiosity-steps --eta
     --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads
     --episodes --evaluation-seconds
