@@ -32,7 +32,7 @@ LEARNER = "critics, policy, temperature"
 MODEL = "memory and world model"
 OTHER = "losses, autograd, Python"
 BY_FUNCTION = {  # the first that a stack has, from its outermost frame on
-    "Adam, rounding": {"optimizers.py:step", "optimizer.py:wrapper", "fused.py:bf16"},
+    "Adam, rounding": {"optimizers.py:step", "optimizer.py:wrapper", "rounded.py:bf16"},
     "gradient's norm": {"clip_grad.py:get_total_norm", "clip_grad.py:_get_total_norm"},
     "targets, averages": {"optimizers.py:follow", "update.py:follow", "update.py:update_ema"},
     "batches, priorities": {

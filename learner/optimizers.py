@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from rmc.common.agent import Agent
 from rmc.learner import kernels
 from rmc.learner.config import UpdateConfig
-from rmc.learner.fused import rounded_weights
+from rmc.learner.rounded import rounded_weights
 
 NOT_ROUNDED = np.empty(0, np.uint16)
 

@@ -23,7 +23,7 @@ def robust(env: EnvConfig) -> RunConfig:
         agent=AgentConfig(normalize_observations=True, impute_missing=True, critic_batch_norm=True),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=96.0, priority_exponent=0.0),
-        update=UpdateConfig(scheme=3, policy_ema_updates=2_000),
+        update=UpdateConfig(scheme=3, policy_ema_updates=2_000, policy_delay=2),
         learner=LearnerConfig(batch_size=16, importance_exponent=0.0, publish_updates=80),
     )
 
@@ -37,7 +37,7 @@ def memory(env: EnvConfig) -> RunConfig:
         agent=replace(base.agent, gate_init="chrono", critic_batch_norm=False),
         actor=replace(base.actor, state_strategy="episode"),
         replay=replace(base.replay, capacity=10_000, replay_ratio=48.0),
-        update=replace(base.update, scheme=1),
+        update=replace(base.update, scheme=1, policy_delay=1),
         learner=replace(base.learner, batch_size=8),
     )
 

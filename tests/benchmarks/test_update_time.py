@@ -1,29 +1,30 @@
 """What a sampled stack of the learner counts as."""
 
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from benchmarks import update_time
-from rmc.learner import fused
+from rmc.learner import fused_heads, rounded
 
 
-def line_of(text: str) -> int:
-    lines = Path(fused.__file__).read_text().splitlines()
-    return next(number for number, line in enumerate(lines, 1) if text in line)
+def frame(module: ModuleType, function: str, text: str) -> str:
+    lines = Path(str(module.__file__)).read_text().splitlines()
+    line = next(number for number, line in enumerate(lines, 1) if text in line)
+    return f"{function} ({module.__file__}:{line})"
 
 
 @pytest.mark.parametrize(
-    ("function", "text", "kind"),
+    ("innermost", "kind"),
     [
-        ("_layer", "y = torch.mm(x, w)", "matrix products"),
-        ("_layer", "kernels.bias_relu(", "gates, biases, ReLUs"),
-        ("bf16", "low.copy_(weight.detach())", "Adam, rounding"),
-        ("_heads", "return out.reshape(", update_time.OTHER),
+        (frame(fused_heads, "relu_layer", "y = torch.mm(x, w)"), "matrix products"),
+        (frame(fused_heads, "relu_layer", "kernels.bias_relu("), "gates, biases, ReLUs"),
+        (frame(rounded, "bf16", "low.copy_(weight.detach())"), "Adam, rounding"),
+        (frame(fused_heads, "_heads", "return out.reshape("), update_time.OTHER),
     ],
 )
-def test_a_stack_counts_as_what_its_innermost_line_does(function: str, text: str, kind: str) -> None:
-    innermost = f"{function} ({fused.__file__}:{line_of(text)})"
+def test_a_stack_counts_as_what_its_innermost_line_does(innermost: str, kind: str) -> None:
     assert update_time.category(["<module> (/x/role.py:1)", "step (/x/learner.py:9)", innermost]) == kind
 
 

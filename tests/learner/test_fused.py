@@ -12,7 +12,8 @@ from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.learner import kernels
 from rmc.learner.config import UpdateConfig
-from rmc.learner.fused import FusedGRU, FusedHead, FusedTwinQ, fuse
+from rmc.learner.fused import FusedGRU, fuse
+from rmc.learner.fused_heads import FusedHead, FusedTwinQ
 from rmc.learner.update_order import make_update
 from tests.learner.rows import SPEC, random_rows, to_batch
 
