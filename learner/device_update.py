@@ -137,7 +137,7 @@ class DeviceUpdate:
         self._copy([raw, importance])
         self._beta.fill_(beta)
         result = self._work(self._update.plan(raw, self._spec, number))
-        self._update.update_ema(number)
+        self._update.average.move(number)
         return [result]
 
     def use_threads(self, number: int) -> None:

@@ -191,7 +191,7 @@ class Learner:
                 self.publish()
 
     def _ask_for_evaluation(self) -> None:
-        blob = self._sound(self.update.policy_weights())
+        blob = self._sound(self.update.average.policy_weights())
         self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate=True)
         self._evaluation_due = False
 
@@ -253,7 +253,7 @@ class Learner:
         began = time.monotonic()
         state = self.update.state_dict()
         self._check_finite(state)  # critics or moments may be spoilt while the policy, for one more update, is not
-        policy = self._sound(self.update.policy_weights(), self._metadata())
+        policy = self._sound(self.update.average.policy_weights(), self._metadata())
         progress = LearnerProgress(
             self.updates, self.env_steps, self.epoch, self._threads.chosen, self._observed_before
         )

@@ -147,7 +147,7 @@ class PipelinedUpdate:
         loss_values, value = update.value_pass(batch, model, slot.beta)
         norm = update.step(update.optimizers[1:], loss_values.values())
         update.follow_value(value)
-        update.update_ema(number, VALUE_PARTS)
+        update.average.move(number, VALUE_PARTS)
         return update.result(batch, model, value, torch.hypot(norm, slot.norm))
 
     def _start(self) -> None:
@@ -156,13 +156,12 @@ class PipelinedUpdate:
         optimizer = update.optimizers[0]
         begin_moments(optimizer, (value for group in optimizer.param_groups for value in group["params"]))
         moments = [value for state in optimizer.state.values() for value in state.values()]
-        averages = [value for name, value in update.average.items() if name.startswith(MODEL_PARTS)]
         own = [value for name, value in update.agent.named_parameters() if name.startswith(MODEL_PARTS)]
         _share(
             [
                 *own,
                 *moments,
-                *averages,
+                *update.average.of(MODEL_PARTS),
                 *update.agent.normalizer.buffers(),
                 update.curiosity_variance,
                 update.fill_loss,
@@ -213,7 +212,7 @@ class PipelinedUpdate:
         loss_values, model = update.model_pass(batch)
         norm = update.step(update.optimizers[:1], loss_values.values())
         update.follow_model(model)
-        update.update_ema(number, MODEL_PARTS)
+        update.average.move(number, MODEL_PARTS)
         slot.write(batch, model, norm)
 
 

@@ -24,13 +24,13 @@ from rmc.learner.config import UpdateConfig
 from rmc.learner.diagnostics import Trace, model_metrics, unexplained_change, value_metrics
 from rmc.learner.fused import fuse
 from rmc.learner.optimizers import adam, by_optimizer, follow
+from rmc.learner.policy_average import PolicyAverage
 from rmc.learner.unroll import impute, unroll
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 MODEL_PARTS = ("memory", "world_model", "next_frame")
 VALUE_PARTS = ("critic", "policy", "log_alpha")
 IMPUTER_UPDATES = 8  # updates for one of the imputer's until a frame is missing: no loss reads it before
-AVERAGE_UPDATES = 10  # updates between moves of the policy's average, which reads and writes all that acts
 TRAINS_MEMORY = {  # the paper's table 1
     1: {"model", "value"},
     2: {"value"},
@@ -84,7 +84,7 @@ class JointUpdate:
         self.agent, self.burn_in, self.config, self.bf16 = agent, burn_in, config, bf16
         self.target_critic = None if agent.config.critic_batch_norm else _target_copy(agent.critic)
         self.target_memory = _target_copy(agent.memory)
-        self.average = {name: value.detach().clone() for name, value in agent.acting().items()}  # theta-bar
+        self.average = PolicyAverage(agent, config.policy_ema_updates)
         self._has_target_memory = "ema" in (config.latent_target, config.target_memory)
         self.optimizers = self._make_optimizers()
         self.generator = torch.Generator(device).manual_seed(seed)
@@ -283,27 +283,13 @@ class JointUpdate:
         if self.target_critic is not None:
             follow(self.target_critic, self.agent.critic, 1.0 - self.config.polyak)
 
-    @torch.no_grad()
-    def update_ema(self, updates: int, parts: tuple[str, ...] = MODEL_PARTS + VALUE_PARTS) -> None:
-        """Every ``AVERAGE_UPDATES``, move those ``parts`` of theta-bar of algorithm 1 towards what acts."""
-        if self.config.policy_ema_updates and updates % AVERAGE_UPDATES == 0:
-            over, acting = min(self.config.policy_ema_updates, updates / 10) / AVERAGE_UPDATES, self.agent.acting()
-            names = [name for name in self.average if name.startswith(parts)]
-            averaged, newest = ([source[name] for name in names] for source in (self.average, {**acting}))
-            torch._foreach_lerp_(averaged, newest, 1.0 / max(1.0, over))
-
-    def policy_weights(self) -> dict[str, Tensor]:
-        """What checkpoints hold and evaluations play: theta-bar, with what normalises observations now."""
-        averaged = self.average if self.config.policy_ema_updates else {}
-        return self.agent.policy_weights() | {name: value.cpu() for name, value in averaged.items()}
-
     def state_dict(self) -> dict[str, Any]:
         """All that an update changes, for a checkpoint."""
         return {
             "agent": self.agent.state_dict(),
             "target_critic": self.target_critic.state_dict() if self.target_critic is not None else {},
             "target_memory": self.target_memory.state_dict(),
-            "average": self.average,
+            "average": self.average.state_dict(),
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "curiosity_variance": self.curiosity_variance,
             "was_missing": self.was_missing,
@@ -318,8 +304,7 @@ class JointUpdate:
         if self.target_critic is not None:
             self.target_critic.load_state_dict(state["target_critic"])
         self.target_memory.load_state_dict(state["target_memory"])
-        for name, value in self.average.items():
-            value.copy_(state["average"][name])
+        self.average.load_state_dict(state["average"])
         for optimizer, saved in zip(self.optimizers, by_optimizer(state["optimizers"], self.optimizers), strict=True):
             own = [{name: group[name] for name in ("lr", "capturable")} for group in optimizer.param_groups]
             optimizer.load_state_dict(saved)

@@ -70,7 +70,7 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         fix = f"its checkpoint {number} cannot be used ({reason}); use another"
         raise ConfigError(OPTION, init_from, fix) from None
-    weights = {name: value.contiguous() for name, value in update.policy_weights().items()}
+    weights = {name: value.contiguous() for name, value in update.average.policy_weights().items()}
     policy = safetensors.torch.save(weights, config.policy_header().metadata())
     checkpoint = pack(update.state_dict(), policy, progress)
     return InitialCheckpoint(
@@ -118,9 +118,8 @@ def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages:
     if update.target_critic is not None:
         critic = state["target_critic"] if parts == "all" else update.agent.critic.state_dict()
         update.target_critic.load_state_dict(critic)
-    acting = dict(update.agent.acting())
-    for name, value in update.average.items():
-        value.copy_(state["average"][name] if averages and name in weights else acting[name].detach())
+    averaged = {name: value for name, value in state["average"].items() if averages and name in weights}
+    update.average.load_state_dict({**update.agent.acting()} | averaged)
     return update
 
 

@@ -21,7 +21,7 @@ from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.learner.diagnostics import latent_rank
 from rmc.learner.learner import Learner
 from rmc.learner.learner_checkpoint import all_finite
-from rmc.learner.update import AVERAGE_UPDATES
+from rmc.learner.policy_average import MOVE_UPDATES
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.server import ReplayServer
 from tests.hostile import hostile_state
@@ -165,7 +165,7 @@ def test_what_is_evaluated_and_saved_is_the_average_where_asked_and_actors_have_
     setting.feed(200)
     while learner.step():
         pass
-    assert learner.updates % AVERAGE_UPDATES  # so that the newest has moved on since the average did
+    assert learner.updates % MOVE_UPDATES  # so that the newest has moved on since the average did
     learner.publish()
     learner.checkpoint()
     acts, judged = (safetensors.torch.load(setting.bus.weights(evaluate)[1]) for evaluate in (False, True))
@@ -177,7 +177,7 @@ def test_what_is_evaluated_and_saved_is_the_average_where_asked_and_actors_have_
         assert torch.equal(judged[name], value) == (not average or name.startswith("normalizer")), name
     learner.close()
     resumed = setting.learner = setting.start(average)
-    for name, value in resumed.update.policy_weights().items():
+    for name, value in resumed.update.average.policy_weights().items():
         assert torch.equal(value, judged[name]), name
 
 

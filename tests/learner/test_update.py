@@ -202,21 +202,22 @@ def test_the_policys_average_is_over_the_last_tenth_and_then_over_so_many():
     """As a plain loop has it. What does not act has none."""
     update = make(dataclasses.replace(ROBUST, impute_missing=True), policy_ema_updates=40)
     names = {name for name, _ in update.agent.named_parameters() if name.startswith(("memory", "policy", "next_frame"))}
-    assert set(update.average) == names
-    expected = {name: value.double() for name, value in update.average.items()}
+    average = update.average.state_dict()
+    assert set(average) == names
+    expected = {name: value.double() for name, value in average.items()}
     for updates in range(10, 1_001, 10):
         with torch.no_grad():
             for value in update.agent.parameters():
                 value.add_(torch.randn_like(value))
-        update.update_ema(updates)
+        update.average.move(updates)
         share = 1.0 if updates <= 100 else max(0.25, 100 / updates)  # ten updates of those it is over
         acting = dict(update.agent.named_parameters())
         expected = {name: (1 - share) * mean + share * acting[name].double() for name, mean in expected.items()}
         for name, mean in expected.items():
-            torch.testing.assert_close(update.average[name].double(), mean, rtol=0, atol=1e-5)
-    for name, value in update.policy_weights().items():
+            torch.testing.assert_close(average[name].double(), mean, rtol=0, atol=1e-5)
+    for name, value in update.average.policy_weights().items():
         if name in names:
-            assert torch.equal(value, update.average[name])
+            assert torch.equal(value, average[name])
             assert not torch.equal(value, acting[name])
         else:
             assert torch.equal(value, update.agent.state_dict()[name])

@@ -1,0 +1,46 @@
+"""Theta-bar of algorithm 1: what acts, averaged over the last updates; checkpoints hold it and evaluations play it."""
+
+from collections.abc import Iterator, Mapping
+
+import torch
+from torch import Tensor
+
+from rmc.common.agent import Agent
+
+MOVE_UPDATES = 10  # updates between moves, which read and write all that acts
+
+
+class PolicyAverage:
+    """Over so many updates, early on over a tenth of those made; over 0 it is what acts."""
+
+    def __init__(self, agent: Agent, updates: int) -> None:
+        self._agent, self._updates = agent, updates
+        self._values = {name: value.detach().clone() for name, value in agent.acting().items()}
+
+    @torch.no_grad()
+    def move(self, updates: int, parts: tuple[str, ...] = ("",)) -> None:
+        """After so many updates, those of what acts whose names begin so; every ``MOVE_UPDATES``."""
+        if self._updates and updates % MOVE_UPDATES == 0:
+            over, acting = min(self._updates, updates / 10) / MOVE_UPDATES, self._agent.acting()
+            names = [name for name in self._values if name.startswith(parts)]
+            averaged, newest = ([source[name] for name in names] for source in (self._values, {**acting}))
+            torch._foreach_lerp_(averaged, newest, 1.0 / max(1.0, over))
+
+    def of(self, parts: tuple[str, ...]) -> Iterator[Tensor]:
+        """The tensors whose names begin so, to be moved elsewhere in memory."""
+        return (value for name, value in self._values.items() if name.startswith(parts))
+
+    def policy_weights(self) -> dict[str, Tensor]:
+        """On the host, with what normalises observations now."""
+        averaged = self._values if self._updates else {}
+        return self._agent.policy_weights() | {name: value.cpu() for name, value in averaged.items()}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """By parameter."""
+        return self._values
+
+    @torch.no_grad()
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from these."""
+        for name, value in self._values.items():
+            value.copy_(state[name])
