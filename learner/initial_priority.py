@@ -41,7 +41,7 @@ class InitialPriority:
         """Windows (B,) -> (B,)."""
         agent, steps = self._agent, slice(self._spec.burn_in, None)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
-        plan = Plan(longest_steps(raw, self._spec), has_missing(raw, self._spec), trains_imputer=False)
+        plan = Plan(longest_steps(raw, self._spec), has_missing(raw, self._spec), False, False)
         batch = view_batch(raw, torch.ones(len(rows)), self._spec, plan)
         m = batch.step_valid[:, steps].float()
         o = agent.normalizer(batch.observation, batch.missing)

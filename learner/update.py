@@ -188,7 +188,7 @@ class JointUpdate:
         """(B, L_t) Q that the policy climbs, by parameters without gradient."""
         frozen = {name: value.detach() for name, value in self.agent.critic.named_parameters()}
         with self._autocast():
-            q = functional_call(self.agent.critic, frozen, (read, action))
+            q: Tensor = functional_call(self.agent.critic, frozen, (read, action))
         return q[0] if self.config.policy_q == "first" else q.min(0).values
 
     def result(self, batch: Batch, model: ModelPass, value: ValuePass, norm: Tensor) -> UpdateResult:
