@@ -2,6 +2,7 @@
 
 Batches take turns in it: rows | values (float64) each. The server writes, says so in a frame with the CRC-32 of what it
 wrote, and the learner checks that where it lies. The learner asks for two ahead and may read one: so there are three.
+The server has looked at the rows' own checksums, so it knows the CRC of whole rows without reading them again.
 """
 
 import fcntl
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from rmc.common.checksum import crc32
 from rmc.common.errors import MessageError
+from rmc.common.row_checksum import crc_of_whole
 from rmc.common.window import Rows, WindowSpec
 
 TURNS = 3
@@ -25,15 +27,17 @@ class SharedBatches:
     def __init__(self, descriptor: int, spec: WindowSpec, batch_size: int) -> None:
         """Raises OSError, ValueError where it is not of that size."""
         self.batch_size, self.turn = batch_size, 0
+        self._crc_of_rows = crc_of_whole(spec.dtype.itemsize, batch_size)
         rows_bytes = batch_size * spec.dtype.itemsize
         self._bytes = np.frombuffer(mmap.mmap(descriptor, shared_bytes(spec, batch_size)), np.uint8).reshape(TURNS, -1)
         self.rows: list[Rows] = [part[:rows_bytes].view(spec.dtype) for part in self._bytes]
         self.weights: list[NDArray[np.float64]] = [part[rows_bytes:].view(np.float64) for part in self._bytes]
 
     def put(self, weights: NDArray[np.float64]) -> dict[str, int]:
-        """Add the weights to rows that lie there already; what the frame says of this turn."""
-        self.weights[self.turn][:] = weights
-        meta = {"turn": self.turn, "crc": crc32(self._bytes[self.turn].data)}
+        """Add the weights to whole rows that lie there already; what the frame says of this turn."""
+        own = self.weights[self.turn]
+        own[:] = weights
+        meta = {"turn": self.turn, "crc": crc32(own.data.cast("B"), self._crc_of_rows)}
         self.turn = (self.turn + 1) % TURNS
         return meta
 

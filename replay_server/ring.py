@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.errors import ConfigError
+from rmc.common.row_checksum import add_checksums, whole_rows
 from rmc.common.window import Rows, WindowSpec
 from rmc.replay_server.commit_record import Progress, RecordPair, record_bytes
 from rmc.replay_server.former_rows import former_fingerprints, former_row_bytes
 from rmc.replay_server.row_check import row_faults
-from rmc.replay_server.row_checksum import add_checksums, whole_rows
 
 _IDENTITY = struct.Struct("<8s16sQQ")  # magic, fingerprint, capacity, row bytes; then its CRC
 _IDENTITY_BYTES = 4096

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rmc.common.errors import MessageError
+from rmc.common.row_checksum import add_checksums
 from rmc.common.shared_batches import TURNS, SharedBatches, reserve_memory, shared_bytes
 from rmc.common.window import WindowSpec
 
@@ -27,6 +28,7 @@ def test_batches_take_turns_and_are_seen_by_the_other_side(descriptor):
     replies = []
     for number in range(TURNS):
         server.rows[server.turn]["serial"] = number
+        add_checksums(server.rows[server.turn])
         replies.append(server.put(np.full(BATCH, float(number))))
     for number, one in enumerate(replies):
         rows, values = learner.take(one)
@@ -36,6 +38,7 @@ def test_batches_take_turns_and_are_seen_by_the_other_side(descriptor):
 
 def test_a_torn_batch_and_a_wrong_turn_are_refused(descriptor):
     server, learner = SharedBatches(descriptor, SPEC, BATCH), SharedBatches(descriptor, SPEC, BATCH)
+    add_checksums(server.rows[0])
     reply = server.put(np.ones(BATCH))
     server.rows[0]["reward"][3, 1] = 5.0
     with pytest.raises(MessageError, match="crc"):

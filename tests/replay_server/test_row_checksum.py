@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.row_checksum import add_checksums, whole_rows
 from rmc.common.window import WindowSpec
-from rmc.replay_server.row_checksum import add_checksums, whole_rows
 from tests.replay_server.support import SPEC, Make, Sender, drain, make_rows
 
 ALL = WindowSpec(obs_dim=3, action_dim=2, state=4, burn_in=2, train=4, missing=3, privileged=2)

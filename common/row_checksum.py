@@ -23,9 +23,9 @@ def add_checksums(rows: Rows) -> None:
 def whole_rows(rows: Rows) -> BoolArray:
     """Which of (n,) contiguous rows fit their checksums."""
     raw, size = _bytes(rows), rows.dtype.itemsize
-    if crc32(raw) == _crc_of_whole(size, len(rows)):
+    if crc32(raw) == crc_of_whole(size, len(rows)):
         return np.ones(len(rows), np.bool_)
-    one = _crc_of_whole(size, 1)
+    one = crc_of_whole(size, 1)
     return np.array([crc32(raw[start : start + size]) == one for start in range(0, len(raw), size)], np.bool_)
 
 
@@ -35,7 +35,7 @@ def _bytes(rows: Rows) -> memoryview:
 
 
 @cache
-def _crc_of_whole(size: int, count: int) -> int:
+def crc_of_whole(size: int, count: int) -> int:
     """Of so many whole rows of so many bytes each."""
     row = bytes(size - CHECKSUM_BYTES)
     return crc32((row + crc32(row).to_bytes(CHECKSUM_BYTES, "little")) * count)
