@@ -14,6 +14,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -82,16 +83,17 @@ def learner_role(run: RunConfig, bus: RedisBus, batch_size: int, precision: Prec
 
 
 def _bare(run: RunConfig, batch_size: int, precision: Precision, seconds: float) -> Measure:
-    """Forward and backward on one batch in place."""
+    """Forward and backward on one batch in place, the policy's as often as in a run."""
     spec = run.window_spec()
     agent = Agent(spec.obs_dim, spec.action_dim, run.agent)
     update, beta = make_update(agent, spec.burn_in, run.update, 0, precision == "bf16"), torch.zeros(())
     rows = random_rows(spec, batch_size)
     raw = torch.from_numpy(rows.view("u1").reshape(batch_size, -1))
-    batch = view_batch(raw, torch.ones(batch_size), spec, update.plan(raw, spec, 2))
+    plans = [update.plan(raw, spec, number) for number in range(2, 2 + run.update.policy_delay)]  # in one the policy's
+    batches = cycle([view_batch(raw, torch.ones(batch_size), spec, plan) for plan in plans])
 
     def work() -> int:
-        parts, *_ = update.forward(batch, beta)
+        parts, *_ = update.forward(next(batches), beta)
         agent.zero_grad(set_to_none=True)
         sum(parts.values()).backward()  # type: ignore[union-attr]
         return batch_size * spec.train

@@ -48,11 +48,12 @@ def test_it_is_the_same_update(agent, bf16, spec):
     in_turn, apart = DeviceUpdate(plain, spec, BATCH), PipelinedUpdate(update, spec, BATCH)
     expected, actual = [], []
     for step in range(1, 41):
+        number = 200 + step  # where an average is over some
         longest = (3, 20, 60, 40)[step % 4] if spec is LONG else None
         # what imputes is trained at some updates, then at all
         raw, importance = host_batch(step, missing=step > 20, spec=spec, longest=longest)
         for updated, results in ((in_turn, expected), (apart, actual)):
-            results += copy.deepcopy(updated(raw, importance, 0.1 * step, step))
+            results += copy.deepcopy(updated(raw, importance, 0.1 * step, number))
         if step % 15 == 0:  # as before weights are read
             actual += copy.deepcopy(apart.drain())
             assert apart.pending == 0
