@@ -126,12 +126,12 @@ docs: $(STAMP)
 results-page: $(STAMP)
 	$(BIN)/python -m docs.results_page
 
-# Short trainings beside the committed lines of earlier ones, for every change of a default: some 20 minutes, two quiet cores.
+# Short trainings beside the committed lines of earlier ones, for every change of a default: some 15 minutes, two quiet cores.
 guard: $(STAMP)
 	$(BIN)/python -m benchmarks.guard
 
 # Each beside what a user would pick instead, where make peers has installed that. Results: docs/performance.md.
-BENCHMARKS := replay ingest learner actor weights growth memory cuda end-to-end update-time
+BENCHMARKS := replay ingest learner actor weights growth memory cuda end-to-end update-time pages
 
 bench: $(addprefix bench-,$(BENCHMARKS))
 

@@ -1,6 +1,6 @@
 """Trained transitions a second of the whole learner role, beside its bare update and stable-baselines3's SAC.
 
-    python -m benchmarks.learner [--env ENV] [--batches 8 32 64 256] [--longest 50 100 200] [--rounds N] [--seconds S]
+    python -m benchmarks.learner [--env ENV] [--batches 16 32 64 256] [--longest 50 100 200] [--rounds N] [--seconds S]
 
 A transition is trained when it is in a batch as a trained step: 15 for each window, B for each of SAC's batches. The
 learner has one thread on the first core and draws from a real replay server, which has the last one with Redis; SAC has
@@ -167,7 +167,7 @@ def _sac(stack: ExitStack, spec: WindowSpec, threads: int, seconds: float) -> Me
 def main() -> None:
     parser = argument_parser(__doc__)
     parser.add_argument("--env", default="HalfCheetah-v5")
-    parser.add_argument("--batches", type=int, nargs="*", default=[8, 32, 64, 256])
+    parser.add_argument("--batches", type=int, nargs="*", default=[16, 32, 64, 256])
     parser.add_argument("--longest", type=int, nargs="*", default=[50, 100, 200])
     options = parser.parse_args()
     run = robust(EnvConfig(options.env))

@@ -16,6 +16,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -54,11 +56,15 @@ def sampled(run: Path, pids: dict[str, int], seconds: float) -> dict[str, dict[s
     spies = [_spy(pid, stacks[name], seconds) for name, pid in pids.items()]
     if failed := [spy.args for spy in spies if spy.wait()]:
         raise ConfigError("py-spy", failed[0], "it failed; the lines above say why")
-    records = [record for record in RunFolder(run).records() if record["role"] == "learner"]
-    speeds = [one["updates_per_s"] for one in records if one["time"] >= began and "updates_per_s" in one]
-    an_update = 1000.0 / statistics.median(speeds)
+    an_update = 1000.0 / updates_per_s(run, began)
     print(f"{1000.0 / an_update:.1f} updates/s")
     return {name: _shares(path, RATE * seconds, an_update) for name, path in stacks.items()}
+
+
+def updates_per_s(run: Path, began: float) -> float:
+    """The median of what a run's learner has said since then."""
+    records = [record for record in RunFolder(run).records() if record["role"] == "learner"]
+    return statistics.median(one["updates_per_s"] for one in records if one["time"] >= began and "updates_per_s" in one)
 
 
 def _spy(pid: int, out: Path, seconds: float) -> subprocess.Popen[bytes]:
@@ -98,8 +104,9 @@ def category(stack: list[str]) -> str:
     return next((kind for kind, calls in BY_LINE.items() if any(call in text for call in calls)), OTHER)
 
 
-def measured(python: str, env: str, seconds: float) -> dict[str, dict[str, float]]:
-    """Of a run that is stopped then."""
+@contextmanager
+def training(python: str, env: str) -> Iterator[tuple[Path, int]]:
+    """A run that is warm and trains on until it is stopped: its folder and its launcher's pid."""
     with tempfile.TemporaryDirectory() as at:
         run = Path(at) / "run"
         words = [python, "-m", "rmc.cli.main", "train", env, "--run-dir", str(run), "--checkpoint-steps", "1000000"]
@@ -109,7 +116,7 @@ def measured(python: str, env: str, seconds: float) -> dict[str, dict[str, float
                 if launcher.poll() is not None:
                     raise ConfigError("train", env, f"it ended with {launcher.returncode}")
                 time.sleep(0.5)
-            return sampled(run, _learners(launcher.pid), seconds)
+            yield run, launcher.pid
         finally:
             launcher.terminate()
             launcher.wait()
@@ -161,7 +168,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=25.0, help="of samples")
     options = parser.parse_args()
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    results[options.name] = measured(options.python, options.env, options.seconds)
+    with training(options.python, options.env) as (run, launcher):
+        results[options.name] = sampled(run, _learners(launcher), options.seconds)
     for process, parts in results[options.name].items():
         print(f"{process}: {sum(parts.values()):.1f} ms, { ({kind: round(ms, 2) for kind, ms in parts.items()}) }")
     RESULTS.write_text(json.dumps(results, indent=1) + "\n")

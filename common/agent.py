@@ -1,4 +1,4 @@
-"""The agent's networks: memory, world model, twin Q, policy, temperature.
+"""The agent's networks: memory, world model, imputer, policy, temperature; critics are in ``common/critic.py``.
 
 Shapes: B batch, T time, O observation, A action, H hidden, E embedding, Z = H (+ E) head input, M flags of what is
 missing (1 for a whole frame, or O), P privileged numbers, which critics alone read.

@@ -27,7 +27,7 @@ HEAD = {
 }
 IN_README = {
     "`robust`": "RMC, preset `robust`",
-    "`robust`ᵗ": "RMC, preset `robust` before batch norm",
+    "`robust`ᵗ": "RMC, an earlier default with target critics",
     "SAC": "SAC of stable-baselines3, heads of 400 and 300 units",
 }
 

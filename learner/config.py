@@ -26,7 +26,7 @@ class UpdateConfig:
     latent_target: Literal["online", "ema"] = "online"
     """Which memory gives the change that the world model predicts."""
     target_memory: Literal["online", "ema"] = "online"
-    """Which memory the target critics read."""
+    """Which memory gives the next state that a target's Q reads."""
     policy_q: Literal["first", "min"] = "min"
     """Which critic the policy climbs: Q_1 (the paper) or the smaller of both."""
     curiosity: float = 0.0
@@ -47,7 +47,7 @@ class UpdateConfig:
     model_norm: Literal["l1", "l2"] = "l1"
     """How the world model's error is measured, as loss and as curiosity."""
     policy_delay: int = 1
-    """Updates of the critics, and of the temperature, for one of the policy."""
+    """k: the policy trains at every k-th update; critics and temperature train at each."""
     n_step: int = 1
     """Steps of reward in a target before it bootstraps; 1 is the paper."""
     eta: float = 0.9
@@ -85,5 +85,5 @@ class LearnerConfig:
     """Matrix products in bfloat16 or float32; auto: bfloat16 where the CPU has instructions for it, TensorFloat-32 on a
     GPU."""
     threads: int = 0
-    """CPU threads of the learner. 0 tries 1, 2, 4 … and keeps the fastest; one on Ray and in lockstep. From 2 on, or 0
-    with two cores, memory and world model of scheme 3 train in a process of their own."""
+    """CPU threads of the learner. 0 tries 1, 2, 4 … and keeps the fastest; one on Ray and in lockstep. With 2 or
+    more, or 0 and two cores, memory and world model of scheme 3 have their own process: not in lockstep, nor on a GPU."""

@@ -1,4 +1,4 @@
-"""The joint update: all losses from the parameters as they stood, one backward, one step.
+"""The joint update: the losses whose turn it is, from the parameters as they stood; one step of each optimiser.
 
 Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, H hidden, S state, Z head input, M flags of
 what is missing, P privileged.
@@ -75,7 +75,7 @@ Losses = dict[str, Tensor]
 
 
 class JointUpdate:
-    """Agent, targets and optimiser, and the update that moves them together."""
+    """Agent, targets where there are some, optimisers, and the update that moves them together."""
 
     def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> None:
         device = agent.log_alpha.device

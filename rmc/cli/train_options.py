@@ -106,7 +106,7 @@ class Train:
     track_tags: tuple[str, ...] = ()
     """The run's tags in the tracker."""
     track_video_every: int | None = None
-    """Film every so-manieth evaluated checkpoint for the tracker; 0, the default, films the final policy alone."""
+    """Film one of so many evaluated checkpoints for the tracker; 0, the default, films the final policy alone."""
     metrics_port: int | None = None
     """Serve the run's metrics to Prometheus on this port, at /metrics; by default on none."""
     metrics_host: str = "127.0.0.1"
