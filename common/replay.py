@@ -90,8 +90,8 @@ class Replay(Protocol):
     def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
         """Give priorities back, (B,) each; those of evicted serials are dropped and counted."""
 
-    def statistics(self) -> ObservationStatistics:
-        """Running observation statistics."""
+    def statistics(self) -> ObservationStatistics | None:
+        """Running observation statistics; None while there is nobody to ask."""
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode from its start to that one, oldest first; None where not all are there."""

@@ -2,7 +2,8 @@
 
 Batches take turns in it: rows | values (float64) each. The server writes, says so in a frame with the CRC-32 of what it
 wrote, and the learner checks that where it lies. The learner asks for two ahead and may read one: so there are three.
-The server has looked at the rows' own checksums, so it knows the CRC of whole rows without reading them again.
+The server has looked at the rows' own checksums, so it knows the CRC of whole rows without reading them again. That is
+the same for all, so the rows' serial numbers follow: another batch than the frame's does not pass.
 """
 
 import fcntl
@@ -37,7 +38,8 @@ class SharedBatches:
         """Add the weights to whole rows that lie there already; what the frame says of this turn."""
         own = self.weights[self.turn]
         own[:] = weights
-        meta = {"turn": self.turn, "crc": crc32(own.data.cast("B"), self._crc_of_rows)}
+        crc = crc32(own.data.cast("B"), self._crc_of_rows)
+        meta = {"turn": self.turn, "crc": crc32(self.rows[self.turn]["serial"].tobytes(), crc)}
         self.turn = (self.turn + 1) % TURNS
         return meta
 
@@ -46,7 +48,7 @@ class SharedBatches:
         turn, crc = meta.get("turn"), meta.get("crc")
         if type(turn) is not int or not 0 <= turn < TURNS:
             raise MessageError("turn", f"{turn!r}, want 0 to {TURNS - 1}")
-        if crc32(self._bytes[turn].data) != crc:
+        if crc32(self.rows[turn]["serial"].tobytes(), crc32(self._bytes[turn].data)) != crc:
             raise MessageError("crc", "a batch in shared memory")
         return self.rows[turn], self.weights[turn]
 

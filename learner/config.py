@@ -86,4 +86,4 @@ class LearnerConfig:
     GPU."""
     threads: int = 0
     """CPU threads of the learner. 0 tries 1, 2, 4 … and keeps the fastest; one on Ray and in lockstep. With 2 or
-    more, or 0 and two cores, memory and world model of scheme 3 have their own process: not in lockstep, nor on a GPU."""
+    more, or 0 and two cores, memory and world model of scheme 3 have their own process; not in lockstep or on a GPU."""

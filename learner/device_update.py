@@ -113,8 +113,6 @@ class HostCopy:
 class DeviceUpdate:
     """An update of batches of one size. A checkpoint must be taken up before the first call, not after."""
 
-    pending = 0  # batches whose results are not given back yet
-
     def __init__(self, update: JointUpdate, spec: WindowSpec, batch_size: int) -> None:
         device = update.agent.log_alpha.device
         self._update, self._spec = update, spec

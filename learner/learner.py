@@ -217,8 +217,9 @@ class Learner:
         return f"rewards reach {self._largest_reward:.2g}: make --reward-scale that much smaller"
 
     def _freeze_statistics(self) -> None:
-        if self.agent.config.normalize_observations and self.env_steps > 0:
-            statistics = self.replay.statistics() + self._observed_before
+        """Of now; those of before while a replay server is away."""
+        if self.agent.config.normalize_observations and self.env_steps > 0 and (own := self.replay.statistics()):
+            statistics = own + self._observed_before
             sums = (statistics.count, statistics.total, statistics.total_square)
             self.agent.freeze_statistics(*(torch.from_numpy(numbers).to(self.device) for numbers in sums))
 

@@ -52,8 +52,17 @@ class LearnerProgress:
 def pack(state: dict[str, Any], policy: bytes, progress: LearnerProgress) -> dict[str, bytes]:
     """A checkpoint's files of ``JointUpdate.state_dict()``, the policy's file and how far training has come."""
     packed = io.BytesIO()
-    torch.save(state, packed)
+    torch.save(_alone(state), packed)
     return {STATE: packed.getvalue(), POLICY: policy, PROGRESS: progress.encode()}
+
+
+def _alone(state: Any) -> Any:
+    """Nested dicts and lists with a copy of each tensor: torch.save takes along whatever lies in the same memory."""
+    if isinstance(state, Tensor):
+        return state.clone()
+    if isinstance(state, dict):
+        return {name: _alone(part) for name, part in state.items()}
+    return [_alone(part) for part in state] if isinstance(state, list) else state
 
 
 def take_up(files: Mapping[str, bytes], update: JointUpdate, device: torch.device) -> LearnerProgress:

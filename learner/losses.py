@@ -50,7 +50,10 @@ def curiosity(error: Tensor, d: Tensor, m: Tensor) -> Tensor:
 
 
 def soft_value(target_q: Tensor, alpha: Tensor, log_pi: Tensor) -> Tensor:
-    """Eq. 9: V(h) = min_j Qbar_j(h, a') - alpha log pi(a'|h), one sample; with batch norm Qbar is Q: (2, B, T) -> (B, T)."""
+    """Eq. 9: V(h) = min_j Qbar_j(h, a') - alpha log pi(a'|h), a' and log pi from one sample: (2, B, T) -> (B, T).
+
+    With batch norm Qbar is Q.
+    """
     return target_q.min(0).values - alpha * log_pi
 
 

@@ -16,7 +16,6 @@ import traceback
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import cycle
 from typing import NoReturn
 
 import setproctitle
@@ -48,7 +47,7 @@ class Slot:
     """A batch and what the model's half makes of it, in shared memory."""
 
     raw: Tensor  # (B, row bytes) uint8
-    importance: Tensor  # (B,)
+    importance: Tensor  # (B,); this and beta are not shared, as the model's half reads neither
     beta: Tensor
     model: ModelPass
     norm: Tensor  # of the model's gradient
@@ -79,28 +78,22 @@ class PipelinedUpdate:
         self._update, self._spec, self._batch_size = update, spec, batch_size
         self._threads = 1  # of each half
         self._pending: deque[tuple[Slot, int, Plan]] = deque()
-        self._number = 0  # of batches handed in
         self._slots: list[Slot] = []
         self._child = 0
         self._pipe: socket.socket | None = None
 
-    @property
-    def pending(self) -> int:
-        """Batches whose results are not given back yet."""
-        return len(self._pending)
-
     def __call__(self, raw: Tensor, importance: Tensor, beta: float, number: int) -> list[UpdateResult]:
-        """(B, row bytes) uint8 without padding, (B,) float32, and the update's number; results, the oldest first.
+        """(B, row bytes) uint8 without padding, (B,) float32, and the update's number, one more than that of the
+        call before; results, the oldest first.
 
         What it returns is overwritten by a later call. Raises RmcError where the other process has ended.
         """
         if not self._slots:
             self._start()
-        slot = self._slots[self._number % len(self._slots)]
+        slot = self._slots[number % len(self._slots)]
         slot.raw.copy_(raw)
         slot.importance.copy_(importance)
         slot.beta.fill_(beta)
-        self._number += 1
         plan = self._update.plan(raw, self._spec, number)
         self._send(number, plan)
         self._pending.append((slot, number, plan))
@@ -180,9 +173,11 @@ class PipelinedUpdate:
         raw = torch.zeros(self._batch_size, self._spec.dtype.itemsize, dtype=torch.uint8)
         importance, norm = torch.ones(self._batch_size), torch.zeros(())
         with torch.no_grad():
-            model = self._update.model_pass(view_batch(raw, importance, self._spec))[1]  # for its shapes and types
+            made = self._update.model_pass(view_batch(raw, importance, self._spec))[1]  # for its shapes and types
+        metrics = {name: value.clone() for name, value in made.metrics.items()}
+        model = ModelPass._make([*(part.clone() for part in made[:-1]), metrics])  # some are the update's own
         slot = Slot(raw, importance, torch.zeros(()), model, norm)
-        _share([raw, importance, slot.beta, norm, *model[:-1], *model.metrics.values()])
+        _share([raw, norm, *model[:-1], *model.metrics.values()])
         return slot
 
     def _be_the_other(self, parent: int, requests: socket.socket) -> NoReturn:
@@ -193,13 +188,12 @@ class PipelinedUpdate:
                 signal.signal(one, signal.SIG_IGN)
             setproctitle.setproctitle(MODEL_PROCESS)
             _close_all_but(requests.fileno())
-            slots = cycle(self._slots)
             while request := requests.recv(REQUEST.size, socket.MSG_WAITALL):
                 number, threads, *plan = REQUEST.unpack(request)
                 torch.set_num_threads(threads)
-                self._model_half(next(slots), number, Plan(*plan))
+                self._model_half(self._slots[number % len(self._slots)], number, Plan(*plan))
                 requests.sendall(b"\0")
-        except BrokenPipeError:
+        except ConnectionError:  # closed, with answers unread
             pass
         except BaseException:
             traceback.print_exc()

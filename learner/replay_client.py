@@ -161,8 +161,8 @@ class ReplayClient:
         parts = (serials.tobytes(), priorities.astype(np.float32).tobytes())
         self._batches.enqueue(Kind.PRIORITIES, {"count": len(serials)}, parts)
 
-    def statistics(self) -> ObservationStatistics:
-        """Running observation statistics; a count of 0 while the server is away."""
+    def statistics(self) -> ObservationStatistics | None:
+        """Running observation statistics; None while the server is away."""
         counts = self._spec.counts
         try:
             body = self._ask(Kind.STATISTICS, {})[1]
@@ -173,7 +173,7 @@ class ReplayClient:
             return ObservationStatistics(count, *sums)
         except AWAY as error:
             log.warning("no statistics from the replay server: %s", error)
-            return ObservationStatistics.none(self._spec)
+            return None
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode from its start to that one; None where not all, or the server, are there."""

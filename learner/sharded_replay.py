@@ -125,10 +125,10 @@ class ShardedReplay:
             of_shard = serials % len(self._stocks) == shard
             stock.replay.update_priorities(serials[of_shard] // len(self._stocks), priorities[of_shard])
 
-    def statistics(self) -> ObservationStatistics:
-        """The sums over all shards."""
-        statistics = [stock.replay.statistics() for stock in self._stocks]
-        return sum(statistics[1:], statistics[0])
+    def statistics(self) -> ObservationStatistics | None:
+        """The sums over all shards; None while one is away."""
+        statistics = [of_shard for stock in self._stocks if (of_shard := stock.replay.statistics()) is not None]
+        return sum(statistics[1:], statistics[0]) if len(statistics) == len(self._stocks) else None
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode, which are all in one shard."""

@@ -19,7 +19,8 @@ class ThreadTrial:
     def __init__(self, choices: Sequence[int], use: Callable[[int], None]) -> None:
         """``choices``, the smallest first; ``use`` sets the number."""
         self._use = use
-        self._seconds: dict[int, list[float]] = {number: [] for number in choices}
+        self._seconds: dict[int, list[float]] = {number: [] for number in choices}  # of each turn
+        self._of_turn = 0.0  # seconds: whole turns compare, as not all updates train all losses
         self._turns = list(chain.from_iterable(repeat(number, TURN) for number in [*choices] * ROUNDS))
         self._updates = 0
         self.chosen = 0
@@ -43,7 +44,10 @@ class ThreadTrial:
             return
         number, place = self._turns[self._updates], self._updates % TURN
         if place >= SETTLING:
-            self._seconds[number].append(seconds)
+            self._of_turn += seconds
+        if place == TURN - 1:
+            self._seconds[number].append(self._of_turn / (TURN - SETTLING))
+            self._of_turn = 0.0
         self._updates += 1
         if self._updates == len(self._turns):
             self._choose_fastest()

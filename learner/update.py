@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from rmc.common.agent import Agent, MemoryOutput, Prediction, squashed_sample
+from rmc.common.agent import Agent, Memory, MemoryOutput, Prediction, squashed_sample
 from rmc.common.critic import critic_input
 from rmc.common.window import WindowSpec
 from rmc.learner import losses
@@ -83,9 +83,9 @@ class JointUpdate:
             fuse(agent)
         self.agent, self.burn_in, self.config, self.bf16 = agent, burn_in, config, bf16
         self.target_critic = None if agent.config.critic_batch_norm else _target_copy(agent.critic)
-        self.target_memory = _target_copy(agent.memory)
+        has_target = "ema" in (config.latent_target, config.target_memory)
+        self.target_memory = _target_copy(agent.memory) if has_target else None
         self.average = PolicyAverage(agent, config.policy_ema_updates)
-        self._has_target_memory = "ema" in (config.latent_target, config.target_memory)
         self.optimizers = self._make_optimizers()
         self.generator = torch.Generator(device).manual_seed(seed)
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
@@ -123,7 +123,7 @@ class JointUpdate:
             z = self._to_bf16(agent.features(memory))
 
             # Prediction, and curiosity from its error
-            target = self._unroll_target(o, batch) if self._has_target_memory else memory
+            target = memory if self.target_memory is None else self._unroll(self.target_memory, o, batch)
             latent = (target if c.latent_target == "ema" else memory).hidden.detach().float()
             prediction = agent.world_model((z if "model" in TRAINS_MEMORY[c.scheme] else z.detach())[:, :-1], a)
             change = latent[:, 1:] - latent[:, :-1]
@@ -239,8 +239,8 @@ class JointUpdate:
         return z.bfloat16() if self.bf16 else z
 
     @torch.no_grad()
-    def _unroll_target(self, o: Tensor, batch: Batch) -> MemoryOutput:
-        return unroll(self.target_memory, o, batch, self.burn_in)
+    def _unroll(self, target: Memory, o: Tensor, batch: Batch) -> MemoryOutput:
+        return unroll(target, o, batch, self.burn_in)
 
     def _noise_like(self, x: Tensor, cut: int) -> Tensor:
         """(B, T, A) standard normal. That of the steps cut off is drawn, too: cut or not, a batch teaches the same."""
@@ -272,7 +272,7 @@ class JointUpdate:
 
     def follow_model(self, model: ModelPass) -> None:
         """What follows the memory's step: its target by Polyak, the running variance, the imputer's last loss."""
-        if self._has_target_memory:
+        if self.target_memory is not None:
             follow(self.target_memory, self.agent.memory, 1.0 - self.config.polyak)
         self.curiosity_variance.copy_(model.curiosity_variance)
         self.fill_loss.copy_(model.fill_loss)
@@ -288,7 +288,7 @@ class JointUpdate:
         return {
             "agent": self.agent.state_dict(),
             "target_critic": self.target_critic.state_dict() if self.target_critic is not None else {},
-            "target_memory": self.target_memory.state_dict(),
+            "target_memory": self.target_memory.state_dict() if self.target_memory is not None else {},
             "average": self.average.state_dict(),
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "curiosity_variance": self.curiosity_variance,
@@ -303,7 +303,8 @@ class JointUpdate:
         self.agent.load_state_dict(state["agent"])
         if self.target_critic is not None:
             self.target_critic.load_state_dict(state["target_critic"])
-        self.target_memory.load_state_dict(state["target_memory"])
+        if self.target_memory is not None:
+            self.target_memory.load_state_dict(state["target_memory"])
         self.average.load_state_dict(state["average"])
         for optimizer, saved in zip(self.optimizers, by_optimizer(state["optimizers"], self.optimizers), strict=True):
             own = [{name: group[name] for name in ("lr", "capturable")} for group in optimizer.param_groups]

@@ -114,7 +114,8 @@ def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages:
     update = make_update(agent, spec.burn_in, config.update, config.seed)
     weights = {name: value for name, value in state["agent"].items() if name.startswith(prefixes)}
     update.agent.load_state_dict(update.agent.state_dict() | weights)
-    update.target_memory.load_state_dict(update.agent.memory.state_dict())
+    if update.target_memory is not None:
+        update.target_memory.load_state_dict(update.agent.memory.state_dict())
     if update.target_critic is not None:
         critic = state["target_critic"] if parts == "all" else update.agent.critic.state_dict()
         update.target_critic.load_state_dict(critic)

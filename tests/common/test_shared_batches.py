@@ -48,6 +48,17 @@ def test_a_torn_batch_and_a_wrong_turn_are_refused(descriptor):
             learner.take({**reply, "turn": turn})
 
 
+def test_another_whole_batch_in_that_turn_is_refused(descriptor):
+    """With equal weights: whole rows have all one CRC."""
+    server, learner = SharedBatches(descriptor, SPEC, BATCH), SharedBatches(descriptor, SPEC, BATCH)
+    add_checksums(server.rows[0])
+    reply = server.put(np.ones(BATCH))
+    server.rows[0]["serial"] = 7
+    add_checksums(server.rows[0])
+    with pytest.raises(MessageError, match="crc"):
+        learner.take(reply)
+
+
 def test_nobody_can_cut_it_short(descriptor):
     with pytest.raises(PermissionError):
         os.ftruncate(descriptor, 0)

@@ -26,6 +26,7 @@ from tests.learner.agents import ROBUST
 from tests.learner.rows import LONG, SPEC, random_rows
 
 BATCH = 8
+NORMED = dataclasses.replace(ROBUST, critic_batch_norm=True)
 IMPUTING = dataclasses.replace(ROBUST, hidden=SPEC.state - SPEC.obs_dim, impute_missing=True)
 
 
@@ -33,7 +34,9 @@ def make(order: str = "joint", device: str = "cpu", bf16: bool = False, config: 
     """In that order, or "apart": its halves may go at once."""
     torch.manual_seed(0)
     update = UpdateConfig(curiosity=0.1, curiosity_scale="std", n_step=2, scheme=3)
-    if order != "apart":
+    if order == "apart":
+        update = dataclasses.replace(update, policy_delay=2)
+    else:
         update = dataclasses.replace(update, update_order=order, latent_target="ema", target_memory="ema", scheme=1)  # type: ignore[arg-type]
     agent = Agent(SPEC.obs_dim, SPEC.action_dim, config).to(device)
     return make_update(agent, SPEC.burn_in, update, 3, bf16)
@@ -50,9 +53,10 @@ def host_batch(
     return (raw.pin_memory(), importance.pin_memory()) if pinned else (raw, importance)
 
 
+@pytest.mark.parametrize("config", [ROBUST, NORMED], ids=["robust", "normed"])
 @pytest.mark.parametrize("order", ["joint", "alternate"])
-def test_it_is_the_same_update(order):
-    plain, update = make(order), make(order)
+def test_it_is_the_same_update(order, config):
+    plain, update = make(order, config=config), make(order, config=config)
     static = DeviceUpdate(update, SPEC, BATCH)
     for step in range(20):
         raw, importance = host_batch(step)
@@ -94,14 +98,15 @@ class OnDevice(TorchDispatchMode):
         return result
 
 
-@pytest.mark.parametrize("config", [ROBUST, IMPUTING], ids=["robust", "imputing"])
+@pytest.mark.parametrize("config", [ROBUST, NORMED, IMPUTING], ids=["robust", "normed", "imputing"])
 @pytest.mark.parametrize("order", ["joint", "alternate"])
 def test_nothing_in_an_update_waits_for_the_host(order, config, monkeypatch):
     """On the device "meta", which has no values: whatever asks for one fails."""
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # meta has none
     update = make(order, config=config)
     for module in (update.agent, update.target_critic, update.target_memory):
-        module.to("meta")
+        if module is not None:
+            module.to("meta")
     update.curiosity_variance = update.curiosity_variance.to("meta")
     update.fill_loss, update.policy_loss = update.fill_loss.to("meta"), update.policy_loss.to("meta")
     moved = SimpleNamespace(param_groups=[{"params": list(update.agent.parameters())}], step=lambda: None)
@@ -252,7 +257,8 @@ def test_a_tensor_on_the_host_is_there_at_once():
 @pytest.mark.parametrize("order", ["joint", "alternate", "apart"])
 def test_a_graph_trains_as_the_updates_one_by_one(order, bf16):
     """100 updates, each plan several times; equal losses to 1e-3."""
-    plain, update = make(order, "cuda", bf16, IMPUTING), make(order, "cuda", bf16, IMPUTING)
+    config = dataclasses.replace(IMPUTING, critic_batch_norm=order == "apart")
+    plain, update = make(order, "cuda", bf16, config), make(order, "cuda", bf16, config)
     static = DeviceUpdate(update, LONG, BATCH)
     for number in range(1, 101):
         raw, importance = host_batch(number, pinned=True, missing=number > 50, spec=LONG, longest=(20, 60)[number % 2])

@@ -338,7 +338,6 @@ def test_a_divergence_from_huge_rewards_names_their_size(setting, size):
 SPOILT = {
     "a critic": lambda update: update.agent.critic.parameters(),
     "a target critic": lambda update: update.target_critic.parameters(),
-    "the target memory": lambda update: update.target_memory.parameters(),
     "the world model": lambda update: update.agent.world_model.parameters(),
     "a mean moment": lambda update: [part["exp_avg"] for part in update.optimizers[0].state.values()],
     "a square moment": lambda update: [part["exp_avg_sq"] for part in update.optimizers[0].state.values()],

@@ -1,6 +1,7 @@
 """The number of threads is tried under load, and the fastest kept with the run."""
 
 import itertools
+import random
 
 import pytest
 
@@ -13,7 +14,7 @@ def tried(took: dict[int, float]) -> tuple[ThreadTrial, list[int], list[int]]:
     trial, updates = ThreadTrial(tuple(took), used.append), []
     while not trial.chosen:
         updates.append(used[-1])
-        trial.note(took[used[-1]] * (50.0 if len(updates) % TURN < 4 else 1.0))  # slow after each change
+        trial.note(took[used[-1]] * (50.0 if (len(updates) - 1) % TURN < 4 else 1.0))  # slow after each change
     return trial, used, updates
 
 
@@ -27,6 +28,17 @@ def test_the_fastest_is_kept(fastest: int, caplog: pytest.LogCaptureFixture) -> 
     assert len(updates) == 3 * ROUNDS * TURN
     assert f"threads of an update: {fastest} (" in caplog.text
     assert f"5.0 ms with {fastest}" in caplog.text
+
+
+def test_updates_of_two_kinds_and_some_that_are_late_do_not_mislead_it() -> None:
+    """The policy trains at every second update: a median of updates would be a long one or a short one."""
+    used: list[int] = []
+    trial, updates, chance = ThreadTrial((1, 2), used.append), 0, random.Random(0)
+    while not trial.chosen:
+        kind = 0.006 if updates % 2 else 0.010
+        trial.note(kind * (0.9 if used[-1] == 2 else 1.0) * (2.0 if chance.random() < 0.1 else 1.0))
+        updates += 1
+    assert trial.chosen == 2
 
 
 def test_what_an_earlier_start_chose_is_taken_up_untried() -> None:

@@ -230,7 +230,7 @@ def test_the_target_memory_is_read_where_the_options_say(option, moved):
     def parts(memory: str) -> dict[str, Tensor]:
         update = make(PAPER, **{option: memory})
         with torch.no_grad():
-            for value in update.target_memory.parameters():
+            for value in update.target_memory.parameters() if update.target_memory is not None else ():
                 value += 0.1
         return update.forward(to_batch(random_rows(8)), torch.tensor(0.0))[0]
 

@@ -233,7 +233,7 @@ def test_who_proves_nothing_ends_no_learner(
     client = ReplayClient(lambda: addresses[-1], SECRET, SPEC, 8)
     assert [client.sample(8).draw for _ in range(3)] == [SampleStatus.WAIT] * 3
     assert len([record for record in caplog.records if "is away: it said" in record.message]) == 1
-    assert client.statistics().count == 0
+    assert client.statistics() is None
     assert client.episode(0) is None
     addresses.append(serve().address)
     assert client.sample(8).draw is SampleStatus.BATCH
@@ -266,7 +266,7 @@ def away_for(served: Served, sample: Sample, reason: str, caplog: pytest.LogCapt
 def test_an_address_that_is_none_is_an_outage(address: str) -> None:
     client = ReplayClient(lambda: address, SECRET, SPEC, 8)
     assert client.sample(8).draw is SampleStatus.WAIT
-    assert client.statistics().count == 0
+    assert client.statistics() is None
     with pytest.raises(RmcError, match="is away"):
         client.stats()
 
