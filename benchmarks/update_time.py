@@ -36,7 +36,7 @@ OTHER = "losses, autograd, Python"
 BY_FUNCTION = {  # the first that a stack has, from its outermost frame on
     "Adam, rounding": {"optimizers.py:step", "optimizer.py:wrapper", "rounded.py:bf16"},
     "gradient's norm": {"clip_grad.py:get_total_norm", "clip_grad.py:_get_total_norm"},
-    "targets, averages": {"optimizers.py:follow", "update.py:follow", "policy_average.py:move"},
+    "targets, averages": {"update.py:follow_model", "update.py:follow_value", "policy_average.py:move"},
     "batches, priorities": {
         "replay_client.py:sample", "replay_client.py:update_priorities", "batch.py:view_batch", "learner.py:_settle",
     },

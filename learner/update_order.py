@@ -14,7 +14,8 @@ from rmc.learner.update import JointUpdate, UpdateResult, detached
 class AlternateUpdate(JointUpdate):
     """Algorithm 1 as printed: model, what fills, critics, policy, temperature in turn, each from a fresh forward.
 
-    Each has an optimiser of its own, so that a memory that several losses train is moved by several.
+    Each has an optimiser of its own, so that a memory that several losses train is moved by several. Each forward moves
+    the running statistics of critics with batch norm.
     """
 
     _STAGES = (
@@ -40,9 +41,10 @@ class AlternateUpdate(JointUpdate):
         metrics: dict[str, Tensor] = {}
         norms = []
         for optimizer, (part, names) in zip(self.optimizers, self._stages(), strict=True):
+            if part == "policy" and not batch.trains_policy:
+                continue
             loss_values, model, value = self.forward(batch, beta)
-            if not (stage_losses := {name: loss for name, loss in loss_values.items() if name in names}):
-                continue  # not the policy's turn
+            stage_losses = {name: loss for name, loss in loss_values.items() if name in names}
             norms.append(self.step([optimizer], stage_losses.values()))
             metrics |= detached(stage_losses)
             if part == "critic":
