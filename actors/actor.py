@@ -80,7 +80,8 @@ class Actor:
         what = f"an environment of {self.name}'s {n}"
         self._make_env, self._envs = make_env, [further_env(make_env, what) for _ in range(n)]
         self._faults: dict[int, Exception] = {}  # of this step, by environment
-        self._broken = self._broken_starts = 0  # episodes that an environment's fault ended; in a row, at their start
+        self._broken = 0  # episodes that an environment's fault ended
+        self._broken_starts = [0] * n  # of each environment, in a row, at their start
         self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, n, spec.missing)
         self._observation = np.zeros((n, spec.obs_dim), np.float32)
         self._reward = np.zeros(n, np.float32)
@@ -300,14 +301,15 @@ class Actor:
         """
         log.warning("%s: environment %d broke in step %d of an episode: %s", self.name, i, self._lengths[i], error)
         self._broken += 1
-        self._broken_starts = self._broken_starts + 1 if self._lengths[i] <= 1 else 0
-        if self._broken_starts >= BROKEN_STARTS:
+        self._broken_starts[i] = self._broken_starts[i] + 1 if self._lengths[i] <= 1 else 0
+        if self._broken_starts[i] >= BROKEN_STARTS:
             raise error
         self._envs[i] = recreate_env(self._envs[i], self._make_env)
         self._begin_episode(i, self._new_seed(i))
 
     def _end_episode(self, env: int) -> None:
         self._episodes += 1
+        self._broken_starts[env] = 0
         self._means.add("episode_return_mean", float(self._returns[env]))
         self._means.add("episode_length_mean", int(self._lengths[env]))
         self._begin_episode(env, seed=None)

@@ -10,6 +10,7 @@ from rmc.analysis.vitals import Record, Vitals
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import MetricsTail
 from rmc.deploy.run.validation import validate
 
 LEAST_SECONDS = 5.0  # of training; fewer say nothing
@@ -47,7 +48,7 @@ def examine_run(folder: RunFolder) -> tuple[list[Finding], float]:
 
     Raises ConfigError where too little was recorded to judge.
     """
-    config, records = folder.config(), list(folder.records())
+    config, records = folder.config(), MetricsTail(folder.metrics).take()
     findings, seconds = examine(records, config), Vitals(records).training().seconds
     if not findings and seconds < LEAST_SECONDS:
         fix = f"it has {seconds:.0f} s of training on record, the doctor needs {LEAST_SECONDS:.0f}; train it for longer"

@@ -3,6 +3,7 @@
 Shapes: T steps of an episode.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -31,7 +32,8 @@ def value_bias(agent: Agent, episodes: list[Episode], gamma: float) -> ValueBias
     for episode in episodes:
         replay = Replay(agent, episode)
         q = replay.outputs[1][0, :, 0]
-        known = len(q) if episode.terminated else max(0, len(q) - round(HORIZONS / (1.0 - gamma)))
+        unknown = 0.0 if episode.terminated else HORIZONS / (1.0 - gamma) if gamma < 1.0 else math.inf
+        known = max(0, len(q) - round(min(unknown, len(q))))
         returns = _soft_returns(episode, _bonus(agent, replay.features), q[-1], gamma)
         expected.append(q[:known])
         came.append(returns[:known])

@@ -101,7 +101,8 @@ class Vitals:
         """The same from the learner's first update on."""
         updates = self.series("learner", "updates")
         began = next((time for time, value in updates if value > updates[0][1]), float("inf"))
-        return Vitals(one for records in self._roles.values() for one in records if one["time"] > began)
+        records = (one for records in self._roles.values() for one in records if one["time"] > began)
+        return Vitals(sorted(records, key=lambda one: float(one["time"])))  # one role may pause while others speak
 
 
 def _is_share(value: Any) -> TypeGuard[float]:

@@ -63,8 +63,10 @@ class CheckpointFolder:
         Raises CheckpointError where it cannot be written; those before it stay, and nothing of it.
         """
         temporary, final = self.folder / f".tmp-{number:09d}", self.path(number)
+        replaced = temporary.with_suffix(".old")
         _check_names(final, files)
-        shutil.rmtree(temporary, ignore_errors=True)
+        for left in (temporary, replaced):
+            shutil.rmtree(left, ignore_errors=True)
         try:
             with suppress(FileExistsError):
                 self.folder.mkdir()  # not its parents: a run's folder that was moved is not begun anew
@@ -73,9 +75,10 @@ class CheckpointFolder:
                 write_synced(temporary / name, content)
             _sync_folder(temporary)
             if final.exists():  # a resumed run repeats this number: the new one replaces the old
-                shutil.rmtree(final)
+                final.rename(replaced)
             temporary.rename(final)
             _sync_folder(self.folder)
+            shutil.rmtree(replaced, ignore_errors=True)
         except OSError as error:
             shutil.rmtree(temporary, ignore_errors=True)
             reason = error.strerror or "?"
@@ -166,7 +169,8 @@ class CheckpointFolder:
     def _best_record(self) -> tuple[int | None, float]:
         try:
             record = json.loads((self.folder / BEST).read_bytes())
-            return int(record["update"]), float(record["eval_return_mean"])
+            number, score = int(record["update"]), float(record["eval_return_mean"])
+            return (number, score) if self.path(number).exists() else (None, float("-inf"))
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return None, float("-inf")
 

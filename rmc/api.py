@@ -91,16 +91,10 @@ def _not_none(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _train(config: RunConfig, options: LaunchOptions) -> dict[str, Any]:
-    assert options.run_dir is not None
-    folder, launcher, console = options.run_dir, options.launcher, terminal()
-    if launcher == "ray":
-        status = training.train(config, options, console)
-    else:
-        run = training.open_folder(config, options)  # with if_exists="new" the folder is another one
-        folder, status = run.path, training.conduct(config, run, options, console)
+    folder, status = training.train(config, options, terminal())
     if status == STOPPED:
         raise KeyboardInterrupt
-    result = RunFolder(folder).result()
+    result = folder.result()
     assert result is not None  # written by every run that ends in order
     return result
 

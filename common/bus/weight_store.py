@@ -9,6 +9,7 @@ from rmc.common.errors import BusUnavailable, FencedError, MessageError
 
 KINDS = ("weights", "evaluate")  # of policies: what acts, and what is evaluated
 PIECES = 4096  # of a policy, at most: 1 GiB
+REPLACED_SECONDS = 5  # that the pieces of the version before are kept
 UNPUBLISHED_SECONDS = 300  # that a piece is kept whose version has not become the newest: far more than all take
 
 
@@ -29,14 +30,14 @@ class WeightStore:
         keys = self._piece_keys(version, len(pieces), evaluate)
         for key, piece in zip(keys, pieces, strict=True):  # one call each: a pipeline would make them one blob again
             self._connection.call(self._connection.redis.set, key, piece, UNPUBLISHED_SECONDS)
-        before = self._head(evaluate)
         self._make_newest(version, f"{version.epoch} {version.update} {len(pieces)} {crc32(blob)}", keys, evaluate)
-        if before is not None and before[0] != version:  # it expires rather than vanishes: a reader amid it can finish
-            self._connection.each("expire", self._piece_keys(before[0], before[1], evaluate), 5)
 
     def _make_newest(self, version: Version, head: str, pieces: list[str], evaluate: bool) -> None:
-        """Name the version as the newest, and keep its pieces: those of a learner that did not come so far expire."""
-        epoch_key = self._connection.key("epoch", "learner")
+        """Name the version as the newest, and keep its pieces: those of a learner that did not come so far expire.
+
+        Those of the version before expire rather than vanish: a reader amid them can finish.
+        """
+        epoch_key, head_key = self._connection.key("epoch", "learner"), self._connection.key(KINDS[evaluate])
 
         def transaction(pipe: Any) -> None:
             held = self._connection.number(pipe.get(epoch_key))
@@ -44,17 +45,23 @@ class WeightStore:
                 raise FencedError(f"learner epoch {version.epoch} was replaced by {held}")
             if pipe.exists(*pieces) < len(pieces):
                 raise BusUnavailable(f"weights {version.update} are gone before they were published")
+            before = self._parsed(pipe.get(head_key))
             pipe.multi()
             if held < version.epoch:  # Redis lost its data: the next learner must not begin below
                 pipe.set(epoch_key, version.epoch)
             for key in pieces:
                 pipe.persist(key)
-            pipe.set(self._connection.key(KINDS[evaluate]), head)
+            pipe.set(head_key, head)
+            if before is not None and before[0] != version:
+                for key in self._piece_keys(before[0], before[1], evaluate):
+                    pipe.expire(key, REPLACED_SECONDS)
 
         self._connection.call(lambda: self._connection.redis.transaction(transaction, epoch_key))
 
     def _head(self, evaluate: bool) -> tuple[Version, int, int] | None:
-        raw = self._connection.call(lambda: self._connection.redis.get(self._connection.key(KINDS[evaluate])))
+        return self._parsed(self._connection.call(self._connection.redis.get, self._connection.key(KINDS[evaluate])))
+
+    def _parsed(self, raw: Any) -> tuple[Version, int, int] | None:
         head = self._connection.integers(raw, 4)
         if head is None or head[2] > PIECES:
             return None

@@ -1,5 +1,7 @@
 """Keeps a run's roles alive as processes of this machine, and ends them so that nothing is left behind."""
 
+import errno
+import logging
 import os
 import signal
 import subprocess
@@ -23,6 +25,8 @@ FIRST_BACKOFF, LONGEST_BACKOFF = 0.25, 10.0  # seconds before a role is started 
 STOP_SECONDS = 3.5  # for the roles to end in order; then they are killed
 EXIT_CONFIG = 2  # the exit status of an error that starting again cannot mend
 TRACEBACK_BYTES = 8192
+NO_PROCESS = errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE  # for now
+log = logging.getLogger(__name__)
 
 
 def from_outside(status: int) -> bool:
@@ -89,8 +93,18 @@ class RoleProcess:
             else:
                 self._note_death(status)
         elif time.monotonic() >= self._start_at:
-            self.restarts += 1
+            self._start_again()
+
+    def _start_again(self) -> None:
+        """Later, where this machine has no process or no memory to give now."""
+        try:
             self.start()
+            self.restarts += 1
+        except OSError as error:
+            if error.errno not in NO_PROCESS:
+                raise
+            log.warning("%s cannot be started now (%s); trying again", self.command.name, error.strerror)
+            self._start_at = time.monotonic() + LONGEST_BACKOFF
 
     def _note_death(self, status: int) -> None:
         now = time.monotonic()

@@ -34,7 +34,7 @@ class Output:
         except (OSError, ValueError) as error:  # ValueError: closed since
             self.lost = not isinstance(error, OSError) or error.errno not in PASSING
             self.failure = getattr(error, "strerror", None) or str(error)
-        self._keep(text)
+        self.keep(text)
         return len(text)
 
     def flush(self) -> None:
@@ -48,9 +48,11 @@ class Output:
             return text.translate(PLAIN).encode(encoding, "replace").decode(encoding)
         return text
 
-    def _keep(self, text: str) -> None:
-        if self.log is not None:
-            with suppress(OSError), self.log.open("a", encoding="utf-8", errors="replace") as log:
+    @classmethod
+    def keep(cls, text: str) -> None:
+        """Write into the run's log, where there is one."""
+        if cls.log is not None:
+            with suppress(OSError), cls.log.open("a", encoding="utf-8", errors="replace") as log:
                 log.write(text)
 
 

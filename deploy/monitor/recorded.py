@@ -67,7 +67,10 @@ def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus
     if not (isinstance(env, str) and _is_whole(seed) and _is_whole(total) and is_finite(ratio)):
         fix = "config.json has no env, seed or total_steps; restore it, or take another run"
         raise ConfigError("RUN", str(folder.path), fix)
-    return RunStatus(env, str(preset), seed, total, ratio, expected)
+    status = RunStatus(env, str(preset), seed, total, ratio, expected)
+    if folder.is_baseline():
+        status.heard = "launcher"
+    return status
 
 
 def _is_whole(value: Any) -> TypeGuard[int]:

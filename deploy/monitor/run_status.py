@@ -48,6 +48,7 @@ class RunStatus:
         self.last: Evaluation | None = None
         self.best: Evaluation | None = None
         self.final_steps: int | None = None  # once the run has its result
+        self.heard = "*"  # which roles speak all the time; of a baseline the launcher alone
         self._pace = Pace()
 
     @property
@@ -89,13 +90,22 @@ class RunStatus:
         now, launcher = time.time(), self.roles.get("launcher", {})
         if launcher.get("redis_away_s"):
             return {"Redis": launcher["redis_away_s"] + now - launcher.get("time", now)}
-        unheard = {role: now - since for role, since in self._since.items() if role not in self.roles}
-        quiet = {role: now - record.get("time", now) for role, record in self.roles.items()}
+        heard = self._of_this_start()
+        unheard = {role: now - since for role, since in self._since.items() if role not in heard}
+        quiet = {role: now - record.get("time", now) for role, record in heard.items() if self.heard in ("*", role)}
         return {role: seconds for role, seconds in unheard.items() if seconds > UNHEARD_SECONDS} | {
             role: seconds
             for role, seconds in sorted(quiet.items())
             if seconds > (LAUNCHER_SECONDS if role == "launcher" else SILENT_SECONDS)
         }
+
+    def _of_this_start(self) -> dict[str, dict[str, Any]]:
+        """The roles that have spoken since the launcher's newest start: one before may have had others."""
+        launcher = self.roles.get("launcher", {})
+        if not (is_finite(launcher.get("time")) and is_finite(launcher.get("start_s"))):
+            return self.roles
+        began = launcher["time"] - launcher["start_s"] - LAUNCHER_SECONDS
+        return {role: said for role, said in self.roles.items() if "time" not in said or _number(said["time"]) >= began}
 
     def get(self, role: str, name: str) -> Any:
         """The newest value, or None."""
@@ -145,13 +155,14 @@ class RunStatus:
     @property
     def episode_return(self) -> float | None:
         """Mean of the actors' newest episode returns."""
-        values = [record["episode_return_mean"] for record in self.roles.values() if "episode_return_mean" in record]
+        said = self._of_this_start().values()
+        values = [record["episode_return_mean"] for record in said if "episode_return_mean" in record]
         return sum(values) / len(values) if values else None
 
     @property
     def broken_episodes(self) -> int:
         """How many the environment's own faults have ended."""
-        return sum(record.get("broken_episodes", 0) for record in self.roles.values())
+        return sum(record.get("broken_episodes", 0) for record in self._of_this_start().values())
 
     @property
     def policy_lag(self) -> float | None:

@@ -76,6 +76,7 @@ def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None
     try:
         ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)
     except ray.exceptions.RayError as error:
+        ray.kill(host, no_restart=True)  # it must not begin once nobody expects it
         fix = f"the run's launcher could not begin on the head ({last_line(error)})"
         raise ConfigError("--launcher", "ray", fix) from None
 

@@ -23,6 +23,8 @@ from rmc.deploy.run import tls
 
 START_SECONDS = 10.0
 STOP_SECONDS = 2.0
+ANSWER_SECONDS = 1.0  # of one call; a server that stands still is asked again
+AWAY = redis.exceptions.ConnectionError, redis.exceptions.TimeoutError
 SOCKET_PATH_LIMIT = 107 if sys.platform == "linux" else 103  # bytes of a unix socket's path that the kernel takes
 MAXMEMORY = 2 << 30  # the last backstop: what is on its way is far less, and a full server refuses instead of evicting
 # Bytes of one value at most: a policy's pieces have 256 KiB, windows some MiB; Redis would take 512 MiB.
@@ -113,9 +115,11 @@ class RedisServer:
         """Take other users than before, of the same secret. A server that is away reads of them when it comes back."""
         self.users = users
         self._write_users()
-        client = redis.Redis.from_url(self.url())
-        with closing(client), suppress(redis.exceptions.ConnectionError):
+        with closing(self._client()) as client, suppress(*AWAY):
             client.acl_load()
+
+    def _client(self) -> redis.Redis:
+        return redis.Redis.from_url(self.url(), socket_timeout=ANSWER_SECONDS)
 
     def _options(self) -> dict[str, str]:
         listening = {"port": "0"}
@@ -143,14 +147,14 @@ class RedisServer:
 
     def _wait(self) -> None:
         assert self.process is not None
-        client = redis.Redis.from_url(self.url())
+        client = self._client()
         deadline = time.monotonic() + START_SECONDS
         try:
             while self.process.poll() is None and time.monotonic() < deadline:
                 try:
                     client.ping()
                     return
-                except redis.exceptions.ConnectionError:
+                except AWAY:
                     time.sleep(0.01)
         finally:
             client.close()

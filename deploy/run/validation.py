@@ -109,6 +109,10 @@ def validate_launch(config: RunConfig, options: LaunchOptions) -> None:
         raise ConfigError("--all-cpus", True, "give --launcher ray; elsewhere say how many --actors")
     if launcher != "ray" and options.tls:
         raise ConfigError("--tls", True, "give --launcher ray; elsewhere take a --redis-url of rediss://")
+    if launcher != "ray" and options.ray_address != "auto":
+        raise ConfigError("--ray-address", options.ray_address, "give --launcher ray, or leave it")
+    if launcher == "lockstep" and options.redis_url is not None:
+        raise ConfigError("--redis-url", shown(options.redis_url), "a lockstep run has no use for one; leave it")
     if launcher == "lockstep" and config.replay.replay_shards > 1:
         fix = "a lockstep run has one; use --launcher local"
         raise ConfigError("--replay-shards", config.replay.replay_shards, fix)

@@ -29,7 +29,7 @@ def train(command: train_options.Train) -> int:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     if command.dry_run:
         return dry_run(command.config(), command.launch_options(), terminal())
-    return training.train(command.config(), command.launch_options(), terminal())
+    return training.train(command.config(), command.launch_options(), terminal())[1]
 
 
 def stats(command: run_options.Stats) -> int:

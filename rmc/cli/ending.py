@@ -9,6 +9,7 @@ from rmc.analysis.doctor import examine
 from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.errors import RoleDied
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import MetricsTail
 from rmc.deploy.run.starts import resume_command
 from rmc.deploy.run.state import STOPPED
 
@@ -60,5 +61,5 @@ def say_result(folder: RunFolder, console: Console) -> int:
 
 def say_findings(folder: RunFolder, console: Console) -> None:
     """What ``rmc doctor`` would say; nothing of a run that was too short to judge."""
-    for finding in examine(list(folder.records()), folder.config()):
+    for finding in examine(MetricsTail(folder.metrics).take(), folder.config()):  # a long run's would fill the memory
         console.print(str(finding), soft_wrap=True)

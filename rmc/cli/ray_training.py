@@ -24,8 +24,11 @@ from rmc.deploy.run.tracking import choose_tracking, keep_tracking
 from rmc.deploy.run.validation import validate, validate_launch
 
 
-def train(config: RunConfig, options: LaunchOptions, console: Console) -> int:
-    """Hand a run to a launcher on the cluster's head, and watch it; Ctrl-C ends the run, a closed terminal does not."""
+def train(config: RunConfig, options: LaunchOptions, console: Console) -> tuple[RunFolder, int]:
+    """Hand a run to a launcher on the cluster's head, and watch it; Ctrl-C ends the run, a closed terminal does not.
+
+    The run's folder, and its exit status.
+    """
     validate(config)
     validate_launch(config, options)
     enough = max(cores(), ceil(placement.reserved_cpus(config)) + config.actors)  # of a cluster of our own
@@ -33,7 +36,7 @@ def train(config: RunConfig, options: LaunchOptions, console: Console) -> int:
         return _watched(config, options, console)
 
 
-def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> int:
+def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> tuple[RunFolder, int]:
     if options.run_dir is not None and (options.run_dir / "secret").exists():
         launcher.check_not_there(RunFolder(options.run_dir))
     placement.check_room(config, options.device)
@@ -53,7 +56,7 @@ def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> int
         console.print(note, soft_wrap=True)
     with signals_caught(hangup=False) as stop:
         attach.watch(folder, console, _passes_on(stop, folder))
-    return say_end(folder, console)
+    return folder, say_end(folder, console)
 
 
 def _passes_on(stop: StopSignal, folder: RunFolder) -> Callable[[], bool]:

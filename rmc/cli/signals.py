@@ -8,6 +8,20 @@ from rmc.common.process.role import StopSignal
 
 
 @contextmanager
+def signals_interrupt() -> Iterator[None]:
+    """SIGTERM and a closed terminal are KeyboardInterrupt, as SIGINT is, for as long as this lasts."""
+    numbers = [signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup ignores it
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
 def signals_caught(hangup: bool = True) -> Iterator[StopSignal]:
     """SIGTERM, SIGINT and a closed terminal only set the signal, for as long as this lasts."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}

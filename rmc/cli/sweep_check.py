@@ -39,10 +39,12 @@ def check_values(spec: Spec, on_this_machine: bool) -> None:
         raise ConfigError(
             named[0], " ".join(spec.words), "the nodes do not have that file; write options into [options]"
         )
+    given = {word.partition("=")[0].replace("_", "-") for word in spec.words}
+    if "--seed" in given:
+        raise ConfigError("--seed", " ".join(spec.words), "a sweep has several: give --seeds")
     for name in RESERVED:
-        flag = f"--{name.replace('_', '-')}"
-        if any(word.partition("=")[0] == flag for word in spec.words):
-            raise ConfigError(flag, " ".join(spec.words), "a sweep's runs are given none; leave it")
+        if option(name) in given:
+            raise ConfigError(option(name), " ".join(spec.words), "a sweep's runs are given none; leave it")
     _check("options of rmc train", " ".join(spec.words), spec, list(spec.words))
     ranges = spec.search.ranges if spec.search is not None else {}
     ends = {name: [value.low, value.high] if isinstance(value, Range) else value for name, value in ranges.items()}

@@ -103,7 +103,7 @@ def grid_work(checked: list[Checked], index: Index) -> Work:
     for job in jobs:
         if job.name not in waiting:
             index.put(job, "finished")
-        elif job.name not in index.lines:
+        elif index.state(job) in OVER or job.name not in index.lines:  # longer than before, or new
             index.put(job, "waiting")
     index.write()
     return Work(Grid(todo), jobs, todo, len(jobs))
@@ -126,6 +126,10 @@ def search_work(spec: Spec, search: Search, config: RunConfig, index: Index, fol
         return is_finished(job, sweep_check.config_of(job))
 
     plan = SearchPlan(search, distributions, index, make, finished, config.learner.checkpoint_steps)
+    for job in plan.todo:
+        if index.state(job) in OVER:
+            index.put(job, "waiting")
+    index.write()
     total = max(search.trials, len(plan.jobs))
     new = [make(f"{TRIAL}{number}", {}) for number in range(len(plan.jobs), total)]
     return Work(plan, plan.jobs, [*plan.todo, *new], total)

@@ -7,10 +7,10 @@ from typing import Any
 from rich.console import Console
 
 from rmc.cli.ending import format_evaluation, say_result, say_stopped
-from rmc.cli.signals import signals_caught
+from rmc.cli.signals import signals_caught, signals_interrupt
 from rmc.common.bus.protocol import Bus
 from rmc.common.checkpoint import POLICY, CheckpointFolder
-from rmc.common.errors import ConfigError, EnvFault
+from rmc.common.errors import ConfigError, EnvFault, RmcError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local import launcher
 from rmc.deploy.local.socket_folder import place_for_sockets
@@ -30,13 +30,17 @@ from rmc.deploy.run.tracking import choose_tracking, keep_tracking
 from rmc.deploy.run.validation import validate, validate_launch
 
 
-def train(config: RunConfig, options: LaunchOptions, console: Console) -> int:
-    """Train to the end, or to a stop signal; the exit status. Raises ConfigError before anything is started."""
+def train(config: RunConfig, options: LaunchOptions, console: Console) -> tuple[RunFolder, int]:
+    """Train to the end, or to a stop signal; the run's folder, which may be a new one, and its exit status.
+
+    Raises ConfigError before anything is started.
+    """
     if options.launcher == "ray":
         from rmc.cli import ray_training  # Ray is an extra, and slow to import
 
         return ray_training.train(config, options, console)
-    return conduct(config, open_folder(config, options), options, console)
+    folder = open_folder(config, options)
+    return folder, conduct(config, folder, options, console)
 
 
 def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
@@ -56,7 +60,18 @@ def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
 
 def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
     """Be the launcher of a run whose folder is locked, from its first evaluation to its last."""
-    status, Output.log, tracker = 1, folder.logs / "launcher.log", None
+    Output.log = folder.logs / "launcher.log"
+    with signals_interrupt():
+        try:
+            return _conduct(config, folder, options, console)
+        except RmcError as error:  # whoever comes back to a closed terminal finds it there
+            if options.launcher != "ray":  # on Ray all that is printed goes there
+                Output.keep(f"{error}\n")
+            raise
+
+
+def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
+    status, tracker = 1, None
     end: dict[str, Any] = {"state": "failed"}
     try:
         console.print(f"run folder {folder.path}", soft_wrap=True)

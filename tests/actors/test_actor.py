@@ -545,3 +545,26 @@ def test_a_reset_that_breaks_is_tried_once_more_on_a_new_environment() -> None:
     assert actor.metrics()["broken_episodes"] == 1
     assert audit(reader.rows(), SPEC).trained.total() == 1000
     actor.close()
+
+
+def test_an_environment_that_breaks_now_and_then_at_once_goes_on() -> None:
+    """Five times in a row is too often; sound episodes in between end the row."""
+    begun = itertools.count()
+
+    class BreaksAtTimes(gym.Wrapper[Any, Any, Any, Any]):
+        def reset(self, **options: Any) -> Any:
+            self._breaks = next(begun) % 3 == 0
+            return self.env.reset(**options)
+
+        def step(self, action: Any) -> Any:
+            if self._breaks:
+                raise RuntimeError("it breaks")
+            return self.env.step(action)
+
+    bus = MemoryBus()
+    publish(bus, 0)
+    clock: Callable[[], float] = itertools.count().__next__
+    actor = Actor(0, 1, lambda: BreaksAtTimes(make_env(COUNTING)), SPEC, AGENT, CONFIG, bus, clock)
+    play(bus, actor, Reader(bus), 2000)
+    assert actor.metrics()["broken_episodes"] > 20
+    actor.close()

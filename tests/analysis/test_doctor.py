@@ -324,3 +324,12 @@ def test_whatever_roles_say_the_doctor_does_not_fail() -> None:
         for record in chance.sample(lines, 40):
             record[chance.choice(names)] = chance.choice(numbers)
         examine(lines, CONFIG)
+
+
+def test_a_role_that_pauses_for_a_minute_does_not_begin_another_start() -> None:
+    said = records(120, learner=shares(0.99), actor_0=shares(0.03, "credit"))
+    said = [one for one in said if one["role"] != "actor-0" or not 1020 < one["time"] < 1090]
+    training = Vitals(said).training()
+    assert training.roles == ["actor-0", "launcher", "learner", "replay"]
+    assert training.busy("learner") == pytest.approx(0.99)
+    assert training.seconds > 100.0

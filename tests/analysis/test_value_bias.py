@@ -45,7 +45,7 @@ def test_of_a_terminated_episode_all_steps_count(agent: Agent, episode: Episode)
 
 def test_of_one_that_was_cut_the_last_steps_are_left_out(agent: Agent, episode: Episode) -> None:
     cut = dataclasses.replace(episode, terminated=False)
-    assert value_bias(agent, [cut], gamma=0.99) is None
+    assert value_bias(agent, [cut], gamma=0.99) is value_bias(agent, [cut], gamma=1.0) is None
     found = value_bias(agent, [cut, episode], gamma=0.4)
     assert found is not None
     assert found.steps == STEPS - 5 + STEPS

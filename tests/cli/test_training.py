@@ -2,19 +2,23 @@
 
 import io
 import json
+import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 
 import gymnasium as gym
+import pytest
 from rich.console import Console
 
 from rmc.analysis import evaluation
 from rmc.cli import main, training
 from rmc.cli.training import conduct
 from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import RoleDied
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.state import STOPPED
 from tests.analysis.test_policy import AGENTS, make_run
 from tests.counting_env import CountingEnv
 
@@ -113,3 +117,33 @@ def test_it_imports_torch_without_its_compiler(tmp_path):
     command = [sys.executable, "-c", TRAINS_AND_GOES_ON]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_stop_signal_amid_the_evaluations_stops_the_run(tmp_path, monkeypatch):
+    """There is no role yet, or no more."""
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
+    monkeypatch.setattr(training, "_launch", lambda *_: True)
+    before = signal.getsignal(signal.SIGTERM)
+    for amid, number in (("_before", signal.SIGTERM), ("_result", signal.SIGHUP)):
+        with monkeypatch.context() as patch:
+            patch.setattr(training, amid, lambda *_, number=number: signal.raise_signal(number))
+            folder.lock()
+            with pytest.raises(KeyboardInterrupt):
+                conduct(folder.config(), folder, placement, Console(quiet=True))
+        assert folder.ended() == STOPPED
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_why_a_run_has_failed_stays_in_its_folder(tmp_path, monkeypatch):
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
+
+    def fail(*_):
+        raise RoleDied("the learner ended 3 times")
+
+    monkeypatch.setattr(training, "_launch", fail)
+    folder.lock()
+    with pytest.raises(RoleDied):
+        conduct(folder.config(), folder, placement, Console(quiet=True))
+    assert (folder.logs / "launcher.log").read_text() == "the learner ended 3 times\n"

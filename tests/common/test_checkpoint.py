@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import os
 import re
+import shutil
 from contextlib import suppress
 from pathlib import Path
 
@@ -181,3 +183,29 @@ def test_the_next_save_may_take_three_times_the_last_one(tmp_path, noted, grante
     assert CheckpointFolder(tmp_path / "none").patience(2.6) == 2.6
     CheckpointFolder(tmp_path).note_save(noted)
     assert CheckpointFolder(tmp_path).patience(2.6) == granted
+
+
+def test_a_number_that_is_saved_again_is_there_whatever_is_removed(tmp_path, monkeypatch):
+    """A kill then leaves the old one or the new one."""
+    folder, remove = CheckpointFolder(tmp_path), shutil.rmtree
+    folder.save(1, FILES)
+
+    def removed(path, **options):
+        remove(path, **options)
+        assert folder.load(1)
+
+    monkeypatch.setattr("rmc.common.checkpoint.shutil.rmtree", removed)
+    folder.save(1, {"state": b"new"})
+    assert folder.load(1) == {"state": b"new"}
+    assert os.listdir(tmp_path) == ["000000001"]
+
+
+def test_a_best_one_that_is_gone_is_none(tmp_path):
+    folder = CheckpointFolder(tmp_path)
+    for number in (1, 2):
+        folder.save(number, FILES)
+    folder.mark_best(2, 5.0)
+    shutil.rmtree(folder.path(2))
+    assert folder.best() is None
+    folder.mark_best(1, 4.0)
+    assert folder.best() == 1

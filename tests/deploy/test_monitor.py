@@ -160,11 +160,11 @@ def test_an_evaluation_stands_where_its_checkpoint_was(monitor: Monitor, tmp_pat
 def test_tensorboard_has_the_main_metrics_and_the_options_under_the_runs_name(
     monitor: Monitor, tmp_path: Path, config: RunConfig
 ) -> None:
-    bus = MemoryBus()
-    bus.emit("learner", {"time": 1.0, "updates_per_s": 45.0, "q_loss": 0.5, "waiting_share": 0.25, "alpha": 0.1})
-    bus.emit("actor-0", {"time": 1.0, "waiting_share": 0.75, "episode_return_mean": 7.0})
-    bus.emit("replay", {"time": 1.0, "env_steps": 900, "env_steps_per_s": 95.0, "waiting_share": math.nan})
-    bus.emit("evaluator", {"time": 1.0, "eval_update": 3, "eval_return_mean": 12.0})
+    bus, now = MemoryBus(), time.time()
+    bus.emit("learner", {"time": now, "updates_per_s": 45.0, "q_loss": 0.5, "waiting_share": 0.25, "alpha": 0.1})
+    bus.emit("actor-0", {"time": now, "waiting_share": 0.75, "episode_return_mean": 7.0})
+    bus.emit("replay", {"time": now, "env_steps": 900, "env_steps_per_s": 95.0, "waiting_share": math.nan})
+    bus.emit("evaluator", {"time": now, "eval_update": 3, "eval_return_mean": 12.0})
     monitor.watch(bus)
     monitor.close()
     shown = EventMultiplexer().AddRunsFromDirectory(str(tmp_path)).Reload()
@@ -297,6 +297,18 @@ def test_a_role_that_never_spoke_is_silent_once_it_should_have(
     monkeypatch.setattr(time, "time", lambda: now() + 2 * UNHEARD_SECONDS)
     says(monitor, {"learner": 0.0, "replay": 0.0, "evaluator": 0.0})
     assert "silent: actor-0 for 60 s" in line(monitor.board)
+    monitor.close()
+
+
+def test_an_actor_that_an_earlier_start_had_is_not_silent(monitor: Monitor) -> None:
+    """It has fewer now; what the last of them said does not count either."""
+    monitor.board.take(
+        {"role": "actor-1", "time": time.time() - 90.0, "episode_return_mean": 9.0, "broken_episodes": 2}
+    )
+    monitor.board.take({"role": "actor-0", "time": time.time(), "episode_return_mean": 1.0})
+    says(monitor, {"learner": 0.0, "replay": 0.0, "evaluator": 0.0}, start_s=30.0)
+    assert "silent" not in line(monitor.board)
+    assert (monitor.board.episode_return, monitor.board.broken_episodes) == (1.0, 0)
     monitor.close()
 
 

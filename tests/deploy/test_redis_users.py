@@ -1,6 +1,7 @@
 """Every role may do in Redis what its work takes, and nothing else; against a real server."""
 
 import re
+import signal
 import socket
 import stat
 import tempfile
@@ -207,6 +208,15 @@ def test_users_that_come_later_get_in(tmp_path: Path) -> None:
         server.admit(more)
         bus_of(server, "actor-2").append(2, EntryId(1, 0), b"hello")
         held.append(1, EntryId(1, 0), b"hello")
+
+
+def test_users_that_come_while_the_server_stands_still_get_in_later(tmp_path: Path) -> None:
+    with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=USERS) as server:
+        assert server.process is not None
+        server.process.send_signal(signal.SIGSTOP)
+        server.admit(RedisUsers(USERS.run, SECRET, (*USERS.roles, "actor-2")))
+        server.process.send_signal(signal.SIGCONT)
+        bus_of(server, "actor-1").ping()
 
 
 def test_passwords_are_nowhere_to_be_read(tmp_path: Path) -> None:

@@ -1,7 +1,11 @@
 """Which end of a role is one, and which is made good."""
 
+import errno
+import os
+import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -132,3 +136,25 @@ esac
 echo ready >> SAID
 while :; do sleep 0.05; done
 """
+
+
+def test_where_no_process_can_be_started_now_it_is_tried_again(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervisor, "LONGEST_BACKOFF", 0.01)
+    role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {}, quick)
+    begin, refusals = subprocess.Popen, iter([errno.EAGAIN, errno.ENOMEM])
+
+    def scarce(*words: Any, **options: Any) -> Any:
+        if number := next(refusals, None):
+            raise OSError(number, os.strerror(number))
+        return begin(*words, **options)
+
+    monkeypatch.setattr(supervisor.subprocess, "Popen", scarce)
+    tend_until(role)
+    assert (role.finished, role.restarts) == (True, 1)
+
+
+def test_another_fault_of_a_start_is_told(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    role = RoleProcess(RoleCommand("learner", ("learner",)), {}, quick)
+    monkeypatch.setattr(supervisor.sys, "executable", "/nowhere")
+    with pytest.raises(FileNotFoundError):
+        role.tend()

@@ -8,6 +8,7 @@ import pytest
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.replay import SampleStatus
 from rmc.common.window import Rows
+from rmc.replay_server import row_check
 from rmc.replay_server.row_check import FAULTS, FLOATS, row_faults
 from rmc.replay_server.server import ReplayServer
 from tests.replay_server.support import SPEC, Make, Sender, close, drain, make_rows
@@ -142,3 +143,13 @@ def test_a_priority_beyond_the_largest_seen_is_not_believed_after_a_restart(
     assert again._store.priorities[3] == 8.0
     assert again._store.priorities[19] == 8.0
     assert again._store.priorities[0] == 1.0
+
+
+def test_huge_numbers_whose_sum_overflows_are_finite(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As that of a window of millions would."""
+    monkeypatch.setattr(row_check, "TINY", np.float32(1.0))
+    row_check._columns.cache_clear()
+    rows = make_rows(3)
+    rows["observation"][1] = 3e38
+    assert not row_faults(rows, SPEC).any()
+    row_check._columns.cache_clear()

@@ -143,6 +143,11 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(
         ([PENDULUM, "--sede", "1"], "options of rmc train='--sede 1': Unrecognized options: --sede"),
         ([PENDULUM, "other"], "options of rmc train='other': Unrecognized options: other"),
         ([PENDULUM, "--run-dir", "x"], "--run-dir='--run-dir x': a sweep's runs are given none"),
+        (
+            [PENDULUM, "--redis_url", "redis://:pw@x"],
+            "--redis-url='--redis_url redis://:pw@x': a sweep's runs are given",
+        ),
+        ([PENDULUM, "--seed", "5"], "--seed='--seed 5': a sweep has several: give --seeds"),
         ([PENDULUM, "--grid", "learning_rate"], "--grid='learning_rate': write NAME=VALUE"),
         ([PENDULUM, "--grid", "scheme=1", "scheme=2"], "has an option twice"),
         ([PENDULUM, "--grid", "lr=1"], "grid.lr=[1]: no option"),

@@ -82,6 +82,7 @@ def test_a_killed_run_is_told_the_other_goes_on_and_the_same_command_resumes(tmp
     steps = sweep.lines()["seed=1"]["env_steps"]
     with Sweeping(folder, *words, "--total-steps", "2600", "--drop-replay") as sweep:
         assert sweep.finish() == 0, sweep.text()
+    assert "without their replay ring" not in sweep.text()  # it is dropped after the run, not before
     assert steps < 2500
     assert all(line["env_steps"] >= 2600 for line in sweep.lines().values())
     log = (folder / "logs" / "seed=1.log").read_text()
