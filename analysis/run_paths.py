@@ -1,11 +1,16 @@
 """What a command that takes many runs is given: folders of runs, folders that hold such, patterns, files of lines."""
 
 import glob
+import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 from rmc.common.errors import ConfigError
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 def expanded(path: Path) -> list[Path]:
@@ -35,3 +40,16 @@ def run_folders(folder: Path) -> Iterator[Path]:
         if "checkpoints" in below and not {"config.json", "metrics.jsonl", ".lock"}.isdisjoint(files):
             below.clear()
             yield Path(path)
+
+
+def each_readable(paths: Iterable[Path], read: Callable[[Path], T]) -> list[T]:
+    """What can be read, each path once; the others are told. Raises ConfigError where there is one alone."""
+    found, once = [], list(dict.fromkeys(paths))
+    for path in once:
+        try:
+            found.append(read(path))
+        except ConfigError as error:
+            if len(once) == 1:
+                raise
+            log.warning("%s (left out)", error)
+    return found

@@ -16,7 +16,7 @@ from rmc.analysis.evaluation import Progress, evaluate_policy
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.analysis.policy_file import read_policy
-from rmc.analysis.run_paths import expanded
+from rmc.analysis.run_paths import each_readable, expanded
 from rmc.cli import run_options
 from rmc.cli.ending import cut_note
 from rmc.cli.signals import signals_caught
@@ -154,15 +154,8 @@ def plot(command: run_options.Plot) -> int:
 
 def _histories(paths: Sequence[Path]) -> list[history.History]:
     """Of all that can be read; the others are told. Raises ConfigError where that is none."""
-    runs = list(dict.fromkeys(run for path in paths for run in expanded(path)))
-    histories = []
-    for run in runs:
-        try:
-            histories += history.read(run)
-        except ConfigError as error:
-            if len(runs) == 1:
-                raise
-            log.warning("%s (left out)", error)
+    runs = [run for path in paths for run in expanded(path)]
+    histories = [one for read in each_readable(runs, history.read) for one in read]
     if not histories:
         raise ConfigError("RUNS", " ".join(map(str, paths)), "no history in there; give runs that were evaluated")
     return histories

@@ -1,16 +1,14 @@
 """``rmc report``."""
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 
 from rmc.analysis.report import check_report, write_report
 from rmc.analysis.report_run import ReportRun
+from rmc.analysis.run_paths import each_readable
 from rmc.cli import run_options
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import terminal
-
-log = logging.getLogger(__name__)
 
 
 def report(command: run_options.Report) -> int:
@@ -27,14 +25,7 @@ def report(command: run_options.Report) -> int:
 
 def _read(paths: Sequence[Path]) -> list[ReportRun]:
     """Each once; those that are no runs are told. Raises ConfigError where none is."""
-    reports = []
-    for path in dict.fromkeys(path.resolve() for path in paths):
-        try:
-            reports.append(ReportRun.read(path))
-        except ConfigError as error:
-            if len(paths) == 1:
-                raise
-            log.warning("%s (left out)", error)
+    reports = each_readable((path.resolve() for path in paths), ReportRun.read)
     if not reports:
         raise ConfigError("RUNS", " ".join(map(str, paths)), "none of them is a run's folder")
     return reports

@@ -7,7 +7,7 @@ import secrets
 import socket
 from contextlib import suppress
 
-from rmc.analysis.run_paths import expanded
+from rmc.analysis.run_paths import each_readable, expanded
 from rmc.cli import run_options
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
@@ -26,8 +26,10 @@ def watch(command: run_options.Watch) -> int:
     from rmc.analysis.live_run import LiveRun
     from rmc.analysis.watch_server import serve  # an extra
 
-    paths = dict.fromkeys(path for given in command.runs for path in expanded(given))
-    runs = [LiveRun(str(path), path) for path in paths]
+    paths = [path for given in command.runs for path in expanded(given)]
+    runs = each_readable(paths, lambda path: LiveRun(str(path), path))
+    if not runs:
+        raise ConfigError("RUNS", " ".join(map(str, command.runs)), "none of them is a run's folder")
     with _listening(command.host, command.port) as listener:
         address, port = listener.getsockname()[:2]
         token = "" if ipaddress.ip_address(address).is_loopback else secrets.token_urlsafe()

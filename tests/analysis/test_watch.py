@@ -282,3 +282,17 @@ def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch, capsys:
     )
     assert run(["watch", "nowhere"]) == 2
     assert "uvicorn is missing; pip install -e '.[watch]'" in capsys.readouterr().err
+
+
+def test_a_run_that_cannot_be_read_is_told_and_the_others_are_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    open_run(CONFIG, tmp_path / "runs" / "good", "fail").unlock(130)
+    (tmp_path / "runs" / "newer" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "runs" / "newer" / "config.json").write_text('{"format": 999}')
+    shown: list[LiveRun] = []
+    monkeypatch.setattr("rmc.analysis.watch_server.serve", lambda runs, *_: shown.extend(runs))
+    assert run(["watch", str(tmp_path / "runs"), "--port", "0"]) == 0
+    assert len(shown) == 1
+    assert "(left out)" in caplog.text
+    assert run(["watch", str(tmp_path / "runs" / "newer"), "--port", "0"]) == 2

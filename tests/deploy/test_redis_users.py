@@ -216,7 +216,9 @@ def test_users_that_come_while_the_server_stands_still_get_in_later(tmp_path: Pa
         server.process.send_signal(signal.SIGSTOP)
         server.admit(RedisUsers(USERS.run, SECRET, (*USERS.roles, "actor-2")))
         server.process.send_signal(signal.SIGCONT)
-        bus_of(server, "actor-1").ping()
+        more = bus_of(server, "actor-1")
+        more.ping()
+        more.redis.close()
 
 
 def test_passwords_are_nowhere_to_be_read(tmp_path: Path) -> None:

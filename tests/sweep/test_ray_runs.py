@@ -13,6 +13,7 @@ import pytest
 
 from rmc.deploy.run.folder import RunFolder
 from rmc.sweep.parcel import pack, unpack
+from rmc.sweep.ray_runs import on_reserved_cores
 from tests.cluster.test_ray import leaves_nothing_behind
 from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
 
@@ -124,3 +125,9 @@ def test_a_copy_is_like_the_folder_and_only_what_changed_is_sent(tmp_path: Path)
 def _content(folder: Path) -> dict[str, str]:
     files = (path for path in folder.rglob("*") if path.is_file() and path.name != "ring")
     return {str(path.relative_to(folder)): path.read_text() for path in files}
+
+
+def test_a_run_takes_one_thread_unless_more_are_asked_for() -> None:
+    """As many as are reserved: by itself a learner would try all of the node's cores."""
+    assert on_reserved_cores(("train", "X")) == ("train", "X", "--threads", "1")
+    assert on_reserved_cores(("train", "X", "--threads=8")) == ("train", "X", "--threads=8")
