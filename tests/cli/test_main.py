@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -211,6 +212,21 @@ def test_a_redis_beside_ray_is_refused_without_its_password() -> None:
     placement = LaunchOptions(None, "fail", "ray", "cpu", "redis://user:hush@localhost:1")
     with pytest.raises(ConfigError, match="--redis-url='redis://localhost:1': a run on Ray"):
         open_folder(debug(EnvConfig(PENDULUM)), placement)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"ray_address": "head:6379"}, "--ray-address='head:6379': give --launcher ray, or leave it"),
+        (
+            {"launcher": "lockstep", "redis_url": "redis://user:hush@localhost:1"},
+            "--redis-url='redis://localhost:1': a lockstep run has no use for one",
+        ),
+    ],
+)
+def test_what_a_launcher_has_no_use_for_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        open_folder(debug(EnvConfig(PENDULUM)), LaunchOptions(None, "fail", **options))
 
 
 def test_a_full_disk_is_one_line(

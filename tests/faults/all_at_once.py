@@ -3,7 +3,7 @@
 Roles, Redis, the launcher and a whole node (launcher, roles and Redis: all that one machine has of it) are killed;
 they stand still; Redis and the replay server are behind bad networks; disks are full, files damaged. The schedule
 follows from the seed: ``schedule.py``. A ring of few windows wraps. Then all is calm, the run goes on to its end, and
-another one trains as long without faults. Each fault is a line of ``--log``. Linux and root.
+its last policy must play nearly as well as can be. Each fault is a line of ``--log``. Linux and root.
 """
 
 import argparse
@@ -18,23 +18,22 @@ from pathlib import Path
 import psutil
 
 from rmc.deploy.run.folder import RunFolder
-from tests.faults.chaos import ENV, OPTIONS, RATIO, Chaos
+from tests.faults.chaos import RATIO, Chaos
 from tests.faults.disk_full import small_disk
 from tests.faults.judge import judge_rows
 from tests.faults.kill_redis import logged_redis
-from tests.faults.loaded import ENDLESS
 from tests.faults.row import Row
 from tests.faults.schedule import EACH_ACTOR, schedule
 from tests.faults.soak import RATIO_TOLERANCE, files_growth, memory_growth
 from tests.faults.witness import went_back
-from tests.integration.running import Training, alive
+from tests.integration.running import alive
 
 GAP_SECONDS = 3.5  # between the beginnings of faults, on average
 CALM_SHARE = 0.1  # steps without faults at the end, for one before
 DISK_MB, DISK_MB_AN_HOUR = 400, 400  # metrics and events grow; a start wants 268 free
 MOST_GROWTH = 0.05  # of a role's memory, over all of its lives
 CONNECTIONS = 3  # of a role that lacks some while a fault has cut them, as at the end nothing has
-LEAST_RETURN = 0.8  # of the one without faults, which has a chance of its own
+BEST_RETURN, LEAST_RETURN = 4.0, 0.8  # of the task; the share of it that a run of half an hour has learnt
 
 
 @contextmanager
@@ -126,13 +125,6 @@ def learnt(folder: Path) -> tuple[float, int]:
     return round(float(result["eval_return_mean"]), 2), int(result["updates"])
 
 
-def without_faults(folder: Path, steps: int) -> tuple[float, int]:
-    """The same of a run of the same options that trains as long."""
-    with Training(folder, *ENDLESS, *OPTIONS, "--total-steps", str(steps), env=ENV) as run:
-        assert run.finish(6 * 3600.0) == 0, run.text()
-    return learnt(folder)
-
-
 def main() -> None:
     """A row; ends with 1 if it failed."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -154,13 +146,10 @@ def main() -> None:
             row = judged(one, name, back)
             is_flat, growth = flat(one)
             returned, updates = learnt(one.folder)
-            print(row, growth, returned, updates, file=sys.stderr, flush=True)
-        calm, all_updates = without_faults(place / "calm", steps)
     held = is_held(one, row.found["replay_ratio"])  # after the calm part: faults hold draws up
-    passed = row.passed and held and is_flat and returned >= LEAST_RETURN * calm
-    returns = {"steps": steps, "return": returned, "return without faults": calm}
-    kept = {"updates": updates, "updates without faults": all_updates}
-    dataclasses.replace(row, passed=passed, found={**row.found, **growth, **returns, **kept}).keep()
+    passed = row.passed and held and is_flat and returned >= LEAST_RETURN * BEST_RETURN
+    learning = {"steps": steps, "updates": updates, "return": returned}
+    dataclasses.replace(row, passed=passed, found={**row.found, **growth, **learning}).keep()
     sys.exit(0 if passed else 1)
 
 

@@ -141,6 +141,16 @@ def test_statistics_are_frozen_into_what_is_published(setting):
     assert set(weights) == set(setting.learner.agent.policy_weights())
 
 
+def test_statistics_stay_while_the_replay_server_is_away(setting, monkeypatch):
+    setting.feed(60)
+    setting.learner.step()
+    before = setting.learner.agent.normalizer.mean.clone()
+    assert before.any()
+    monkeypatch.setattr(setting.learner.replay, "statistics", lambda: None)
+    setting.learner.publish()
+    assert torch.equal(setting.learner.agent.normalizer.mean, before)
+
+
 def test_checkpoint_holds_the_policy_and_resumes(setting):
     setting.feed(60)
     while setting.learner.step():
