@@ -85,5 +85,5 @@ class LearnerConfig:
     """Matrix products in bfloat16 or float32; auto: bfloat16 where the CPU has instructions for it, TensorFloat-32 on a
     GPU."""
     threads: int = 0
-    """CPU threads of the learner. 0 tries 1, 2, 4 … and keeps the fastest; one on Ray and in lockstep. With 2 or
-    more, or 0 and two cores, memory and world model of scheme 3 have their own process; not in lockstep or on a GPU."""
+    """CPU threads of the learner. 0 tries 1, 2, 4 … and keeps the fastest; one on Ray and in lockstep. With 2 or more,
+    or 0 on two cores, scheme 3 has a second process; not in lockstep or on a GPU."""

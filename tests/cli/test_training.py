@@ -125,9 +125,9 @@ def test_a_stop_signal_amid_the_evaluations_stops_the_run(tmp_path, monkeypatch)
     placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
     monkeypatch.setattr(training, "_launch", lambda *_: True)
     before = signal.getsignal(signal.SIGTERM)
-    for amid, number in (("_before", signal.SIGTERM), ("_result", signal.SIGHUP)):
+    for amid in ("_before", "_result"):
         with monkeypatch.context() as patch:
-            patch.setattr(training, amid, lambda *_, number=number: signal.raise_signal(number))
+            patch.setattr(training, amid, lambda *_: signal.raise_signal(signal.SIGTERM))
             folder.lock()
             with pytest.raises(KeyboardInterrupt):
                 conduct(folder.config(), folder, placement, Console(quiet=True))
