@@ -146,7 +146,7 @@ def main() -> None:
             row = judged(one, name, back)
             is_flat, growth = flat(one)
             returned, updates = learnt(one.folder)
-    held = is_held(one, row.found["replay_ratio"])  # after the calm part: faults hold draws up
+            held = is_held(one, row.found["replay_ratio"])  # after the calm part: faults hold draws up
     passed = row.passed and held and is_flat and returned >= LEAST_RETURN * BEST_RETURN
     learning = {"steps": steps, "updates": updates, "return": returned}
     dataclasses.replace(row, passed=passed, found={**row.found, **growth, **learning}).keep()
