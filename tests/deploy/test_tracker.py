@@ -137,7 +137,7 @@ def test_trackio_has_the_run_over_its_starts(
     assert (about["env"]["id"], about["tags"]) == ("InvertedPendulum-v5", ["a", "b"])
 
 
-@pytest.mark.parametrize("name", ["wandb", "trackio"])
+@pytest.mark.parametrize("name", [pytest.param("wandb", marks=pytest.mark.long), "trackio"])
 def test_every_second_evaluated_checkpoint_is_filmed(
     name: Any, folder: RunFolder, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -155,6 +155,7 @@ def test_a_search_runs_its_trials(tmp_path: Path) -> None:
     assert float(rows[0][-1]) >= float(rows[1][-1])
 
 
+@pytest.mark.long
 def test_a_trial_far_below_the_others_is_stopped_in_order(tmp_path: Path) -> None:
     folder = tmp_path / "sweep"
     table = TABLE.replace("trials = 2", "trials = 5")
