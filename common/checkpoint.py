@@ -40,6 +40,9 @@ class CheckpointFolder:
         if self._lock is None:
             fix = "another process trains in this folder; stop it first"
             raise ConfigError("--run-dir", str(self.folder.parent), fix)
+        for old in self.folder.glob(".tmp-*.old"):  # of a save that was killed between its two renames
+            with suppress(OSError):  # the new one is there
+                old.rename(self.path(int(old.stem.removeprefix(".tmp-"))))
         for leftover in self.folder.glob(".tmp-*"):
             shutil.rmtree(leftover)
 
@@ -80,6 +83,8 @@ class CheckpointFolder:
             _sync_folder(self.folder)
             shutil.rmtree(replaced, ignore_errors=True)
         except OSError as error:
+            with suppress(OSError):  # it was not replaced
+                replaced.rename(final)
             shutil.rmtree(temporary, ignore_errors=True)
             reason = error.strerror or "?"
             raise CheckpointError(f"checkpoint {final} cannot be written ({reason})", reason) from None

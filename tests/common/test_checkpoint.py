@@ -200,6 +200,25 @@ def test_a_number_that_is_saved_again_is_there_whatever_is_removed(tmp_path, mon
     assert os.listdir(tmp_path) == ["000000001"]
 
 
+def test_a_save_that_fails_or_is_killed_between_its_renames_leaves_the_old_one(tmp_path, monkeypatch):
+    folder, rename = CheckpointFolder(tmp_path), Path.rename
+    folder.save(1, FILES)
+
+    def refuse(path, target):
+        if path.name == ".tmp-000000001":
+            raise OSError(5, "Input/output error")
+        return rename(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", refuse)
+        with pytest.raises(CheckpointError):
+            folder.save(1, {"state": b"new"})
+    assert folder.load(1) == FILES
+    folder.path(1).rename(tmp_path / ".tmp-000000001.old")
+    folder.lock()
+    assert folder.load(1) == FILES
+
+
 def test_a_best_one_that_is_gone_is_none(tmp_path):
     folder = CheckpointFolder(tmp_path)
     for number in (1, 2):
