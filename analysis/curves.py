@@ -4,7 +4,6 @@ From five seeds on, the interquartile mean and its bootstrap interval; with fewe
 Runs of other length, unfinished ones, and further runs of the same seed are an agent of their own.
 """
 
-import importlib.util
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +24,7 @@ from rmc.analysis.statistics import (
     probability_of_improvement,
 )
 from rmc.common.errors import ConfigError
-from rmc.common.extra import how_to_install
+from rmc.common.extra import check_installed
 
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 Axis = Literal["env_steps", "updates", "wall_s"]
@@ -78,8 +77,7 @@ def curve(run: History, by: Axis) -> tuple[NDArray[np.float64], NDArray[np.float
 
 def draw(groups: Groups, by: Axis, out: Path) -> None:
     """A panel an environment, a colour an agent. Raises ConfigError where it cannot be written."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError("--out", str(out), f"matplotlib is missing; {how_to_install('plot')}")
+    check_installed("plot", ("matplotlib",), "--out", str(out))
     check_writable("--out", out, PICTURES)
     from matplotlib.figure import Figure  # an extra
 

@@ -7,7 +7,6 @@ The model's metadata hold the policy's header, as its safetensors do.
 """
 
 import contextlib
-import importlib.util
 import io
 import logging
 import warnings
@@ -20,11 +19,9 @@ from torch import Tensor, nn
 
 from rmc.analysis.policy_file import PolicyFile
 from rmc.common.agent import Agent
-from rmc.common.errors import ConfigError
-from rmc.common.extra import how_to_install
+from rmc.common.extra import check_installed
 
 INPUTS, OUTPUTS = ("observation", "previous_action", "missing", "state"), ("action", "next_state")
-NEEDED = ("onnx", "onnxscript")
 
 
 class _Step(nn.Module):
@@ -52,9 +49,7 @@ class _Step(nn.Module):
 
 def export(policy: PolicyFile, out: Path) -> None:
     """Write a policy to ``out``, its header in the model's metadata. Raises ConfigError."""
-    for name in NEEDED:
-        if importlib.util.find_spec(name) is None:
-            raise ConfigError("--out", str(out), f"{name} is missing; {how_to_install('onnx')}")
+    check_installed("onnx", ("onnx", "onnxscript"), "--out", str(out))
     header = policy.header
     flags = header.layout.missing
     agent = Agent(header.obs_dim, header.action_dim, header.agent, flags)

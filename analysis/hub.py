@@ -1,6 +1,5 @@
 """Files to and from a repository of the Hugging Face hub; HF_ENDPOINT names another hub."""
 
-import importlib.util
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -8,17 +7,16 @@ from pathlib import Path
 
 from rmc.common.checkpoint import POLICY
 from rmc.common.errors import ConfigError
-from rmc.common.extra import how_to_install
+from rmc.common.extra import check_installed
 
 SCHEME = "hf:/"  # before a repository's name, where a path is asked for; a Path keeps but one of its slashes
 CARD = "README.md"
 UNREACHED = (ConnectionError, TimeoutError, RuntimeError)  # of hf-xet, through which large files go
 
 
-def check_installed(repo: str) -> None:
+def check_hub(repo: str) -> None:
     """Raises ConfigError where the hub's library is missing."""
-    if importlib.util.find_spec("huggingface_hub") is None:
-        raise ConfigError("REPO", repo, f"huggingface-hub is missing; {how_to_install('hub')}")
+    check_installed("hub", ("huggingface_hub",), "REPO", repo)
 
 
 def push(repo: str, files: Mapping[str, bytes], private: bool) -> str:
@@ -36,7 +34,7 @@ def push(repo: str, files: Mapping[str, bytes], private: bool) -> str:
 
 def pull(repo: str, revision: str | None = None) -> Path:
     """A repository's policy, in the hub's own cache. Raises ConfigError."""
-    check_installed(repo)
+    check_hub(repo)
     from huggingface_hub import hf_hub_download
 
     with _in_one_line(repo, revision):

@@ -1,6 +1,5 @@
 """``rmc report``: one HTML file about runs, which a browser shows without a network."""
 
-import importlib.util
 import time
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -13,8 +12,7 @@ from rmc.analysis.curves import LAST, grouped
 from rmc.analysis.history import History
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.report_run import ReportRun
-from rmc.common.errors import ConfigError
-from rmc.common.extra import how_to_install
+from rmc.common.extra import check_installed
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import option
 from rmc.deploy.run.starts import format_starts
@@ -37,9 +35,7 @@ CHARTS = (  # what is drawn over wall time: its name, its unit, and its lines by
 
 def check_report(out: Path) -> None:
     """Raises ConfigError where a report cannot be made, or not there."""
-    for package in ("matplotlib", "jinja2"):
-        if importlib.util.find_spec(package) is None:
-            raise ConfigError("--out", str(out), f"{package} is missing; {how_to_install('report')}")
+    check_installed("report", ("matplotlib", "jinja2"), "--out", str(out))
     check_writable("--out", out, PAGES)
 
 

@@ -1,7 +1,6 @@
 """An episode of a policy as a video, rendered off screen."""
 
 import dataclasses
-import importlib.util
 import inspect
 import json
 import os
@@ -21,7 +20,7 @@ from rmc.common.env.faults import call_env
 from rmc.common.env.make import entry_point, find_spec, make_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError, EnvFault
-from rmc.common.extra import how_to_install
+from rmc.common.extra import check_installed
 from rmc.common.whole_file import written_whole
 
 VIDEOS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
@@ -36,8 +35,7 @@ ENVS_FAULT = 3  # exit status of a probe whose environment is at fault
 
 def prepare(env: EnvConfig, out: Path) -> None:
     """See that an episode can be filmed, and choose what renders. Raises ConfigError, which says why not."""
-    if importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise ConfigError("--video", str(out), f"imageio-ffmpeg is missing; {how_to_install('video')}")
+    check_installed("video", ("imageio_ffmpeg",), "--video", str(out))
     check_writable("--video", out, VIDEOS)
     fault = _mode_fault(env)
     if fault is not None:

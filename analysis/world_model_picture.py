@@ -4,7 +4,6 @@ Shapes: T steps of the episode, O observation, A action, H hidden, M flags of wh
 Observations are normalised ones.
 """
 
-import importlib.util
 import io
 import pickle
 from contextlib import closing
@@ -25,7 +24,7 @@ from rmc.analysis.value_bias import ValueBias, value_bias
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError
-from rmc.common.extra import how_to_install
+from rmc.common.extra import check_installed
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
@@ -124,8 +123,7 @@ def _error(predicted: Tensor, episode: Episode, horizon: int) -> tuple[Tensor, T
 
 def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, Remembered, ValueBias | None]:
     """Play several episodes, look at the first, and write the picture with what is remembered. Raises ConfigError."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError("--out", str(out), f"matplotlib is missing; {how_to_install('plot')}")
+    check_installed("plot", ("matplotlib",), "--out", str(out))
     check_writable("--out", out, PICTURES)
     folder = RunFolder(run)
     config, agent = _grounded(folder, checkpoint)

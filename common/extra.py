@@ -3,6 +3,8 @@
 import importlib.util
 from pathlib import Path
 
+from rmc.common.errors import ConfigError
+
 
 def how_to_install(extra: str) -> str:
     """The command for an extra of pyproject.toml. PyPI's ``rmc`` is another project, ours is ``rmc-rl``."""
@@ -13,3 +15,10 @@ def how_to_install(extra: str) -> str:
     if (above / "pyproject.toml").exists():  # a checkout; a wheel's files lie in site-packages
         return f"pip install -e '.[{extra}]' in {above}"
     return f"pip install 'rmc-rl[{extra}]'"
+
+
+def check_installed(extra: str, packages: tuple[str, ...], field: str, value: object) -> None:
+    """Raises ConfigError, which names ``field`` and ``value``, where a package of an extra is missing."""
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise ConfigError(field, value, f"{package.replace('_', '-')} is missing; {how_to_install(extra)}")

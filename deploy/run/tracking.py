@@ -1,7 +1,6 @@
 """Which tracker follows a run: chosen on the command line, kept in the run's folder for when it goes on."""
 
 import dataclasses
-import importlib.util
 import json
 import logging
 import re
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from rmc.common.errors import ConfigError
-from rmc.common.extra import how_to_install
+from rmc.common.extra import check_installed
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import option
 from rmc.deploy.run.folder import RunFolder, read_object
@@ -58,8 +57,7 @@ def _refuse_without_tracker(options: LaunchOptions) -> None:
 
 
 def _check(tracker: str, project: str, tags: tuple[str, ...], video_every: int) -> None:
-    if importlib.util.find_spec(tracker) is None:
-        raise ConfigError("--track", tracker, f"{tracker} is not installed; {_how_to_install(tracker)}")
+    check_installed(tracker, (tracker,), "--track", tracker)
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", project):
         fix = "take up to 100 letters, digits, and _ . - after the first"
         raise ConfigError("--track-project", project, fix)
@@ -70,10 +68,6 @@ def _check(tracker: str, project: str, tags: tuple[str, ...], video_every: int) 
         raise ConfigError(
             "--track-video-every", video_every, "take 1 or more evaluations, or 0 for the final one alone"
         )
-
-
-def _how_to_install(tracker: str) -> str:
-    return how_to_install("wandb") if tracker == "wandb" else how_to_install("trackio")
 
 
 def keep_tracking(folder: RunFolder, tracking: Tracking | None) -> None:

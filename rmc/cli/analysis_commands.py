@@ -1,7 +1,6 @@
 """What each command does that looks at a run or an environment."""
 
 import dataclasses
-import importlib.util
 import json
 import logging
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from rmc.cli import run_options
 from rmc.cli.ending import cut_note
 from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
-from rmc.common.extra import how_to_install
+from rmc.common.extra import check_installed
 from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.folder import RunFolder
@@ -75,9 +74,7 @@ def _say_played(command: run_options.Evaluate, played: dict[str, Any]) -> None:
 
 
 def _check_baselines(what: str) -> None:
-    for package in ("stable_baselines3", "sb3_contrib"):
-        if importlib.util.find_spec(package) is None:
-            raise ConfigError("baseline", what, f"{package} is missing; {how_to_install('baselines')}")
+    check_installed("baselines", ("stable_baselines3", "sb3_contrib"), "baseline", what)
 
 
 def _result_line(played: dict[str, Any]) -> str:

@@ -1,7 +1,6 @@
 """What each command of the command line does."""
 
 import dataclasses
-import importlib.util
 import json
 import logging
 
@@ -12,7 +11,7 @@ from rmc.cli.dry_run import dry_run
 from rmc.cli.ending import say_end
 from rmc.cli.redis_password import warn_of_password
 from rmc.common.errors import ConfigError
-from rmc.common.extra import how_to_install
+from rmc.common.extra import check_installed
 from rmc.deploy.monitor import attach as attachment
 from rmc.deploy.monitor.recorded import recorded_status, status_json
 from rmc.deploy.monitor.table import table
@@ -68,8 +67,7 @@ def list_runs(command: run_options.List) -> int:
 
 
 def _check_ray(address: str) -> None:
-    if importlib.util.find_spec("ray") is None:
-        raise ConfigError("--ray-address", address, f"Ray is not installed; {how_to_install('ray')}")
+    check_installed("ray", ("ray",), "--ray-address", address)
 
 
 def doctor(command: run_options.Doctor) -> int:

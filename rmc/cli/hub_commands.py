@@ -16,7 +16,7 @@ def run_hub(command: hub_options.Hub) -> int:
 
 
 def _push(action: hub_options.Push) -> int:
-    hub.check_installed(action.repo)
+    hub.check_hub(action.repo)
     policy = read_policy(action.run, action.checkpoint)
     text = model_card.card(policy.header, action.repo, action.license)
     files = {POLICY: policy.encode(), hub.CARD: text.encode()}

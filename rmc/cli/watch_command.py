@@ -1,6 +1,5 @@
 """``rmc watch``."""
 
-import importlib.util
 import ipaddress
 import os
 import secrets
@@ -10,7 +9,7 @@ from contextlib import suppress
 from rmc.analysis.run_paths import each_readable, expanded
 from rmc.cli import run_options
 from rmc.common.errors import ConfigError
-from rmc.common.extra import how_to_install
+from rmc.common.extra import check_installed
 from rmc.deploy.monitor.view import terminal
 
 ANY = ("0.0.0.0", "::")
@@ -20,9 +19,7 @@ def watch(command: run_options.Watch) -> int:
     """Serve the page until Ctrl-C."""
     if not command.runs:
         raise ConfigError("RUNS", "", "give folders of runs")
-    for package in ("starlette", "uvicorn"):
-        if importlib.util.find_spec(package) is None:
-            raise ConfigError("RUNS", str(command.runs[0]), f"{package} is missing; {how_to_install('watch')}")
+    check_installed("watch", ("starlette", "uvicorn"), "RUNS", str(command.runs[0]))
     from rmc.analysis.live_run import LiveRun
     from rmc.analysis.watch_server import serve  # an extra
 

@@ -1,5 +1,6 @@
 """Policies to and from a hub, in processes of their own: its library reads the environment when it is imported."""
 
+import importlib.util
 import json
 import os
 import subprocess
@@ -158,8 +159,9 @@ def test_without_the_extra_one_line_says_how_to_get_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "huggingface_hub" else name)
-    monkeypatch.setattr("rmc.analysis.hub.how_to_install", lambda extra: f"pip install 'rmc-rl[{extra}]'")
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "huggingface_hub" else there(name))
+    monkeypatch.setattr("rmc.common.extra.how_to_install", lambda extra: f"pip install 'rmc-rl[{extra}]'")
     for words in (["hub", "push", "run", "me/swings"], ["hub", "pull", "me/swings"]):
         assert "huggingface-hub is missing; pip install 'rmc-rl[hub]'" in complaint(words, capsys)
     assert main.run(["hub"]) == 2

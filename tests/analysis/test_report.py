@@ -1,5 +1,6 @@
 """rmc report: one page that a real browser shows without a network, of every kind of run."""
 
+import importlib.util
 import json
 import re
 import shutil
@@ -232,8 +233,8 @@ def test_a_folder_that_is_no_run_is_left_out(trained: Path, tmp_path: Path, capl
 def test_what_is_not_installed_is_named(
     package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    there = report.importlib.util.find_spec
-    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None if name == package else there(name))
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else there(name))
     assert run(["report", "nowhere", "--out", str(tmp_path / "report.html")]) == 2
     err = capsys.readouterr().err
     assert f"{package} is missing; pip install" in err

@@ -2,6 +2,7 @@
 
 import dataclasses
 import http.client
+import importlib.util
 import json
 import os
 import selectors
@@ -22,7 +23,6 @@ from imageio_ffmpeg import write_frames
 from matplotlib.image import imsave
 
 from rmc.analysis.live_run import POINTS, Curve, LiveRun
-from rmc.cli import watch_command
 from rmc.cli.main import run
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.folder import RunFolder
@@ -276,10 +276,8 @@ def test_what_it_cannot_do_is_one_line(
 
 
 def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    there = watch_command.importlib.util.find_spec
-    monkeypatch.setattr(
-        watch_command.importlib.util, "find_spec", lambda name: None if name == "uvicorn" else there(name)
-    )
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "uvicorn" else there(name))
     assert run(["watch", "nowhere"]) == 2
     assert "uvicorn is missing; pip install -e '.[watch]'" in capsys.readouterr().err
 

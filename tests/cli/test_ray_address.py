@@ -130,7 +130,7 @@ def test_without_ray_it_is_said_how_to_install_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)  # as Python keeps what cannot be imported
     said = refusal(capsys, *words, "--ray-address", "auto")
-    assert said.startswith("rmc: --ray-address='auto': Ray is not installed; pip install ")
+    assert said.startswith("rmc: --ray-address='auto': ray is missing; pip install ")
 
 
 def test_what_ray_says_is_not_among_the_json(

@@ -6,11 +6,13 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 import rmc
 from rmc.common.extra import how_to_install
+from rmc.deploy.run.tracking import Tracker
 
 ROOT = Path(__file__).parents[2]
 SOURCES = ("actors", "analysis", "common", "deploy", "learner", "replay_server", "rmc", "Makefile")
@@ -44,5 +46,6 @@ def test_every_hint_asks_for_it_and_names_an_extra() -> None:
     ]
     texts = {path: path.read_text() for path in paths}
     assert not [str(path) for path, text in texts.items() if re.search(r"""install ['"]?rmc\\?\[""", text)]
-    asked = {name for text in texts.values() for name in re.findall(r"""how_to_install\(['"]([^'"]*)['"]\)""", text)}
-    assert asked == extras.keys() - {"dev"}
+    asks = re.compile(r"""(?:how_to_install|check_installed)\(['"]([^'"]*)['"]""")
+    asked = {name for text in texts.values() for name in asks.findall(text)}
+    assert asked | {*get_args(Tracker)} == extras.keys() - {"dev"}

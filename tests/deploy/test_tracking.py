@@ -88,5 +88,5 @@ def test_a_damaged_note_is_named(folder: RunFolder, text: str) -> None:
 def test_a_missing_extra_is_said(folder: RunFolder, tracker: str, monkeypatch: pytest.MonkeyPatch) -> None:
     there = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == tracker else there(name))
-    with pytest.raises(ConfigError, match=rf"--track='{tracker}': {tracker} is not installed; pip install .*{tracker}"):
+    with pytest.raises(ConfigError, match=rf"--track='{tracker}': {tracker} is missing; pip install .*{tracker}"):
         chosen(folder, track=tracker)
