@@ -72,12 +72,12 @@ class ReplayConnection:
         raise MessageError("replay", f"{meta.get('error')!s:.200}")
 
     def send(self, kind: Kind, meta: dict[str, Any], parts: tuple[bytes | memoryview, ...] = ()) -> None:
-        """Send a frame whose body is the parts in order, after what was put off."""
+        """Send a frame whose body is the parts in order, after what is enqueued."""
         self.enqueue(kind, meta, parts)
         self.flush()
 
     def flush(self) -> None:
-        """Send what was put off."""
+        """Send what is enqueued."""
         if self._unsent:
             self._socket.sendall(b"".join(self._unsent))
             self._unsent.clear()

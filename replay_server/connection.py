@@ -84,7 +84,7 @@ class ClientConnection:
         return Frame(header.kind, decode_meta(raw_meta, body, header), body)
 
     def send(self, kind: Kind, meta: Mapping[str, Any], parts: tuple[memoryview, ...] = ()) -> None:
-        """Send what the kernel takes now and keep the rest, without a copy: see ``own``."""
+        """Send what the kernel takes now and keep the rest, without a copy: see ``copy_pending``."""
         self._unacked += [memoryview(encode_frame(kind, meta, parts)), *(part for part in parts if part.nbytes)]
         self._zero_copy = True
         self.flush()

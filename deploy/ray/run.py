@@ -1,4 +1,4 @@
-"""A run on Ray: the roles of ``local.py`` as named, detached actors on the nodes of a cluster.
+"""A run on Ray: the roles of ``deploy/local/launcher.py`` as named, detached actors on the nodes of a cluster.
 
 Ray core starts again what dies, here or elsewhere. The launcher is such an actor itself, on the head, beside
 the run's Redis and folder; it places the others, gives new nodes actors, and hears why a role died.

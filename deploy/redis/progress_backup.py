@@ -36,7 +36,7 @@ class ProgressBackup:
                 write_whole(self._path, msgpack.packb(progress))
 
     def restore(self, bus: Bus) -> None:
-        """Say them where Redis has nothing; a replay server whose ring is older then goes on from them.
+        """Restore the counters in Redis where it has none; a replay server with an older ring goes on from them.
 
         A file that cannot be read is told, and does not keep the run from going on: most often the ring has them, too.
         """

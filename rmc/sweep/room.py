@@ -11,7 +11,7 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.preflight import DISK_RESERVE, cores
 from rmc.sweep.job import Job
 
-PROCESS_BYTES = 400 << 20  # of one with torch and MuJoCo; measured in docs/performance.md: 308 to 503 MB
+PROCESS_BYTES = 400 << 20  # of one with torch and MuJoCo; measured in docs/performance.md: 203 to 498 MB
 
 
 def run_cores(config: RunConfig, lockstep: bool) -> int:

@@ -71,6 +71,26 @@ def test_every_equation_leads_to_its_code_and_back() -> None:
     assert seen == {6, 7, 8, 9, 10, 11, 12}
 
 
+def test_what_the_table_of_equations_names_is_in_the_sources() -> None:
+    table = (ROOT / "docs" / "algorithm.md").read_text().split("## From the paper to the code")[1].split("\n\n")[1]
+    cells = [re.split(r"(?<!\\)\|", row)[3] for row in table.splitlines()[2:]]
+    named = [name for cell in cells for name in re.findall(r"`([\w./]+)`", cell)]
+    folders = ("actors", "common", "learner", "replay_server")
+    sources = "\n".join(path.read_text() for folder in folders for path in (ROOT / folder).rglob("*.py"))
+    files, names = ([name for name in named if ("/" in name) == kind] for kind in (True, False))
+    assert len(files) > 2
+    assert len(names) > 20
+    assert not [name for name in files if not (ROOT / name).exists()]
+    last = {name: name.split(".")[-1] for name in names}
+    assert not [name for name, end in last.items() if not re.search(rf"(def|class) {end}\b|^{end}\b", sources, re.M)]
+
+
+def test_the_tests_that_security_names_exist() -> None:
+    named = re.findall(r"(?:tests/|\btest_)[\w/]*\.py", (ROOT / "SECURITY.md").read_text())
+    assert len(named) > 5
+    assert not [name for name in named if not (ROOT / name).exists()]
+
+
 def test_its_make_targets_exist() -> None:
     makefile = (ROOT / "Makefile").read_text()
     targets = re.findall(r"make (\w+)", README)
