@@ -28,7 +28,7 @@ CHUNK = 10  # updates between looks at the clock
 def _update(run: RunConfig, precision: Precision) -> JointUpdate:
     spec, device = run.window_spec(), torch.device("cuda")
     agent = Agent(spec.obs_dim, spec.action_dim, run.agent).to(device)
-    return make_update(agent, spec.burn_in, run.update, 0, set_precision(precision, device))
+    return make_update(agent, run.update, 0, set_precision(precision, device))
 
 
 def measure(run: RunConfig, batch_size: int, precision: Precision, seconds: float, rounds: int) -> list[Row]:

@@ -86,7 +86,7 @@ def _bare(run: RunConfig, batch_size: int, precision: Precision, seconds: float)
     """Forward and backward on one batch in place, the policy's as often as in a run."""
     spec = run.window_spec()
     agent = Agent(spec.obs_dim, spec.action_dim, run.agent)
-    update, beta = make_update(agent, spec.burn_in, run.update, 0, precision == "bf16"), torch.zeros(())
+    update, beta = make_update(agent, run.update, 0, precision == "bf16"), torch.zeros(())
     rows = random_rows(spec, batch_size)
     raw = torch.from_numpy(rows.view("u1").reshape(batch_size, -1))
     plans = [update.plan(raw, spec, number) for number in range(2, 2 + run.update.policy_delay)]  # in one the policy's
@@ -135,7 +135,7 @@ def cut(run: RunConfig, longest: int, seconds: float, rounds: int) -> list[Row]:
 
     def measured(is_cut: bool) -> Measure:
         agent = Agent(spec.obs_dim, spec.action_dim, run.agent)
-        update = make_update(agent, spec.burn_in, run.update, 0, has_fast_bf16(torch.device("cpu")))
+        update = make_update(agent, run.update, 0, has_fast_bf16(torch.device("cpu")))
 
         plan = update.plan(raw, spec, 2)
         if not is_cut:

@@ -42,10 +42,14 @@ class Batch:
     step_valid: Tensor  # (B, T) bool
     burned_in: Tensor  # (B,) bool: the burn-in is real
     importance: Tensor  # (B,)
+    burn_in: int  # L_b
     cut: int  # steps of padding that all its windows have after the T
-    fills: bool  # as the plan says
-    trains_imputer: bool
-    trains_policy: bool
+    plan: Plan
+
+    @property
+    def trained(self) -> slice:
+        """The steps after the burn-in, of the T or the T + 1."""
+        return slice(self.burn_in, None)
 
 
 def importance_weights(
@@ -119,7 +123,8 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec, plan: Plan | N
     The rows' padding must be zero: see ``clear_padding``. Without a plan, all steps, and nothing is left out.
     """
     assert raw.shape[1] == spec.dtype.itemsize, (raw.shape, spec.dtype.itemsize)
-    steps, fills, trains_imputer, trains_policy = plan or Plan(spec.steps, True, True, True)
+    plan = plan or Plan(spec.steps, True, True, True)
+    steps = plan.steps
     floats, integers = raw.view(torch.float32), raw.view(torch.int32)
 
     def field(items: Tensor, name: str) -> Tensor:
@@ -146,8 +151,7 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec, plan: Plan | N
         step_valid=step_valid,
         burned_in=first == 0,
         importance=importance,
+        burn_in=spec.burn_in,
         cut=spec.steps - steps,
-        fills=fills,
-        trains_imputer=trains_imputer,
-        trains_policy=trains_policy,
+        plan=plan,
     )

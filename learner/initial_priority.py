@@ -39,14 +39,14 @@ class InitialPriority:
     @torch.no_grad()
     def __call__(self, rows: Rows) -> NDArray[np.float32]:
         """Windows (B,) -> (B,)."""
-        agent, steps = self._agent, slice(self._spec.burn_in, None)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
         plan = Plan(longest_steps(raw, self._spec), has_missing(raw, self._spec), False, False)
         batch = view_batch(raw, torch.ones(len(rows)), self._spec, plan)
+        agent, steps = self._agent, batch.trained
         m = batch.step_valid[:, steps].float()
         o = agent.normalizer(batch.observation, batch.missing)
-        o = impute(agent, o, batch, self._spec.burn_in)
-        z = agent.features(unroll(agent.memory, o, batch, self._spec.burn_in))
+        o = impute(agent, o, batch)
+        z = agent.features(unroll(agent.memory, o, batch))
         read = critic_input(z, agent.normalized_privileged(batch.privileged[:, steps]))
         mean, log_std = agent.policy(z)
         pi, log_pi = squashed_sample(mean, log_std, torch.randn(mean.shape, generator=self._generator))

@@ -83,7 +83,7 @@ class Learner:
         self.agent.start_gates(spec.steps)
         self.agent.to(self.device)
         bf16 = set_precision(config.precision, self.device)
-        self.update = make_update(self.agent, spec.burn_in, update, seed, bf16)
+        self.update = make_update(self.agent, update, seed, bf16)
         self._updated: DeviceUpdate | PipelinedUpdate = (
             PipelinedUpdate(self.update, spec, config.batch_size)
             if two_processes

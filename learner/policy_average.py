@@ -15,12 +15,13 @@ class PolicyAverage:
 
     def __init__(self, agent: Agent, updates: int) -> None:
         self._agent, self._updates = agent, updates
-        self._values = {name: value.detach().clone() for name, value in agent.acting().items()}
+        averaged = agent.acting() if updates else {}
+        self._values = {name: value.detach().clone() for name, value in averaged.items()}
 
     @torch.no_grad()
     def move(self, updates: int, parts: tuple[str, ...] = ("",)) -> None:
         """After so many updates, those of what acts whose names begin so; every ``MOVE_UPDATES``."""
-        if self._updates and updates % MOVE_UPDATES == 0:
+        if self._values and updates % MOVE_UPDATES == 0:
             over, acting = min(self._updates, updates / 10) / MOVE_UPDATES, self._agent.acting()
             names = [name for name in self._values if name.startswith(parts)]
             averaged, newest = ([source[name] for name in names] for source in (self._values, {**acting}))
@@ -32,8 +33,7 @@ class PolicyAverage:
 
     def policy_weights(self) -> dict[str, Tensor]:
         """On the host, with what normalises observations now."""
-        averaged = self._values if self._updates else {}
-        return self._agent.policy_weights() | {name: value.cpu() for name, value in averaged.items()}
+        return self._agent.policy_weights() | {name: value.cpu() for name, value in self._values.items()}
 
     def state_dict(self) -> dict[str, Tensor]:
         """By parameter."""

@@ -10,16 +10,17 @@ from rmc.common.agent import Agent, Memory, MemoryOutput
 from rmc.learner.batch import Batch
 
 
-def unroll(memory: Memory, o: Tensor, batch: Batch, burn_in: int) -> MemoryOutput:
+def unroll(memory: Memory, o: Tensor, batch: Batch) -> MemoryOutput:
     """(B, L_t + 1, ·) from the stored state, which starts the trained part itself where the burn-in is padding."""
-    n, hidden = burn_in, _burned_in(memory, o, batch, burn_in)
-    remembered: MemoryOutput = memory(o[:, n:], batch.missing[:, n:], batch.prev_action[:, n:], hidden)
+    steps, hidden = batch.trained, _burned_in(memory, o, batch)
+    remembered: MemoryOutput = memory(o[:, steps], batch.missing[:, steps], batch.prev_action[:, steps], hidden)
     return remembered
 
 
 @torch.no_grad()
-def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
+def _burned_in(memory: Memory, o: Tensor, batch: Batch) -> Tensor:
     """(B, H), the state before the first trained step."""
+    n = batch.burn_in
     if not n:
         return batch.state
     hidden = batch.state[:, : memory.gru.hidden_size]
@@ -28,14 +29,14 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch, n: int) -> Tensor:
     return torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
 
 
-def impute(agent: Agent, o: Tensor, batch: Batch, burn_in: int) -> Tensor:
+def impute(agent: Agent, o: Tensor, batch: Batch) -> Tensor:
     """(B, L + 1, O) with missing frames filled where configured, along the states that ``unroll`` goes through."""
-    if agent.next_frame is None or not batch.fills:
+    if agent.next_frame is None or not batch.plan.fills:
         return o
 
     def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:
         return agent.fill(o[:, steps], batch.missing[:, steps], batch.prev_action[:, steps], state)
 
-    past, state = part(slice(burn_in), batch.state)
+    past, state = part(slice(batch.burn_in), batch.state)
     state = torch.where(batch.burned_in.unsqueeze(1), state, batch.state)
-    return torch.cat([past, part(slice(burn_in, None), state)[0]], 1)
+    return torch.cat([past, part(batch.trained, state)[0]], 1)

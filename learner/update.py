@@ -77,11 +77,11 @@ Losses = dict[str, Tensor]
 class JointUpdate:
     """Agent, targets where there are some, optimisers, and the update that moves them together."""
 
-    def __init__(self, agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> None:
+    def __init__(self, agent: Agent, config: UpdateConfig, seed: int, bf16: bool = False) -> None:
         device = agent.log_alpha.device
         if bf16 and device.type == "cpu":
             fuse(agent)
-        self.agent, self.burn_in, self.config, self.bf16 = agent, burn_in, config, bf16
+        self.agent, self.config, self.bf16 = agent, config, bf16
         self.target_critic = None if agent.config.critic_batch_norm else _target_copy(agent.critic)
         has_target = "ema" in (config.latent_target, config.target_memory)
         self.target_memory = _target_copy(agent.memory) if has_target else None
@@ -113,13 +113,13 @@ class JointUpdate:
     def model_pass(self, batch: Batch) -> tuple[Losses, ModelPass]:
         """Memory, prediction and curiosity; reads nothing of critics, policy and temperature."""
         agent, c = self.agent, self.config
-        a, _, d, m = _trained(batch, self.burn_in)
+        a, _, d, m = _trained(batch)
         with torch.no_grad():
             o = agent.normalizer(batch.observation, batch.missing)
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
-            o = impute(agent, o, batch, self.burn_in)
-            memory = unroll(agent.memory, o, batch, self.burn_in)
+            o = impute(agent, o, batch)
+            memory = unroll(agent.memory, o, batch)
             z = self._to_bf16(agent.features(memory))
 
             # Prediction, and curiosity from its error
@@ -144,12 +144,12 @@ class JointUpdate:
     def value_pass(self, batch: Batch, model: ModelPass, beta: Tensor) -> tuple[Losses, ValuePass]:
         """Intuition: one policy sample for every step serves both the target and the policy loss."""
         agent, c, z = self.agent, self.config, model.z
-        a, r, d, m = _trained(batch, self.burn_in)
-        privileged = agent.normalized_privileged(batch.privileged[:, self.burn_in :])
+        a, r, d, m = _trained(batch)
+        privileged = agent.normalized_privileged(batch.privileged[:, batch.trained])
         alpha = agent.log_alpha.exp().detach()
         z_value, z_policy = (z if loss in TRAINS_MEMORY[c.scheme] else z.detach() for loss in ("value", "policy"))
         with self._autocast():
-            with torch.set_grad_enabled(batch.trains_policy):
+            with torch.set_grad_enabled(batch.plan.trains_policy):
                 mean, log_std = agent.policy(z_policy)
                 pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean, batch.cut))
             now = critic_input(z_value[:, :-1], privileged[:, :-1]), a
@@ -165,7 +165,7 @@ class JointUpdate:
             "q_loss": losses.q_loss(q, y, batch.importance, m),
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
-        if batch.trains_policy:
+        if batch.plan.trains_policy:
             loss_values["policy_loss"] = losses.policy_loss(log_pi, self._frozen_q(*climbed), alpha, m)
         reported = {"policy_loss": self.policy_loss.clone()} | detached(loss_values)
         trace = Trace(reported, alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m)
@@ -194,7 +194,7 @@ class JointUpdate:
     def result(self, batch: Batch, model: ModelPass, value: ValuePass, norm: Tensor) -> UpdateResult:
         """What an update gives back of its passes; ``norm`` is the gradient's."""
         metrics = model.metrics | value.metrics | {"grad_norm": norm}
-        observed = batch.observation_valid[:, self.burn_in :]
+        observed = batch.observation_valid[:, batch.trained]
         return UpdateResult(value.priorities, metrics, model.hidden, observed, model.observation_unexplained)
 
     def plan(self, raw: Tensor, spec: WindowSpec, number: int) -> Plan:
@@ -211,8 +211,8 @@ class JointUpdate:
 
     def _fill_losses(self, o: Tensor, memory: MemoryOutput, batch: Batch, m: Tensor) -> Losses:
         """The loss of what imputes, where it is configured and its turn."""
-        imputer, steps = self.agent.next_frame, slice(self.burn_in, None)
-        if imputer is None or not batch.trains_imputer:
+        imputer, steps = self.agent.next_frame, batch.trained
+        if imputer is None or not batch.plan.trains_imputer:
             return {}
         with self._autocast():
             now, after, a = o[:, steps][:, :-1], o[:, steps][:, 1:], batch.action[:, steps]
@@ -223,7 +223,7 @@ class JointUpdate:
         """The loss of predicted observations, where configured, and what the world model leaves unexplained."""
         if not self.agent.config.grounding:
             return {}, o.new_zeros(0)
-        steps = slice(self.burn_in, None)
+        steps = batch.trained
         r, seen, now, after = batch.reward[:, steps], _seen(batch)[:, steps], o[:, steps][:, :-1], o[:, steps][:, 1:]
         predicted, both = now + prediction.observation_change.float(), seen[:, 1:] * seen[:, :-1]
         grounded = seen[:, 1:] if self.agent.config.impute_missing else both
@@ -240,7 +240,7 @@ class JointUpdate:
 
     @torch.no_grad()
     def _unroll(self, target: Memory, o: Tensor, batch: Batch) -> MemoryOutput:
-        return unroll(target, o, batch, self.burn_in)
+        return unroll(target, o, batch)
 
     def _noise_like(self, x: Tensor, cut: int) -> Tensor:
         """(B, T, A) standard normal. That of the steps cut off is drawn, too: cut or not, a batch teaches the same."""
@@ -335,9 +335,9 @@ def _target_copy(module: ModuleT) -> ModuleT:
     return copied
 
 
-def _trained(batch: Batch, burn_in: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _trained(batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """a_t, r_t, d_t and the mask m_t of the trained steps: (B, L_t, A), (B, L_t) each."""
-    steps = slice(burn_in, None)
+    steps = batch.trained
     return (
         batch.action[:, steps],
         batch.reward[:, steps],

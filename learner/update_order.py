@@ -41,7 +41,7 @@ class AlternateUpdate(JointUpdate):
         metrics: dict[str, Tensor] = {}
         norms = []
         for optimizer, (part, names) in zip(self.optimizers, self._stages(), strict=True):
-            if part == "policy" and not batch.trains_policy:
+            if part == "policy" and not batch.plan.trains_policy:
                 continue
             loss_values, model, value = self.forward(batch, beta)
             stage_losses = {name: loss for name, loss in loss_values.items() if name in names}
@@ -56,7 +56,7 @@ class AlternateUpdate(JointUpdate):
         return self.result(batch, model, value, torch.stack(norms).norm())
 
 
-def make_update(agent: Agent, burn_in: int, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:
+def make_update(agent: Agent, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:
     """The update in the order that the config names."""
     kind = JointUpdate if config.update_order == "joint" else AlternateUpdate
-    return kind(agent, burn_in, config, seed, bf16)
+    return kind(agent, config, seed, bf16)

@@ -74,8 +74,8 @@ def seen_by(checkpoint: Path, config: RunConfig, batch: Batch) -> Seen:
     spec = config.window_spec()
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
     agent.load_state_dict(torch.load(checkpoint / STATE, weights_only=True)["agent"])
-    o = impute(agent, agent.normalizer(batch.observation, batch.missing), batch, spec.burn_in)
-    remembered = unroll(agent.memory, o, batch, spec.burn_in)
+    o = impute(agent, agent.normalizer(batch.observation, batch.missing), batch)
+    remembered = unroll(agent.memory, o, batch)
     parts = remembered.hidden, agent.features(remembered), o[:, spec.burn_in :]
     return Seen(agent, *(part[:, :-1].flatten(0, 1) for part in parts))
 

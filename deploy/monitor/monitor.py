@@ -109,8 +109,7 @@ class Monitor:
         main = main_metrics(self.board) if record["role"] == "launcher" else evaluation_metrics(record)
         self._metrics_log.write(record, self.board.env_steps if at is None else at, main)
         update, score = record.get("eval_update"), record.get("eval_return_mean")
-        whole = isinstance(update, int) and is_finite(score)  # partial records are ignored
-        if record["role"] == "evaluator" and whole:
+        if record["role"] == "evaluator" and isinstance(update, int) and is_finite(score):
             self._unmarked[update] = float(score)
         with suppress(OSError):  # no room; the next record tries again
             for update in list(self._unmarked):

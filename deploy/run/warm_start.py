@@ -111,7 +111,7 @@ def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages:
     spec, prefixes = config.window_spec(), PARTS[parts]
     torch.manual_seed(config.seed)  # the rest is as the learner would make it
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
-    update = make_update(agent, spec.burn_in, config.update, config.seed)
+    update = make_update(agent, config.update, config.seed)
     weights = {name: value for name, value in state["agent"].items() if name.startswith(prefixes)}
     update.agent.load_state_dict(update.agent.state_dict() | weights)
     if update.target_memory is not None:

@@ -74,8 +74,8 @@ def relearned(agent_name: str, rows: Rows, spec: WindowSpec) -> tuple[Batch, tor
     agent = AGENTS[agent_name]
     raw = torch.from_numpy(rows.view(np.uint8).reshape(len(rows), -1))
     batch = view_batch(raw, torch.ones(len(rows)), spec)
-    o = impute(agent, agent.normalizer(batch.observation, batch.missing), batch, spec.burn_in)
-    return batch, unroll(agent.memory, o, batch, spec.burn_in).hidden
+    o = impute(agent, agent.normalizer(batch.observation, batch.missing), batch)
+    return batch, unroll(agent.memory, o, batch).hidden
 
 
 @settings(max_examples=40, deadline=None)

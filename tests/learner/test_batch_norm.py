@@ -148,7 +148,7 @@ def test_an_update_has_no_targets_and_its_checkpoint_brings_the_statistics_back(
     for _ in range(2):
         torch.manual_seed(0)
         config = AgentConfig(hidden=SPEC.state, embedding=8, heads=(16, 12), critic_batch_norm=True)
-        updates.append(make_update(Agent(SPEC.obs_dim, SPEC.action_dim, config), SPEC.burn_in, UpdateConfig(), 0))
+        updates.append(make_update(Agent(SPEC.obs_dim, SPEC.action_dim, config), UpdateConfig(), 0))
     first, second = updates
     assert first.target_critic is None
     for turn in range(3):

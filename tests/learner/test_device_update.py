@@ -39,7 +39,7 @@ def make(order: str = "joint", device: str = "cpu", bf16: bool = False, config: 
     else:
         update = dataclasses.replace(update, update_order=order, latent_target="ema", target_memory="ema", scheme=1)  # type: ignore[arg-type]
     agent = Agent(SPEC.obs_dim, SPEC.action_dim, config).to(device)
-    return make_update(agent, SPEC.burn_in, update, 3, bf16)
+    return make_update(agent, update, 3, bf16)
 
 
 def host_batch(

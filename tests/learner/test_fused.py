@@ -187,7 +187,7 @@ def test_the_way_back_through_the_critics_gives_what_is_asked_for(pair, asked):
 def test_an_update_in_bfloat16_is_fused_and_one_in_float32_is_not():
     for low in (True, False):
         agent = Agent(SPEC.obs_dim, SPEC.action_dim, AgentConfig(hidden=SPEC.state, embedding=8, heads=(16, 12)))
-        update = make_update(agent, SPEC.burn_in, UpdateConfig(), 0, low)
+        update = make_update(agent, UpdateConfig(), 0, low)
         assert isinstance(agent.memory.gru, FusedGRU) == low
         assert isinstance(update.target_critic, FusedTwinQ) == low
         before = {name: value.clone() for name, value in agent.state_dict().items()}

@@ -39,7 +39,7 @@ def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput, fil
     priority_fn = InitialPriority(spec, config, update, seed=3)
     priority_fn.load(safetensors.torch.save(agent.broadcast_weights()))
     rows = random_rows(6, spec=spec)
-    learner = make_update(agent, SPEC.burn_in, update, seed=3)
+    learner = make_update(agent, update, seed=3)
     expected = learner.forward(to_batch(rows, spec), torch.zeros(()))[2].priorities
     np.testing.assert_allclose(priority_fn(rows), expected, rtol=1e-5)
 

@@ -43,7 +43,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def make(agent: str, bf16: bool, spec: WindowSpec = SPEC) -> JointUpdate:
     torch.manual_seed(0)
     network = Agent(spec.obs_dim, spec.action_dim, AGENTS[agent], spec.missing, spec.privileged)
-    return make_update(network, spec.burn_in, ROBUST, 3, bf16)
+    return make_update(network, ROBUST, 3, bf16)
 
 
 @pytest.mark.parametrize("bf16", [False, True])
@@ -112,7 +112,7 @@ def test_it_goes_on_from_a_checkpoint_of_the_other_kind():
 def test_a_checkpoint_holds_what_the_plain_updates_does():
     """Not the batches that lie in the same memory, before a resume and after it."""
     agents = [Agent(SPEC.obs_dim, SPEC.action_dim, AGENTS["robust"]) for _ in range(2)]
-    update, plain = (make_update(agent, SPEC.burn_in, RAW, 3) for agent in agents)
+    update, plain = (make_update(agent, RAW, 3) for agent in agents)
     apart, in_turn = PipelinedUpdate(update, SPEC, BATCH), DeviceUpdate(plain, SPEC, BATCH)
     for one in (apart, in_turn):
         one(*host_batch(1), 0.1, 1)

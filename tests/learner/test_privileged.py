@@ -24,7 +24,7 @@ SPEC = dataclasses.replace(BY_NUMBER, state=CONFIG.state_size(BY_NUMBER.obs_dim)
 def make(privileged: int = SPEC.privileged, bf16: bool = False, **options: object) -> JointUpdate:
     torch.manual_seed(0)
     agent = Agent(SPEC.obs_dim, SPEC.action_dim, CONFIG, SPEC.missing, privileged)
-    return make_update(agent, SPEC.burn_in, UpdateConfig(curiosity=0.5, **options), 3, bf16)  # type: ignore[arg-type]
+    return make_update(agent, UpdateConfig(curiosity=0.5, **options), 3, bf16)  # type: ignore[arg-type]
 
 
 def rows_with(privileged: float) -> np.ndarray:

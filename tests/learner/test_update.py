@@ -26,7 +26,7 @@ def make(agent: AgentConfig, bf16: bool = False, **options: object) -> JointUpda
     torch.manual_seed(0)
     network = Agent(SPEC.obs_dim, SPEC.action_dim, agent)
     network.normalizer.freeze(torch.tensor(10), torch.ones(SPEC.obs_dim), torch.full((SPEC.obs_dim,), 20.0))
-    return make_update(network, SPEC.burn_in, UpdateConfig(curiosity=0.5, **options), 3, bf16)  # type: ignore[arg-type]
+    return make_update(network, UpdateConfig(curiosity=0.5, **options), 3, bf16)  # type: ignore[arg-type]
 
 
 def silence_all_but(keep: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,7 +143,7 @@ def test_padded_burn_in_starts_from_the_stored_state():
     rows["first"] = SPEC.burn_in
     rows["observation"][:, : SPEC.burn_in] = 0.0
     batch, update = to_batch(rows), make(PAPER)
-    hidden = unroll(update.agent.memory, batch.observation, batch, SPEC.burn_in).hidden
+    hidden = unroll(update.agent.memory, batch.observation, batch).hidden
     n = SPEC.burn_in
     o, missing, previous = batch.observation[:, n:], batch.missing[:, n:], batch.prev_action[:, n:]
     alone = update.agent.memory(o, missing, previous, batch.state).hidden
@@ -155,7 +155,7 @@ def test_burn_in_gets_no_gradient():
     rows["first"] = 0
     batch, update = to_batch(rows), make(PAPER)
     o = batch.observation.clone().requires_grad_()
-    unroll(update.agent.memory, o, batch, SPEC.burn_in).hidden.sum().backward()
+    unroll(update.agent.memory, o, batch).hidden.sum().backward()
     assert o.grad is not None
     assert not o.grad[:, : SPEC.burn_in].any()
     assert o.grad[:, SPEC.burn_in :].any()
@@ -254,7 +254,7 @@ def test_state_comes_back_bit_for_bit():
     torch.save(stopped.state_dict(), file)
     file.seek(0)
     torch.manual_seed(99)
-    resumed = make_update(Agent(SPEC.obs_dim, SPEC.action_dim, ROBUST), SPEC.burn_in, straight.config, seed=1234)
+    resumed = make_update(Agent(SPEC.obs_dim, SPEC.action_dim, ROBUST), straight.config, seed=1234)
     resumed.load_state_dict(torch.load(file, weights_only=True))
     for seed in range(3, 6):
         a, b = (u(to_batch(random_rows(8, seed)), BETA) for u in (straight, resumed))

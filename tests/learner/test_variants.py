@@ -83,7 +83,7 @@ def assert_same_updates(sizes: WindowSpec, agent: AgentConfig, options: dict[str
     network.freeze_statistics(torch.tensor([10]), total, 20.0 * total)
     config = UpdateConfig(curiosity=BETA, learning_rate=1e-2, **options)  # type: ignore[arg-type]
     plain = PlainUpdate(copy.deepcopy(network), SPEC.burn_in, config, seed=3)
-    update = make_update(network, SPEC.burn_in, config, seed=3)
+    update = make_update(network, config, seed=3)
     spec = dataclasses.replace(sizes, state=agent.state_size(SPEC.obs_dim))
     for turn in range(3):
         rows, importance = random_rows(4, turn, spec), np.linspace(0.3, 1.0, 4).astype(np.float32)
