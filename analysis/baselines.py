@@ -32,7 +32,7 @@ from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, c
 from rmc.analysis.evaluation import FINAL_EPISODES, Progress, Watch, missing_shares
 from rmc.common.env.make import env_layout, make_env
 from rmc.common.env.wrappers import Floats
-from rmc.common.errors import ConfigError
+from rmc.common.errors import ConfigError, first_line
 from rmc.common.process.role import StopSignal
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import flat, option
@@ -132,8 +132,8 @@ def _reading(state: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # zipfile, pickle and torch raise several unrelated classes
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise ConfigError("RUN", str(state), f"cannot be read ({reason}); restore it, or train another run") from None
+        fix = f"cannot be read ({first_line(error)}); restore it, or train another run"
+        raise ConfigError("RUN", str(state), fix) from None
 
 
 def _grow(buffer: ReplayBuffer, size: int) -> None:

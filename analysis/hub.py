@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rmc.common.checkpoint import POLICY
-from rmc.common.errors import ConfigError
+from rmc.common.errors import ConfigError, first_line
 from rmc.common.extra import check_installed
 
 SCHEME = "hf:/"  # before a repository's name, where a path is asked for; a Path keeps but one of its slashes
@@ -69,6 +69,5 @@ def _in_one_line(repo: str, revision: str | None = None) -> Iterator[None]:
         raise ConfigError("REPO", repo, f"the hub refuses it (HTTP {status}); {fix}") from None
     except (*UNREACHED, errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError, errors.HTTPError) as error:  # type: ignore[attr-defined]
         cause = error.__cause__ if isinstance(error, errors.LocalEntryNotFoundError) and error.__cause__ else error
-        reason = (str(cause).splitlines() or [type(cause).__name__])[0]
-        fix = f"cannot be reached ({reason}); try again with a network"
+        fix = f"cannot be reached ({first_line(cause)}); try again with a network"
         raise ConfigError("HF_ENDPOINT", constants.ENDPOINT, fix) from None

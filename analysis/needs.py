@@ -11,8 +11,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.local.trial import RoleUse, Trial
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import Machine
-from rmc.deploy.run.preflight import DISK_RESERVE
-from rmc.replay_server import ring
+from rmc.deploy.run.preflight import DISK_RESERVE, ring_bytes
 
 KEPT_BESIDE = 2  # checkpoints beside the newest: the best, and the one that is being written
 WIRE_SHARE = 0.2  # of the speed at which memory is copied: on its way a window is copied and checked some times
@@ -74,12 +73,6 @@ def needs(config: RunConfig, trial: Trial, machine: Machine) -> list[Need]:
         threads(config, trial.records, machine),
         Need("time to the end", f"{duration(seconds)} at {at}"),
     ]
-
-
-def ring_bytes(config: RunConfig) -> int:
-    """Of the rings of all replay servers."""
-    shards = config.replay.replay_shards
-    return shards * ring.file_bytes(config.window_spec(), -(-config.replay.capacity // shards))
 
 
 def memory(config: RunConfig, roles: dict[str, RoleUse], machine: Machine) -> list[Need]:

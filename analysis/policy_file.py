@@ -14,7 +14,7 @@ from rmc.analysis import hub
 from rmc.common.agent import Agent
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.checkpoint import POLICY, PROGRESS
-from rmc.common.errors import ConfigError, MessageError
+from rmc.common.errors import ConfigError, MessageError, first_line
 from rmc.common.policy_header import METADATA_KEY, PolicyHeader
 from rmc.deploy.monitor.recorded import empty_status
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
@@ -117,15 +117,9 @@ def _check_shapes(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> N
         with torch.device("meta"):
             agent = Agent(header.obs_dim, header.action_dim, header.agent, header.layout.missing)
             expected = agent.policy_shapes()
-    except (
-        RuntimeError,
-        ArithmeticError,
-        TypeError,
-        ValueError,
-        IndexError,
-    ) as error:  # of torch, for sizes that nothing can have
-        reason = str(error).splitlines()[0]
-        raise MessageError("damaged header", f"no networks have its sizes ({reason}); copy it again") from None
+    except (RuntimeError, ArithmeticError, TypeError, ValueError, IndexError) as error:  # torch's, for such sizes
+        fault = f"no networks have its sizes ({first_line(error)}); copy it again"
+        raise MessageError("damaged header", fault) from None
     for name in sorted(expected.keys() | shapes.keys()):
         if expected.get(name) != shapes.get(name):
             fault = f"{name} has shape {shapes.get(name)}, its header says {expected.get(name)}; copy it again"

@@ -15,8 +15,8 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import flat
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import preset_config
+from rmc.deploy.run.state import run_state
 
-ENDED_BY_SIGNAL = 130
 Series = tuple[list[float], list[float]]
 
 
@@ -50,13 +50,8 @@ class ReportRun:
 
     @property
     def state(self) -> str:
-        """Whether it trains, has finished or was stopped."""
-        if self.folder.trainer() is not None:
-            return "training"
-        if self.folder.result() is not None:
-            return "finished"
-        ended = self.folder.ended()
-        return "stopped" if ended in (None, ENDED_BY_SIGNAL) else f"ended with status {ended}"
+        """What became of it."""
+        return run_state(self.folder)
 
     @property
     def env_steps(self) -> int:

@@ -23,7 +23,7 @@ from rmc.analysis.out_file import check_writable
 from rmc.analysis.value_bias import ValueBias, value_bias
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.checkpoint import STATE
-from rmc.common.errors import ConfigError
+from rmc.common.errors import ConfigError, first_line
 from rmc.common.extra import check_installed
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import RunConfig
@@ -60,8 +60,7 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     try:
         agent.load_state_dict(torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)["agent"])
     except (pickle.UnpicklingError, EOFError, RuntimeError, KeyError, TypeError) as error:
-        reason = (str(error).strip() or "empty").splitlines()[0]
-        fix = f"its {STATE} is not this run's ({reason}); use another"
+        fix = f"its {STATE} is not this run's ({first_line(error)}); use another"
         raise ConfigError("--checkpoint", checkpoint, fix) from None
     return agent.eval()
 

@@ -63,3 +63,13 @@ class CheckpointError(RmcError):
 
 class RoleDied(RmcError):
     """A role died more often than the supervisor restarts it."""
+
+
+def first_line(error: BaseException) -> str:
+    """Its message's, or its name where it has none."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def last_line(error: BaseException) -> str:
+    """The same of its last: Ray puts whole tracebacks before that."""
+    return (str(error).strip() or type(error).__name__).splitlines()[-1]

@@ -17,7 +17,7 @@ from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Bus, Version
 from rmc.common.checkpoint import STATE, CheckpointFolder
-from rmc.common.errors import CheckpointError, FencedError, RmcError
+from rmc.common.errors import CheckpointError, FencedError, RmcError, first_line
 from rmc.common.policy_header import PolicyHeader
 from rmc.common.replay import ObservationStatistics, Replay, Sample, SampleStatus
 from rmc.common.window import WindowSpec
@@ -277,8 +277,8 @@ class Learner:
         try:
             progress = take_up(files, self.update, self.device)
         except NOT_OURS as error:
-            reason = (str(error).strip() or "empty").splitlines()[0]
-            raise CheckpointError(f"{self.checkpoints.path(number)}: {STATE} is not this run's ({reason})") from None
+            fault = f"{STATE} is not this run's ({first_line(error)})"
+            raise CheckpointError(f"{self.checkpoints.path(number)}: {fault}") from None
         self.updates = self.last_checkpoint = progress.updates
         self.env_steps = self._checkpoint_steps = progress.env_steps
         self._threads.take_up(progress.threads)

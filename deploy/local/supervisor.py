@@ -34,6 +34,22 @@ def from_outside(status: int) -> bool:
     return status in (-signal.SIGKILL, -signal.SIGTERM)
 
 
+class QuickDeaths:
+    """A role's own deaths in a row, each soon after its start; too many of them end the run."""
+
+    def __init__(self, name: str, env_timeout: float) -> None:
+        self.name, self.env_timeout, self.count = name, env_timeout, 0
+
+    def note(self, status: int, lived: float, last_words: str, where: str = "") -> None:
+        """One more, after so many seconds. Raises RoleDied where it is one too many, or starting again cannot help."""
+        lived -= self.env_timeout if status == HUNG_STATUS else 0.0
+        self.count = self.count + 1 if lived < QUICK_SECONDS and not from_outside(status) else 0
+        if self.count >= QUICK_DEATHS or status == EXIT_CONFIG:
+            how = f"killed by signal {-status}" if status < 0 else f"exit status {status}"
+            often = f"{self.count} times in a row soon after its start" if self.count > 1 else "at once"
+            raise RoleDied(f"{self.name} ended {often}{where}, {how}; its last words:\n{last_words}")
+
+
 class RoleProcess:
     """One role: its process, its log, its deaths. Of a single thread, it is forked where there is a fork server."""
 
@@ -46,7 +62,7 @@ class RoleProcess:
         self._process: subprocess.Popen[bytes] | ForkedProcess | None = None
         self.log_start = 0  # where in its log this start's words begin
         self._started_at, self._start_at = 0.0, 0.0
-        self._quick_deaths, self.finished = 0, False
+        self._deaths, self.finished = QuickDeaths(command.name, command.env_timeout), False
 
     @property
     def running(self) -> bool:
@@ -108,14 +124,8 @@ class RoleProcess:
 
     def _note_death(self, status: int) -> None:
         now = time.monotonic()
-        lived = now - self._started_at - (self.command.env_timeout if status == HUNG_STATUS else 0.0)
-        quick = lived < QUICK_SECONDS and not from_outside(status)
-        self._quick_deaths = self._quick_deaths + 1 if quick else 0
-        if self._quick_deaths >= QUICK_DEATHS or status == EXIT_CONFIG:
-            how = f"killed by signal {-status}" if status < 0 else f"exit status {status}"
-            often = f"{self._quick_deaths} times in a row soon after its start" if self._quick_deaths > 1 else "at once"
-            raise RoleDied(f"{self.command.name} ended {often}, {how}; its last words:\n{self.last_words()}")
-        self._start_at = now + min(FIRST_BACKOFF * 2**self._quick_deaths, LONGEST_BACKOFF)
+        self._deaths.note(status, now - self._started_at, self.last_words())
+        self._start_at = now + min(FIRST_BACKOFF * 2**self._deaths.count, LONGEST_BACKOFF)
 
     def last_words(self) -> str:
         """The end of its log, of this start only: the traceback, if it left one."""

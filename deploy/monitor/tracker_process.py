@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rmc.common.bus.metrics_record import is_finite
+from rmc.common.errors import first_line
 from rmc.deploy.monitor.films import Films
 from rmc.deploy.monitor.main_metrics import evaluation_metrics, main_metrics
 from rmc.deploy.monitor.recorded import empty_status
@@ -57,7 +58,7 @@ def main() -> None:
         assert tracking is not None
         _follow(folder, _begin(folder, tracking, notify), read_from, Films(folder, tracking.video_every), notify)
     except Exception as error:
-        notify(f"{_first_line(error)}; the run goes on without it")
+        notify(f"{first_line(error)}; the run goes on without it")
         raise
 
 
@@ -83,10 +84,6 @@ def _notify_first_warning(notify: Notify) -> None:
             notify(str(message))
 
     warnings.showwarning = show  # type: ignore[assignment]
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def _follow(folder: RunFolder, run: TrackedRun, read_from: int, films: Films, notify: Notify) -> None:

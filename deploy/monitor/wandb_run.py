@@ -6,6 +6,7 @@ from typing import Any
 
 import wandb
 
+from rmc.common.errors import first_line
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.tracking import Tracking
 
@@ -21,8 +22,8 @@ class WandbRun:
         try:
             self._run = _begin(folder, tracking, None)
         except wandb.Error as error:
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            notify(f"{reason.rstrip('.')}; recorded offline, and wandb sync {folder.path}/wandb/offline-run-* sends it")
+            reason = first_line(error).rstrip(".")
+            notify(f"{reason}; recorded offline, and wandb sync {folder.path}/wandb/offline-run-* sends it")
             wandb.teardown()  # of the service that still holds the id
             self._run = _begin(folder, tracking, "offline")
         self._run.define_metric(STEPS)

@@ -16,11 +16,11 @@ except ImportError as missing:
 
     raise ConfigError("--launcher", "ray", f"Ray is not installed; {how_to_install('ray')}") from missing
 
-from rmc.common.errors import ConfigError
+from rmc.common.errors import ConfigError, first_line, last_line
 from rmc.deploy.local.role_command import launcher_command
 from rmc.deploy.ray.head import check_head
 from rmc.deploy.ray.launcher_actor import LauncherActor
-from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, last_line
+from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
@@ -43,8 +43,7 @@ def joined(address: str, cpus: int | None = None) -> Iterator[None]:
             check_head(address)
             ray.init(address=address, **quiet)
     except (OSError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        fix = f"no Ray cluster answers ({reason}); start one with ray start --head, or take local"
+        fix = f"no Ray cluster answers ({first_line(error)}); start one with ray start --head, or take local"
         raise ConfigError("--ray-address", address, fix) from None
     finally:
         os.umask(mask)

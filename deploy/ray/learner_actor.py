@@ -7,6 +7,7 @@ from typing import Any
 import ray
 
 from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import last_line
 from rmc.deploy.ray import role_actor
 from rmc.deploy.ray.role_actor import (
     AWAY,
@@ -16,7 +17,6 @@ from rmc.deploy.ray.role_actor import (
     SETTLE_SECONDS,
     RoleActor,
     actor_name,
-    last_line,
 )
 
 

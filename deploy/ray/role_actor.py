@@ -76,11 +76,6 @@ def scratch_folder(run: str) -> Path:
     return folder
 
 
-def last_line(error: BaseException) -> str:
-    """What an error says in the end; Ray puts whole tracebacks before that."""
-    return (str(error).strip() or type(error).__name__).splitlines()[-1]
-
-
 def actor_name(run: str, role: str) -> str:
     """The Ray actor's name of a role."""
     return f"{run}:{role}"

@@ -8,9 +8,7 @@ from typing import Any
 
 import ray
 
-from rmc.common.errors import RoleDied
-from rmc.common.process.watchdog import HUNG_STATUS
-from rmc.deploy.local.supervisor import EXIT_CONFIG, QUICK_DEATHS, QUICK_SECONDS, from_outside
+from rmc.deploy.local.supervisor import QuickDeaths
 from rmc.deploy.ray.role_actor import Report
 
 POLL_SECONDS = 0.5  # between questions to each host
@@ -21,14 +19,14 @@ class RoleHandle:
     """A role's host as the launcher sees it: asked how it is again and again, without waiting for it."""
 
     def __init__(self, name: str, handle: Any, cpus: float, env_timeout: float = 0.0) -> None:
-        self.name, self.handle, self.cpus, self._env_timeout = name, handle, cpus, env_timeout
+        self.name, self.handle, self.cpus = name, handle, cpus
         self.report: Report | None = None  # the newest; None until the first
         self.restarts = 0
         self.dead = ""  # for good, and why: somebody killed it, or it could not begin
         self.waits_since = time.monotonic()  # for a CPU, or to be started again; unless it runs
         self._question: Any = None
         self._asked_at = self._began_at = 0.0
-        self._quick_deaths, self._mourned = 0, ""
+        self._deaths, self._death_noted = QuickDeaths(name, env_timeout), ""
 
     @property
     def running(self) -> bool:
@@ -81,15 +79,11 @@ class RoleHandle:
         if report.log or not (logs / f"{self.name}.log").exists():
             with (logs / f"{self.name}.log").open("ab") as file:
                 file.write(report.log)
-        if report.status and self._mourned != report.incarnation:
-            self._mourned = report.incarnation
+        if report.status and self._death_noted != report.incarnation:
+            self._death_noted = report.incarnation
             self._note_death(report)
 
     def _note_death(self, report: Report) -> None:
         assert report.status is not None
-        lived = time.monotonic() - self._began_at - (self._env_timeout if report.status == HUNG_STATUS else 0.0)
-        quick = lived < QUICK_SECONDS and not from_outside(report.status)
-        self._quick_deaths = self._quick_deaths + 1 if quick else 0
-        if report.status == EXIT_CONFIG or self._quick_deaths >= QUICK_DEATHS:
-            often = f"{self._quick_deaths} times in a row soon after its start" if self._quick_deaths > 1 else "at once"
-            raise RoleDied(f"{self.name} ended {often} on {report.node}; its last words:\n{report.last_words}")
+        lived = time.monotonic() - self._began_at
+        self._deaths.note(report.status, lived, report.last_words, f" on {report.node}")

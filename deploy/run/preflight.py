@@ -10,19 +10,19 @@ from pathlib import Path
 import psutil
 
 from rmc.common.errors import ConfigError
-from rmc.common.window import WindowSpec
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.replay_server import ring
 
 DISK_RESERVE = 256 << 20  # bytes left for checkpoints, metrics and logs
 
 
 def check_machine(config: RunConfig, options: LaunchOptions) -> None:
-    """Raises ConfigError where device, disk, memory or port does not do. On Ray, the device is a node's."""
+    """Raises ConfigError where device, disk, memory or port does not do. On Ray, device and ring are a node's."""
     if options.launcher != "ray":
         check_learner(config, options.device)
-    runs = Path("runs") if options.run_dir is None else options.run_dir / "replay"
-    check_ring_fits(config.window_spec(), config.replay.capacity, runs.resolve())
+    if options.launcher in ("local", "lockstep"):
+        check_ring_fits(config, Path("runs") if options.run_dir is None else options.run_dir)
     check_port(options)
 
 
@@ -52,25 +52,34 @@ def check_learner(config: RunConfig, device: str) -> None:
         check_batch_fits(config)
 
 
-def check_ring_fits(spec: WindowSpec, capacity: int, folder: Path) -> None:
-    """Raises ConfigError where the ring is larger than the free disk or the machine's memory.
+def ring_bytes(config: RunConfig) -> int:
+    """Of the rings of all replay servers, on disk and mapped. Makes an environment once."""
+    shards = config.replay.replay_shards
+    return shards * ring.file_bytes(config.window_spec(), -(-config.replay.capacity // shards))
 
-    The ring is a mapped file; one larger than the memory would turn every draw into disk reads.
+
+def check_ring_fits(config: RunConfig, run_dir: Path) -> None:
+    """Raises ConfigError where a run's rings are larger than the free disk or the machine's memory.
+
+    A ring is a mapped file; one larger than the memory would turn every draw into disk reads.
     """
-    size = spec.dtype.itemsize * capacity
-    ring = folder / "ring"
-    existing = ring.stat().st_size if ring.exists() else 0
-    there = next(path for path in (folder, *folder.parents) if path.exists())
-    free_disk = shutil.disk_usage(there).free
-    if size - existing > max(0, free_disk - DISK_RESERVE):
-        fits = (max(0, free_disk - DISK_RESERVE) + existing) // spec.dtype.itemsize
+    size, capacity, row = ring_bytes(config), config.replay.capacity, config.window_spec().dtype.itemsize
+
+    def most(room: int) -> int:
+        return max(0, capacity - -(-(size - room) // row))
+
+    rings = [run_dir / shard.role / "ring" for shard in config.shards()]
+    existing = sum(path.stat().st_size for path in rings if path.exists())
+    free_disk = shutil.disk_usage(existing_parent(run_dir.resolve())).free
+    room = existing + max(0, free_disk - DISK_RESERVE)
+    if size > room:
         rest = f"{_gb(free_disk)} are free, {_gb(DISK_RESERVE)} of which are left for checkpoints and logs"
-        fix = f"take at most {fits}" if fits else "make room"
+        fix = f"take at most {most(room)}" if most(room) else "make room"
         raise ConfigError("--capacity", capacity, f"takes {_gb(size)} of disk, {rest}; {fix}")
     memory = psutil.virtual_memory().total
     if size > memory:
-        fits = memory // spec.dtype.itemsize
-        raise ConfigError("--capacity", capacity, f"takes {_gb(size)} of {_gb(memory)} memory; take at most {fits}")
+        fault = f"takes {_gb(size)} of {_gb(memory)} memory; take at most {most(memory)}"
+        raise ConfigError("--capacity", capacity, fault)
 
 
 def check_batch_fits(config: RunConfig) -> None:
@@ -91,6 +100,11 @@ def check_batch_fits(config: RunConfig) -> None:
 
 def _gb(size: int) -> str:
     return f"{size / 1e9:.3g} GB"
+
+
+def existing_parent(path: Path) -> Path:
+    """The folder itself, or the nearest above it that is there."""
+    return next(one for one in (path, *path.parents) if one.exists())
 
 
 def cores() -> int:

@@ -17,7 +17,7 @@ from torch import Tensor
 from rmc.common.agent import Agent
 from rmc.common.agent_config import FILL_PARTS, POLICY_PARTS
 from rmc.common.checkpoint import PROGRESS, STATE
-from rmc.common.errors import ConfigError
+from rmc.common.errors import ConfigError, first_line
 from rmc.common.replay import ObservationStatistics
 from rmc.common.window import WindowSpec
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
@@ -67,8 +67,7 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
         update = _begun(config, state, parts, bool(source.update.policy_ema_updates))
         progress = _progress(config.window_spec(), update.agent, json.loads(files[PROGRESS])["env_steps"], parts)
     except (KeyError, RuntimeError, ValueError, EOFError, UnpicklingError) as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        fix = f"its checkpoint {number} cannot be used ({reason}); use another"
+        fix = f"its checkpoint {number} cannot be used ({first_line(error)}); use another"
         raise ConfigError(OPTION, init_from, fix) from None
     weights = {name: value.contiguous() for name, value in update.average.policy_weights().items()}
     policy = safetensors.torch.save(weights, config.policy_header().metadata())

@@ -16,6 +16,7 @@ from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.preflight import cores as cores_here
+from rmc.deploy.run.preflight import ring_bytes
 from rmc.deploy.run.state import STOPPED
 from rmc.sweep import room
 from rmc.sweep.grid import Grid, grid_jobs, is_finished, make_job
@@ -180,7 +181,7 @@ def _place(command: Sweep, todo: list[Job], checked: list[Checked]) -> Iterator[
     """Where the runs run, and that in words. Raises ConfigError where there is no room for them."""
     lockstep = {one.options.launcher for one in checked} == {"lockstep"}
     cores = max(room.run_cores(one.config, lockstep) for one in checked)
-    ring = max(room.ring_bytes(one.config) for one in checked)
+    ring = max(ring_bytes(one.config) for one in checked)
     memory = max(room.run_memory(one.config, lockstep) for one in checked)
     gpus = int(any(one.options.device.startswith("cuda") for one in checked))
     if command.launcher == "local":

@@ -7,8 +7,7 @@ from typing import Any
 
 import ray
 
-from rmc.common.errors import ConfigError
-from rmc.deploy.ray.role_actor import last_line
+from rmc.common.errors import ConfigError, last_line
 from rmc.sweep.job import Job
 from rmc.sweep.local_runs import last_line as last_log_line
 from rmc.sweep.node_run import NodeRun

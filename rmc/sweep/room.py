@@ -8,7 +8,7 @@ import psutil
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.preflight import DISK_RESERVE, cores
+from rmc.deploy.run.preflight import DISK_RESERVE, cores, existing_parent, ring_bytes
 from rmc.sweep.job import Job
 
 PROCESS_BYTES = 400 << 20  # of one with torch and MuJoCo; measured in docs/performance.md: 203 to 498 MB
@@ -17,11 +17,6 @@ PROCESS_BYTES = 400 << 20  # of one with torch and MuJoCo; measured in docs/perf
 def run_cores(config: RunConfig, lockstep: bool) -> int:
     """The learner's threads, which the first actor shares, and a core for each other actor."""
     return max(1, config.learner.threads) + (0 if lockstep else config.actors - 1)
-
-
-def ring_bytes(config: RunConfig) -> int:
-    """Of a run's replay ring, on disk and mapped. Makes an environment once."""
-    return config.window_spec().dtype.itemsize * config.replay.capacity
 
 
 def run_memory(config: RunConfig, lockstep: bool) -> int:
@@ -40,8 +35,7 @@ def check_disk(folder: Path, jobs: Sequence[Job], ring: int, at_once: int, dropp
     """Raises ConfigError where the rings of runs that have none yet are larger than the free disk."""
     new = sum(not (job.folder / "replay").exists() for job in jobs)
     count = min(new, at_once) if dropped else new
-    there = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.exists())
-    free = shutil.disk_usage(there).free - DISK_RESERVE
+    free = shutil.disk_usage(existing_parent(folder.resolve())).free - DISK_RESERVE
     if count * ring > max(0, free):
         fix = f"{count} rings take {count * ring / 1e9:.3g} GB, {max(0, free) / 1e9:.3g} GB are free; "
         way = "take fewer --jobs or a smaller capacity" if dropped else "take --drop-replay, or a smaller capacity"

@@ -1,6 +1,9 @@
 """What does not fit this machine is refused in one line, which says what does."""
 
 import dataclasses
+import re
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import psutil
@@ -11,7 +14,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, WindowConfig
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.preflight import check_batch_fits, check_machine
+from rmc.deploy.run.preflight import DISK_RESERVE, check_batch_fits, check_machine, check_ring_fits, ring_bytes
 from rmc.deploy.run.presets import robust
 
 
@@ -53,3 +56,38 @@ def test_a_run_is_refused_so_before_it_starts_but_on_a_gpu(memory: int, tmp_path
         check_machine(run(990, 64), options)
     check_machine(run(990, 64), dataclasses.replace(options, device="cuda"))
     check_machine(run(15, 64), options)
+
+
+@pytest.mark.parametrize("shards", [1, 2])
+def test_a_ring_that_the_disk_does_not_hold_is_refused_with_the_largest_that_it_does(
+    shards: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = DISK_RESERVE + 1_000_000
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+
+    def of(capacity: int) -> RunConfig:
+        config = run(15, 8)
+        return dataclasses.replace(
+            config, replay=dataclasses.replace(config.replay, capacity=capacity, replay_shards=shards)
+        )
+
+    with pytest.raises(ConfigError, match=r"^--capacity=100000: takes 0.37\d GB of disk") as error:
+        check_ring_fits(of(100_000), tmp_path)
+    most = int(re.findall(r"\d+", str(error.value))[-1])
+    check_ring_fits(of(most - most % shards), tmp_path)
+    assert ring_bytes(of(most + shards)) > 1_000_000
+    for shard in of(100_000).shards():  # a run that goes on has its rings already
+        (tmp_path / shard.role).mkdir()
+        with (tmp_path / shard.role / "ring").open("wb") as ring:
+            ring.truncate(ring_bytes(of(100_000)) // shards)
+    check_ring_fits(of(100_000), tmp_path)
+
+
+def test_a_ring_on_another_machine_is_not_judged_by_this_ones_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    options = LaunchOptions(tmp_path / "run", "fail", "local", "cpu", None)
+    with pytest.raises(ConfigError, match=r"^--capacity=100: takes .*; make room$"):
+        check_machine(run(15, 8), options)
+    check_machine(run(15, 8), dataclasses.replace(options, launcher="ray"))
