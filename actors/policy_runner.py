@@ -195,8 +195,9 @@ class PolicyRunner:
         x = torch.from_numpy(np.concatenate([state, prev_action], 1))
         for layer in self._next_frame:
             x = layer(x)
-        expected: Floats = state[:, self._config.hidden :] + x.numpy()
-        return expected.clip(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+        last_frame = state[:, self._config.hidden :]
+        expected: Floats = (last_frame + x.numpy()).clip(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+        return expected * last_frame.any(1, keepdims=True)
 
     def _embedded(self, x: Tensor) -> Tensor:
         if self._embed is None:

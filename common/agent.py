@@ -261,7 +261,7 @@ class Agent(nn.Module):
         """What is missing of o_t becomes what is expected from (h_{t-1}, o_{t-1}, a_{t-1}), o_{t-1} filled itself.
 
         (B, T, O) normalised, (B, T, M) bool, (B, T, A), (B, S) the state before the first step -> (B, T, O) and the
-        state after the last. No gradient.
+        state after the last. No gradient. Until an episode's first frame is seen it is zeros, the mean.
         """
         assert self.next_frame is not None
         hidden, last_frame = state[:, : self.config.hidden], state[:, self.config.hidden :]
@@ -269,6 +269,7 @@ class Agent(nn.Module):
         with torch.autocast(observation.device.type, enabled=False):  # at a step at a time the casts outweigh the rest
             for o, was_missing, a in zip(observation.unbind(1), missing.unbind(1), prev_action.unbind(1), strict=True):
                 expected = self.next_frame(hidden, last_frame, a).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+                expected = expected * (last_frame != 0).any(-1, keepdim=True)
                 last_frame = torch.where(was_missing, expected, o)
                 hidden = self.memory.step(last_frame, was_missing, a, hidden)
                 frames.append(last_frame.unsqueeze(1))

@@ -48,6 +48,7 @@ def reference(
     hidden, last = state[:, : agent.config.hidden], state[:, agent.config.hidden :]
     if agent.config.impute_missing:
         expected = agent.next_frame(hidden, last, prev_action).clamp(-10.0, 10.0)
+        expected[~last.any(1)] = 0.0  # nothing was seen yet
         normalized = torch.where(missing, expected, normalized)
     remembered = agent.memory(normalized.unsqueeze(1), missing.unsqueeze(1), prev_action.unsqueeze(1), hidden)
     mean, log_std = agent.policy(agent.features(remembered).squeeze(1))

@@ -104,7 +104,7 @@ class PlainUpdate:
             previous = torch.tensor(row["prev_action"] if t == row["first"] else row["action"][t - 1])
             numbers[t] = self.seen(row, t)
             if self.agent.config.impute_missing:
-                expected = self.agent.next_frame(h, last, previous).clamp(-10, 10)
+                expected = self.agent.next_frame(h, last, previous).clamp(-10, 10) if last.any() else 0 * last
                 numbers[t] = torch.where(torch.tensor(row["missing"][t] > 0), expected, numbers[t])
             last = numbers[t]
             without = self.agent.config.head_input == "observation"

@@ -155,6 +155,22 @@ def test_blanks_are_filled_to_the_precision_of_bfloat16_and_nothing_else_is_touc
     assert (plain - o)[missing].norm() > 0.1
 
 
+def test_until_an_episodes_first_frame_is_seen_it_is_zeros():
+    torch.manual_seed(0)
+    plain = Agent(3, 2, FILLING)
+    fused = copy.deepcopy(plain)
+    fuse(fused)
+    o, action, state = torch.zeros(2, 4, 3), torch.zeros(2, 4, 2), torch.zeros(2, 27)
+    missing = torch.tensor([[True, True, False, True]] * 2).unsqueeze(-1)
+    o[:, 2] = torch.tensor([0.5, 0.0, -1.0])
+    with torch.autocast("cpu", torch.bfloat16):
+        filled = [agent.fill(o, missing, action, state)[0] for agent in (plain, fused)]
+    for seen in filled:
+        assert not seen[:, :2].any()
+        assert torch.equal(seen[:, 2], o[:, 2])
+        assert (seen[:, 3] != 0).all()
+
+
 def test_what_fills_a_blank_stays_where_observations_are():
     for output, _ in impute(FILLING, low=True, scale=1e6)[:2]:
         assert output.abs().max() == 10.0
