@@ -38,6 +38,7 @@ from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import flat, option
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.opening import forget_start, has_more_than_a_start, make, new_folder
 from rmc.deploy.run.starts import note_start, resume_command
@@ -183,7 +184,7 @@ class _Run(BaseCallback):
         self.config, self.folder, self._console = config, folder, console
         choice = choose(config.algorithm, config.settings, config.env.id)
         self._vec, self._model = self._load(choice)
-        self._began, self._wall_before = time.monotonic(), folder.wall_seconds()
+        self._began, self._wall_before = time.monotonic(), wall_seconds(folder.metrics)
         self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, 0.0
         self._next_evaluation = self._after(self.steps)
         self._initial = self._first_evaluation()

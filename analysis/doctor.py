@@ -34,7 +34,8 @@ def examine(records: Sequence[Record], config: RunConfig) -> list[Finding]:
     """
     validate(config)
     vitals = Vitals(records)
-    findings = [diagnosis(vitals, config) for diagnosis in ALWAYS]
+    away = run_faults.redis_away(vitals, config)  # then nothing else can be judged
+    findings = [away] if away else [diagnosis(vitals, config) for diagnosis in ALWAYS]
     training = vitals.training()
     if training.seconds >= LEAST_SECONDS and not any(findings):
         findings += [diagnosis(training, config) for diagnosis in IN_TRAINING]

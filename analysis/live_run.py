@@ -98,10 +98,13 @@ class LiveRun:
             take_state(self._status, self._folder)
             self._status.total_steps = empty_status(self._folder).total_steps  # a resume may change it
             self.media = newest_media(self._folder.path)
-            status = status_json(self._folder, self._status)
+            return self._found()
         except (ConfigError, OSError) as error:
             return {"fault": str(error)}
-        over = self._status.is_over
+
+    def _found(self) -> dict[str, Any]:
+        """Raises OSError where a file goes meanwhile."""
+        status, over = status_json(self._folder, self._status), self._status.is_over
         return {
             **{name: status[name] for name in SHOWN},
             "fault": "",

@@ -14,6 +14,14 @@ HALF_FULL, WORTH_WINDOWS = 0.5, 10_000  # of a ring, when a smaller one is worth
 WARM_UP_SECONDS = 300.0  # that are left of it
 
 
+def redis_away(vitals: Vitals, _: RunConfig) -> Finding | None:
+    """Nothing is heard of anybody while Redis does not answer; the launcher says for how long."""
+    seconds = vitals.last("launcher", "redis_away_s")
+    if seconds < STALLED_SECONDS / 2:
+        return None
+    return Finding("redis away", f"no answer for {seconds:.0f} s", "every role waits for it; look at its server")
+
+
 def stalled(vitals: Vitals, _: RunConfig) -> Finding | None:
     """Deadlock: every role speaks, none gets on. A run that has finished is none."""
     if vitals.last("learner", "finished"):
@@ -87,8 +95,9 @@ def stale_weights(vitals: Vitals, config: RunConfig) -> Finding | None:
     lag = vitals.mean("replay", "policy_lag_mean")
     if lag is None or lag < STALE_UPDATES:
         return None
-    trained = config.learner.batch_size * config.window.trained_steps
-    refreshing = config.actor.refresh_steps * config.actors * config.replay.replay_ratio / trained / 2
+    drawn, draws = (sum(vitals.last(role, name) for role in vitals.of("replay")) for name in ("drawn_steps", "draws"))
+    trained = drawn / max(1.0, draws)
+    refreshing = config.actor.refresh_steps * config.actors * config.replay.replay_ratio / max(1.0, trained) / 2
     name, now = "--refresh-steps", config.actor.refresh_steps
     if config.learner.publish_updates > refreshing:
         name, now = "--publish-updates", config.learner.publish_updates

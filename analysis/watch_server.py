@@ -95,8 +95,8 @@ class TokenGuard:
             await PlainTextResponse("open the address that rmc watch has printed\n", 401)(scope, receive, send)
 
 
-def application(runs: Sequence[LiveRun], broadcast: Broadcast, token: str) -> Starlette:
-    """The page of these runs; without a ``token`` for browsers of this machine alone."""
+def application(runs: Sequence[LiveRun], broadcast: Broadcast, host: str, token: str) -> Starlette:
+    """The page of these runs, at ``host``; without a ``token`` for browsers of this machine alone."""
     page = files("rmc.analysis").joinpath("watch.html").read_text(encoding="utf-8")
 
     async def show(_: Request) -> Response:
@@ -112,18 +112,18 @@ def application(runs: Sequence[LiveRun], broadcast: Broadcast, token: str) -> St
             raise HTTPException(404)
         return FileResponse(path)
 
-    guard = Middleware(TokenGuard, token) if token else Middleware(TrustedHostMiddleware, LOOPBACK)
+    guard = Middleware(TokenGuard, token) if token else Middleware(TrustedHostMiddleware, [*LOOPBACK, host])
     routes = [Route("/", show), Route("/events", stream), Route("/media/{run:int}/{kind}", media)]
     return Starlette(routes=routes, middleware=[guard])
 
 
-def serve(runs: Sequence[LiveRun], listener: socket.socket, token: str) -> None:
+def serve(runs: Sequence[LiveRun], listener: socket.socket, host: str, token: str) -> None:
     """Serve the page on a socket until Ctrl-C, which is a KeyboardInterrupt."""
 
     async def run() -> None:
         broadcast = Broadcast(runs)
         config = uvicorn.Config(
-            application(runs, broadcast, token), lifespan="off", ws="none", log_config=None, access_log=False,
+            application(runs, broadcast, host, token), lifespan="off", ws="none", log_config=None, access_log=False,
             proxy_headers=False, server_header=False, headers=list(HEADERS.items()),
         )  # fmt: skip
         server = uvicorn.Server(config)

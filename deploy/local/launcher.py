@@ -81,9 +81,8 @@ class LocalRun:
         """Start again what died: roles, and the embedded Redis. Raises RoleDied."""
         if self._sockets.renew():
             log.warning("%s was removed; it is made again", self._sockets.path)
-        if self._server is not None and not self._server.alive():
-            log.warning("the embedded Redis died or lost its socket; starting it again")
-            self._server.start()
+        if self._server is not None:
+            self._server.tend()
         self._end_unreachable()
         self._registration.tend()
         self.supervisor.tend()
@@ -165,5 +164,6 @@ def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monito
     while stop.requested and time.monotonic() < deadline:  # the learner saves; what it says then is still recorded
         monitor.watch(bus)
         time.sleep(TICK_SECONDS)
+    registration.keep()
     _expire(bus)
     return monitor.learner_finished()

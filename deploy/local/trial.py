@@ -49,7 +49,7 @@ class Trial:
 
 def trial_config(config: RunConfig) -> RunConfig:
     """The same run with a ring and a warm-up that are over soon."""
-    enough = config.learner.batch_size * config.window.trained_steps
+    enough = config.learner.batch_size * config.window_spec().train
     replay = dataclasses.replace(
         config.replay,
         capacity=min(config.replay.capacity, max(RING_WINDOWS, config.learner.batch_size)),

@@ -21,7 +21,7 @@ from rmc.deploy.monitor.view import View
 from rmc.deploy.run.config import RunConfig, flat
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.host import HostFigures
-from rmc.deploy.run.metrics_tail import MetricsTail
+from rmc.deploy.run.metrics_tail import MetricsTail, wall_seconds
 
 RECORD_SECONDS = 5.0  # between the launcher's own records, and looks at the run's folder
 log = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ class Monitor:
         self._cursors: dict[str, str] = {}
         self._refused = 0  # records and values that could not be read
         self._redis_bytes = 0
-        self._started, self._wall_before = time.monotonic(), folder.wall_seconds()
+        self._started, self._wall_before = time.monotonic(), wall_seconds(folder.metrics)
         self._next_record, self._is_away = 0.0, False
         self._metrics_log, self._host = MetricsLog(folder, flat(config)), HostFigures(folder.path)
         self._folder, self._writable, self._tracker = folder, True, tracker

@@ -12,6 +12,7 @@ import ray
 from ray.util.placement_group import remove_placement_group
 
 from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.whole_file import write_whole
 from rmc.deploy.local.supervisor import QUICK_DEATHS, QUICK_SECONDS
 from rmc.deploy.monitor import attach
 from rmc.deploy.monitor.recorded import recorded_status
@@ -57,9 +58,12 @@ class LauncherActor(RoleActor):
         if status >= 0:
             return True
         deaths = self._folder / "launcher-deaths"
-        recent = [float(word) for word in deaths.read_text().split()] if deaths.exists() else []
+        recent: list[float] = []
+        with suppress(OSError, ValueError):  # there were none, or that is damaged
+            recent = [float(word) for word in deaths.read_text().split()]
         recent = [when for when in recent if time.time() - when < QUICK_SECONDS * QUICK_DEATHS]
-        deaths.write_text(" ".join(map(str, [*recent, time.time()])))
+        with suppress(OSError):  # the disk is full
+            write_whole(deaths, " ".join(map(str, [*recent, time.time()])).encode())
         return len(recent) + 1 >= QUICK_DEATHS
 
     def flush_artifacts(self) -> None:

@@ -3,11 +3,13 @@
 import dataclasses
 import logging
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import ray
 
+from rmc.deploy.local.fork_server import open_log
 from rmc.deploy.local.supervisor import QuickDeaths
 from rmc.deploy.ray.role_actor import Report
 
@@ -77,7 +79,7 @@ class RoleHandle:
             log.warning("%s: %s", self.name, report.trouble or "checkpoints reach the head again")
         self.report = report
         if report.log or not (logs / f"{self.name}.log").exists():
-            with (logs / f"{self.name}.log").open("ab") as file:
+            with suppress(OSError), open_log(logs / f"{self.name}.log") as file:  # a full disk is waited out
                 file.write(report.log)
         if report.status and self._death_noted != report.incarnation:
             self._death_noted = report.incarnation

@@ -22,6 +22,7 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RoleDied
 from rmc.common.process.role import StopSignal
 from rmc.common.shard import WHOLE
+from rmc.common.whole_file import write_whole
 from rmc.deploy.local.launcher import TICK_SECONDS
 from rmc.deploy.local.role_environment import URL_VARIABLE
 from rmc.deploy.local.socket_folder import SocketFolder
@@ -77,7 +78,7 @@ class ClusterRun:
                 tls.make_certificate(folder.path, ip)
             number, self._moved = _port(folder, ip)
             port = Port(ip, number, folder.path if encrypted else None)
-            self._server = RedisServer(self._sockets.path, port=port, users=self._users())
+            self._server = RedisServer(self._sockets.path, port=port, users=self._users(config))
             self._leave.enter_context(self._server)
             self.bus = connect(self._server.url(), folder.name)
             self._registration = Registration(config, folder, self.bus)
@@ -91,8 +92,8 @@ class ClusterRun:
         self._look_at = 0.0
         self._learners = WaitingLearners()
 
-    def _users(self) -> RedisUsers:
-        return RedisUsers(self._folder.name, self._folder.secret(), self.config.roles())
+    def _users(self, config: RunConfig) -> RedisUsers:
+        return RedisUsers(self._folder.name, self._folder.secret(), config.roles())
 
     # -- placing --------------------------------------------------------------------------------------
 
@@ -155,9 +156,7 @@ class ClusterRun:
         """Hear every host, and place what is not. Raises RoleDied."""
         if self._sockets.renew():
             log.warning("%s was removed; it is made again", self._sockets.path)
-        if not self._server.alive():
-            log.warning("the embedded Redis died or lost its socket; starting it again")
-            self._server.start()
+        self._server.tend()
         self._registration.tend()
         for role_handle in list(self._hosts.values()):
             role_handle.ask(self._folder.logs)
@@ -240,12 +239,12 @@ class ClusterRun:
             return
         grown = dataclasses.replace(self.config, actors=fit)
         try:
+            self._folder.write_config(grown)
             self._registration.change(grown)
-        except (BusUnavailable, BusFull):  # the next look tries again
+            self._server.admit(self._users(grown))
+        except (BusUnavailable, BusFull, OSError):  # the next look tries again
             return
         self.config = grown
-        self._server.admit(self._users())
-        self._folder.write_config(grown)
         for name, role_handle in self._hosts.items():
             if name.startswith("replay"):
                 role_handle.handle.restart.remote()
@@ -347,14 +346,19 @@ def train(
 def _port(folder: RunFolder, ip: str) -> tuple[int, bool]:
     """A port for the run's Redis, and whether it had another before, which is taken now."""
     note = folder.path / "redis-port"
-    had = int(note.read_text()) if note.exists() else None
+    had = None
+    with suppress(OSError, ValueError):  # there is none, or it is damaged
+        had = int(note.read_text())
     ports = list(range(FIRST_PORT, LAST_PORT + 1))
     own = zlib.crc32(folder.name.encode()) % len(ports)  # runs that begin together do not want the same
     candidates = [*([had] if had else []), *ports[own:], *ports[:own]]
     for port in candidates:
-        with socket.socket() as probe, suppress(OSError):
+        with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((ip, port))
-            note.write_text(f"{port}\n")
+            try:
+                probe.bind((ip, port))
+            except OSError:
+                continue
+            write_whole(note, f"{port}\n".encode())
             return port, had not in (None, port)
     raise ConfigError("--launcher", "ray", f"no port from {FIRST_PORT} to {LAST_PORT} is free on {ip} for Redis")

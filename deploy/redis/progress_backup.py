@@ -33,7 +33,7 @@ class ProgressBackup:
         with suppress(BusUnavailable, BusFull, OSError):  # the disk is full: those before stay
             progress = {role: raw for role in self._roles if (raw := bus.progress(role)) is not None}
             if progress and all(map(is_whole, progress.values())):
-                write_whole(self._path, msgpack.packb(progress))
+                write_whole(self._path, msgpack.packb(self._before() | progress))
 
     def restore(self, bus: Bus) -> None:
         """Restore the counters in Redis where it has none; a replay server with an older ring goes on from them.
@@ -47,6 +47,12 @@ class ProgressBackup:
             return
         for role, raw in progress.items():
             bus.set_progress(role, raw)
+
+    def _before(self) -> dict[str, bytes]:
+        """What a replay server that is away had counted stays."""
+        with suppress(OSError, ValueError):
+            return self._kept()
+        return {}
 
     def _kept(self) -> dict[str, bytes]:
         """By role. Raises OSError, ValueError."""

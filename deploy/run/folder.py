@@ -168,11 +168,6 @@ class RunFolder:
         finally:
             os.unlink(temporary)
 
-    def wall_seconds(self) -> float:
-        """How long the run was trained before, over all its starts."""
-        seconds = (record.get("wall_s") for record in self.records() if record["role"] == "launcher")
-        return max(filter(is_finite, seconds), default=0.0)
-
     def lock(self) -> None:
         """Be the one launcher of this run. Raises ConfigError where another one is."""
         self._lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)

@@ -6,6 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from rmc.common.bus.metrics_record import is_finite
 from rmc.deploy.run.folder import parse_record
 
 RECENT_BYTES = 16 << 20  # at the end of a file, within which every role has said all of its metrics
@@ -46,3 +47,9 @@ def _evaluations(file: BinaryIO, size: int) -> tuple[list[dict[str, Any]], int]:
             records.append(parse_record(content[content.rfind(b"\n", 0, at) + 1 : stop]))
             at = content.find(EVALUATION, stop, end)
     return [record for record in records if record is not None], end
+
+
+def wall_seconds(metrics: Path) -> float:
+    """How long a run was trained before, over all its starts: each says it with all of them."""
+    seconds = (record.get("wall_s") for record in MetricsTail(metrics).take() if record["role"] == "launcher")
+    return max(filter(is_finite, seconds), default=0.0)

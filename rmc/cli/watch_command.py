@@ -34,7 +34,7 @@ def watch(command: run_options.Watch) -> int:
         host = f"[{host}]" if ":" in host else host
         terminal().print(f"http://{host}:{port}/" + (f"?token={token}" if token else ""), soft_wrap=True)
         with suppress(KeyboardInterrupt):
-            serve(runs, listener, token)
+            serve(runs, listener, host, token)
     return 0
 
 

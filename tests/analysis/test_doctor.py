@@ -165,8 +165,17 @@ def test_an_evaluator_that_cannot_keep_up() -> None:
     assert run_faults.evaluator_starved(starving, none) is None
 
 
+def test_while_redis_is_away_nobody_is_blamed() -> None:
+    """The launcher alone is heard, and says for how long."""
+    spoken = records(30)
+    away = [{"role": "launcher", "time": 1030.0 + second, "redis_away_s": float(second)} for second in range(90)]
+    (finding,) = examine([*spoken, *away], CONFIG)
+    assert str(finding) == "redis away: no answer for 89 s; every role waits for it; look at its server"
+    assert "redis away" not in {one.name for one in examine(spoken, CONFIG)}
+
+
 def test_stale_weights_name_the_option_that_ages_them() -> None:
-    old = vitals(replay={"policy_lag_mean": 4_000.0})
+    old = vitals(replay={"policy_lag_mean": 4_000.0, "drawn_steps": 480.0, "draws": 2.0})
     refresh = dataclasses.replace(CONFIG, actor=dataclasses.replace(CONFIG.actor, refresh_steps=20_000))
     finding = run_faults.stale_weights(old, refresh)
     assert str(finding) == (

@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ import pytest
 from imageio_ffmpeg import write_frames
 from matplotlib.image import imsave
 
+from rmc.analysis import live_run
 from rmc.analysis.live_run import POINTS, Curve, LiveRun
 from rmc.cli.main import run
 from rmc.common.env.config import EnvConfig
@@ -155,6 +157,25 @@ def test_only_this_machine_reads_and_nobody_writes(serve: Serve, folder: RunFold
         assert get(url, "/", Host=f"{host}:{port}")[0] == status
     for method in ("POST", "PUT", "PATCH", "DELETE"):
         assert [get(url, path, method)[0] for path in ("/", "/events", "/media/0/picture")] == [405] * 3
+
+
+def test_a_name_of_this_machine_that_leads_to_itself_is_answered(serve: Serve, folder: RunFolder) -> None:
+    """On Debian a machine's own name is 127.0.1.1."""
+    url, _ = serve(str(folder.path), "--host", "127.0.1.1")
+    with urllib.request.urlopen(url, timeout=10) as answer:
+        assert answer.status == 200
+    connection = http.client.HTTPConnection("127.0.1.1", urlsplit(url).port, timeout=10)
+    connection.request("GET", "/", headers={"Host": "rebound.example"})
+    assert connection.getresponse().status == 400
+    connection.close()
+
+
+def test_a_picture_that_goes_as_it_is_looked_at_is_no_end(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    live, gone = LiveRun("run", folder.path), folder.path / "picture.png"
+    monkeypatch.setattr(live_run, "newest_media", lambda _: {"picture": gone})
+    found = live.look()
+    assert found is not None
+    assert str(gone) in found["fault"]
 
 
 def test_nothing_else_of_the_folder_is_served(serve: Serve, folder: RunFolder) -> None:

@@ -29,17 +29,27 @@ DOCS = (ROOT / "docs" / "watching.md").read_text()
 HERE = "127.0.0.1"
 promtool = pytest.mark.skipif(shutil.which("promtool") is None, reason="no promtool here: apt-get install prometheus")
 STOPS, RISES = "0+50x5 250x40", "0+50x45"  # a value each minute
+ANOTHER_RUN = {'rmc_run_info{run="a"}': "1x10 stale", 'rmc_run_info{run="b"}': "_x10 1x30"}
 CASES = [  # an alert, what it looks at, and in which minutes it is silent and fires
     ("RmcNothingLearnt", {'rmc_updates{role="learner"}': STOPS}, [12], [16, 40]),
     ("RmcNothingLearnt", {'rmc_updates{role="learner"}': "0x40"}, [8], [12]),  # a warm-up
     ("RmcNothingLearnt", {'rmc_updates{role="learner"}': RISES}, [2, 12, 40], []),
+    ("RmcNothingLearnt", {'rmc_updates{role="learner"}': "0+60x25 stale"}, [24, 30, 35, 40], []),  # a run's end
     ("RmcRoleSilent", {'rmc_silent_seconds{role="actor-0"}': "0x3 30 90x2 0x3"}, [2, 4, 8], [5, 6]),
     ("RmcRingLost", {'rmc_ring_windows{role="replay"}': "0+100x10 1000x10 20+20x30"}, [5, 20, 48], [22, 30, 45]),
+    (
+        "RmcRingLost",  # another run on the same port
+        {'rmc_ring_windows{role="replay"}': "1000x10 20+20x30", **ANOTHER_RUN}, [12, 20, 30, 38], [],
+    ),
+    (
+        "RmcRingLost", {'rmc_ring_windows{role="replay"}': "1000x20 20+20x30", 'rmc_run_info{run="a"}': "1x50"},
+        [20, 48], [22, 30, 43],
+    ),
     ("RmcWeightsStale", {'rmc_weights_update{role="actor-0"}': STOPS, "rmc_updates": RISES}, [12], [16]),
     ("RmcWeightsStale", {'rmc_weights_update{role="actor-0"}': STOPS, "rmc_updates": STOPS}, [12, 16], []),
     ("RmcWeightsStale", {'rmc_weights_update{role="actor-0"}': RISES, "rmc_updates": RISES}, [12, 40], []),
     ("RmcDiskNearlyFull", {"rmc_host_disk_free_bytes": "10e9x5 1e9x9", "rmc_host_disk_bytes": "99e9x15"}, [5], [8]),
-]
+]  # fmt: skip
 
 
 @pytest.fixture

@@ -26,6 +26,7 @@ from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.run.config import to_json
 from rmc.deploy.run.folder import RESULT, RunFolder
 from rmc.deploy.run.launch_options import IfExists
+from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 
@@ -188,7 +189,7 @@ def test_odd_lines_of_metrics_are_passed_over(tmp_path: Path) -> None:
     records = [{"role": "launcher", "time": 1.0, "wall_s": 3.0}, evaluation | {"time": 1.0}]
     odd = [b"5", b'{"a": 1}', b'{"role": 1}', b'{"role": "launcher", "wall_s": "abc"}', b"\xff", b'{"role": "launch']
     folder.metrics.write_bytes(b"\n".join([odd[-2], *(json.dumps(one).encode() for one in records), *odd]))
-    assert folder.wall_seconds() == 3.0
+    assert wall_seconds(folder.metrics) == 3.0
     assert [one.return_mean for one in of_run(folder).evaluations] == [7.0]
     assert run(["stats", str(folder.path)]) == 0
 

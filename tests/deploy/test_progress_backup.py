@@ -37,6 +37,17 @@ def test_what_was_published_is_said_again_where_nothing_is(tmp_path: Path) -> No
     assert (after.progress("replay-0"), after.progress("replay-1")) == (FIRST, NEWER)
 
 
+def test_what_a_server_that_is_away_had_counted_stays(tmp_path: Path) -> None:
+    counters, before, after = ProgressBackup(RunFolder(tmp_path), shards=2), MemoryBus(), MemoryBus()
+    commit(before, "replay-0", FIRST)
+    commit(before, "replay-1", SECOND)
+    counters.keep(before)
+    commit(after, "replay-0", NEWER)  # Redis came back empty, and the other one's node is lost
+    counters.keep(after, at_once=True)
+    counters.restore(again := MemoryBus())
+    assert (again.progress("replay-0"), again.progress("replay-1")) == (NEWER, SECOND)
+
+
 def test_an_empty_redis_does_not_take_the_copy_away(tmp_path: Path) -> None:
     counters, bus = ProgressBackup(RunFolder(tmp_path), shards=1), MemoryBus()
     counters.restore(bus)

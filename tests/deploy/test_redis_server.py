@@ -66,3 +66,24 @@ def test_long_path_is_refused(tmp_path: Path) -> None:
 def test_failed_start_says_why(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="did not start"):
         RedisServer(tmp_path, maxmemory=-1).start()
+
+
+def test_one_that_cannot_be_started_again_now_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with RedisServer(tmp_path) as server:
+        assert server.process is not None
+        server.process.kill()
+        server.process.wait()
+        with monkeypatch.context() as patched:
+
+            def no_memory(*_: object, **__: object) -> None:
+                raise OSError(12, "Cannot allocate memory")
+
+            patched.setattr(subprocess, "Popen", no_memory)
+            server.tend()
+            server.tend()
+        assert sum("trying again" in message for message in caplog.messages) == 2
+        server.tend()
+        with redis.Redis.from_url(server.url()) as client:
+            assert client.ping()

@@ -121,7 +121,8 @@ def flat(one: Chaos) -> tuple[bool, dict[str, float]]:
 def learnt(folder: Path) -> tuple[float, int]:
     """The return of the policy that a run ended with, and its updates."""
     result = RunFolder(folder).result()
-    assert result is not None
+    if result is None:  # it could not be trained to its end
+        return float("-inf"), 0
     return round(float(result["eval_return_mean"]), 2), int(result["updates"])
 
 

@@ -34,6 +34,7 @@ from rmc.common.errors import RmcError
 from rmc.common.policy_header import METADATA_KEY
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.starts import format_starts, last_launch
 from rmc.deploy.run.validation import validate
 from tests.faults.fuzz import Case, mutate, tried
@@ -183,7 +184,7 @@ def resumed(run: Path) -> None:
     CheckpointFolder(folder.checkpoints).latest()
     CheckpointFolder(folder.checkpoints).last_save()
     folder.check_sizes("x", {"observations": 4, "actions": 1})
-    folder.initial(), folder.wall_seconds(), folder.name
+    folder.initial(), wall_seconds(folder.metrics), folder.name
 
 
 def acted(run: Path) -> None:

@@ -36,7 +36,7 @@ def soaked(
     looks = watch(run, seconds, settled)
     growth, files = memory_growth(looks), max(files_growth(looks).values())
     ratio, full = run.newest("replay", "replay_ratio"), run.newest("replay", "ring_fill") == 1.0
-    passed = max(growth.values()) < most_growth and not files and full and abs(ratio / RATIO - 1) < off
+    passed = max(growth.values()) < most_growth and files <= 0 and full and abs(ratio / RATIO - 1) < off
     facts = {f"{role}_grew": round(share, 4) for role, share in growth.items()}
     facts |= {"files_grew": files, "replay_ratio": round(ratio, 3), "updates": run.newest("learner", "updates")}
     return Row(f"soak, {seconds / 60:.0f} minutes", 1, passed, found=facts)
