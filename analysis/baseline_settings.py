@@ -97,14 +97,6 @@ class Choice:
     normalize: bool = False  # observations and rewards by running statistics
 
 
-def transitions_per_update(config: BaselineConfig) -> int:
-    """Transitions that one update is trained on: a batch, or one pass over what was collected."""
-    arguments = choose(config.algorithm, config.settings, config.env.id).arguments
-    if config.algorithm in OFF_POLICY:
-        return int(arguments.get("batch_size", 256))
-    return int(arguments.get("n_steps", 2048 if config.algorithm == "ppo" else 128))
-
-
 def choose(algorithm: Algorithm, settings: Settings, env_id: str) -> Choice:
     """For an environment; those that the zoo has not tuned have its defaults for MuJoCo."""
     noise = NOISE if algorithm in ("td3", "ddpg") else 0.0

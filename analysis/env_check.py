@@ -44,6 +44,7 @@ class Played:
     lengths: list[int] = field(default_factory=list)  # of episodes that ended
     terminated: int = 0
     seconds: float = 0.0
+    missing: list[float] = field(default_factory=list)  # shares of the observations that steps gave
 
     def play(self, env: Env, steps: int, seed: int) -> None:
         """So many steps with uniform actions. Raises what the environment raises."""
@@ -51,10 +52,11 @@ class Played:
         self.observations.append(env.reset(seed=seed)[0])
         for _ in range(steps):
             start = time.perf_counter()
-            observation, reward, terminated, truncated, _ = env.step(_action(env, rng))
+            observation, reward, terminated, truncated, info = env.step(_action(env, rng))
             self.seconds += time.perf_counter() - start
             self.observations.append(observation)
             self.rewards.append(float(reward))
+            self.missing.append(float(np.mean(info.get("missing", False))))
             length += 1
             if terminated or truncated:
                 self.lengths.append(length)
@@ -117,14 +119,19 @@ def _plain(text: str) -> str:
     return " ".join(text.replace("\x1b[33m", "").replace("\x1b[0m", "").removeprefix("WARN: ").split())
 
 
+def _time_limit(env: Env) -> int | None:
+    return env.spec.max_episode_steps if env.spec else None
+
+
 def _facts(env: Env, played: Played) -> Iterator[str]:
-    limit = env.spec.max_episode_steps if env.spec else None
     sizes = [space.shape[0] for space in (env.observation_space, env.action_space) if space.shape]
-    yield f"observations {sizes[0]}, actions {sizes[1]}, time limit {limit or 'none'}"
+    yield f"observations {sizes[0]}, actions {sizes[1]}, time limit {_time_limit(env) or 'none'}"
     if played.rewards:
         rewards = np.array(played.rewards)
         speed = len(rewards) / played.seconds
         yield f"{len(rewards):,} random steps, {speed:,.0f} a second; reward {rewards.mean():.3g} ± {rewards.std():.3g}"
+    if any(played.missing):
+        yield f"{np.mean(played.missing):.0%} of what is observed is missing"
     if played.lengths:
         ended = f"{played.terminated} of them terminated, the others cut off"
         yield f"{len(played.lengths)} episodes of {min(played.lengths)} to {max(played.lengths)} steps, {ended}"
@@ -155,7 +162,7 @@ def _hints(env: Env, played: Played) -> Iterator[str]:
     yield from _reward_notes(np.abs(rewards))
     if not rewards.any():
         yield "note: no random step was rewarded; learning will need luck, or curiosity (--curiosity)"
-    if not played.lengths:
+    if not played.lengths and not _time_limit(env):
         yield "note: no episode ended; without a time limit an evaluation stops at 10 000 steps (--time-limit)"
     if not np.array_equal(_again(env), _again(env)):
         yield "note: the same seed and actions gave other observations; runs will not be repeatable"

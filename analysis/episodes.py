@@ -70,15 +70,17 @@ class HiddenPart:
 class Record(gym.Wrapper[Floats, Floats, Floats, Floats]):
     """Keeps the newest observation of the environment that it wraps."""
 
-    newest: Floats  # (F,)
+    newest: Floats  # (F,), NaN where the environment itself calls it missing
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        self.newest, info = self.env.reset(seed=seed, options=options)
-        return self.newest, info
+        observation, info = self.env.reset(seed=seed, options=options)
+        self.newest = np.where(info.get("missing", False), np.float32(np.nan), observation)
+        return observation, info
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        self.newest, reward, terminated, truncated, info = self.env.step(action)
-        return self.newest, float(reward), terminated, truncated, info
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.newest = np.where(info.get("missing", False), np.float32(np.nan), observation)
+        return observation, float(reward), terminated, truncated, info
 
 
 def recorded(env: Env) -> tuple[Env, Record]:

@@ -45,7 +45,6 @@ class History:
     seed: int
     env_steps: int
     updates: int
-    transitions: int  # trained, a step of a window each
     wall_s: float
     initial_return: float | None
     evaluations: list[Evaluation] = field(default_factory=list)
@@ -85,10 +84,11 @@ def _object(line: bytes, place: str, names: Sequence[str]) -> dict[str, Any]:
 
 def _of_line(raw: dict[str, Any], place: str) -> History:
     try:
-        history = History(**{**raw, "evaluations": [Evaluation(**one) for one in raw["evaluations"]]})
+        known = {name: value for name, value in raw.items() if name != "transitions"}  # of older lines
+        history = History(**{**known, "evaluations": [Evaluation(**one) for one in raw["evaluations"]]})
     except TypeError as error:
         raise ConfigError("RUNS", place, f"not a history ({error}); mend the line, or remove it") from None
-    numbers: list[Any] = [history.seed, history.env_steps, history.updates, history.transitions, history.wall_s]
+    numbers: list[Any] = [history.seed, history.env_steps, history.updates, history.wall_s]
     numbers += [] if history.initial_return is None else [history.initial_return]
     numbers += [value for one in history.evaluations for value in dataclasses.astuple(one)]
     texts = history.agent, history.env, history.commit
@@ -119,7 +119,6 @@ def of_run(folder: RunFolder) -> History:
         about.seed,
         last.env_steps,
         last.updates,
-        last.updates * about.transitions_per_update,
         last.wall_s,
         result.get("initial_return_mean"),
         evaluations,
@@ -134,7 +133,6 @@ class About:
     agent: str
     env: str
     seed: int
-    transitions_per_update: int
 
 
 def describe(path: Path) -> About:
@@ -142,18 +140,11 @@ def describe(path: Path) -> About:
     folder = RunFolder(path)
     if folder.is_baseline():
         baseline = baseline_settings.read(folder)
-        per_update = baseline_settings.transitions_per_update(baseline)
-        return About(_with(baseline.name, _stack(baseline.env)), _env_label(baseline.env), baseline.seed, per_update)
+        return About(_with(baseline.name, _stack(baseline.env)), _env_label(baseline.env), baseline.seed)
     config = folder.config()
     name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
     agent = _with(name, [*_changes(config), *_stack(config.env)])
-    return About(agent, _env_label(config.env), config.seed, config.learner.batch_size * _trained_steps(config))
-
-
-def _trained_steps(config: RunConfig) -> int:
-    """Of a window. Only for whole episodes an environment is made, which a machine that plots may lack."""
-    whole = config.actor.state_strategy == "episode"
-    return config.window_spec().train if whole else config.window.trained_steps
+    return About(agent, _env_label(config.env), config.seed)
 
 
 def _with(name: str, words: list[str]) -> str:

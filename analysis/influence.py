@@ -134,7 +134,8 @@ def _of_start(
 
 
 def _changes(replay: Replay, start: int, deviation: Tensor) -> Tensor:
-    """(D, O), one dimension each, towards zero, so that what is normalised stays within its clip."""
+    """(D, O), one dimension each, towards zero, so that normalised it stays within its clip; what is missing stays."""
+    deviation = deviation.where(~replay.missing[start].expand_as(deviation), 0.0)
     change = torch.diag(torch.where(replay.observations[start] > 0, -deviation, deviation))
     if len(change) <= CHANGED:
         return change

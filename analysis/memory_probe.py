@@ -94,6 +94,7 @@ def _of_part(rows: Samples, part: HiddenPart) -> Probe | None:
 
 def _probe(name: str, rows: Samples, y: Doubles, at: NDArray[np.bool_]) -> Probe | None:
     """Of (N, Y) at some of the steps; None where there is nothing to train or test on."""
+    at = at & np.isfinite(y).all(1)  # what the environment itself lacks is known to nobody
     quarter, y = rows.quarter[at], y[at]
     if len(set(quarter.tolist())) < QUARTERS:
         return None

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rmc.common.agent_config import CRITIC_PARTS, FILL_PARTS, LOG_STD_RANGE, NORMALIZED_CLIP, POLICY_PARTS, AgentConfig
+from rmc.common.agent_config import CRITIC_PARTS, LOG_STD_RANGE, NORMALIZED_CLIP, POLICY_PARTS, AgentConfig
 from rmc.common.critic import TwinQ
 
 STD_FLOOR = 1e-2  # a constant dimension is not blown up
@@ -295,23 +295,20 @@ class Agent(nn.Module):
 
     def acting(self) -> dict[str, nn.Parameter]:
         """The parameters that it takes to act, by name."""
-        return {name: value for name, value in self.named_parameters() if name.startswith(self._acting())}
+        return {name: value for name, value in self.named_parameters() if name.startswith(POLICY_PARTS)}
 
     def policy_weights(self) -> dict[str, Tensor]:
         """What it takes to act, detached, on the CPU: what fills missing frames, too, where they are filled."""
-        return self._weights(self._acting())
+        return self._weights(POLICY_PARTS)
 
     def policy_shapes(self) -> dict[str, tuple[int, ...]]:
         """Of ``policy_weights``; also of an agent on the device ``meta``, which takes no memory."""
         state = self.state_dict().items()
-        return {name: tuple(value.shape) for name, value in state if name.startswith(self._acting())}
+        return {name: tuple(value.shape) for name, value in state if name.startswith(POLICY_PARTS)}
 
     def broadcast_weights(self) -> dict[str, Tensor]:
         """What actors are sent: the critics, too, where they rate their windows."""
-        return self._weights(self._acting() + (CRITIC_PARTS if self.config.initial_priority == "actor" else ()))
-
-    def _acting(self) -> tuple[str, ...]:
-        return POLICY_PARTS + (FILL_PARTS if self.config.impute_missing else ())
+        return self._weights(POLICY_PARTS + (CRITIC_PARTS if self.config.initial_priority == "actor" else ()))
 
     def _weights(self, parts: tuple[str, ...]) -> dict[str, Tensor]:
         return {

@@ -192,8 +192,9 @@ class Noise(CorruptObservation):
         super().__init__(env)
         self._deviation = deviation
 
-    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:  # noqa: ARG002 (others say so in it)
-        return observation + self._deviation * self._rng.standard_normal(observation.shape, np.float32)
+    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
+        noisy = observation + self._deviation * self._rng.standard_normal(observation.shape, np.float32)
+        return np.where(info.get("missing", False), observation, noisy)
 
 
 class Delay(gym.Wrapper[Floats, Floats, Floats, Floats]):

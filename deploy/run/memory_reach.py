@@ -1,5 +1,6 @@
 """How far back a memory can learn, beside how long an episode lasts, in one line."""
 
+from rmc.common.env.make import PYBULLET
 from rmc.deploy.run.config import RunConfig
 
 
@@ -21,7 +22,8 @@ def reach_note(config: RunConfig) -> str | None:
     """That line where it matters: something older may count, and observations may not show it. Raises ConfigError."""
     steps, time_limit = config.window_spec().train, config.layout.time_limit
     is_whole = time_limit is not None and time_limit <= steps
-    may_hide = config.env.takes_away() or ":" in config.env.id  # options say so, or it is the user's own
+    shipped = config.env.id.startswith(PYBULLET)  # with positions or velocities alone
+    may_hide = config.env.takes_away() or shipped or ":" in config.env.id  # options say so, or it is the user's own
     if is_whole or config.agent.head_input == "observation" or not may_hide:
         return None
     return format_reach(steps, time_limit)

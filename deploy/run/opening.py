@@ -15,6 +15,7 @@ from rmc.deploy.run.config import RunConfig, flat, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import IfExists, LaunchOptions
 from rmc.deploy.run.starts import note_start, starts
+from rmc.deploy.run.validation import validate_windows
 
 log = logging.getLogger(__name__)
 SAME_AGENT = {  # what a run that goes on may have otherwise, and learns the same
@@ -82,7 +83,9 @@ def open_run(
     before, initial = config, None
     if there:
         before = _taken_up(folder, config, if_exists, options)
-    elif options.init_from is not None:
+    else:
+        validate_windows(config)
+    if not there and options.init_from is not None:
         from rmc.deploy.run import warm_start  # imports torch
 
         initial = warm_start.prepare(config, options.init_from, options.init_parts)

@@ -4,7 +4,7 @@ from typing import Any
 
 from rmc.common.bus.redis_url import shown
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig, option
+from rmc.deploy.run.config import RunConfig, WindowConfig, option
 from rmc.deploy.run.launch_options import LaunchOptions
 
 _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no range
@@ -98,6 +98,17 @@ def validate(config: RunConfig) -> None:
         raise ConfigError(
             "--total-steps", config.total_steps, f"take more than --warmup-steps={config.replay.warmup_steps}"
         )
+
+
+def validate_windows(config: RunConfig) -> None:
+    """Raises ConfigError for steps of a window that its strategy has no use for. A run that has begun may have them."""
+    window, default, strategy = config.window, WindowConfig(), config.actor.state_strategy
+    if strategy == "episode" and window.trained_steps != default.trained_steps:
+        fix = "an episode is one window; leave it, or take --state-strategy burn-in"
+        raise ConfigError("--trained-steps", window.trained_steps, fix)
+    if strategy != "burn-in" and window.burn_in not in (0, default.burn_in):
+        fix = f"--state-strategy {strategy} has no burn-in; leave it, or take --state-strategy burn-in"
+        raise ConfigError("--burn-in", window.burn_in, fix)
 
 
 def validate_launch(config: RunConfig, options: LaunchOptions) -> None:

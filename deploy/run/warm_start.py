@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from rmc.common.agent import Agent
-from rmc.common.agent_config import FILL_PARTS, POLICY_PARTS
+from rmc.common.agent_config import POLICY_PARTS
 from rmc.common.checkpoint import PROGRESS, STATE
 from rmc.common.errors import ConfigError, first_line
 from rmc.common.replay import ObservationStatistics
@@ -29,11 +29,11 @@ from rmc.learner.update import JointUpdate
 from rmc.learner.update_order import make_update
 
 OPTION = "--init-from"
-PREDICTS = ("normalizer.", "memory.", "world_model.", *FILL_PARTS)
+PREDICTS = ("normalizer.", "memory.", "world_model.", "next_frame.")
 PARTS: dict[InitParts, tuple[str, ...]] = {  # the beginnings of what is taken
     "all": ("",),
     "memory+world-model": PREDICTS,
-    "policy": (*POLICY_PARTS, *FILL_PARTS),
+    "policy": POLICY_PARTS,
 }
 NOT_IN: dict[InitParts, set[str]] = {  # options of the networks that say nothing of these parts
     "all": {"initial_priority", "gate_init"},

@@ -15,7 +15,7 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import this_machine
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.preflight import check_learner
-from rmc.deploy.run.validation import validate, validate_launch
+from rmc.deploy.run.validation import validate, validate_launch, validate_windows
 
 FITS, NOT, SLOWER = "ok", "DOES NOT FIT", "slower"
 
@@ -23,6 +23,7 @@ FITS, NOT, SLOWER = "ok", "DOES NOT FIT", "slower"
 def dry_run(config: RunConfig, options: LaunchOptions, console: Console) -> int:
     """Try, measure, tell; 0 where it fits, else 1. Nothing is written in the run's folder. Raises ConfigError."""
     validate(config)
+    validate_windows(config)
     validate_launch(config, options)
     if options.launcher != "local":
         raise ConfigError("--dry-run", True, f"a trial needs --launcher local, not {options.launcher}")

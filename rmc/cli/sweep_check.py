@@ -12,7 +12,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, flat, option, option_words
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.preflight import check_machine
-from rmc.deploy.run.validation import validate, validate_launch
+from rmc.deploy.run.validation import validate, validate_launch, validate_windows
 from rmc.sweep.job import Job
 from rmc.sweep.spec import Range, Spec
 
@@ -96,6 +96,7 @@ def _checked(job: Job, on_this_machine: bool) -> Checked:
     command = parser.parse(list(job.words))
     config, options = command.config(), dataclasses.replace(command.launch_options(), run_dir=job.folder)
     validate(config)
+    validate_windows(config)
     validate_launch(config, options)
     if on_this_machine:
         check_machine(config, options)

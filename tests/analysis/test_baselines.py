@@ -134,7 +134,6 @@ def test_a_stack_of_frames_belongs_to_the_agent(tmp_path):
     past = of_run(RunFolder(tmp_path / "run"))
     assert past.agent == "SAC 400-300 --frame-stack 4"
     assert past.env == "InvertedPendulum-v5, flicker 0.5"
-    assert past.transitions == past.updates * 256
 
 
 @pytest.mark.parametrize("body", ["HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Humanoid-v5", "Ant-v5", "mine:Own-v0"])

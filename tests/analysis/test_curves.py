@@ -13,12 +13,12 @@ from rmc.cli.main import run
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import to_json
-from rmc.deploy.run.presets import robust
+from rmc.deploy.run.presets import memory, robust
 
 
 def history_of(agent="RMC", env="HalfCheetah-v5", seed=0, last=100.0, initial: float | None = 0.0) -> History:
     evaluations = [Evaluation(1000 * i, 10 * i, 5.0 * i, last * i / 3, 1.0) for i in (1, 2, 3)]
-    return History(agent, env, seed, 3000, 30, 14400, 15.0, initial, evaluations, True, "abc")
+    return History(agent, env, seed, 3000, 30, 15.0, initial, evaluations, True, "abc")
 
 
 def shown(tables) -> str:
@@ -57,7 +57,6 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     assert past.env == "Hopper-v5, flicker 0.5"
     assert (past.seed, past.finished, past.initial_return) == (3, False, None)
     assert past.evaluations == [Evaluation(500, 50, 5.0, 7.0, 1.0), Evaluation(900, 90, 15.0, 9.0, 1.0)]
-    assert past.transitions == 90 * 16 * 15
     result = {"updates": 100, "env_steps": 1000, "wall_s": 21.0, "eval_return_mean": 11.0, "eval_return_std": 2.0}
     result["eval_episodes"] = 10
     (tmp_path / "result.json").write_text(json.dumps({**result, "initial_return_mean": -1.0}))
@@ -69,11 +68,9 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     assert [one.env_steps for one in past.evaluations] == [500, 1000]
 
 
-def test_a_window_that_is_an_episode_counts_with_its_length(tmp_path):
-    config = robust(EnvConfig("HalfCheetah-v5"))
-    actor = dataclasses.replace(config.actor, state_strategy="episode")
-    (tmp_path / "config.json").write_text(to_json(dataclasses.replace(config, actor=actor)))
-    assert history.describe(tmp_path).transitions_per_update == 16 * 1000
+def test_a_run_is_described_without_its_environment(tmp_path):
+    (tmp_path / "config.json").write_text(to_json(memory(EnvConfig("nowhere:X-v0"))))
+    assert history.describe(tmp_path).agent == "RMC memory"
 
 
 def odd(**fields) -> str:

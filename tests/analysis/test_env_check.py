@@ -154,6 +154,9 @@ def test_what_options_take_away_is_no_fault(capsys: pytest.CaptureFixture[str]) 
     status, printed = checked("Pendulum-v1", capsys, *words)
     assert status == 0
     assert "observations 3, actions 1, time limit 200" in printed
+    assert "no episode ended" not in printed
+    (share,) = re.findall(r"(\d+)% of what is observed is missing", printed)
+    assert 25 <= int(share) <= 65  # 1 - 0.7 * 0.8 is 44
     assert "fault" not in printed
 
 

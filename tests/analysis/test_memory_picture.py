@@ -14,7 +14,7 @@ from rich.console import Console
 
 from rmc.analysis import memory_picture
 from rmc.analysis.episodes import Episode, HiddenPart, Player, hidden_parts, recorded, remembered
-from rmc.analysis.influence import Replay, influence
+from rmc.analysis.influence import Replay, _changes, influence
 from rmc.analysis.memory_picture import Remembered, remember, tables
 from rmc.analysis.memory_probe import Samples, _of_part, explained, probes, samples
 from rmc.common.agent import Agent
@@ -189,6 +189,31 @@ def test_rows_are_the_memory_beside_what_was_seen_last(tmp_path: Path) -> None:
     wrong = dataclasses.replace(parts[0], columns=slice(0, 0))
     assert probe.name == "observation, where missing"
     assert probes(agent, episodes, [wrong]) == []
+
+
+def test_what_is_missing_is_not_changed(of_memory_env: list[Episode]) -> None:
+    """Else a memory that reads zeros in its place would seem to remember what it never saw."""
+    episode = of_memory_env[0]
+    size = episode.observation.shape[2]
+    missing = torch.zeros(1, episode.missing.shape[1], size, dtype=torch.bool)
+    missing[0, 0, 0] = True
+    replay = Replay(built(ASLEEP), dataclasses.replace(episode, missing=missing))
+    change = _changes(replay, 0, torch.ones(size))
+    assert not change[:, 0].any()
+    assert (change[1:, 1:].abs().sum(1) > 0).all()
+
+
+def test_what_the_environment_itself_lacks_is_not_read_out() -> None:
+    rng, rows = np.random.default_rng(3), 400
+    h, quarter = rng.normal(size=(rows, 2)), np.arange(rows) % 4
+    own = h.copy()
+    own[::3] = np.nan
+    every = np.ones((rows, 1), np.bool_)
+    found = _of_part(
+        Samples(h, np.zeros((rows, 1)), own, {}, every, quarter), HiddenPart("x", slice(0, 2), True, slice(0, 1))
+    )
+    assert found is not None
+    assert found.from_memory > 0.99
 
 
 def test_a_ridge_regression_reads_what_is_there_and_nothing_else() -> None:

@@ -108,7 +108,7 @@ def test_a_browser_shows_it_without_a_network(trained: Path, other: Path, tmp_pa
 
 def test_the_table_is_of_all_runs_of_an_agent(trained: Path, other: Path) -> None:
     evaluations = [[Evaluation(100, 10, 1.0, 5.0, 0.0), Evaluation(200, 20, 2.0, mean, 0.0)] for mean in (10.0, 20.0)]
-    past = [History("RMC", "E", seed, 200, 20, 1, 2.0, 0.0, scores, True) for seed, scores in enumerate(evaluations)]
+    past = [History("RMC", "E", seed, 200, 20, 2.0, 0.0, scores, True) for seed, scores in enumerate(evaluations)]
     row = report.final_row("RMC", past)
     assert dict(zip(report.COLUMNS, row, strict=True)) == {
         "agent": "RMC", "runs": "2", "return": "15.0 ± 5.0", "each run": "10, 20", "worst of last 5": "5.0",

@@ -62,6 +62,13 @@ def test_a_missing_frame_has_no_noise() -> None:
         assert observation.any() == (not info["missing"])
 
 
+def test_what_the_environment_calls_missing_has_no_noise() -> None:
+    seen, _, infos = played(EnvConfig("tests.partial_env:Partial-v0", noise=0.5))
+    flags = np.array([info["missing"] for info in infos])
+    assert 0.1 < flags.mean() < 0.5
+    np.testing.assert_array_equal(np.stack(seen) != 0.0, ~flags)
+
+
 def test_stacked_frames_are_the_newest_oldest_first() -> None:
     clear, _, _ = played(EnvConfig(CHEETAH))
     stacked, _, infos = played(EnvConfig(CHEETAH, frame_stack=3))

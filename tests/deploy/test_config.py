@@ -14,7 +14,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig, flat, from_json, option, to_json
 from rmc.deploy.run.presets import debug, memory, paper, preset_config, robust
-from rmc.deploy.run.validation import validate
+from rmc.deploy.run.validation import validate, validate_windows
 
 ENV = EnvConfig("InvertedPendulum-v5")
 NAMES: list[Preset] = ["robust", "memory", "paper", "debug"]
@@ -126,6 +126,15 @@ def test_values_that_do_not_go_together_are_refused() -> None:
         validate(with_value(config, "total_steps", config.replay.warmup_steps))
     with pytest.raises(ConfigError, match="--stride=5: an episode is one window"):
         validate(with_value(with_value(config, "actor.stride", 5), "actor.state_strategy", "episode"))
+    longer = with_value(config, "window.trained_steps", 100)
+    with pytest.raises(ConfigError, match="--trained-steps=100: an episode is one window"):
+        validate_windows(with_value(longer, "actor.state_strategy", "episode"))
+    validate_windows(longer)
+    for strategy in ("episode", "zero", "stored"):
+        burnt = with_value(with_value(config, "window.burn_in", 40), "actor.state_strategy", strategy)
+        with pytest.raises(ConfigError, match=f"--burn-in=40: --state-strategy {strategy} has no burn-in"):
+            validate_windows(burnt)
+        validate(burnt)  # a run that has it goes on
     with pytest.raises(ConfigError, match="--missing-flag"):
         validate(with_value(with_value(config, "agent.missing_flag", True), "env.frame_stack", 2))
     with pytest.raises(ConfigError, match=r"--impute-missing=True: .*--normalize-observations; .*--no-impute-missing"):

@@ -1,6 +1,7 @@
 """Who is told how far back a memory can learn, and with which options."""
 
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium as gym
@@ -43,6 +44,7 @@ def test_the_line_names_both_lengths_and_the_options() -> None:
         run("Pendulum-v1", flicker=0.5),
         run("Pendulum-v1", noise=0.1),
         run("Pendulum-v1", drop_sensors=0.1),
+        *([run("pybullet/AntPositions-v0")] if find_spec("pybullet_envs_gymnasium") else []),
         run("Pendulum-v1", delay=2),
         run("HalfCheetah-v5", hide="velocities"),
         run(trained_steps=99),
