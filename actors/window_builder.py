@@ -66,10 +66,6 @@ class WindowBuilder:
         self.count = 0
 
     @property
-    def capacity(self) -> int:
-        return len(self._rows)
-
-    @property
     def open(self) -> bool:
         """Whether any step is in no finished window yet."""
         return bool((self._time - self._start > self._covered).any())

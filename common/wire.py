@@ -51,6 +51,14 @@ class Kind(IntEnum):
     SHARED = 14  # server -> client: BATCH without its body, which lies in shared memory: turn and crc32 with the rest
 
 
+NONCE_BYTES = 32  # random ones, of each side
+
+
+def is_proof(received: object, expected: bytes) -> bool:
+    """Whether a proof that came is the expected one, in a time that tells nothing."""
+    return isinstance(received, bytes) and hmac.compare_digest(received, expected)
+
+
 def proof(secret: bytes, side: bytes, challenge: bytes, nonce: bytes) -> bytes:
     """HMAC-SHA256 with which a side, ``client``, ``server`` or (it, too) ``fenced``, shows that it knows the secret."""
     return hmac.new(secret, side + challenge + nonce, hashlib.sha256).digest()

@@ -98,16 +98,11 @@ def grounding_loss(
     predicted: Tensor, observation: Tensor, predicted_reward: Tensor, r: Tensor, seen: Tensor, m: Tensor
 ) -> Tensor:
     """L1 of o_{t+1} (mean over O) where ``seen`` (B, T, M): not missing, nor o_t unless that was filled; and of r_t."""
-    return _observation_error(predicted, observation, seen, m) + masked_mean((predicted_reward - r).abs(), m)
+    return observation_loss(predicted, observation, seen, m) + masked_mean((predicted_reward - r).abs(), m)
 
 
-def fill_loss(expected: Tensor, observation: Tensor, seen: Tensor, m: Tensor) -> Tensor:
-    """L1 of o_{t+1} (mean over O) that is to fill what is missing, where ``seen``: it was not missing."""
-    return _observation_error(expected, observation, seen, m)
-
-
-def _observation_error(expected: Tensor, observation: Tensor, seen: Tensor, m: Tensor) -> Tensor:
-    """L1 of (B, T, O), mean over what is ``seen`` (B, T, M)."""
+def observation_loss(expected: Tensor, observation: Tensor, seen: Tensor, m: Tensor) -> Tensor:
+    """L1 of o_{t+1} (B, T, O), mean over what is ``seen`` (B, T, M); alone it trains what imputes."""
     by_flag = (expected - observation).abs().reshape(*seen.shape, -1).mean(-1)
     return masked_mean(by_flag, m.unsqueeze(-1) * seen)
 

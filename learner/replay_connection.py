@@ -1,6 +1,5 @@
 """A connection to a replay server that has proved that it knows the run's secret. Frames: ``common/wire.py``."""
 
-import hmac
 import os
 import socket
 import ssl
@@ -10,9 +9,18 @@ from typing import Any, NoReturn
 from rmc.common.errors import AuthenticationError, FencedError, MessageError
 from rmc.common.shared_batches import SharedBatches
 from rmc.common.window import WindowSpec
-from rmc.common.wire import HEADER, FrameHeader, Kind, decode_header, decode_meta, encode_frame, proof
+from rmc.common.wire import (
+    HEADER,
+    NONCE_BYTES,
+    FrameHeader,
+    Kind,
+    decode_header,
+    decode_meta,
+    encode_frame,
+    is_proof,
+    proof,
+)
 
-NONCE_BYTES = 32
 TIMEOUT = 10.0  # seconds until a silent server counts as gone
 RECEIVE_BUFFER = 8 << 20
 
@@ -55,7 +63,7 @@ class ReplayConnection:
         if header.kind is Kind.ERROR:
             self._check_not_fenced(meta)
             raise AuthenticationError(f"it said {meta.get('error')!r:.200}")
-        authentic = _equal(meta.get("proof"), proof(secret, b"server", nonce, challenge))
+        authentic = is_proof(meta.get("proof"), proof(secret, b"server", nonce, challenge))
         if header.kind is not Kind.WELCOME or not authentic:
             raise AuthenticationError("the replay server does not know this run's secret")
         if meta.get("fingerprint") != fingerprint:
@@ -63,7 +71,7 @@ class ReplayConnection:
 
     def _check_not_fenced(self, meta: dict[str, Any]) -> None:
         """It ends the learner, so it is believed with a proof for this connection alone, at any time of it."""
-        if _equal(meta.get("fenced"), self._fenced):
+        if is_proof(meta.get("fenced"), self._fenced):
             raise FencedError(str(meta.get("error")))
 
     def raise_error(self, meta: dict[str, Any]) -> NoReturn:
@@ -128,10 +136,6 @@ class ReplayConnection:
     def close(self) -> None:
         self._reader.close()
         self._socket.close()
-
-
-def _equal(received: Any, expected: bytes) -> bool:
-    return isinstance(received, bytes) and hmac.compare_digest(received, expected)
 
 
 def _connect(address: str, tls: ssl.SSLContext | None) -> socket.socket:

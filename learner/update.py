@@ -217,7 +217,7 @@ class JointUpdate:
         with self._autocast():
             now, after, a = o[:, steps][:, :-1], o[:, steps][:, 1:], batch.action[:, steps]
             expected = imputer(self._to_bf16(memory.hidden.detach()[:, :-1]), now, a)
-        return {"fill_loss": losses.fill_loss(expected, after, _seen(batch)[:, steps][:, 1:], m)}
+        return {"fill_loss": losses.observation_loss(expected, after, _seen(batch)[:, steps][:, 1:], m)}
 
     def _grounding_loss(self, o: Tensor, prediction: Prediction, batch: Batch, m: Tensor) -> tuple[Losses, Tensor]:
         """The loss of predicted observations, where configured, and what the world model leaves unexplained."""

@@ -14,7 +14,6 @@ answered WAIT at once, and the client asks again.
 
 import contextlib
 import errno
-import hmac
 import logging
 import os
 import selectors
@@ -31,12 +30,11 @@ from rmc.common.errors import AuthenticationError, ConfigError, FencedError, Mes
 from rmc.common.replay import SampleStatus
 from rmc.common.shared_batches import SharedBatches, reserve_memory, shared_bytes
 from rmc.common.window import WindowSpec
-from rmc.common.wire import Kind, proof
+from rmc.common.wire import NONCE_BYTES, Kind, is_proof, proof
 from rmc.replay_server.connection import ClientConnection, Frame
 from rmc.replay_server.server import ReplayServer
 
 log = logging.getLogger(__name__)
-NONCE_BYTES = 32
 MAX_CONNECTIONS = 32
 AUTHENTICATION_SECONDS = 5.0
 SEND_BUFFER = 8 << 20  # bytes: a batch should leave in one call
@@ -164,8 +162,7 @@ class SocketServer:
         nonce, received = frame.meta.get("nonce"), frame.meta.get("proof")
         if frame.kind is not Kind.PROOF or not isinstance(nonce, bytes) or len(nonce) != NONCE_BYTES:
             raise AuthenticationError("no proof came")
-        expected = proof(self._secret, b"client", connection.challenge, nonce)
-        if not isinstance(received, bytes) or not hmac.compare_digest(received, expected):
+        if not is_proof(received, proof(self._secret, b"client", connection.challenge, nonce)):
             raise AuthenticationError("the client does not know this run's secret")
         connection.nonce = nonce
         self._introduce(connection, frame.meta.get("epoch"))

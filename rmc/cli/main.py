@@ -9,6 +9,7 @@ import sys
 
 from rmc.common.process import descendants, watchdog
 from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
+from rmc.deploy.local.role_environment import SINGLE_THREAD
 from rmc.deploy.monitor import output
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
@@ -51,8 +52,8 @@ def run(words: list[str]) -> int:
         descendants.adopt_orphans()  # of what environments start
     if words[:1] == ["role"] and SINGLE_THREADED.intersection(words[1:2]):
         # before numpy and torch are imported, which read these once
-        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-            os.environ.setdefault(name, "1")
+        for name, value in SINGLE_THREAD.items():
+            os.environ.setdefault(name, value)
     _choose_temporary_folder()
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
     try:

@@ -79,9 +79,6 @@ class EvaluatorRole(_Role):
     """Run the evaluator of a registered run in this process."""
 
 
-AnyRole = ActorRole | ReplayRole | LearnerRole | EvaluatorRole | LauncherRole
-
-
 @dataclass(frozen=True)
 class Role:
     """Be one role of a run in this process: rmc train starts them, or you do, with --launcher manual."""
