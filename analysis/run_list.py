@@ -52,22 +52,22 @@ def summary(path: Path) -> RunSummary:
     """What is known of a run; that it is damaged, where it cannot be read."""
     folder = RunFolder(path)
     try:
-        board, result = recorded_status(folder, RECENT_BYTES), folder.result() or {}
+        status, result = recorded_status(folder, RECENT_BYTES), folder.result() or {}
     except (ConfigError, OSError) as error:
         return RunSummary(str(path), fault=str(error))
-    returns = [one.return_mean for one in (board.best, board.last) if one is not None]
+    returns = [one.return_mean for one in (status.best, status.last) if one is not None]
     returns += [result["eval_return_mean"]] if result else []
     return RunSummary(
         str(path),
-        str(board.state),
-        board.env,
-        board.preset,
-        board.seed,
-        result.get("env_steps", board.env_steps),
-        board.total_steps,
+        str(status.state),
+        status.env,
+        status.preset,
+        status.seed,
+        result.get("env_steps", status.env_steps),
+        status.total_steps,
         returns[-1] if returns else None,
         max(returns, default=None),
-        result.get("wall_s", board.elapsed_s),
+        result.get("wall_s", status.elapsed_s),
     )
 
 

@@ -94,7 +94,7 @@ def _train(config: RunConfig, folder: RunFolder, device: str, watcher: Monitor, 
                 raise KeyboardInterrupt
             run.tend()
             watcher.watch(run.bus)
-            if first is None and watcher.board.get("learner", "updates"):
+            if first is None and watcher.status.get("learner", "updates"):
                 first = time.monotonic()
             if first is None and time.monotonic() > began + LONGEST_SECONDS:
                 raise ConfigError("--dry-run", True, _unbegun(watcher))
@@ -112,7 +112,7 @@ def _train(config: RunConfig, folder: RunFolder, device: str, watcher: Monitor, 
 def _unbegun(watcher: Monitor) -> str:
     waits = [
         f"{role} for {record['waiting_for']}"
-        for role, record in watcher.board.roles.items()
+        for role, record in watcher.status.roles.items()
         if record.get("waiting_for")
     ]
     return f"no update within {LONGEST_SECONDS:.0f} s (waiting: {', '.join(waits)}); is the environment slow?"

@@ -26,15 +26,15 @@ STOP_SECONDS = 60.0
 def watch(folder: RunFolder, console: Console, gone: Callable[[], bool]) -> int | None:
     """Show a run until its launcher ends, and give its exit status; None where it is ``gone`` without one."""
     config, tail = folder.config(), MetricsTail(folder.metrics)
-    board = empty_status(folder, (*config.roles(), "launcher"))
-    catch_up(board, tail)
-    view = View(board, console)
+    status = empty_status(folder, (*config.roles(), "launcher"))
+    catch_up(status, tail)
+    view = View(status, console)
     try:
         while folder.ended() is None and not gone():
-            catch_up(board, tail)
+            catch_up(status, tail)
             time.sleep(LOOK_SECONDS)
     finally:
-        catch_up(board, tail)
+        catch_up(status, tail)
         view.close(run_state(folder))
     return folder.ended()
 

@@ -61,21 +61,21 @@ RESTARTS = "restarts_"  # and a role
 class RunCollector(Collector):
     """What a run's roles said last, in Prometheus's terms."""
 
-    def __init__(self, board: RunStatus, run: str) -> None:
-        self._board, self._run = board, run
+    def __init__(self, status: RunStatus, run: str) -> None:
+        self._status, self._run = status, run
 
     def collect(self) -> Iterator[Metric]:
         """Every metric, as it is now."""
-        board, roles = self._board, self._board.roles
-        about = {"run": self._run, "env": board.env, "preset": board.preset, "seed": str(board.seed)}
+        status, roles = self._status, self._status.roles
+        about = {"run": self._run, "env": status.env, "preset": status.preset, "seed": str(status.seed)}
         yield InfoMetricFamily("rmc_run", "The run.", about)
         for name, text, value in (
-            ("total_steps", "Environment steps of the run's total.", board.total_steps),
-            ("evaluation_return", "Mean of the last evaluation.", board.last.return_mean if board.last else None),
-            ("evaluation_return_best", "Mean of the best one.", board.best.return_mean if board.best else None),
+            ("total_steps", "Environment steps of the run's total.", status.total_steps),
+            ("evaluation_return", "Mean of the last evaluation.", status.last.return_mean if status.last else None),
+            ("evaluation_return_best", "Mean of the best one.", status.best.return_mean if status.best else None),
         ):
             yield GaugeMetricFamily(f"rmc_{name}", text, value)
-        silent = board.silent()
+        silent = status.silent()
         yield _gauge(
             "silent_seconds",
             "Seconds that a role, or Redis, has said nothing for too long; else 0.",
@@ -148,12 +148,12 @@ class _Handler(WSGIRequestHandler):
 
 
 @contextmanager
-def served(board: RunStatus, run: str, options: LaunchOptions) -> Iterator[None]:
+def served(status: RunStatus, run: str, options: LaunchOptions) -> Iterator[None]:
     """Serve a run's metrics meanwhile. Raises ConfigError where the port cannot be had."""
     assert options.metrics_port is not None
     check_port(options)
     registry = CollectorRegistry()
-    registry.register(RunCollector(board, run))
+    registry.register(RunCollector(status, run))
     with make_server(options.metrics_host, options.metrics_port, make_wsgi_app(registry), _Server, _Handler) as server:
         thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
         thread.start()

@@ -9,19 +9,19 @@ from rmc.deploy.monitor.run_status import RunStatus
 MAIN = "Main/"  # TensorBoard sorts capitals before the roles' names
 
 
-def main_metrics(board: RunStatus) -> dict[str, float]:
+def main_metrics(status: RunStatus) -> dict[str, float]:
     """Rates, waiting shares, losses and the training return, as far as they are known."""
-    learner = board.roles.get("learner", {})
+    learner = status.roles.get("learner", {})
     waits = {
         "waiting_share_learner": learner.get("waiting_share"),
-        "waiting_share_replay": board.replay("waiting_share", mean),
-        "waiting_share_actors": _actors_waiting(board),
+        "waiting_share_replay": status.replay("waiting_share", mean),
+        "waiting_share_actors": _actors_waiting(status),
     }
     losses = {name: value for name, value in learner.items() if name.endswith("_loss")}
     metrics: dict[str, Any] = {
-        "env_steps_per_s": board.replay("env_steps_per_s", sum),
+        "env_steps_per_s": status.replay("env_steps_per_s", sum),
         "updates_per_s": learner.get("updates_per_s"),
-        "episode_return": board.episode_return,
+        "episode_return": status.episode_return,
         **waits,
         **losses,
     }
@@ -36,10 +36,10 @@ def evaluation_metrics(record: dict[str, Any]) -> dict[str, float]:
     return {MAIN + name: float(record[key]) for name, key in names.items() if is_finite(record.get(key))}
 
 
-def _actors_waiting(board: RunStatus) -> float | None:
+def _actors_waiting(status: RunStatus) -> float | None:
     shares = [
         record["waiting_share"]
-        for role, record in board.roles.items()
+        for role, record in status.roles.items()
         if role.startswith("actor-") and "waiting_share" in record
     ]
     return mean(shares) if shares else None

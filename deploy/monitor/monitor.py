@@ -31,9 +31,9 @@ class Monitor:
     """Reads every role's records and shows them. ``watch`` as often as you like; ``close`` at the end."""
 
     def __init__(self, folder: RunFolder, config: RunConfig, console: Console, tracker: Tracker | None = None) -> None:
-        self.board = empty_status(folder, config.roles())
+        self.status = empty_status(folder, config.roles())
         for record in MetricsTail(folder.metrics).take():  # of earlier starts
-            self.board.take_evaluation(record)
+            self.status.take_evaluation(record)
         self.restarts: Callable[[], dict[str, int]] = dict  # how often each role was started again
         self.unplaced: Callable[[], list[str]] = list  # roles that run nowhere now
         self._checkpoints = CheckpointFolder(folder.checkpoints, config.learner.keep_checkpoints)
@@ -46,7 +46,7 @@ class Monitor:
         self._metrics_log, self._host = MetricsLog(folder, flat(config)), HostFigures(folder.path)
         self._folder, self._writable, self._tracker = folder, True, tracker
         self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
-        self.view, self.outage = View(self.board, console), OutageLog("launcher")
+        self.view, self.outage = View(self.status, console), OutageLog("launcher")
 
     @property
     def wall_seconds(self) -> float:
@@ -55,7 +55,7 @@ class Monitor:
 
     def learner_finished(self) -> bool:
         """Whether the learner said that all steps are in and its last checkpoint is written."""
-        return bool(self.board.get("learner", "finished"))
+        return bool(self.status.get("learner", "finished"))
 
     def skip_old(self, bus: Bus) -> None:
         """Pass over what an earlier start left in a shared Redis."""
@@ -102,12 +102,12 @@ class Monitor:
 
     def take(self, record: dict[str, Any]) -> None:
         """Write one record (with its ``role``) and take it into the view."""
-        at = self.board.checkpoint_steps(record.get("eval_update"))  # an evaluation belongs where its checkpoint was
+        at = self.status.checkpoint_steps(record.get("eval_update"))  # an evaluation belongs where its checkpoint was
         if at is not None:
             record = record | {"eval_env_steps": at}
-        self.board.take(record)
-        main = main_metrics(self.board) if record["role"] == "launcher" else evaluation_metrics(record)
-        self._metrics_log.write(record, self.board.env_steps if at is None else at, main)
+        self.status.take(record)
+        main = main_metrics(self.status) if record["role"] == "launcher" else evaluation_metrics(record)
+        self._metrics_log.write(record, self.status.env_steps if at is None else at, main)
         update, score = record.get("eval_update"), record.get("eval_return_mean")
         if record["role"] == "evaluator" and isinstance(update, int) and is_finite(score):
             self._unmarked[update] = float(score)

@@ -11,27 +11,27 @@ MOST_SILENT = 3  # that are named
 WAITING_SHARE = 0.5  # from which a role is said to wait
 
 
-def notices(board: RunStatus) -> dict[str, str]:
+def notices(status: RunStatus) -> dict[str, str]:
     """What is not as it should be, by its heading."""
-    off = board.replay("replay_ratio_off", max)
-    restarts, broken = board.get("launcher", "restarts"), board.broken_episodes
+    off = status.replay("replay_ratio_off", max)
+    restarts, broken = status.get("launcher", "restarts"), status.broken_episodes
     texts = {
-        "not running": "" if board.is_over else board.get("launcher", "not_running"),
-        "silent": _silent(board),
-        "not saved": board.get("learner", "checkpoint_error"),
-        "damaged": _damaged(board),
-        "replay ratio": f"far from {board.replay_ratio:g}, see the troubleshooting page" if off else "",
+        "not running": "" if status.is_over else status.get("launcher", "not_running"),
+        "silent": _silent(status),
+        "not saved": status.get("learner", "checkpoint_error"),
+        "damaged": _damaged(status),
+        "replay ratio": f"far from {status.replay_ratio:g}, see the troubleshooting page" if off else "",
         "restarts": f"{number(restarts, ',')} of roles that died" if restarts else "",
         "broken": f"{number(broken, ',')} episodes, by the environment's faults" if broken else "",
     }
     return {name: str(text) for name, text in texts.items() if text}
 
 
-def waits(board: RunStatus) -> str:
+def waits(status: RunStatus) -> str:
     """Who waits most of the time, and for what; roles of a kind that wait for the same are counted."""
-    silent = board.silent()
+    silent = status.silent()
     groups: dict[tuple[str, str], dict[str, float]] = defaultdict(dict)
-    for role, record in sorted(board.roles.items()):
+    for role, record in sorted(status.roles.items()):
         share, reason = record.get("waiting_share", 0.0), record.get("waiting_for")
         if role not in silent and share > WAITING_SHARE and reason and role != "evaluator":
             groups[role.partition("-")[0], str(reason)][role] = share
@@ -45,14 +45,14 @@ def count(roles: dict[str, Any]) -> str:
     return first if len(roles) == 1 else f"{len(roles)} {kind}"
 
 
-def _damaged(board: RunStatus) -> str:
+def _damaged(status: RunStatus) -> str:
     """What was found damaged and passed over."""
-    counts = {"windows of the ring": board.replay("damaged_windows", sum)}
-    counts["newer checkpoints"] = board.get("learner", "damaged_checkpoints")
+    counts = {"windows of the ring": status.replay("damaged_windows", sum)}
+    counts["newer checkpoints"] = status.get("learner", "damaged_checkpoints")
     return ", ".join(f"{number(count, ',')} {name}" for name, count in counts.items() if count)
 
 
-def _silent(board: RunStatus) -> str:
-    roles = [f"{who} for {seconds:,.0f} s" for who, seconds in board.silent().items()]
+def _silent(status: RunStatus) -> str:
+    roles = [f"{who} for {seconds:,.0f} s" for who, seconds in status.silent().items()]
     more = len(roles) - MOST_SILENT
     return ", ".join(roles[:MOST_SILENT]) + (f" and {more} more" if more > 0 else "")

@@ -5,25 +5,25 @@ from rmc.deploy.monitor.notices import notices, waits
 from rmc.deploy.monitor.run_status import RunStatus
 
 
-def line(board: RunStatus) -> str:
+def line(status: RunStatus) -> str:
     """How far it is, how fast, how good, and what holds it back."""
     parts = [
-        f"{board.share_done:.0%}",
-        f"{board.env_steps:,} of {board.total_steps:,} steps",
-        f"{number(board.get('learner', 'updates_per_s'), ',.0f')} updates/s",
-        _evaluation(board),
-        time_and_eta(board.elapsed_s, board.eta_s, board.is_over),
-        *(f"{name}: {text}" for name, text in notices(board).items()),
+        f"{status.share_done:.0%}",
+        f"{status.env_steps:,} of {status.total_steps:,} steps",
+        f"{number(status.get('learner', 'updates_per_s'), ',.0f')} updates/s",
+        _evaluation(status),
+        time_and_eta(status.elapsed_s, status.eta_s, status.is_over),
+        *(f"{name}: {text}" for name, text in notices(status).items()),
     ]
-    if waiting := waits(board):
+    if waiting := waits(status):
         parts.append(f"waiting: {waiting}")
     return " | ".join(parts)
 
 
-def _evaluation(board: RunStatus) -> str:
-    if board.last is None or board.best is None:
+def _evaluation(status: RunStatus) -> str:
+    if status.last is None or status.best is None:
         return f"eval {number(None)}"
-    return f"eval {_return(board.last.return_mean)} (best {_return(board.best.return_mean)})"
+    return f"eval {_return(status.last.return_mean)} (best {_return(status.best.return_mean)})"
 
 
 def _return(value: float) -> str:

@@ -15,46 +15,46 @@ from rmc.deploy.run.state import run_state
 
 def recorded_status(folder: RunFolder, recent_bytes: int = RECENT_BYTES) -> RunStatus:
     """As its metrics say. Raises ConfigError where the folder is no run's or is damaged."""
-    board = empty_status(folder)
-    take_state(board, folder)
-    catch_up(board, MetricsTail(folder.metrics, recent_bytes))
-    return board
+    status = empty_status(folder)
+    take_state(status, folder)
+    catch_up(status, MetricsTail(folder.metrics, recent_bytes))
+    return status
 
 
-def take_state(board: RunStatus, folder: RunFolder) -> None:
+def take_state(status: RunStatus, folder: RunFolder) -> None:
     """Take in what has become of the run. Raises ConfigError where that is damaged."""
-    board.state = run_state(folder)
-    result = folder.result() if board.state == "finished" else None
-    board.final_steps = None if result is None else int(result["env_steps"])
+    status.state = run_state(folder)
+    result = folder.result() if status.state == "finished" else None
+    status.final_steps = None if result is None else int(result["env_steps"])
 
 
-def status_json(folder: RunFolder, board: RunStatus) -> dict[str, Any]:
+def status_json(folder: RunFolder, status: RunStatus) -> dict[str, Any]:
     """All of it as ``rmc stats --json`` prints it; a number that JSON has not, like infinity, is null."""
-    status = {
+    shown = {
         "run": str(folder.path),
-        "state": board.state,
-        "env": board.env,
-        "preset": board.preset,
-        "seed": board.seed,
-        "env_steps": board.env_steps,
-        "total_steps": board.total_steps,
-        "share_done": board.share_done,
-        "elapsed_s": board.elapsed_s,
-        "eta_s": board.eta_s,
-        "last_evaluation": board.last and asdict(board.last),
-        "best_evaluation": board.best and asdict(board.best),
-        "notices": notices(board),
-        "roles": board.roles,
+        "state": status.state,
+        "env": status.env,
+        "preset": status.preset,
+        "seed": status.seed,
+        "env_steps": status.env_steps,
+        "total_steps": status.total_steps,
+        "share_done": status.share_done,
+        "elapsed_s": status.elapsed_s,
+        "eta_s": status.eta_s,
+        "last_evaluation": status.last and asdict(status.last),
+        "best_evaluation": status.best and asdict(status.best),
+        "notices": notices(status),
+        "roles": status.roles,
         "result": folder.result(),
     }
-    plain: dict[str, Any] = json.loads(json.dumps(status), parse_constant=lambda _: None)
+    plain: dict[str, Any] = json.loads(json.dumps(shown), parse_constant=lambda _: None)
     return plain
 
 
-def catch_up(board: RunStatus, tail: MetricsTail) -> None:
+def catch_up(status: RunStatus, tail: MetricsTail) -> None:
     """Take in what is new."""
     for record in tail.take():
-        board.take(record)
+        status.take(record)
 
 
 def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus:

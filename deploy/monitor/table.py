@@ -21,40 +21,40 @@ STYLES = {"finished": "green", "training": "cyan", "stopped": "yellow", "failed"
 Fact = tuple[str, str]  # a figure's name and its text
 
 
-def table(board: RunStatus, width: int, height: int | None = None) -> RenderableType:
+def table(status: RunStatus, width: int, height: int | None = None) -> RenderableType:
     """All of it, or with a ``height`` what fits into so many rows."""
     beside = width >= SIDE_WIDTH
     columns = width // 2 - 2 if beside else width
-    warnings = notices(board)
-    lines = [_title(board, columns), _bar(board, columns), *_lines(_essentials(board), columns)]
+    warnings = notices(status)
+    lines = [_title(status, columns), _bar(status, columns), *_lines(_essentials(status), columns)]
     lines += [row for fact in warnings.items() for row in _rows(*fact, columns, "yellow")]
-    everyone, room = len(board.roles), (height or 10**6) - len(lines)
+    everyone, room = len(status.roles), (height or 10**6) - len(lines)
     if beside:
         whole = Table.grid(padding=(0, 4, 0, 0))
         whole.add_row(
-            Group(*lines[:height], *_lines(_details(board), columns, room)), _roles(board, len(lines) + room - 1)
+            Group(*lines[:height], *_lines(_details(status), columns, room)), _roles(status, len(lines) + room - 1)
         )
         return whole
-    least = min(everyone, len(_groups(board)))
+    least = min(everyone, len(_groups(status)))
     if room <= least:
-        waiting = _rows("waiting", waits(board) or number(None), columns)
+        waiting = _rows("waiting", waits(status) or number(None), columns)
         return Group(*[*lines, *waiting][:height])
-    details = _lines(_details(board), columns, room - least - 1)
-    return Group(*lines, *details, _roles(board, room - len(details) - 1))
+    details = _lines(_details(status), columns, room - least - 1)
+    return Group(*lines, *details, _roles(status, room - len(details) - 1))
 
 
-def _title(board: RunStatus, width: int) -> Text:
-    rest = Text(f" · {board.preset} · seed {board.seed}")
-    if board.state is not None:
-        rest.append(" · ").append(board.state, STYLES[board.state])
-    env = Text(board.env)
+def _title(status: RunStatus, width: int) -> Text:
+    rest = Text(f" · {status.preset} · seed {status.seed}")
+    if status.state is not None:
+        rest.append(" · ").append(status.state, STYLES[status.state])
+    env = Text(status.env)
     env.truncate(max(8, width - rest.cell_len), overflow="ellipsis")
     return Text.assemble((env.plain, "bold"), rest)
 
 
-def _bar(board: RunStatus, width: int) -> RenderableType:
+def _bar(status: RunStatus, width: int) -> RenderableType:
     bar = Table.grid(padding=(0, 1, 0, 0))
-    done = board.share_done
+    done = status.share_done
     bar.add_row(
         Text(f"{done:.1%}", "bold"),
         ProgressBar(1.0, done, min(BAR, width - 8), complete_style="cyan", finished_style="green"),
@@ -79,13 +79,13 @@ def _rows(name: str, text: str, width: int, style: str = "bold") -> list[Text]:
     return [Text.assemble((f"{'' if i else name:<{LABEL}}", style), row) for i, row in enumerate(rows)]
 
 
-def _essentials(board: RunStatus) -> list[Fact]:
-    rate, learner = board.replay("env_steps_per_s", sum), board.roles.get("learner", {})
+def _essentials(status: RunStatus) -> list[Fact]:
+    rate, learner = status.replay("env_steps_per_s", sum), status.roles.get("learner", {})
     return [
-        ("env steps", f"{board.env_steps:,} of {board.total_steps:,}, {number(rate, ',.0f')} /s"),
-        ("time", time_and_eta(board.elapsed_s, board.eta_s, board.is_over)),
-        ("evaluation", _evaluation(board.last)),
-        ("best", _evaluation(board.best)),
+        ("env steps", f"{status.env_steps:,} of {status.total_steps:,}, {number(rate, ',.0f')} /s"),
+        ("time", time_and_eta(status.elapsed_s, status.eta_s, status.is_over)),
+        ("evaluation", _evaluation(status.last)),
+        ("best", _evaluation(status.best)),
         ("updates", f"{number(learner.get('updates'), ',')}, {number(learner.get('updates_per_s'), ',.1f')} /s"),
     ]
 
@@ -98,21 +98,21 @@ def _evaluation(evaluation: Evaluation | None) -> str:
     return f"{number(evaluation.return_mean, ',.1f')} ± {number(evaluation.return_std, ',.1f')} at {at}"
 
 
-def _details(board: RunStatus) -> list[Fact]:
+def _details(status: RunStatus) -> list[Fact]:
     """What is known of the rest."""
-    learner, ratio = board.roles.get("learner", {}), board.replay("replay_ratio", mean)
+    learner, ratio = status.roles.get("learner", {}), status.replay("replay_ratio", mean)
     losses = ", ".join(f"{name[:-5]} {number(learner[name])}" for name in learner if name.endswith("_loss"))
     facts = [
-        ("episodes", f"return {number(board.episode_return, ',.1f')}, with exploration"),
+        ("episodes", f"return {number(status.episode_return, ',.1f')}, with exploration"),
         ("losses", losses or number(None)),
-        ("replay", f"ring {number(board.replay('ring_fill', mean), '.0%')} full, "
-                   f"ratio {number(ratio, ',.1f')}" + ("" if ratio is None else f" of {board.replay_ratio:g}")),
+        ("replay", f"ring {number(status.replay('ring_fill', mean), '.0%')} full, "
+                   f"ratio {number(ratio, ',.1f')}" + ("" if ratio is None else f" of {status.replay_ratio:g}")),
         ("alpha, beta", f"{number(learner.get('alpha'))}, {number(learner.get('beta'))}"),
         ("curiosity", f"{number(learner.get('curiosity_share'), '.1%')} of the reward"),
         ("latent rank", f"{number(learner.get('latent_rank'), '.1f')}, "
                         f"{number(learner.get('model_unexplained'), '.0%')} of its change unexplained"),
         ("staleness", _staleness(learner)),
-        ("policy lag", f"{number(board.policy_lag, ',.1f')} updates"),
+        ("policy lag", f"{number(status.policy_lag, ',.1f')} updates"),
     ]  # fmt: skip
     return [(name, text) for name, text in facts if re.search(r"\d|inf|nan", text)]
 
@@ -129,18 +129,18 @@ def _staleness(learner: dict[str, Any]) -> str:
     return f"state {state}, Q {q}, age {number(learner.get('sample_age_mean'), ',.0f')} updates"
 
 
-def _groups(board: RunStatus) -> list[dict[str, dict[str, Any]]]:
+def _groups(status: RunStatus) -> list[dict[str, dict[str, Any]]]:
     """The roles by kind, the launcher left out."""
     kinds: dict[str, dict[str, dict[str, Any]]] = {}
-    for role in sorted(board.roles, key=lambda role: (len(role), role)):
+    for role in sorted(status.roles, key=lambda role: (len(role), role)):
         if role != "launcher":
-            kinds.setdefault(role.partition("-")[0], {})[role] = board.roles[role]
+            kinds.setdefault(role.partition("-")[0], {})[role] = status.roles[role]
     return [kinds[kind] for kind in sorted(kinds, key=lambda kind: (kind == "actor", kind))]
 
 
-def _roles(board: RunStatus, most: int) -> Table:
+def _roles(status: RunStatus, most: int) -> Table:
     """A row for each role, or for each kind where there would be more than ``most``."""
-    groups, silent = _groups(board), board.silent()
+    groups, silent = _groups(status), status.silent()
     if sum(map(len, groups)) <= most:
         groups = [{role: record} for group in groups for role, record in group.items()]
     roles = Table("role", "busy", "waiting", "for", box=None, padding=(0, 2, 0, 0), pad_edge=False)

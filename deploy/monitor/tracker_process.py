@@ -88,23 +88,23 @@ def _notify_first_warning(notify: Notify) -> None:
 
 def _follow(folder: RunFolder, run: TrackedRun, read_from: int, films: Films, notify: Notify) -> None:
     """A row now and then, one for each evaluation, films, and the end."""
-    board, tail = empty_status(folder), MetricsTail(folder.metrics, read_from=read_from)
+    status, tail = empty_status(folder), MetricsTail(folder.metrics, read_from=read_from)
     due, end = time.monotonic() + ROW_SECONDS, None
     while end is None:
         end = _end_of_run()
         for record in tail.take():
-            board.take(record)
+            status.take(record)
             if values := evaluation_metrics(record):
-                run.log(values, _at(board, record))
-                films.take(record, _at(board, record))
+                run.log(values, _at(status, record))
+                films.take(record, _at(status, record))
         _log_film(films, run, notify)
         if time.monotonic() >= due or end is not None:
             due = time.monotonic() + ROW_SECONDS
-            run.log(row(board), board.env_steps)
+            run.log(row(status), status.env_steps)
     films.close()
     if video := end.pop("video", None):
-        run.log_video(Path(video), end.get("env_steps", board.env_steps))
-    run.finish({"env_steps": board.env_steps} | end)
+        run.log_video(Path(video), end.get("env_steps", status.env_steps))
+    run.finish({"env_steps": status.env_steps} | end)
 
 
 def _log_film(films: Films, run: TrackedRun, notify: Notify) -> None:
@@ -124,22 +124,22 @@ def _end_of_run() -> dict[str, Any] | None:
     return dict(json.loads(ending)) if ending else {"state": "lost"}
 
 
-def _at(board: RunStatus, evaluation: dict[str, Any]) -> int:
+def _at(status: RunStatus, evaluation: dict[str, Any]) -> int:
     """Where the evaluated checkpoint stood, if that is known."""
     at = evaluation.get("eval_env_steps")
-    return int(at) if is_finite(at) else board.env_steps
+    return int(at) if is_finite(at) else status.env_steps
 
 
-def row(board: RunStatus) -> dict[str, float]:
+def row(status: RunStatus) -> dict[str, float]:
     """What is logged: the main metrics, and all of every role but single actors and the evaluator."""
     roles = {
         f"{role}/{name}": float(value)
-        for role, record in board.roles.items()
+        for role, record in status.roles.items()
         if not role.startswith(("actor-", "evaluator"))
         for name, value in record.items()
         if name != "time" and is_finite(value)
     }
-    return main_metrics(board) | roles
+    return main_metrics(status) | roles
 
 
 if __name__ == "__main__":

@@ -23,10 +23,10 @@ def terminal(width: int | None = None) -> Console:
 
 
 class View:
-    """A board shown on a console, live where that is a terminal; by a thread, whatever its owner waits for."""
+    """A run's status shown on a console, live where that is a terminal; by a thread, whatever its owner waits for."""
 
-    def __init__(self, board: RunStatus, console: Console) -> None:
-        self._board, self._console, self._due = board, console, 0.0
+    def __init__(self, status: RunStatus, console: Console) -> None:
+        self._status, self._console, self._due = status, console, 0.0
         self._lock, self._over = threading.Lock(), threading.Event()
         self._live: Live | None = None
         if console.is_terminal:
@@ -52,17 +52,17 @@ class View:
         if self._live is not None:
             self._live.update(self._table(), refresh=True)
         else:
-            self._console.print(line(self._board), soft_wrap=True)
+            self._console.print(line(self._status), soft_wrap=True)
 
     def _table(self) -> RenderableType:
         """With a row left for the cursor."""
-        return table(self._board, self._console.width, self._console.height - 1)
+        return table(self._status, self._console.width, self._console.height - 1)
 
     def close(self, state: State | None = None) -> None:
         """Show the last state, and leave it there."""
         self._over.set()
         self._thread.join()
-        self._board.state = state
+        self._status.state = state
         self._show()
         if self._live is not None:
             self._live.stop()

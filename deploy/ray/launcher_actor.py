@@ -86,14 +86,14 @@ class LauncherActor(RoleActor):
     def summary(self) -> RunSummary:
         """How the run is. Raises ConfigError where its folder is damaged."""
         folder = RunFolder(self._folder)
-        board, past_starts = recorded_status(folder, RECENT_BYTES), starts(folder)
-        heard = set(board.roles) - set(board.silent())
+        status, past_starts = recorded_status(folder, RECENT_BYTES), starts(folder)
+        heard = set(status.roles) - set(status.silent())
         at = self._claim.read_text().split()[:1] if "learner" in heard else []
         address = next((node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] in at), None)
         actors = sum(role.startswith("actor-") for role in heard)
         since = past_starts[-1].time if past_starts else None
         place = socket.gethostname(), str(folder.path)
-        return RunSummary(board.env, board.env_steps, board.total_steps, address, actors, since, *place)
+        return RunSummary(status.env, status.env_steps, status.total_steps, address, actors, since, *place)
 
     def end(self) -> float:
         """Ask the run's launcher to end it in order; the seconds that this may take."""

@@ -34,13 +34,13 @@ def train(command: train_options.Train) -> int:
 def stats(command: run_options.Stats) -> int:
     """Print the newest metrics of a run, and its result if it has one."""
     folder, console = RunFolder(command.run), terminal()
-    board = recorded_status(folder)
-    if not board.roles:
+    status = recorded_status(folder)
+    if not status.roles:
         raise ConfigError("RUN", str(folder.path), "it has no metrics yet; train it first")
     if command.json:
-        console.print(json.dumps(status_json(folder, board)), soft_wrap=True)
+        console.print(json.dumps(status_json(folder, status)), soft_wrap=True)
         return 0
-    console.print(table(board, console.width))
+    console.print(table(status, console.width))
     if history := format_starts(folder):
         console.print(history, soft_wrap=True)
     if (result := folder.result()) is not None:

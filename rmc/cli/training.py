@@ -93,7 +93,7 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
             monitor.close()
         if not finished:
             status, end = STOPPED, {"state": "stopped"}
-            return say_stopped(folder, monitor.board.env_steps, console)
+            return say_stopped(folder, monitor.status.env_steps, console)
         result = _result(config, folder, monitor, before, console)
         folder.write_result(result)
         status, end = 0, {"state": "finished", **result}
@@ -118,7 +118,7 @@ def _metrics_served(folder: RunFolder, monitor: Monitor, options: LaunchOptions)
         return nullcontext()
     from rmc.deploy.monitor import exporter  # every role would hold a web server
 
-    return exporter.served(monitor.board, folder.name, options)
+    return exporter.served(monitor.status, folder.name, options)
 
 
 def _video(config: RunConfig, folder: RunFolder, console: Console) -> str | None:
@@ -194,6 +194,6 @@ def _result(
         **after,
         "initial_return_mean": before["eval_return_mean"],
         "wall_s": monitor.wall_seconds,
-        "replay_ratio": monitor.board.replay("replay_ratio", mean),
+        "replay_ratio": monitor.status.replay("replay_ratio", mean),
         "restarts": sum(monitor.restarts().values()),
     }

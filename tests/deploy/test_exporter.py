@@ -58,15 +58,15 @@ def port() -> int:
 
 
 @pytest.fixture
-def board() -> RunStatus:
-    board, now = RunStatus("Pendulum-v1", "debug", 3, 4_000, 32.0, ("actor-0", "learner")), time.time()
-    board.take({"role": "actor-0", "time": now - 20.0, "busy_share": 0.25, "weights_update": 40, "refused_weights": 2})
-    board.take({"role": "learner", "time": now, "updates": 60, "updates_per_s": math.nan, 'a"}\\': 1})
+def status() -> RunStatus:
+    status, now = RunStatus("Pendulum-v1", "debug", 3, 4_000, 32.0, ("actor-0", "learner")), time.time()
+    status.take({"role": "actor-0", "time": now - 20.0, "busy_share": 0.25, "weights_update": 40, "refused_weights": 2})
+    status.take({"role": "learner", "time": now, "updates": 60, "updates_per_s": math.nan, 'a"}\\': 1})
     replay = {"env_steps": 700, "ring_windows": 30, "ring_capacity": 90, "dead_letters": 5, "dead_letters_crc": 4}
-    board.take({"role": "replay", "time": now, **replay, 'dead_letters_"}\\ 1': 1, "refused_clients": 0})
-    board.take({"role": "evaluator", "time": now, "eval_return_mean": -9.5, "eval_update": 40})
-    board.take({"role": "launcher", "time": now, "restarts": 2, "restarts_actor-0": 2, "restarts_learner": 0})
-    return board
+    status.take({"role": "replay", "time": now, **replay, 'dead_letters_"}\\ 1': 1, "refused_clients": 0})
+    status.take({"role": "evaluator", "time": now, "eval_return_mean": -9.5, "eval_update": 40})
+    status.take({"role": "launcher", "time": now, "restarts": 2, "restarts_actor-0": 2, "restarts_learner": 0})
+    return status
 
 
 def scraped(port: int) -> str:
@@ -74,8 +74,8 @@ def scraped(port: int) -> str:
         return str(answer.read().decode())
 
 
-def test_every_role_is_shown(board: RunStatus, port: int) -> None:
-    with exporter.served(board, "first", LaunchOptions(None, metrics_port=port)):
+def test_every_role_is_shown(status: RunStatus, port: int) -> None:
+    with exporter.served(status, "first", LaunchOptions(None, metrics_port=port)):
         for _ in range(2 * exporter.MOST_CLIENTS):
             text = scraped(port)
     families = list(text_string_to_metric_families(text))
@@ -108,8 +108,8 @@ def test_every_alert_is_documented() -> None:
     assert {rule["alert"] for rule in group["rules"]} == documented("alert") == {alert for alert, *_ in CASES}
 
 
-def test_strangers_take_few_handles_and_the_end_waits_for_none(board: RunStatus, port: int) -> None:
-    with exporter.served(board, "first", LaunchOptions(None, metrics_port=port)):
+def test_strangers_take_few_handles_and_the_end_waits_for_none(status: RunStatus, port: int) -> None:
+    with exporter.served(status, "first", LaunchOptions(None, metrics_port=port)):
         strangers = [socket.create_connection((HERE, port), timeout=10) for _ in range(exporter.MOST_CLIENTS)]
         with socket.create_connection((HERE, port), timeout=10) as one_more:
             assert one_more.recv(1) == b""
@@ -135,8 +135,8 @@ def test_a_launcher_on_ray_is_told(options: dict[str, Any]) -> None:
 
 
 @promtool
-def test_the_names_are_as_prometheus_wants_them(board: RunStatus, port: int) -> None:
-    with exporter.served(board, "first", LaunchOptions(None, metrics_port=port)):
+def test_the_names_are_as_prometheus_wants_them(status: RunStatus, port: int) -> None:
+    with exporter.served(status, "first", LaunchOptions(None, metrics_port=port)):
         text = scraped(port)
     done = subprocess.run(["promtool", "check", "metrics"], input=text, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout + done.stderr) == (0, "")

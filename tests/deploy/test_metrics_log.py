@@ -68,10 +68,10 @@ def test_no_half_of_a_line_is_left(folder: RunFolder, monkeypatch: pytest.Monkey
 
 
 def test_a_view_that_cannot_be_written_ends_nothing() -> None:
-    board = RunStatus("Pendulum-v1", "debug", 0, 100, 4.0)
+    status = RunStatus("Pendulum-v1", "debug", 0, 100, 4.0)
     with open("/dev/full", "wb", buffering=0) as raw:
         full = io.TextIOWrapper(raw, write_through=True)
-        View(board, Console(file=unfailing(full), force_terminal=False)).refresh()
+        View(status, Console(file=unfailing(full), force_terminal=False)).refresh()
         with pytest.raises(OSError, match="No space"):
             full.write("x")
 

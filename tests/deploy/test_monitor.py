@@ -72,8 +72,8 @@ def test_any_number_is_shown(monitor: Monitor, value: float) -> None:
     for role in ROLES:
         bus.emit(role, {"waiting_for": "credit", **dict.fromkeys(NAMES, value)})
     monitor.watch(bus)
-    assert any(text in line(monitor.board) for text in ("credit", "silent")) or not value > 0.5
-    Console(quiet=True).print(table(monitor.board, 80))
+    assert any(text in line(monitor.status) for text in ("credit", "silent")) or not value > 0.5
+    Console(quiet=True).print(table(monitor.status, 80))
     monitor.close()
 
 
@@ -84,16 +84,16 @@ def test_any_number_is_shown(monitor: Monitor, value: float) -> None:
 def test_steps_beyond_what_a_float_counts_are_shown(monitor: Monitor, counter: float, shown: int) -> None:
     monitor.take({"role": "replay", "env_steps": counter})
     monitor.take({"role": "learner", "checkpoint_update": 3, "checkpoint_env_steps": counter})
-    assert monitor.board.env_steps == shown
-    assert monitor.board.checkpoint_steps(3) == (shown or None)
-    assert f"{shown:,} of " in line(monitor.board)
+    assert monitor.status.env_steps == shown
+    assert monitor.status.checkpoint_steps(3) == (shown or None)
+    assert f"{shown:,} of " in line(monitor.status)
     monitor.close()
 
 
 def test_names_are_shown_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """And not taken for a console's markup, which would swallow or refuse them."""
-    board = RunStatus("mine:[red]Env[/x]-v0", "debug", 0, 100, 32.0)
-    terminal(200).print(table(board, 200), "run folder /runs/[words] :tada: [/]")
+    status = RunStatus("mine:[red]Env[/x]-v0", "debug", 0, 100, 32.0)
+    terminal(200).print(table(status, 200), "run folder /runs/[words] :tada: [/]")
     shown = capsys.readouterr().out
     assert "mine:[red]Env[/x]-v0 · debug" in shown
     assert "/runs/[words] :tada: [/]" in shown
@@ -108,8 +108,8 @@ def test_whatever_a_role_leaves_out_the_run_goes_on(monitor: Monitor, tmp_path: 
             record = {name: chance.choice(NUMBERS) for name in [NAMES[seed], *chance.sample(NAMES, count)]}
             bus.emit(role, decode_record(encode_record(record)))
         monitor.watch(bus)
-        assert line(monitor.board)
-        Console(quiet=True).print(table(monitor.board, 80))
+        assert line(monitor.status)
+        Console(quiet=True).print(table(monitor.status, 80))
     monitor.close()
     folder = RunFolder(tmp_path / "run")
     assert 0 <= wall_seconds(folder.metrics) < 60
@@ -126,7 +126,7 @@ def test_half_of_an_evaluation_is_none(monitor: Monitor, record: dict[str, float
     assert monitor._checkpoints.best() is None
     monitor.take({"role": "evaluator", "eval_update": 3, "eval_return_mean": 1})
     assert monitor._checkpoints.best() == 3
-    assert "1.0 ± – at update 3" in shown(monitor.board)[0]
+    assert "1.0 ± – at update 3" in shown(monitor.status)[0]
     monitor.close()
 
 
@@ -138,7 +138,7 @@ def test_each_role_speaks_for_itself_only(monitor: Monitor, tmp_path: Path) -> N
     monitor.close()
     lines = [json.loads(text) for text in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert {record["role"] for record in lines} == {"actor-0", "launcher"}
-    assert monitor.board.get("learner", "updates") is None
+    assert monitor.status.get("learner", "updates") is None
 
 
 def test_an_evaluation_stands_where_its_checkpoint_was(monitor: Monitor, tmp_path: Path) -> None:
@@ -201,16 +201,16 @@ def test_evaluations_of_earlier_starts_are_known(config: RunConfig, tmp_path: Pa
     evaluations = [{"role": "evaluator", "time": 1.0, "eval_return_mean": score, "eval_update": 3} for score in scores]
     folder.metrics.write_text("".join(json.dumps(record) + "\n" for record in evaluations))
     monitor = Monitor(folder, config, Console(quiet=True))
-    assert "eval 5 (best 9)" in line(monitor.board)
-    assert "evaluator" not in monitor.board.roles  # it has not spoken in this start
+    assert "eval 5 (best 9)" in line(monitor.status)
+    assert "evaluator" not in monitor.status.roles  # it has not spoken in this start
     monitor.close()
 
 
 def test_new_names_without_end_are_left_out(monitor: Monitor) -> None:
     for start in range(0, 3 * MOST_NAMES, 100):
-        monitor.board.take({"role": "actor-0", "env_steps": start, **{f"n{start + i}": 0 for i in range(100)}})
-    assert len(monitor.board.roles["actor-0"]) <= MOST_NAMES
-    assert monitor.board.get("actor-0", "env_steps") == 3 * MOST_NAMES - 100
+        monitor.status.take({"role": "actor-0", "env_steps": start, **{f"n{start + i}": 0 for i in range(100)}})
+    assert len(monitor.status.roles["actor-0"]) <= MOST_NAMES
+    assert monitor.status.get("actor-0", "env_steps") == 3 * MOST_NAMES - 100
     monitor.close()
 
 
@@ -232,11 +232,11 @@ def test_evaluations_that_found_no_room_are_marked_when_there_is_some(
     monitor.close()
 
 
-def shown(board: RunStatus) -> list[str]:
+def shown(status: RunStatus) -> list[str]:
     """The view as a table, and as a line."""
     console = Console(file=io.StringIO(), width=200)
-    console.print(table(board, 200))
-    return [console.file.getvalue(), line(board)]  # type: ignore[attr-defined]
+    console.print(table(status, 200))
+    return [console.file.getvalue(), line(status)]  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
@@ -256,8 +256,8 @@ def test_what_is_not_as_it_should_be_is_shown(
 ) -> None:
     for sound in (False, True):
         record = dict.fromkeys(metrics, type(next(iter(metrics.values())))()) if sound else metrics
-        monitor.board.take({"role": role, **record})
-        for text_of in shown(monitor.board):
+        monitor.status.take({"role": role, **record})
+        for text_of in shown(monitor.status):
             assert (heading in text_of and text in text_of) is not sound
     monitor.close()
 
@@ -265,57 +265,59 @@ def test_what_is_not_as_it_should_be_is_shown(
 def says(monitor: Monitor, ago: dict[str, float], **launcher: float) -> None:
     """Records of roles, each from so many seconds ago."""
     for role, seconds in ago.items():
-        monitor.board.take({"role": role, "time": time.time() - seconds, "waiting_share": 1.0, "waiting_for": "credit"})
-    monitor.board.take({"role": "launcher", "time": time.time(), "redis_away_s": 0.0, **launcher})
+        monitor.status.take(
+            {"role": role, "time": time.time() - seconds, "waiting_share": 1.0, "waiting_for": "credit"}
+        )
+    monitor.status.take({"role": "launcher", "time": time.time(), "redis_away_s": 0.0, **launcher})
 
 
 def test_every_view_says_who_is_silent_and_for_how_long(monitor: Monitor) -> None:
     says(monitor, {"learner": 12.2, "actor-0": 0.5, "replay": 4.0, "evaluator": 0.0})
-    for text_of in shown(monitor.board):
+    for text_of in shown(monitor.status):
         assert "learner for 12 s" in text_of
         assert "actor-0 for" not in text_of
-    assert "waiting: actor-0 100% for credit, replay 100% for credit" in line(monitor.board)  # learner's is too old
+    assert "waiting: actor-0 100% for credit, replay 100% for credit" in line(monitor.status)  # learner's is too old
     says(monitor, {"learner": 0.0})
-    assert not any("silent" in text for text in shown(monitor.board))
+    assert not any("silent" in text for text in shown(monitor.status))
     monitor.close()
 
 
 def test_a_redis_that_is_away_is_who_is_silent(monitor: Monitor) -> None:
     says(monitor, {"learner": 40.0, "actor-0": 41.0}, redis_away_s=38.0)
-    for text_of in shown(monitor.board):
+    for text_of in shown(monitor.status):
         assert "Redis for 38 s" in text_of
-    assert "learner for" not in line(monitor.board)
+    assert "learner for" not in line(monitor.status)
     monitor.close()
-    assert not any("silent" in text for text in shown(monitor.board))  # a run that is over
+    assert not any("silent" in text for text in shown(monitor.status))  # a run that is over
 
 
 def test_a_role_that_never_spoke_is_silent_once_it_should_have(
     monitor: Monitor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     says(monitor, {"learner": 0.0, "replay": 0.0, "evaluator": 0.0})
-    assert "silent" not in line(monitor.board)
+    assert "silent" not in line(monitor.status)
     now = time.time
     monkeypatch.setattr(time, "time", lambda: now() + 2 * UNHEARD_SECONDS)
     says(monitor, {"learner": 0.0, "replay": 0.0, "evaluator": 0.0})
-    assert "silent: actor-0 for 60 s" in line(monitor.board)
+    assert "silent: actor-0 for 60 s" in line(monitor.status)
     monitor.close()
 
 
 def test_an_actor_that_an_earlier_start_had_is_not_silent(monitor: Monitor) -> None:
     """It has fewer now; what the last of them said does not count either."""
-    monitor.board.take(
+    monitor.status.take(
         {"role": "actor-1", "time": time.time() - 90.0, "episode_return_mean": 9.0, "broken_episodes": 2}
     )
-    monitor.board.take({"role": "actor-0", "time": time.time(), "episode_return_mean": 1.0})
+    monitor.status.take({"role": "actor-0", "time": time.time(), "episode_return_mean": 1.0})
     says(monitor, {"learner": 0.0, "replay": 0.0, "evaluator": 0.0}, start_s=30.0)
-    assert "silent" not in line(monitor.board)
-    assert (monitor.board.episode_return, monitor.board.broken_episodes) == (1.0, 0)
+    assert "silent" not in line(monitor.status)
+    assert (monitor.status.episode_return, monitor.status.broken_episodes) == (1.0, 0)
     monitor.close()
 
 
 def test_many_that_are_silent_are_counted(monitor: Monitor) -> None:
     says(monitor, {f"actor-{index}": 20.0 for index in range(9)})
-    assert "silent: actor-0 for 20 s, actor-1 for 20 s, actor-2 for 20 s and 6 more" in line(monitor.board)
+    assert "silent: actor-0 for 20 s, actor-1 for 20 s, actor-2 for 20 s and 6 more" in line(monitor.status)
     monitor.close()
 
 

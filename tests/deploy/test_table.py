@@ -12,11 +12,11 @@ from rmc.deploy.monitor.run_status import RunStatus
 from rmc.deploy.monitor.table import table
 
 WIDTHS = (40, 80, 120, 250)
-SECONDS = 40  # that the board's history lasts
+SECONDS = 40  # that the status's history lasts
 RATE = 95  # environment steps a second
 
 
-def board(actors: int = 2, start: float = 0.0) -> RunStatus:
+def full_status(actors: int = 2, start: float = 0.0) -> RunStatus:
     """A run at 120 000 of a million steps, with two evaluations; its records begin at a start's second."""
     status, now = RunStatus("HalfCheetah-v5", "robust", 1, 1_000_000, 32.0), time.time()
     for ago in range(SECONDS, -1, -1):
@@ -49,7 +49,7 @@ def drawn(of: RunStatus, width: int, height: int | None, **console: bool) -> lis
 @pytest.mark.parametrize("width", WIDTHS)
 def test_what_matters_is_there_at_every_size(width: int, height: int | None, trouble: bool, actors: int) -> None:
     """In 15 rows, too, of which the cursor takes one."""
-    of = board(actors)
+    of = full_status(actors)
     if trouble:
         of.take({"role": "learner", "time": time.time(), "checkpoint_error": "No space left on device"})
         of.take({"role": "launcher", "time": time.time(), "wall_s": 1270.0, "start_s": SECONDS, "restarts": 3})
@@ -75,36 +75,36 @@ def test_what_matters_is_there_at_every_size(width: int, height: int | None, tro
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_details_fill_the_room_that_is_left(width: int) -> None:
-    assert "latent rank" not in " ".join(drawn(board(), min(width, 80), 14))
-    assert "latent rank" in " ".join(drawn(board(), width, 40))
+    assert "latent rank" not in " ".join(drawn(full_status(), min(width, 80), 14))
+    assert "latent rank" in " ".join(drawn(full_status(), width, 40))
 
 
 def test_many_actors_share_a_row_where_rows_are_few() -> None:
-    assert any("32 actors" in row and "90%" in row for row in drawn(board(32), 80, 14))
-    assert any("actor-31" in row for row in drawn(board(32), 80, None))
+    assert any("32 actors" in row and "90%" in row for row in drawn(full_status(32), 80, 14))
+    assert any("actor-31" in row for row in drawn(full_status(32), 80, None))
 
 
 def test_a_terminal_has_colour_unless_it_asks_for_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.delenv("NO_COLOR", raising=False)
     cyan, escape = "\x1b[36m", "\x1b"
-    assert cyan in "".join(drawn(board(), 80, 14, force_terminal=True))
-    assert escape not in "".join(drawn(board(), 80, 14, force_terminal=False))
+    assert cyan in "".join(drawn(full_status(), 80, 14, force_terminal=True))
+    assert escape not in "".join(drawn(full_status(), 80, 14, force_terminal=False))
     monkeypatch.setenv("NO_COLOR", "1")
-    assert cyan not in "".join(drawn(board(), 80, 14, force_terminal=True))
+    assert cyan not in "".join(drawn(full_status(), 80, 14, force_terminal=True))
 
 
 def test_the_plain_line_says_how_far_it_is_and_who_waits() -> None:
-    text = line(board(4))
+    text = line(full_status(4))
     assert text.startswith("12% | 120,000 of 1,000,000 steps | 45 updates/s | eval 4,310 (best 4,402) | 0:21:10, ETA ")
     assert text.endswith(" | waiting: 4 actors 90% for credit, replay 80% for draws")
     assert line(RunStatus("Env-v0", "debug", 0, 100, 1.0)) == "0% | 0 of 100 steps | – updates/s | eval – | –, ETA –"
 
 
 def test_the_end_is_told_from_the_last_minute_of_this_start() -> None:
-    of = board()
+    of = full_status()
     assert of.eta_s == pytest.approx(880_000 / RATE)
-    resumed, now = board(start=100.0), time.time()
+    resumed, now = full_status(start=100.0), time.time()
     resumed.take({"role": "launcher", "time": now, "wall_s": 1270.0, "start_s": 0.0})
     assert resumed.eta_s is None  # of another start nothing is taken over
     for second in range(12):
@@ -124,7 +124,7 @@ def test_no_end_is_told_before_the_learner_learns_or_while_no_steps_come() -> No
 
 
 def test_the_time_goes_on_until_the_run_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    of, now = board(), time.time()
+    of, now = full_status(), time.time()
     monkeypatch.setattr(run_status.time, "time", lambda: now + 100)
     assert of.elapsed_s == pytest.approx(1370, abs=2)
     of.state = "finished"
