@@ -84,7 +84,7 @@ class Learner:
     def step(self) -> int:
         """One batch, its priorities sent back."""
         sample = self.client.sample(BATCH)
-        assert sample.draw is SampleStatus.BATCH
+        assert sample.status is SampleStatus.BATCH
         assert sample.rows is not None
         assert sample.weights is not None
         self.env_steps = sample.env_steps

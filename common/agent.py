@@ -257,7 +257,7 @@ class Agent(nn.Module):
             self.privileged_normalizer.freeze(*(numbers[self.obs_dim :] for numbers in sums))
 
     @torch.no_grad()
-    def fill(self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    def impute(self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """What is missing of o_t becomes what is expected from (h_{t-1}, o_{t-1}, a_{t-1}), o_{t-1} filled itself.
 
         (B, T, O) normalised, (B, T, M) bool, (B, T, A), (B, S) the state before the first step -> (B, T, O) and the
@@ -280,15 +280,15 @@ class Agent(nn.Module):
     ) -> tuple[MemoryOutput, Tensor, Tensor]:
         """The memory along a sequence; what it read, (B, T, O), missing frames filled; the state after, (B, S)."""
         seen = observation
-        if self.fills(missing):
-            seen, after = self.fill(observation, missing, prev_action, state)
+        if self.may_impute(missing):
+            seen, after = self.impute(observation, missing, prev_action, state)
         remembered: MemoryOutput = self.memory(seen, missing, prev_action, state)
         if seen is observation:
             last_frame = seen[:, -1, : state.shape[1] - self.config.hidden]
             after = torch.cat([remembered.hidden[:, -1], last_frame], 1)
         return remembered, seen, after
 
-    def fills(self, missing: Tensor) -> bool:
+    def may_impute(self, missing: Tensor) -> bool:
         """Whether there may be anything to fill; a GPU would have to wait to be asked, an export cannot ask."""
         cannot_ask = missing.device.type != "cpu" or torch.compiler.is_exporting()
         return self.config.impute_missing and (cannot_ask or bool(missing.any()))

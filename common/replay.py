@@ -28,7 +28,7 @@ class Sample:
     ``weights``, priority ** exponent each, of ``total_weight`` over all ``windows``.
     """
 
-    draw: SampleStatus
+    status: SampleStatus
     rows: Rows | None  # (B,)
     weights: NDArray[np.float64] | None  # (B,)
     total_weight: float

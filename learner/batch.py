@@ -21,7 +21,7 @@ class Plan(NamedTuple):
     """What the host decides of an update before it runs, so that no device has to be asked."""
 
     steps: int  # of each window, L_b and up to L_t
-    fills: bool  # whether a frame may be missing
+    has_missing: bool  # whether a frame may be missing
     trains_imputer: bool
     trains_policy: bool
 

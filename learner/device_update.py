@@ -135,7 +135,7 @@ class DeviceUpdate:
         self._copy([raw, importance])
         self._beta.fill_(beta)
         result = self._work(self._update.plan(raw, self._spec, number))
-        self._update.average.move(number)
+        self._update.average.update(number)
         return [result]
 
     def use_threads(self, number: int) -> None:
@@ -164,9 +164,9 @@ class DeviceUpdate:
         with torch.cuda.stream(self._beside):
             value_losses, value = update.value_pass(batch, model, self._beta)
             value_norm = update.step(update.optimizers[1:], value_losses.values())
-            update.follow_value(value)
+            update.after_value_step(value)
         model_norm = update.step(update.optimizers[:1], model_losses.values())
-        update.follow_model(model)
+        update.after_model_step(model)
         current.wait_stream(self._beside)
         return update.result(batch, model, value, torch.hypot(model_norm, value_norm))
 

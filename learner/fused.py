@@ -43,13 +43,13 @@ class FusedAgent(Agent):
     """Fills missing frames with every weight rounded once for all steps, not once a step."""
 
     @torch.no_grad()
-    def fill(self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    def impute(self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """As ``Agent.fill``, which it is without a memory, or where the embedding has no plain layer."""
         c = self.config
         if not (c.embedding and applies(observation)) or c.layer_norm or c.head_input == "observation":
-            return super().fill(observation, missing, prev_action, state)
+            return super().impute(observation, missing, prev_action, state)
         with torch.autocast("cpu", enabled=False):
-            return _fill(self, observation, missing, prev_action, state)
+            return _impute(self, observation, missing, prev_action, state)
 
 
 class FusedGRU(Rounded, nn.GRU):
@@ -71,7 +71,7 @@ class FusedGRU(Rounded, nn.GRU):
         return sequence, sequence[:, -1].unsqueeze(0)
 
 
-def _fill(
+def _impute(
     agent: Agent, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor
 ) -> tuple[Tensor, Tensor]:
     """(B, T, O), (B, T, M), (B, T, A), (B, S) -> (B, T, O), (B, S)."""

@@ -64,14 +64,17 @@ def lower(x: Floats, out: Bits) -> None:
 
 
 @_compiled
-def gru_step(gi: Bits, gh: Bits, bi: Floats, bh: Floats, h: Floats, kept: Floats, new: Floats, new_low: Bits) -> None:
+def gru_step(
+    gi: Bits, gh: Bits, bi: Floats, bh: Floats, h: Floats, gate_cache: Floats, new: Floats, new_bf16: Bits
+) -> None:
     """h' = n + z (h - n) from the products gi = W_i x and gh = W_h h, (B, 3H) in nn.GRU's order r, z, n.
 
-    ``kept`` (B, 4H): r, z, n and W_hn h + b_hn, for the way back. Each loop over few arrays, or it has no vector form.
+    ``gate_cache`` (B, 4H): r, z, n and W_hn h + b_hn, for the way back.
+    Each loop is over few arrays, or it has no vector form.
     """
     size = h.shape[1]
     for b in range(h.shape[0]):
-        gates, n, m = kept[b, : 2 * size], kept[b, 2 * size : 3 * size], kept[b, 3 * size :]
+        gates, n, m = gate_cache[b, : 2 * size], gate_cache[b, 2 * size : 3 * size], gate_cache[b, 3 * size :]
         for j in range(2 * size):
             gates[j] = _sigmoid(_up(gi[b, j]) + bi[j] + (_up(gh[b, j]) + bh[j]))
         for j in range(size):
@@ -82,28 +85,28 @@ def gru_step(gi: Bits, gh: Bits, bi: Floats, bh: Floats, h: Floats, kept: Floats
             n[j] = TWO * _sigmoid(TWO * n[j]) - ONE  # tanh
         for j in range(size):
             new[b, j] = n[j] + gates[size + j] * (h[b, j] - n[j])
-        lower(new[b], new_low[b])
+        lower(new[b], new_bf16[b])
 
 
 @_compiled
 def gru_step_back(
-    d: Floats, through: Bits, grad: Floats, h: Floats, kept: Floats, dgi: Bits, dgh: Bits, dbi: Floats, dbn: Floats
-) -> None:
+    d: Floats, grad_recurrent: Bits, grad: Floats, h: Floats, gate_cache: Floats, dgi: Bits, dgh: Bits,
+    dbi: Floats, dbn: Floats,
+) -> None:  # fmt: skip
     """Gradients of one step's gates, (B, 3H) each, added up over B into the biases' own.
 
-    ``d`` (B, H) comes as what the next step's z let through, leaves as what this one's does; ``through`` is what came
-    by the next step's product, ``grad`` what its own output got. ``dbn`` is b_hn's; the other two of b_h are b_i's.
+    ``d`` (B, H) comes as what the next step's z let through, leaves as what this one's does. ``grad_recurrent`` is what
+    came by the next step's product, ``grad`` what its own output got. ``dbn`` is b_hn's; b_h's other two are b_i's.
     """
     size = h.shape[1]
     work = np.empty(3 * size, np.float32)
     ar, az, an = work[:size], work[size : 2 * size], work[2 * size :]
     for b in range(h.shape[0]):
-        r, z, n, m = (
-            kept[b, :size], kept[b, size : 2 * size], kept[b, 2 * size : 3 * size], kept[b, 3 * size :]
-        )  # fmt: skip
+        r, z, n = gate_cache[b, :size], gate_cache[b, size : 2 * size], gate_cache[b, 2 * size : 3 * size]
+        m = gate_cache[b, 3 * size :]
         total = d[b]
         for j in range(size):
-            total[j] += grad[b, j] + _up(through[b, j])
+            total[j] += grad[b, j] + _up(grad_recurrent[b, j])
         for j in range(size):
             an[j] = total[j] * (ONE - z[j]) * (ONE - n[j] * n[j])
         for j in range(size):

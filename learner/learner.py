@@ -115,13 +115,13 @@ class Learner:
             self._ask_for_evaluation()
         sample = self.replay.sample(self.config.batch_size)
         self.env_steps = max(self.env_steps, sample.env_steps)
-        if sample.draw is not SampleStatus.BATCH:
-            self._settle()
-        if sample.draw is SampleStatus.WAIT:
+        if sample.status is not SampleStatus.BATCH:
+            self._flush()
+        if sample.status is SampleStatus.WAIT:
             self._waiting = "experience"
             self._publish_if_forgotten()
             return False
-        if sample.draw is SampleStatus.FINISHED:
+        if sample.status is SampleStatus.FINISHED:
             self._waiting = "disk"
             self.finished = self.checkpoint()
             return self.finished
@@ -131,7 +131,7 @@ class Learner:
         self._learn(sample)
         self._threads.note(time.perf_counter() - began)
         if self.env_steps >= self._next_checkpoint:
-            self._settle()
+            self._flush()
             self.checkpoint()
         return True
 
@@ -165,7 +165,7 @@ class Learner:
         if self.updates % self.config.publish_updates == 0:
             self.publish()
 
-    def _settle(self) -> None:
+    def _flush(self) -> None:
         """Finish what is pending and give all priorities back."""
         self._finish_pending()
         self._return_priorities(leave=0)
@@ -179,7 +179,7 @@ class Learner:
     def publish(self) -> None:
         """Broadcast the policy with the newest observation statistics frozen into it. Raises FencedError."""
         self._freeze_statistics()
-        blob, version = self._sound(self.agent.broadcast_weights()), Version(self.epoch, self.updates)
+        blob, version = self._serialize_finite(self.agent.broadcast_weights()), Version(self.epoch, self.updates)
         self.bus.publish_weights(version, blob)
         self._published = version
 
@@ -191,11 +191,11 @@ class Learner:
                 self.publish()
 
     def _ask_for_evaluation(self) -> None:
-        blob = self._sound(self.update.average.policy_weights())
+        blob = self._serialize_finite(self.update.average.policy_weights())
         self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate=True)
         self._evaluation_due = False
 
-    def _sound(self, weights: dict[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
+    def _serialize_finite(self, weights: dict[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
         """Weights as they are sent and saved. Raises RmcError where they are not finite: neither must then happen."""
         self._check_finite(weights)
         return safetensors.torch.save(weights, metadata)
@@ -254,7 +254,7 @@ class Learner:
         began = time.monotonic()
         state = self.update.state_dict()
         self._check_finite(state)  # critics or moments may be spoilt while the policy, for one more update, is not
-        policy = self._sound(self.update.average.policy_weights(), self._metadata())
+        policy = self._serialize_finite(self.update.average.policy_weights(), self._metadata())
         progress = LearnerProgress(
             self.updates, self.env_steps, self.epoch, self._threads.chosen, self._observed_before
         )
@@ -308,7 +308,7 @@ class Learner:
         """Save what a resumed run needs, unless that is done, a newer learner has taken over, or training diverged."""
         try:
             if not (self.finished or self._fenced or self._diverged):
-                self._settle()
+                self._flush()
                 if self.updates > self.last_checkpoint:
                     self.save()
         except RmcError as error:  # diverged since the last look, or no room: the checkpoint before is kept

@@ -45,13 +45,13 @@ class CompiledAdam(torch.optim.Adam):
         state, gradient = self.state[parameter], parameter.grad
         assert gradient is not None
         moments = _flat(state["exp_avg"]), _flat(state["exp_avg_sq"])
-        low, step = _low(self._rounded, parameter), state["step"].view(1).numpy()
+        bf16, step = _bf16_copy(self._rounded, parameter), state["step"].view(1).numpy()
         assert all(moment.size == parameter.numel() for moment in moments)  # the kernel does not look
-        kernels.adam(_flat(parameter), _flat(gradient), *moments, low, step, *rates)
+        kernels.adam(_flat(parameter), _flat(gradient), *moments, bf16, step, *rates)
 
 
 @torch.no_grad()
-def follow(target: nn.Module, source: nn.Module, weight: float) -> None:
+def polyak_update(target: nn.Module, source: nn.Module, weight: float) -> None:
     """target <- target + weight (source - target), parameter by parameter; ``weight`` from 0 to 1."""
     pairs = list(zip(target.parameters(), source.parameters(), strict=True))
     if pairs[0][0].device.type != "cpu":
@@ -59,7 +59,7 @@ def follow(target: nn.Module, source: nn.Module, weight: float) -> None:
         return
     rounded = rounded_weights([target])
     for old, new in pairs:
-        kernels.polyak(_flat(old), _flat(new), _low(rounded, old), weight)
+        kernels.polyak(_flat(old), _flat(new), _bf16_copy(rounded, old), weight)
 
 
 def _flat(tensor: Tensor) -> NDArray[np.float32]:
@@ -68,10 +68,10 @@ def _flat(tensor: Tensor) -> NDArray[np.float32]:
     return flat
 
 
-def _low(rounded: Mapping[Tensor, Tensor], weight: Tensor) -> NDArray[np.uint16]:
+def _bf16_copy(rounded: Mapping[Tensor, Tensor], weight: Tensor) -> NDArray[np.uint16]:
     """(K,) its copy in bfloat16, or (0,) where there is none."""
-    low = rounded.get(weight)
-    return NOT_ROUNDED if low is None else low.view(-1).view(torch.uint16).numpy()
+    bf16 = rounded.get(weight)
+    return NOT_ROUNDED if bf16 is None else bf16.view(-1).view(torch.uint16).numpy()
 
 
 def adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:

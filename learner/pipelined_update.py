@@ -139,8 +139,8 @@ class PipelinedUpdate:
         model = slot.model_of(batch)
         loss_values, value = update.value_pass(batch, model, slot.beta)
         norm = update.step(update.optimizers[1:], loss_values.values())
-        update.follow_value(value)
-        update.average.move(number, VALUE_PARTS)
+        update.after_value_step(value)
+        update.average.update(number, VALUE_PARTS)
         return update.result(batch, model, value, torch.hypot(norm, slot.norm))
 
     def _start(self) -> None:
@@ -154,7 +154,7 @@ class PipelinedUpdate:
             [
                 *own,
                 *moments,
-                *update.average.of(MODEL_PARTS),
+                *update.average.tensors(MODEL_PARTS),
                 *update.agent.normalizer.buffers(),
                 update.curiosity_variance,
                 update.fill_loss,
@@ -165,7 +165,7 @@ class PipelinedUpdate:
         parent, self._pipe = os.getpid(), ours
         self._child = os.fork()
         if self._child == 0:
-            self._be_the_other(parent, theirs)
+            self._run_child(parent, theirs)
         theirs.close()
         torch.set_num_threads(self._threads)
 
@@ -180,7 +180,7 @@ class PipelinedUpdate:
         _share([raw, norm, *model[:-1], *model.metrics.values()])
         return slot
 
-    def _be_the_other(self, parent: int, requests: socket.socket) -> NoReturn:
+    def _run_child(self, parent: int, requests: socket.socket) -> NoReturn:
         """In the new process, which ends with the other one, or once that closes its end."""
         try:
             exit_with_parent(parent)
@@ -205,8 +205,8 @@ class PipelinedUpdate:
         update, batch = self._update, view_batch(slot.raw, slot.importance, self._spec, plan)
         loss_values, model = update.model_pass(batch)
         norm = update.step(update.optimizers[:1], loss_values.values())
-        update.follow_model(model)
-        update.average.move(number, MODEL_PARTS)
+        update.after_model_step(model)
+        update.average.update(number, MODEL_PARTS)
         slot.write(batch, model, norm)
 
 

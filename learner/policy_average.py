@@ -19,7 +19,7 @@ class PolicyAverage:
         self._values = {name: value.detach().clone() for name, value in averaged.items()}
 
     @torch.no_grad()
-    def move(self, updates: int, parts: tuple[str, ...] = ("",)) -> None:
+    def update(self, updates: int, parts: tuple[str, ...] = ("",)) -> None:
         """After so many updates, those of what acts whose names begin so; every ``MOVE_UPDATES``."""
         if self._values and updates % MOVE_UPDATES == 0:
             over, acting = min(self._updates, updates / 10) / MOVE_UPDATES, self._agent.acting()
@@ -27,7 +27,7 @@ class PolicyAverage:
             averaged, newest = ([source[name] for name in names] for source in (self._values, {**acting}))
             torch._foreach_lerp_(averaged, newest, 1.0 / max(1.0, over))
 
-    def of(self, parts: tuple[str, ...]) -> Iterator[Tensor]:
+    def tensors(self, parts: tuple[str, ...]) -> Iterator[Tensor]:
         """The tensors whose names begin so, to be moved elsewhere in memory."""
         return (value for name, value in self._values.items() if name.startswith(parts))
 

@@ -94,7 +94,7 @@ class ReplayClient:
 
     def _away(self) -> Sample:
         """What was known last, without a batch."""
-        return replace(self._last, draw=SampleStatus.WAIT, rows=None, weights=None)
+        return replace(self._last, status=SampleStatus.WAIT, rows=None, weights=None)
 
     def _receive_sample(self, drawn_elsewhere_steps: int) -> Sample:
         connection = self._batches = self._batches or self._open_batches()

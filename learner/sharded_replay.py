@@ -30,7 +30,7 @@ class _Stock:
         while len(self._rows) < count:
             self.last = self.replay.sample(self._chunk, drawn_elsewhere_steps)
             if self.last.rows is None or self.last.weights is None:
-                return self.last.draw
+                return self.last.status
             self._rows = np.concatenate([self._rows, self.last.rows])
             self._weights = np.concatenate([self._weights, self.last.weights])
         return SampleStatus.BATCH
@@ -84,7 +84,7 @@ class ShardedReplay:
 
     def _live(self) -> NDArray[np.bool_]:
         """(S,) which shards have not finished."""
-        return np.array([stock.last.draw is not SampleStatus.FINISHED for stock in self._stocks])
+        return np.array([stock.last.status is not SampleStatus.FINISHED for stock in self._stocks])
 
     def _drawn_outside(self, stock: _Stock) -> int:
         """Trained steps drawn from the other shards."""
@@ -110,14 +110,14 @@ class ShardedReplay:
         return self._sample(SampleStatus.BATCH, rows, weights)
 
     def _sample(
-        self, draw: SampleStatus, rows: Rows | None = None, weights: NDArray[np.float64] | None = None
+        self, status: SampleStatus, rows: Rows | None = None, weights: NDArray[np.float64] | None = None
     ) -> Sample:
         last = [stock.last for stock in self._stocks]
         total_weight, windows, env_steps, drawn_steps = (
             sum(getattr(sample, name) for sample in last)
             for name in ("total_weight", "windows", "env_steps", "drawn_steps")
         )
-        return Sample(draw, rows, weights, total_weight, windows, env_steps, drawn_steps)
+        return Sample(status, rows, weights, total_weight, windows, env_steps, drawn_steps)
 
     def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
         """Give priorities back to the shards that the windows came from."""

@@ -31,11 +31,11 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch) -> Tensor:
 
 def impute(agent: Agent, o: Tensor, batch: Batch) -> Tensor:
     """(B, L + 1, O) with missing frames filled where configured, along the states that ``unroll`` goes through."""
-    if agent.next_frame is None or not batch.plan.fills:
+    if agent.next_frame is None or not batch.plan.has_missing:
         return o
 
     def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:
-        return agent.fill(o[:, steps], batch.missing[:, steps], batch.prev_action[:, steps], state)
+        return agent.impute(o[:, steps], batch.missing[:, steps], batch.prev_action[:, steps], state)
 
     past, state = part(slice(batch.burn_in), batch.state)
     state = torch.where(batch.burned_in.unsqueeze(1), state, batch.state)

@@ -23,7 +23,7 @@ from rmc.learner.batch import Batch, Plan, has_missing, update_steps
 from rmc.learner.config import UpdateConfig
 from rmc.learner.diagnostics import Trace, model_metrics, unexplained_change, value_metrics
 from rmc.learner.fused import fuse
-from rmc.learner.optimizers import adam, by_optimizer, follow
+from rmc.learner.optimizers import adam, by_optimizer, polyak_update
 from rmc.learner.policy_average import PolicyAverage
 from rmc.learner.unroll import impute, unroll
 
@@ -100,8 +100,8 @@ class JointUpdate:
         """One update from a Batch; ``beta`` is a scalar tensor."""
         loss_values, model, value = self.forward(batch, beta)
         norm = self.step(self.optimizers, loss_values.values())
-        self.follow_model(model)
-        self.follow_value(value)
+        self.after_model_step(model)
+        self.after_value_step(value)
         return self.result(batch, model, value, norm)
 
     def forward(self, batch: Batch, beta: Tensor) -> tuple[Losses, ModelPass, ValuePass]:
@@ -131,11 +131,11 @@ class JointUpdate:
             i, curiosity_variance = self._scaled(losses.curiosity(error, d, m), m)
             next_z = (self._to_bf16(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:].detach()
         loss_values = {"model_loss": losses.model_loss(error, d, m)}
-        fill_losses = self._fill_losses(o, memory, batch, m)
+        imputer_losses = self._imputer_losses(o, memory, batch, m)
         grounding_loss, unexplained = self._grounding_loss(o, prediction, batch, m)
-        loss_values |= fill_losses | grounding_loss
+        loss_values |= imputer_losses | grounding_loss
         metrics = model_metrics(detached(loss_values), change, i, d, m, c.model_norm)
-        fill_loss = detached(fill_losses).get("fill_loss", self.fill_loss)
+        fill_loss = detached(imputer_losses).get("fill_loss", self.fill_loss)
         if agent.next_frame is not None:
             metrics["fill_loss"] = fill_loss
         hidden = memory.hidden.detach()
@@ -209,7 +209,7 @@ class JointUpdate:
         self.was_missing |= fills
         return Plan(steps, fills, bool(self.was_missing) or number % IMPUTER_UPDATES == 1, trains_policy)
 
-    def _fill_losses(self, o: Tensor, memory: MemoryOutput, batch: Batch, m: Tensor) -> Losses:
+    def _imputer_losses(self, o: Tensor, memory: MemoryOutput, batch: Batch, m: Tensor) -> Losses:
         """The loss of what imputes, where it is configured and its turn."""
         imputer, steps = self.agent.next_frame, batch.trained
         if imputer is None or not batch.plan.trains_imputer:
@@ -270,18 +270,18 @@ class JointUpdate:
             optimizer.step()
         return norm.detach()
 
-    def follow_model(self, model: ModelPass) -> None:
+    def after_model_step(self, model: ModelPass) -> None:
         """What follows the memory's step: its target by Polyak, the running variance, the imputer's last loss."""
         if self.target_memory is not None:
-            follow(self.target_memory, self.agent.memory, 1.0 - self.config.polyak)
+            polyak_update(self.target_memory, self.agent.memory, 1.0 - self.config.polyak)
         self.curiosity_variance.copy_(model.curiosity_variance)
         self.fill_loss.copy_(model.fill_loss)
 
-    def follow_value(self, value: ValuePass) -> None:
+    def after_value_step(self, value: ValuePass) -> None:
         """What follows the critics' step: their targets by Polyak, the policy's last loss."""
         self.policy_loss.copy_(value.metrics["policy_loss"])
         if self.target_critic is not None:
-            follow(self.target_critic, self.agent.critic, 1.0 - self.config.polyak)
+            polyak_update(self.target_critic, self.agent.critic, 1.0 - self.config.polyak)
 
     def state_dict(self) -> dict[str, Any]:
         """All that an update changes, for a checkpoint."""

@@ -51,8 +51,8 @@ class AlternateUpdate(JointUpdate):
                 of_critics = model, value
         model, value = of_critics
         value = value._replace(metrics=value.metrics | metrics)
-        self.follow_model(model)
-        self.follow_value(value)
+        self.after_model_step(model)
+        self.after_value_step(value)
         return self.result(batch, model, value, torch.stack(norms).norm())
 
 

@@ -34,14 +34,14 @@ class ClientConnection:
         self.nonce = b""  # of a client that has shown its proof
         self.opened = time.monotonic()
         self._inbox = bytearray()
-        self._unacked: deque[memoryview] = deque()
+        self._unsent: deque[memoryview] = deque()
         self.shared: SharedBatches | None = None  # where its batches lie, if not in the socket
         self._zero_copy = False  # unsent frames may hold views of the sender's buffers
 
     @property
     def sending(self) -> bool:
         """Whether something is still to be sent; until then nothing more is read from this client."""
-        return bool(self._unacked)
+        return bool(self._unsent)
 
     def encrypt(self) -> bool:
         """Go on with the handshake of a socket that needs one; whether it is over."""
@@ -85,7 +85,7 @@ class ClientConnection:
 
     def send(self, kind: Kind, meta: Mapping[str, Any], parts: tuple[memoryview, ...] = ()) -> None:
         """Send what the kernel takes now and keep the rest, without a copy: see ``copy_pending``."""
-        self._unacked += [memoryview(encode_frame(kind, meta, parts)), *(part for part in parts if part.nbytes)]
+        self._unsent += [memoryview(encode_frame(kind, meta, parts)), *(part for part in parts if part.nbytes)]
         self._zero_copy = True
         self.flush()
 
@@ -93,29 +93,29 @@ class ClientConnection:
         """Send an empty frame and a file descriptor with it."""
         frame = encode_frame(kind, {})
         sent = socket.send_fds(self.socket, [frame], [descriptor])
-        self._unacked += [memoryview(frame[sent:])] * (sent < len(frame))
+        self._unsent += [memoryview(frame[sent:])] * (sent < len(frame))
 
     def flush(self) -> None:
         """Go on sending."""
-        while self._unacked:
+        while self._unsent:
             try:
                 sent = self._send_some()
             except (BlockingIOError, ssl.SSLWantWriteError, ssl.SSLWantReadError):
                 return
-            while self._unacked and sent >= self._unacked[0].nbytes:
-                sent -= self._unacked.popleft().nbytes
-            if self._unacked:
-                self._unacked[0] = self._unacked[0][sent:]
+            while self._unsent and sent >= self._unsent[0].nbytes:
+                sent -= self._unsent.popleft().nbytes
+            if self._unsent:
+                self._unsent[0] = self._unsent[0][sent:]
 
     def _send_some(self) -> int:
         if isinstance(self.socket, ssl.SSLSocket):  # which cannot gather
-            return self.socket.send(self._unacked[0])
-        return self.socket.sendmsg(self._unacked)
+            return self.socket.send(self._unsent[0])
+        return self.socket.sendmsg(self._unsent)
 
     def copy_pending(self) -> None:
         """Copy what is still unsent, because its buffer is about to be used again."""
         if self._zero_copy:
-            self._unacked = deque(memoryview(bytes(part)) for part in self._unacked)
+            self._unsent = deque(memoryview(bytes(part)) for part in self._unsent)
             self._zero_copy = False
 
     def close(self) -> None:

@@ -23,7 +23,7 @@ class RateLimiter:
     total_steps: int
     slack_steps: int
 
-    def draw(self, inserted: int, drawn: int, batch_steps: int) -> SampleStatus:
+    def status(self, inserted: int, drawn: int, batch_steps: int) -> SampleStatus:
         """Whether a batch of at most ``batch_steps`` trained steps may be drawn now.
 
         Once all steps are in, what the ratio still owes is drawn without the tolerance.

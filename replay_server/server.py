@@ -236,7 +236,7 @@ class ReplayServer:
         """
         progress, tree = self._store.ring.progress, self._store.tree
         progress.elsewhere_steps = max(progress.elsewhere_steps, drawn_elsewhere_steps)
-        draw = self._limiter.draw(self._inserted, self._drawn, batch_size * self.spec.train)
+        draw = self._limiter.status(self._inserted, self._drawn, batch_size * self.spec.train)
         if draw is SampleStatus.BATCH and tree.total == 0.0:
             draw = SampleStatus.WAIT
         self._note_waiting(draw)
@@ -279,9 +279,9 @@ class ReplayServer:
             self._buffers[0] = np.empty(batch_size, self.spec.dtype)
         return self._buffers[0][:batch_size]
 
-    def _note_waiting(self, draw: SampleStatus) -> None:
+    def _note_waiting(self, status: SampleStatus) -> None:
         warming_up = self._inserted < self._limiter.warmup_steps
-        waiting_for = ("warm-up" if warming_up else "env_steps") if draw is SampleStatus.WAIT else ""
+        waiting_for = ("warm-up" if warming_up else "env_steps") if status is SampleStatus.WAIT else ""
         if waiting_for != self._waiting_for:
             self._waiting_for, self._waiting_since = waiting_for, time.monotonic()
 
@@ -345,7 +345,7 @@ class ReplayServer:
 
     def waiting_for(self) -> str:
         """``windows`` from the actors where nothing may be drawn before more come, else ``draws`` by the learner."""
-        return "windows" if self._limiter.draw(self._inserted, self._drawn, 0) is SampleStatus.WAIT else "draws"
+        return "windows" if self._limiter.status(self._inserted, self._drawn, 0) is SampleStatus.WAIT else "draws"
 
     def checkpoint(self) -> None:
         """Make everything durable: a server opened here afterwards goes on as this one would."""

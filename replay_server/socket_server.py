@@ -79,7 +79,7 @@ class SocketServer:
                 self._accept()
             elif key.data in self._connections:  # not ended earlier in this round
                 self._serve(key.data, events)
-        self._end_strangers()
+        self._end_unauthenticated()
         return bool(ready)
 
     def _accept(self) -> None:
@@ -87,7 +87,7 @@ class SocketServer:
             accepted, _ = self._listener.accept()
         except OSError:  # it went away again, or we are out of file handles
             return
-        if len(self._connections) >= MAX_CONNECTIONS and not self._end_oldest_stranger():
+        if len(self._connections) >= MAX_CONNECTIONS and not self._evict_oldest_unauthenticated():
             self.refused["too-many"] += 1
             accepted.close()
             return
@@ -105,7 +105,7 @@ class SocketServer:
             except OSError:
                 self._end(connection)
 
-    def _end_oldest_stranger(self) -> bool:
+    def _evict_oldest_unauthenticated(self) -> bool:
         """Make room, so that a crowd of strangers keeps no client out; whether there was one to end."""
         unauthenticated = [connection for connection in self._connections if not connection.authenticated]
         if unauthenticated:
@@ -165,12 +165,12 @@ class SocketServer:
         if not is_proof(received, proof(self._secret, b"client", connection.challenge, nonce)):
             raise AuthenticationError("the client does not know this run's secret")
         connection.nonce = nonce
-        self._introduce(connection, frame.meta.get("epoch"))
+        self._register_learner(connection, frame.meta.get("epoch"))
         connection.authenticated = True
         answer = proof(self._secret, b"server", nonce, connection.challenge)
         connection.send(Kind.WELCOME, {"proof": answer, "fingerprint": self._spec.fingerprint})
 
-    def _introduce(self, connection: ClientConnection, epoch: Any) -> None:
+    def _register_learner(self, connection: ClientConnection, epoch: Any) -> None:
         """Only the newest learner is served, so that one which was stopped and replaced writes nothing any more."""
         if type(epoch) is not int or not 0 <= epoch < 2**62:
             raise AuthenticationError(f"{epoch!r} is no learner's epoch")
@@ -235,7 +235,7 @@ class SocketServer:
             sample = self._server.sample(batch_size, drawn_elsewhere_steps, shared.rows[shared.turn])
         meta = {name: getattr(sample, name) for name in ("total_weight", "windows", "env_steps", "drawn_steps")}
         if sample.rows is None or sample.weights is None:
-            connection.send(Kind.FINISHED if sample.draw is SampleStatus.FINISHED else Kind.WAIT, meta)
+            connection.send(Kind.FINISHED if sample.status is SampleStatus.FINISHED else Kind.WAIT, meta)
         elif shared is None or shared.batch_size != batch_size:
             connection.send(Kind.BATCH, meta, (sample.rows.view(np.uint8).data, sample.weights.data.cast("B")))
         else:
@@ -263,7 +263,7 @@ class SocketServer:
             connection.send(Kind.ERROR, {"error": detail, **shown})
         self._end(connection)
 
-    def _end_strangers(self) -> None:
+    def _end_unauthenticated(self) -> None:
         """Who says nothing for long is sent away, so that strangers cannot fill the server."""
         oldest = time.monotonic() - AUTHENTICATION_SECONDS
         for connection in list(self._connections):

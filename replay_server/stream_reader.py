@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rmc.common.bus.protocol import LIVES, Bus, Entry, EntryId, actor_role
+from rmc.common.bus.protocol import MAX_EPOCH_GAP, Bus, Entry, EntryId, actor_role
 from rmc.common.errors import BusFull, MessageError
 from rmc.common.shard import WHOLE, Shard
 from rmc.common.window import Rows, WindowSpec
@@ -183,4 +183,4 @@ def _is_possible(new: EntryId, before: EntryId, newest_epoch: int) -> bool:
     """Whether a life can have reached an id, where ``before`` was taken last and its actor has taken so many epochs."""
     if new.epoch == before.epoch:
         return new.seq <= min(before.seq + SKIPPED, LARGEST.seq)
-    return new.epoch <= min(newest_epoch, before.epoch + LIVES, LARGEST.epoch) and new.seq <= LARGEST.seq
+    return new.epoch <= min(newest_epoch, before.epoch + MAX_EPOCH_GAP, LARGEST.epoch) and new.seq <= LARGEST.seq

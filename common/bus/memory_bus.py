@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rmc.common.bus.protocol import (
-    LIVES,
+    MAX_EPOCH_GAP,
     METRICS_KEPT,
     Ack,
     Entry,
@@ -44,7 +44,7 @@ class MemoryBus:
 
     def take_epoch(self, role: str, floor: int = 0) -> int:
         held = self._epochs.get(role, 0)
-        self._epochs[role] = (held if floor <= held < floor + LIVES else floor) + 1
+        self._epochs[role] = (held if floor <= held < floor + MAX_EPOCH_GAP else floor) + 1
         return self._epochs[role]
 
     def check_room(self, role: str) -> None:
@@ -58,7 +58,7 @@ class MemoryBus:
         if entry_id.seq == 0:
             self._epochs[actor_role(actor)] = max(self.current_epoch(actor_role(actor)), entry_id.epoch)
         if entry_id <= last:
-            if last.epoch > min(self.current_epoch(actor_role(actor)), entry_id.epoch + LIVES):
+            if last.epoch > min(self.current_epoch(actor_role(actor)), entry_id.epoch + MAX_EPOCH_GAP):
                 raise BusUnavailable(f"actor {actor}: there is an entry of epoch {last.epoch}, which nobody has taken")
             if last.epoch > entry_id.epoch:
                 raise FencedError(f"actor {actor}: epoch {last.epoch} has replaced epoch {entry_id.epoch}")

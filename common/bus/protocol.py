@@ -28,7 +28,7 @@ from typing import Any, NamedTuple, Protocol
 from rmc.common.checksum import crc32
 from rmc.common.errors import MessageError
 
-LIVES = 1 << 16  # epochs that a role can take at most beyond the last one that is known of it
+MAX_EPOCH_GAP = 1 << 16  # epochs that a role can take at most beyond the last one that is known of it
 METRICS_KEPT = 300  # records of a role, at least: five minutes
 
 
@@ -104,7 +104,7 @@ class Bus(Protocol):
     def take_epoch(self, role: str, floor: int = 0) -> int:
         """A new epoch of this role, larger than ``floor`` and than any taken before.
 
-        At most ``LIVES`` above ``floor``: where more are counted, somebody has changed the counter, and it is mended.
+        At most ``MAX_EPOCH_GAP`` above ``floor``: more was counted by a stranger, and the counter is mended.
         """
 
     def check_room(self, role: str) -> None:

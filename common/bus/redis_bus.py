@@ -7,7 +7,7 @@ from typing import Any
 
 from rmc.common.bus.metrics_record import decode_record, encode_record
 from rmc.common.bus.protocol import (
-    LIVES,
+    MAX_EPOCH_GAP,
     METRICS_KEPT,
     Ack,
     Entry,
@@ -63,7 +63,7 @@ class RedisBus(RedisConnection):
 
     def take_epoch(self, role: str, floor: int = 0) -> int:
         key = self.key("epoch", role)
-        while not floor < (epoch := self._next_epoch(key, floor)) <= floor + LIVES:
+        while not floor < (epoch := self._next_epoch(key, floor)) <= floor + MAX_EPOCH_GAP:
             # Redis lost its data, or somebody changed them; two lives that catch up at once still get one each.
             self.call(self.redis.incrby, key, floor - epoch)
         return epoch
@@ -114,7 +114,7 @@ class RedisBus(RedisConnection):
             raise _gone(stream) from None  # it was dropped after it had refused the id
         if last.epoch == entry_id.epoch:
             return
-        if last.epoch > min(self.current_epoch(actor_role(actor)), entry_id.epoch + LIVES):
+        if last.epoch > min(self.current_epoch(actor_role(actor)), entry_id.epoch + MAX_EPOCH_GAP):
             raise BusUnavailable(f"{stream} has an entry of epoch {last.epoch}, which nobody has taken")
         raise FencedError(f"actor {actor}: epoch {last.epoch} has replaced epoch {entry_id.epoch}")
 

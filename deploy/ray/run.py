@@ -53,7 +53,7 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
 NODES_SECONDS = 2.0  # between looks for nodes that came
-HOMELESS_SECONDS = 8.0  # without a node for the learner, after which actors make room
+LEARNER_PENDING_SECONDS = 8.0  # without a node for the learner, after which actors make room
 GIVE_WAY_SECONDS = 300.0  # without a node for another run's learner, after which actors are placed all the same
 LOST_SECONDS = 120.0  # within which a role's host may be lost for good twice
 STOP_SECONDS = 20.0  # for all roles to end in order and for the last checkpoint to reach the head
@@ -188,7 +188,7 @@ class ClusterRun:
             self._keep_low_actors()
         elif max(first) >= NODES_SECONDS:  # it has not only begun
             self._end_waiting_actors()
-            if waiting.get(own, 0.0) >= HOMELESS_SECONDS:
+            if waiting.get(own, 0.0) >= LEARNER_PENDING_SECONDS:
                 self._learners.count_anew(own)
                 self._make_room()
 
@@ -197,7 +197,8 @@ class ClusterRun:
         if cpus() >= reserved_cpus(self.config) + self.config.actors:  # they are only being started again
             return
         actors = self._actors()
-        waiting = [one for one in actors if not one.running and time.monotonic() > one.waits_since + HOMELESS_SECONDS]
+        overdue = time.monotonic() - LEARNER_PENDING_SECONDS
+        waiting = [one for one in actors if not one.running and one.waits_since < overdue]
         if waiting and actors[-1].running:
             log.warning("%s waits for a CPU; %s gives it its own", waiting[0].name, actors[-1].name)
             self._end_host(actors[-1])

@@ -12,7 +12,7 @@ import redis
 
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import (
-    LIVES,
+    MAX_EPOCH_GAP,
     METRICS_KEPT,
     PIECE_BYTES,
     Ack,
@@ -117,9 +117,9 @@ def test_a_hello_makes_its_epoch_known_again(bus):
 
 
 def test_epochs_far_beyond_the_floor_are_not_believed(bus):
-    bus.append(0, EntryId(LIVES + 10, 0), b"hello")
+    bus.append(0, EntryId(MAX_EPOCH_GAP + 10, 0), b"hello")
     assert bus.take_epoch("actor-0", floor=3) == 4
-    assert bus.take_epoch("actor-0", floor=LIVES + 7) == LIVES + 8
+    assert bus.take_epoch("actor-0", floor=MAX_EPOCH_GAP + 7) == MAX_EPOCH_GAP + 8
 
 
 def test_a_replaced_replay_server_cannot_trim(bus):

@@ -58,7 +58,7 @@ def draw(client: ReplayClient, batch: int) -> np.ndarray:
     deadline = time.monotonic() + 20.0
     while time.monotonic() < deadline:
         sample = client.sample(batch)
-        if sample.draw is SampleStatus.BATCH:
+        if sample.status is SampleStatus.BATCH:
             assert sample.rows is not None
             return sample.rows
         time.sleep(0.05)
@@ -85,7 +85,7 @@ def test_who_does_not_encrypt_or_expects_another_certificate_gets_nothing(
     tls.make_certificate(other)
     for context in (None, tls.client_context(other)):
         client = ReplayClient(lambda: served.sockets.address, SECRET, SPEC, 8, tls=context)
-        assert client.sample(8).draw is SampleStatus.WAIT
+        assert client.sample(8).status is SampleStatus.WAIT
         client.close()
     host, _, port = served.sockets.address.removeprefix("tcp:").rpartition(":")
     with socket.create_connection((host, int(port))):  # says nothing at all

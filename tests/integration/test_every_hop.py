@@ -78,7 +78,7 @@ def draw_everything(client: ReplayClient, steps: int) -> np.ndarray:
     deadline = time.monotonic() + SECONDS
     while time.monotonic() < deadline:
         sample = client.sample(BATCH)
-        if sample.draw is not SampleStatus.BATCH:
+        if sample.status is not SampleStatus.BATCH:
             time.sleep(0.01)
             continue
         assert sample.rows is not None

@@ -172,8 +172,8 @@ def test_the_ratio_holds_over_the_whole(count: int, tmp_path: Path) -> None:
     config = ReplayConfig(capacity=4_000, replay_ratio=ratio, warmup_steps=warmup, priority_exponent=0.0)
     whole = Whole(tmp_path, count, config, total)
     batches, worst = 0, 0.0
-    while (sample := whole.replay.sample(BATCH)).draw is not SampleStatus.FINISHED:
-        if sample.draw is SampleStatus.BATCH:
+    while (sample := whole.replay.sample(BATCH)).status is not SampleStatus.FINISHED:
+        if sample.status is SampleStatus.BATCH:
             batches += 1
             worst = max(worst, batches * BATCH * SPEC.train - ratio * (sample.env_steps - warmup))
         else:
@@ -193,7 +193,7 @@ def test_a_shard_goes_on_after_a_restart(tmp_path: Path) -> None:
     whole = Whole(tmp_path, 2, ReplayConfig(capacity=400, replay_ratio=8.0, warmup_steps=0))
     whole.send([20, 20, 20, 20])
     for _ in range(4):
-        assert whole.replay.sample(BATCH).draw is SampleStatus.BATCH
+        assert whole.replay.sample(BATCH).status is SampleStatus.BATCH
     before = whole.servers[1].stats()
     whole.servers[1].close()
     again = ReplayServer(SPEC, whole.servers[1].config, tmp_path / "1", 3, 10**9, ACTORS, 64, whole.bus, Shard(1, 2))

@@ -92,7 +92,7 @@ def test_where_nothing_is_blank_the_state_is_that_of_the_step_by_step_way():
     sequence = (o, torch.zeros(2, 6, 1, dtype=torch.bool), action, state)
     with torch.no_grad():
         _, seen, after = agent.unroll(*sequence)
-        torch.testing.assert_close(after, agent.fill(*sequence)[1])
+        torch.testing.assert_close(after, agent.impute(*sequence)[1])
     assert torch.equal(seen, o)
 
 

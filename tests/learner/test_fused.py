@@ -139,7 +139,7 @@ def impute(config, low, scale=1.0, flags=1):
     missing = torch.rand(B, T, flags, generator=generator) < 0.5
     o[missing.expand_as(o)] = 0.0
     with torch.autocast("cpu", torch.bfloat16, enabled=low):
-        filled = [agent.fill(o, missing, action, state) for agent in (plain, fused)]
+        filled = [agent.impute(o, missing, action, state) for agent in (plain, fused)]
     return *filled, o, missing.expand_as(o)
 
 
@@ -164,7 +164,7 @@ def test_until_an_episodes_first_frame_is_seen_it_is_zeros():
     missing = torch.tensor([[True, True, False, True]] * 2).unsqueeze(-1)
     o[:, 2] = torch.tensor([0.5, 0.0, -1.0])
     with torch.autocast("cpu", torch.bfloat16):
-        filled = [agent.fill(o, missing, action, state)[0] for agent in (plain, fused)]
+        filled = [agent.impute(o, missing, action, state)[0] for agent in (plain, fused)]
     for seen in filled:
         assert not seen[:, :2].any()
         assert torch.equal(seen[:, 2], o[:, 2])

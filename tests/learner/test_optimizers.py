@@ -12,7 +12,7 @@ from rmc.learner.config import UpdateConfig
 from rmc.learner.fused import fuse
 from rmc.learner.fused_heads import FusedHead
 from rmc.learner.kernels import BLOCK
-from rmc.learner.optimizers import CompiledAdam, adam, begin_moments, follow
+from rmc.learner.optimizers import CompiledAdam, adam, begin_moments, polyak_update
 from rmc.learner.rounded import Rounded, rounded_weights
 from rmc.learner.update_order import make_update
 from tests.learner.rows import SPEC, random_rows, to_batch
@@ -151,7 +151,7 @@ def test_a_target_follows_as_by_torch_and_is_rounded():
         for value in source.parameters():
             value.add_(torch.randn_like(value))
     expected = [old.lerp(new, 0.01) for old, new in zip(target.parameters(), source.parameters(), strict=True)]
-    follow(target, source, 0.01)
+    polyak_update(target, source, 0.01)
     for value, wanted in zip(target.parameters(), expected, strict=True):
         assert torch.allclose(value, wanted, rtol=1e-6, atol=1e-7)
     assert all(torch.equal(low, weight.to(torch.bfloat16)) for weight, low in rounded_weights([target]).items())

@@ -209,7 +209,7 @@ def test_the_policys_average_is_over_the_last_tenth_and_then_over_so_many():
         with torch.no_grad():
             for value in update.agent.parameters():
                 value.add_(torch.randn_like(value))
-        update.average.move(updates)
+        update.average.update(updates)
         share = 1.0 if updates <= 100 else max(0.25, 100 / updates)  # ten updates of those it is over
         acting = dict(update.agent.named_parameters())
         expected = {name: (1 - share) * mean + share * acting[name].double() for name, mean in expected.items()}
@@ -322,7 +322,7 @@ def update_of(update: JointUpdate, number: int, is_missing: bool) -> UpdateResul
     clear_padding(rows, WITH_FRAMES)
     raw = torch.from_numpy(rows.view("u1").reshape(8, -1))
     plan = update.plan(raw, WITH_FRAMES, number)
-    assert plan.fills == is_missing
+    assert plan.has_missing == is_missing
     return update(view_batch(raw, torch.ones(8), WITH_FRAMES, plan), BETA)
 
 

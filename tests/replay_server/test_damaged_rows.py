@@ -60,11 +60,11 @@ def test_a_damaged_row_is_never_drawn(
 def test_a_ring_of_damaged_rows_alone_makes_the_learner_wait(make: Make, bus: MemoryBus) -> None:
     server = filled(make, bus)
     server._store.ring.rows["last"] = 10**9
-    assert server.sample(8).draw is SampleStatus.WAIT
+    assert server.sample(8).status is SampleStatus.WAIT
     assert (server.stats()["drawn_steps"], server.stats()["draws"]) == (0, 0)
     assert server.stats()["damaged_windows"] == 20
     server.update_priorities(np.arange(20), np.ones(20, np.float32))
-    assert server.sample(8).draw is SampleStatus.WAIT
+    assert server.sample(8).status is SampleStatus.WAIT
 
 
 def test_an_episode_with_a_damaged_row_is_none(make: Make, bus: MemoryBus) -> None:

@@ -65,11 +65,11 @@ def test_windows_in_batches_out_and_metrics(redis_url: str, run_name: str, tmp_p
     try:
         until(lambda: bus.replay_address("replay") is not None)
         sender, client = Sender(bus), client_of(bus)
-        assert client.sample(16).draw is SampleStatus.WAIT
+        assert client.sample(16).status is SampleStatus.WAIT
         for _ in range(10):
             sender.send(5)
         until(lambda: running.server.stats()["windows"] == 50)
-        until(lambda: client.sample(16).draw is SampleStatus.BATCH)
+        until(lambda: client.sample(16).status is SampleStatus.BATCH)
         sample = client.sample(16)
         assert sample.rows is not None
         assert (sample.rows["reward"][:, 0] == sample.rows["serial"]).all()
@@ -100,10 +100,10 @@ def test_a_replaced_learner_that_comes_first_is_not_served(
         metrics = running.process.metrics()
         assert (metrics["refused_clients"], metrics["refused_clients_fenced"]) == (1, 1)
         client = client_of(bus, epoch)
-        assert client.sample(16).draw is SampleStatus.WAIT
+        assert client.sample(16).status is SampleStatus.WAIT
         bus.take_epoch("learner")  # by a third, which has not come yet
         with pytest.raises(FencedError):
-            until(lambda: client.sample(16).draw is SampleStatus.BATCH)
+            until(lambda: client.sample(16).status is SampleStatus.BATCH)
         client.close()
     finally:
         running.end()
@@ -121,14 +121,14 @@ def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_
         until(lambda: bus.replay_address("replay") is not None)
         sender, client = Sender(bus), client_of(bus)
         sender.send(40)
-        until(lambda: client.sample(16).draw is SampleStatus.BATCH)
+        until(lambda: client.sample(16).status is SampleStatus.BATCH)
         redis_server.close()
         with pytest.raises(BusUnavailable):
             bus.ack(0)
         until(lambda: running.process.waiting_for() == "redis")
         started = time.monotonic()
         for _ in range(40):  # past several looks at the bus that is away
-            assert client.sample(16).draw is SampleStatus.BATCH
+            assert client.sample(16).status is SampleStatus.BATCH
             time.sleep(0.05)
         assert time.monotonic() - started < 10.0
         redis_server.start()  # empty: it keeps no files
@@ -137,7 +137,7 @@ def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_
         os.kill(redis_server.process.pid, signal.SIGSTOP)  # it does not answer, either
         began, served = time.monotonic(), 0
         while (now := time.monotonic()) < began + 2.5 * TIMEOUT_SECONDS:
-            assert client.sample(16).draw is SampleStatus.BATCH
+            assert client.sample(16).status is SampleStatus.BATCH
             served += time.monotonic() - now < 1.0
         os.kill(redis_server.process.pid, signal.SIGCONT)
         assert served > 40

@@ -30,7 +30,7 @@ def test_bounds(ratio: float, warmup: int, total: int, slack: int, inserted: int
     assert shares == sorted(shares, reverse=True)
     assert limiter.limit(drawn) <= total
     assert limiter.is_final(drawn) == (limiter.limit(drawn) == total)
-    draw = limiter.draw(inserted, drawn, 64)
+    draw = limiter.status(inserted, drawn, 64)
     if inserted < min(warmup, total):
         assert draw is SampleStatus.WAIT
     if draw is SampleStatus.BATCH:
@@ -46,9 +46,9 @@ def test_bounds(ratio: float, warmup: int, total: int, slack: int, inserted: int
 
 def test_final_debt_is_drawn_without_tolerance() -> None:
     limiter = RateLimiter(10.0, 100, 1000, 50)
-    assert limiter.draw(1000, 9000 - 64, 64) is SampleStatus.BATCH
-    assert limiter.draw(1000, 9001 - 64, 64) is SampleStatus.FINISHED
-    assert limiter.draw(999, 9001 - 64, 64) is SampleStatus.BATCH
+    assert limiter.status(1000, 9000 - 64, 64) is SampleStatus.BATCH
+    assert limiter.status(1000, 9001 - 64, 64) is SampleStatus.FINISHED
+    assert limiter.status(999, 9001 - 64, 64) is SampleStatus.BATCH
     assert limiter.ratio(1000, 9000) == 10.0
 
 
@@ -102,7 +102,7 @@ def test_never_deadlocks(data: st.DataObject) -> None:
         moved = False
         for index in order.sample(range(-1, len(actors)), len(actors) + 1):
             if index < 0:
-                draw = limiter.draw(inserted, drawn, batch)
+                draw = limiter.status(inserted, drawn, batch)
                 drawn += (batch - order.randrange(TRAIN)) * (draw is SampleStatus.BATCH)  # short windows count less
                 finished |= draw is SampleStatus.FINISHED
                 moved |= draw is not SampleStatus.WAIT

@@ -80,7 +80,7 @@ def draw_until(client: ReplayClient, end: float, rng: np.random.Generator) -> in
         if sample.rows is None:
             time.sleep(0.001)
             continue
-        draws += sample.draw is SampleStatus.BATCH
+        draws += sample.status is SampleStatus.BATCH
         client.update_priorities(sample.rows["serial"].copy(), rng.exponential(size=32).astype(np.float32))
     return draws
 

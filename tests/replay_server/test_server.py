@@ -210,7 +210,7 @@ def test_the_limiter_holds_draws_and_credit(make: Make, bus: MemoryBus) -> None:
     server, senders = make(config, total=200, slack=16), [Sender(bus, 0), Sender(bus, 1)]
     drain(server)
     assert [sender.granted() for sender in senders] == [28, 28]  # (40 + 16) / 2 each
-    assert server.sample(4).draw is SampleStatus.WAIT
+    assert server.sample(4).status is SampleStatus.WAIT
     assert (server.stats()["learner_waiting_for"], server.waiting_for()) == ("warm-up", "windows")
     senders[0].send(5)
     drain(server)
@@ -220,7 +220,7 @@ def test_the_limiter_holds_draws_and_credit(make: Make, bus: MemoryBus) -> None:
     assert [sender.granted() for sender in senders] == [20, 36]  # 56 of 56 are in
     assert server.waiting_for() == "draws"
     draws = 0
-    while server.sample(4).draw is SampleStatus.BATCH:
+    while server.sample(4).status is SampleStatus.BATCH:
         draws += 1
     assert draws == (16 * 2 + 16 * 2 + 16) // 16  # the steps past the warm-up, the slack's worth, one batch
     assert (server.stats()["learner_waiting_for"], server.waiting_for()) == ("env_steps", "windows")
@@ -239,7 +239,7 @@ def test_small_credit_is_published_late_but_at_once_where_the_learner_waits(make
         server.sample(64)
     sender.send(1)
     drain(server)  # this publishes all of it; from here on only every hundred steps or so
-    while server.sample(64).draw is SampleStatus.BATCH:
+    while server.sample(64).status is SampleStatus.BATCH:
         published.add(sender.granted())
         draws += 1
         server.step()
@@ -259,7 +259,7 @@ def test_the_end_is_announced_and_reached(make: Make, bus: MemoryBus) -> None:
     assert ack is not None
     assert not ack.final
     sent, outcomes = 2, []
-    while (draw := server.sample(4).draw) is not SampleStatus.FINISHED:
+    while (draw := server.sample(4).status) is not SampleStatus.FINISHED:
         outcomes.append(draw)
         if draw is SampleStatus.WAIT:
             drain(server)
@@ -277,7 +277,7 @@ def test_the_end_is_announced_and_reached(make: Make, bus: MemoryBus) -> None:
 
 
 def test_an_empty_ring_makes_the_learner_wait(make: Make) -> None:
-    assert make().sample(4).draw is SampleStatus.WAIT
+    assert make().sample(4).status is SampleStatus.WAIT
 
 
 def test_a_new_life_counts_from_zero(make: Make, bus: MemoryBus) -> None:
@@ -540,7 +540,7 @@ def test_a_changed_ratio_counts_from_there(ratio: float, make: Make, bus: Memory
     for _ in range(30):
         sender.send(4)
         drain(server)
-        while server.sample(4).draw is SampleStatus.BATCH:
+        while server.sample(4).status is SampleStatus.BATCH:
             pass
     close(server)
     changed, count = ReplayConfig(capacity=100, replay_ratio=ratio, warmup_steps=40), 0
@@ -550,7 +550,7 @@ def test_a_changed_ratio_counts_from_there(ratio: float, make: Make, bus: Memory
         for _ in range(10):
             sender.send(4)
             drain(server)
-            while server.sample(4).draw is SampleStatus.BATCH:
+            while server.sample(4).status is SampleStatus.BATCH:
                 count += 1
             assert server.waiting_for() == "windows"
         stats = server.stats()
@@ -566,10 +566,10 @@ def test_a_ratio_that_changes_in_the_warm_up_changes_nothing_else(make: Make, bu
     drain(server)
     close(server)
     server = make(ReplayConfig(capacity=100, replay_ratio=2.0, warmup_steps=40))
-    assert server.sample(4).draw is SampleStatus.WAIT
+    assert server.sample(4).status is SampleStatus.WAIT
     sender.send(6)
     drain(server)
-    assert server.sample(4).draw is SampleStatus.BATCH
+    assert server.sample(4).status is SampleStatus.BATCH
 
 
 def test_a_ring_that_does_not_say_its_ratio_counts_from_where_it_is_opened(make: Make, bus: MemoryBus) -> None:
@@ -583,6 +583,6 @@ def test_a_ring_that_does_not_say_its_ratio_counts_from_where_it_is_opened(make:
     close(server)
     drawn = 0
     server = make(config)
-    while server.sample(4).draw is SampleStatus.BATCH:
+    while server.sample(4).status is SampleStatus.BATCH:
         drawn += 4 * SPEC.train
     assert drawn <= 16 * 8.0 + 4 * SPEC.train

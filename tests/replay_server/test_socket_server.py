@@ -231,12 +231,12 @@ def test_who_proves_nothing_ends_no_learner(
 
     addresses = [impostor(frame)]
     client = ReplayClient(lambda: addresses[-1], SECRET, SPEC, 8)
-    assert [client.sample(8).draw for _ in range(3)] == [SampleStatus.WAIT] * 3
+    assert [client.sample(8).status for _ in range(3)] == [SampleStatus.WAIT] * 3
     assert len([record for record in caplog.records if "is away: it said" in record.message]) == 1
     assert client.statistics() is None
     assert client.episode(0) is None
     addresses.append(serve().address)
-    assert client.sample(8).draw is SampleStatus.BATCH
+    assert client.sample(8).status is SampleStatus.BATCH
     client.close()
 
 
@@ -254,18 +254,18 @@ def away_for(served: Served, sample: Sample, reason: str, caplog: pytest.LogCapt
     """The client waits, and says once why."""
     lawful, client = served.replay.sample, served.client(0)
     served.replay.sample = lambda *_: sample  # type: ignore[method-assign]
-    assert [client.sample(8).draw for _ in range(3)] == [SampleStatus.WAIT] * 3
+    assert [client.sample(8).status for _ in range(3)] == [SampleStatus.WAIT] * 3
     (message,) = [record.message for record in caplog.records if "is away" in record.message]
     assert f"is away: {reason}: " in message
     served.replay.sample = lawful  # type: ignore[method-assign]
-    assert client.sample(8).draw is SampleStatus.BATCH
+    assert client.sample(8).status is SampleStatus.BATCH
     client.close()
 
 
 @pytest.mark.parametrize("address", ["tcp:127.0.0.1:no", "tcp:127.0.0.1:99999", "unix:a\0b", "tcp:" + "x" * 99 + ":1"])
 def test_an_address_that_is_none_is_an_outage(address: str) -> None:
     client = ReplayClient(lambda: address, SECRET, SPEC, 8)
-    assert client.sample(8).draw is SampleStatus.WAIT
+    assert client.sample(8).status is SampleStatus.WAIT
     assert client.statistics() is None
     with pytest.raises(RmcError, match="is away"):
         client.stats()
@@ -451,12 +451,12 @@ def test_a_client_of_other_windows_is_told(serve: Serve) -> None:
 def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> None:
     addresses: list[str] = []
     client = ReplayClient(lambda: addresses[-1] if addresses else None, SECRET, SPEC, 16)
-    assert client.sample(16).draw is SampleStatus.WAIT
+    assert client.sample(16).status is SampleStatus.WAIT
     for _ in range(2):
         served = serve()
         addresses.append(served.address)
         draws = [client.sample(16) for _ in range(6)]
-        assert [sample.draw for sample in draws[2:]] == [SampleStatus.BATCH] * 4
+        assert [sample.status for sample in draws[2:]] == [SampleStatus.BATCH] * 4
         assert draws[-1].env_steps == 200 * SPEC.train
         client.update_priorities(np.arange(16), np.full(16, 3.0, np.float32))
         assert client.statistics().count == 200 * SPEC.train
@@ -466,7 +466,7 @@ def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> Non
         assert client.episode(999) is None
         served.close()
         served.close = lambda: None  # type: ignore[method-assign]
-    assert client.sample(16).draw in (SampleStatus.WAIT, SampleStatus.BATCH)
+    assert client.sample(16).status in (SampleStatus.WAIT, SampleStatus.BATCH)
     client.close()
 
 

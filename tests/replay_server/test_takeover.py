@@ -36,7 +36,7 @@ def test_a_lost_ring_takes_no_counter_back(make: Make, kind: str, redis_url: str
     sender.send(12)
     drain(server)
     for _ in range(4):
-        assert server.sample(2).draw is SampleStatus.BATCH
+        assert server.sample(2).status is SampleStatus.BATCH
     server.update_priorities(np.array([3]), np.array([9.0], np.float32))
     sender.send(1)
     drain(server)  # the commit publishes what was drawn before it
@@ -60,7 +60,7 @@ def test_a_lost_ring_takes_no_counter_back(make: Make, kind: str, redis_url: str
     assert sender.granted() == 52 + 20 + 16  # a warm-up and the slack beyond what was in
     sender.send(4)
     drain(server)
-    assert server.sample(2).draw is SampleStatus.WAIT  # 16 of 20 steps
+    assert server.sample(2).status is SampleStatus.WAIT  # 16 of 20 steps
     sender.send(1)
     drain(server)
     sample = server.sample(2)
@@ -242,7 +242,7 @@ def test_a_ring_of_which_nothing_is_left_begins_empty(make: Make, bus: MemoryBus
     drain(server)
     assert (server.stats()["windows"], server.stats()["ring_fill"]) == (12, 0)
     assert sender.granted() == 48 + 20 + 16  # or everyone would wait for the other
-    assert server.sample(2).draw is SampleStatus.WAIT
+    assert server.sample(2).status is SampleStatus.WAIT
 
 
 def test_a_ring_that_is_ahead_of_another_that_came_after_it_goes(make: Make, bus: MemoryBus) -> None:
