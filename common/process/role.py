@@ -58,7 +58,7 @@ class Heartbeat:
         self.outage = OutageLog(role.name)
         self._next_metrics = self._next_stop = 0.0
 
-    def says_stop(self) -> bool:
+    def stop_requested(self) -> bool:
         """Whether the bus says so; while Redis is away the role goes on with what needs none."""
         now = time.monotonic()
         try:
@@ -97,7 +97,7 @@ def run_role(
     clock = BusyClock()
     pulse = Heartbeat(role, bus, clock)
     try:
-        while not (stop.requested or finished() or pulse.says_stop()):
+        while not (stop.requested or finished() or pulse.stop_requested()):
             try:
                 if role.step():
                     clock.busy()

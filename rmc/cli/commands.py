@@ -8,7 +8,7 @@ from rmc.analysis import run_list
 from rmc.analysis.doctor import examine_run
 from rmc.cli import run_options, train_options, training
 from rmc.cli.dry_run import dry_run
-from rmc.cli.ending import say_end
+from rmc.cli.ending import print_end
 from rmc.cli.redis_password import warn_of_password
 from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
@@ -91,7 +91,7 @@ def attach(command: run_options.Attach) -> int:
     except KeyboardInterrupt:
         console.print(f"it goes on; rmc stop {command.run} ends it", soft_wrap=True)
         return 0
-    return say_end(folder, console)
+    return print_end(folder, console)
 
 
 def stop(command: run_options.Stop) -> int:
@@ -106,7 +106,7 @@ def stop(command: run_options.Stop) -> int:
     if folder.is_baseline():  # its own terminal says how
         terminal().print(f"{folder.path} has ended", soft_wrap=True)
         return 0
-    say_end(folder, terminal())
+    print_end(folder, terminal())
     return 0
 
 

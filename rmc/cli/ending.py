@@ -14,15 +14,15 @@ from rmc.deploy.run.starts import resume_command
 from rmc.deploy.run.state import STOPPED
 
 
-def say_end(folder: RunFolder, console: Console) -> int:
+def print_end(folder: RunFolder, console: Console) -> int:
     """Print how a run ended that another process trained; its exit status."""
     status = folder.ended()
     if status == 0:
-        return say_result(folder, console)
+        return print_result(folder, console)
     if status == STOPPED:
         newest = CheckpointFolder(folder.checkpoints).latest()
         steps = json.loads(newest[1][PROGRESS])["env_steps"] if newest else 0
-        return say_stopped(folder, steps, console)
+        return print_stopped(folder, steps, console)
     log_file = folder.logs / "launcher.log"
     last_lines = log_file.read_text(errors="replace").strip().splitlines()[-30:] if log_file.exists() else []
     console.print("\n".join(last_lines), soft_wrap=True)
@@ -41,25 +41,25 @@ def cut_note(evaluation: dict[str, Any]) -> str:
     return ", cut when its seconds were over" if evaluation.get("eval_cut") else ""
 
 
-def say_stopped(folder: RunFolder, env_steps: int, console: Console) -> int:
+def print_stopped(folder: RunFolder, env_steps: int, console: Console) -> int:
     """Print how to go on; the exit status."""
     console.print(f"stopped at environment step {env_steps:,}; to go on:")
     console.print(f"  {resume_command(folder)}", soft_wrap=True)
-    say_findings(folder, console)
+    print_findings(folder, console)
     return STOPPED
 
 
-def say_result(folder: RunFolder, console: Console) -> int:
+def print_result(folder: RunFolder, console: Console) -> int:
     result = folder.result()
     assert result is not None
     console.print(f"after training:  {format_evaluation(result)}")
     facts = f"{result['env_steps']:,} environment steps, {result['updates']:,} updates, {result['wall_s']:,.0f} s"
     console.print(f"{facts}; {folder.result_file}", soft_wrap=True)
-    say_findings(folder, console)
+    print_findings(folder, console)
     return 0
 
 
-def say_findings(folder: RunFolder, console: Console) -> None:
+def print_findings(folder: RunFolder, console: Console) -> None:
     """What ``rmc doctor`` would say; nothing of a run that was too short to judge."""
     for finding in examine(MetricsTail(folder.metrics).take(), folder.config()):  # a long run's would fill the memory
         console.print(str(finding), soft_wrap=True)

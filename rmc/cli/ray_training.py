@@ -8,7 +8,7 @@ from math import ceil
 
 from rich.console import Console
 
-from rmc.cli.ending import say_end
+from rmc.cli.ending import print_end
 from rmc.cli.signals import signals_caught
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local.socket_folder import place_for_sockets
@@ -56,7 +56,7 @@ def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> tup
         console.print(note, soft_wrap=True)
     with signals_caught(hangup=False) as stop:
         attach.watch(folder, console, _passes_on(stop, folder))
-    return folder, say_end(folder, console)
+    return folder, print_end(folder, console)
 
 
 def _passes_on(stop: StopSignal, folder: RunFolder) -> Callable[[], bool]:

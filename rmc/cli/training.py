@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.console import Console
 
-from rmc.cli.ending import format_evaluation, say_result, say_stopped
+from rmc.cli.ending import format_evaluation, print_result, print_stopped
 from rmc.cli.signals import signals_caught, signals_interrupt
 from rmc.common.bus.protocol import Bus
 from rmc.common.checkpoint import POLICY, CheckpointFolder
@@ -93,7 +93,7 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
             monitor.close()
         if not finished:
             status, end = STOPPED, {"state": "stopped"}
-            return say_stopped(folder, monitor.status.env_steps, console)
+            return print_stopped(folder, monitor.status.env_steps, console)
         result = _result(config, folder, monitor, before, console)
         folder.write_result(result)
         status, end = 0, {"state": "finished", **result}
@@ -110,7 +110,7 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
             tracker.close(end)
         folder.unlock(status)
     console.print(f"before training: {format_evaluation(before)}")
-    return say_result(folder, console)
+    return print_result(folder, console)
 
 
 def _metrics_served(folder: RunFolder, monitor: Monitor, options: LaunchOptions) -> AbstractContextManager[None]:
