@@ -12,8 +12,8 @@ class EvaluatorConfig:
     """Episodes per evaluation, played with the policy's mean, one after the other. 0 evaluates before and after
     training alone, with no evaluator beside the actors."""
     evaluation_seconds: float = 300.0
-    """Seconds after which an evaluation is cut: episodes that are over count, or else the first as far as it came.
-    0 never cuts."""
+    """Time limit of an evaluation, in seconds; 0 is none. Finished episodes count; if none finished, the first one's
+    return so far."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class ActorConfig:
     envs_per_actor: int = 4
     """N, environments of one actor; more of them share one forward pass."""
     stride: int = 0
-    """Steps between the starts of two windows; fewer than are trained let them overlap; 0 is as many, no overlap."""
+    """Steps between window starts. Below --trained-steps windows overlap; 0 means --trained-steps."""
     state_strategy: Literal["zero", "stored", "burn-in", "episode"] = "burn-in"
     """What a window's memory starts from: zeros; the actor's stored state; that state, then burned in; or zeros at the
     episode's start. In the last case the window is the whole episode, up to the time limit."""
@@ -36,4 +36,4 @@ class ActorConfig:
     chunk_seconds: float = 0.5
     """A chunk that is not full is sent after so long."""
     unacked_bytes: int = 64 << 20
-    """Most bytes kept to be sent again; the actor waits when they are reached."""
+    """Maximum bytes of unacknowledged windows; the actor pauses there."""

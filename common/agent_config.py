@@ -21,16 +21,14 @@ class AgentConfig:
     heads: tuple[int, int] = (400, 300)
     """Hidden layers of every head."""
     gate_init: Literal["uniform", "chrono"] = "uniform"
-    """How the GRU's update gates start: as PyTorch has them, or so that units hold what they have for 2 to T steps, T
-    those of a window (chrono initialisation)."""
+    """Initial bias of the GRU's update gates: PyTorch's, or chrono: time constants of 2 to T steps, T a window's."""
     layer_norm: bool = False
     """LayerNorm between the embedding's Linear and its ReLU."""
     head_input: HeadInput = "hidden"
     """What the heads read: the hidden state; beside it the current embedding, or observation; or the observation alone,
     an agent without a memory."""
     critic_batch_norm: bool = False
-    """Batch norm before each layer of the critics. Values of now and of next then come from one pass, and there are no
-    target critics."""
+    """Batch norm in the critics, as CrossQ has it: Q of this and the next state share one pass; no target critics."""
     privileged_critic: bool = False
     """The critics, and nothing else, also read the environment's info["privileged"]. Where it gives none, that is the
     observation before any option takes from it."""

@@ -54,8 +54,7 @@ class UpdateConfig:
     """Weight of the largest against the mean absolute TD error in a window's priority."""
 
     policy_ema_updates: int = 0
-    """Updates over which the policy that checkpoints hold, and evaluations play, is averaged, at most a tenth of those
-    made; actors have the newest. 0 does not average."""
+    """Averaging window, in updates, of the saved and evaluated policy; at most 10 % of the updates so far. 0: off."""
 
     def halves_are_apart(self) -> bool:
         """Whether memory and world model read nothing of critics, policy and temperature, nor of a common norm."""
@@ -85,5 +84,5 @@ class LearnerConfig:
     """Matrix products in bfloat16 or float32; auto: bfloat16 where the CPU has instructions for it, TensorFloat-32 on a
     GPU."""
     threads: int = 0
-    """CPU threads of the learner. 0 tries 1, 2, 4 … and keeps the fastest; one on Ray and in lockstep. With 2 or more,
-    or 0 on two cores, scheme 3 has a second process; not in lockstep or on a GPU."""
+    """CPU threads of the learner. 0 tries 1, 2, 4 … and keeps the fastest; 1 on Ray and in lockstep. With 2 or more, or
+    0 on several cores, scheme 3 trains in two processes; not in lockstep or on a GPU."""

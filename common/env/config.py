@@ -22,8 +22,7 @@ class EnvConfig:
     drop_sensors: float = 0.0
     """Probability that a dimension of the observation is zero, each on its own, at every step, the reset included."""
     flicker_burst: float = 1.0
-    """Mean steps in a row for which a flickered frame or a dropped sensor is missing; as many are missing as without.
-    Below 1 / (1 - probability), which is chance alone, it changes nothing."""
+    """Mean length of a run of missing steps; the share that is missing stays. No effect below 1 / (1 - probability)."""
     delay: int = 0
     """Steps after which an observation reaches the agent; until then it sees the episode's first one."""
     hide: Literal["nothing", "velocities", "positions"] = "nothing"
@@ -37,8 +36,7 @@ class EnvConfig:
     time_limit: int = 0
     """Steps of the environment after which an episode is cut off; 0 keeps the environment's own limit."""
     env_timeout: float = 60.0
-    """Seconds after which a call into an environment hangs: its making, reset, step, render or close. Its process ends;
-    a role's is started again."""
+    """Timeout of a call into an environment, in seconds. Its process then ends; a role is started again."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keywords that the environment is made with, like goal=1.5 map=maze pose=[0,1]: numbers, words, JSON."""
 

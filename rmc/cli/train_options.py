@@ -83,7 +83,7 @@ class Train:
     init_from: str | None = None
     """RUN or RUN:CHECKPOINT whose networks and normaliser it begins with."""
     init_parts: InitParts = "all"
-    """What is taken of them: all; the memory and what predicts; or what it takes to act."""
+    """Networks to copy: all; memory, world model and imputer; or memory, policy and imputer."""
     launcher: Launcher = "local"
     """Processes on this machine; on a Ray cluster; every role in one thread, the same seed giving the same bits; or
     by hand."""
@@ -100,13 +100,13 @@ class Train:
     """With --launcher ray: encrypt what the roles say across machines; needs a Redis server built with TLS on the
     head."""
     track: Tracker | Literal["off"] | None = None
-    """Follow the run in a tracker, also where it goes on later; by default as before: a new run in none."""
+    """Log to a tracker. The default is the run's last choice, and none for a new run."""
     track_project: str | None = None
     """The tracker's project, by default rmc."""
     track_tags: tuple[str, ...] = ()
     """The run's tags in the tracker."""
     track_video_every: int | None = None
-    """Film one of so many evaluated checkpoints for the tracker; 0, the default, films the final policy alone."""
+    """Film every Nth evaluated checkpoint for the tracker; 0, the default, films the final policy alone."""
     metrics_port: int | None = None
     """Serve the run's metrics to Prometheus on this port, at /metrics; by default on none."""
     metrics_host: str = "127.0.0.1"
@@ -137,8 +137,8 @@ def from_config(config: RunConfig, launch: LaunchOptions) -> Train:
 
 @dataclass(frozen=True)
 class Resume(Train):
-    """Go on with a run: what is not said is as it was. --help shows the basic options, --help-all all of them; behind
-    RUN they show the run's own values as defaults."""
+    """Go on with a run. Options that are not given keep their values. --help shows the basic options, --help-all all of
+    them; behind RUN they show the run's own values as defaults."""
 
     env: KnownEnvOptions
     run_dir: KnownRunDir = None
