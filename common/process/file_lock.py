@@ -16,7 +16,7 @@ def take_lock(path: Path, patience: float = LOCK_SECONDS) -> int | None:
     handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     began = time.monotonic()
     warned = False
-    while not _try_lock(handle):
+    while not try_lock(handle, fcntl.LOCK_EX):
         if time.monotonic() >= began + patience:
             os.close(handle)
             return None
@@ -27,9 +27,10 @@ def take_lock(path: Path, patience: float = LOCK_SECONDS) -> int | None:
     return handle
 
 
-def _try_lock(handle: int) -> bool:
+def try_lock(handle: int, kind: int) -> bool:
+    """Whether the handle has the lock now, ``fcntl.LOCK_EX`` or ``fcntl.LOCK_SH``."""
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     return True

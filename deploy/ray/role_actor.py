@@ -16,6 +16,7 @@ import ray
 from rmc.common.errors import CheckpointError
 from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.local.supervisor import EXIT_CONFIG, RoleProcess
+from rmc.deploy.ray.node import leave_rays_worker, private_folder
 
 NAMESPACE = "rmc"
 LAST_WORDS_SECONDS = 1.5  # a host outlives its role so long, for the launcher to hear why it died
@@ -68,12 +69,7 @@ def scratch_folder(run: str) -> Path:
 
     Short, for the sockets in it; the run's folder itself lies with its launcher, on the head.
     """
-    folder = Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{run[-8:]}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    status = folder.lstat()
-    if status.st_uid != os.getuid() or status.st_mode & 0o077:
-        raise RuntimeError(f"{folder} is not private; remove it")
-    return folder
+    return private_folder(Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{run[-8:]}")
 
 
 def actor_name(run: str, role: str) -> str:
@@ -110,10 +106,7 @@ class RoleActor:
 
     def _environment(self) -> dict[str, str]:
         """Without what Ray says to its own workers: a role is none, and the launcher begins a job of its own."""
-        for name in ("RAY_JOB_ID", "RAY_RAYLET_PID", "OMP_NUM_THREADS"):
-            os.environ.pop(name, None)
-        if os.path.isdir(self._task.working_folder):
-            os.chdir(self._task.working_folder)
+        leave_rays_worker(self._task.working_folder)
         return {name: self._filled(value) for name, value in self._task.environment.items()}
 
     def _start(self) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite, is_metric
 from rmc.common.errors import ConfigError
+from rmc.common.process.file_lock import take_lock, try_lock
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import RunConfig, check_sizes, from_json, to_json
 from rmc.deploy.run.migrations import migrated
@@ -170,14 +171,9 @@ class RunFolder:
 
     def lock(self) -> None:
         """Be the one launcher of this run. Raises ConfigError where another one is."""
-        self._lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        deadline = time.monotonic() + LOCK_SECONDS
-        while not _locked(self._lock, fcntl.LOCK_EX):
-            if time.monotonic() >= deadline:
-                os.close(self._lock)
-                self._lock = None
-                raise ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first")
-            time.sleep(0.05)
+        self._lock = take_lock(self.path / ".lock", LOCK_SECONDS)
+        if self._lock is None:
+            raise ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first")
         self._was = self.path.stat()
         self._note(f"training {os.getpid()} {socket.gethostname()}")
 
@@ -212,7 +208,7 @@ class RunFolder:
         try:
             with (self.path / ".lock").open("rb") as file:
                 word, *rest = file.read().decode().split()
-                free = _locked(file.fileno(), fcntl.LOCK_SH)
+                free = try_lock(file.fileno(), fcntl.LOCK_SH)
                 return None if free or word != "training" else int(rest[0])
         except (FileNotFoundError, ValueError, IndexError):
             return None
@@ -233,14 +229,6 @@ class RunFolder:
             return None
         except ValueError as error:
             raise ConfigError("RUN", str(self.path), f".lock is damaged ({error}); remove that file") from None
-
-
-def _locked(handle: int, kind: int) -> bool:
-    try:
-        fcntl.flock(handle, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def read_object(path: Path, *numbers: str) -> dict[str, Any]:

@@ -26,8 +26,7 @@ class Evaluate:
     episodes: int = 10
     """Episodes to play."""
     seconds: float = 0.0
-    """Seconds after which no more are played: those that are over count, or else the first as far as it came. 0 plays
-    all."""
+    """Time limit, in seconds; 0 is none. Finished episodes count; if none finished, the first one's return so far."""
     flicker: tuple[float, ...] = ()
     """Probabilities of a missing observation, each of which is played; by default the run's own."""
     checkpoint: Checkpoint = "latest"

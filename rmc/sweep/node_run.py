@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rmc.common.process.file_lock import take_lock
+from rmc.deploy.ray.node import leave_rays_worker, private_folder
 from rmc.sweep.local_runs import spawn
 from rmc.sweep.parcel import Parcel, Stamps, pack, unpack
 
@@ -19,11 +20,8 @@ class NodeRun:
     """``rmc train`` in a folder of the node that goes with it. Ends with the sweep."""
 
     def __init__(self, words: tuple[str, ...], name: str, brought: Parcel, working_folder: str) -> None:
-        for variable in ("RAY_JOB_ID", "RAY_RAYLET_PID", "OMP_NUM_THREADS"):  # for Ray's own workers
-            os.environ.pop(variable, None)
-        if os.path.isdir(working_folder):  # where the user's own environments may lie
-            os.chdir(working_folder)
-        base = _private(Path(tempfile.gettempdir()) / f"rmc-sweep-{os.getuid()}")
+        leave_rays_worker(working_folder)
+        base = private_folder(Path(tempfile.gettempdir()) / f"rmc-sweep-{os.getuid()}")
         for abandoned in _abandoned(base):
             shutil.rmtree(abandoned, ignore_errors=True)
         self._place = Path(tempfile.mkdtemp(dir=base))
@@ -49,15 +47,6 @@ class NodeRun:
     def stop(self) -> None:
         """As rmc stop does."""
         self._process.send_signal(signal.SIGTERM)
-
-
-def _private(folder: Path) -> Path:
-    """Raises RuntimeError where others may write there."""
-    folder.mkdir(mode=0o700, exist_ok=True)
-    about = folder.lstat()
-    if about.st_uid != os.getuid() or about.st_mode & 0o077:
-        raise RuntimeError(f"{folder} is not private; remove it")
-    return folder
 
 
 def _abandoned(base: Path) -> Iterator[Path]:
