@@ -1,12 +1,16 @@
 """The processes that play environments: actors and the evaluator."""
 
 import os
+import time
+from collections.abc import Callable
 from functools import partial
 
 import torch
 
 from rmc.actors.actor import Actor
 from rmc.actors.evaluator import Evaluator
+from rmc.common.bus.protocol import Bus
+from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import run_role
 from rmc.deploy.local.role_process import Process, RunConnection
@@ -25,19 +29,27 @@ def run_actor(place: RunConnection, index: int) -> None:
     if not 0 <= index < config.actors:
         raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
     torch.set_num_threads(1)
-    spec, priority_fn = config.window_spec(), initial_priority(config, index)
     make_env = partial(process.make_env, config.agent.privileged_critic)
     with process.starting(f"actor-{index}"):
-        bus, rate = process.bus, priority_fn
-        actor = Actor(index, config.seed, make_env, spec, config.agent, config.actor, bus, priority_fn=rate)
+        actor = make_actor(config, index, make_env, process.bus)
     run_role(actor, process.bus, process.stop, idle_seconds=ACTOR_IDLE_SECONDS)
 
 
-def initial_priority(config: RunConfig, index: int) -> InitialPriority | None:
-    """What rates the windows of an actor, where actors do."""
-    if config.agent.initial_priority == "max":
-        return None
-    return InitialPriority(config.window_spec(), config.agent, config.update, config.seed + index)
+def make_actor(
+    config: RunConfig, index: int, make_env: Callable[[], Env], bus: Bus, clock: Callable[[], float] = time.monotonic
+) -> Actor:
+    """A run's actor; it rates its own windows where the config says so."""
+    spec, agent = config.window_spec(), config.agent
+    actors_rate = agent.initial_priority == "actor"
+    priority = InitialPriority(spec, agent, config.update, config.seed + index) if actors_rate else None
+    return Actor(index, config.seed, make_env, spec, agent, config.actor, bus, clock, priority)
+
+
+def make_evaluator(
+    config: RunConfig, make_env: Callable[[], Env], bus: Bus, clock: Callable[[], float] = time.monotonic
+) -> Evaluator:
+    """A run's evaluator."""
+    return Evaluator(config.seed, make_env, config.agent, config.evaluator, bus, clock, config.layout.missing)
 
 
 def run_evaluator(place: RunConnection) -> None:
@@ -46,8 +58,6 @@ def run_evaluator(place: RunConnection) -> None:
     config = process.config
     torch.set_num_threads(1)
     os.nice(EVALUATOR_NICENESS)
-    missing = config.layout.missing
     with process.starting("evaluator"):
-        bus = process.bus
-        evaluator = Evaluator(config.seed, process.make_env, config.agent, config.evaluator, bus, missing=missing)
+        evaluator = make_evaluator(config, process.make_env, process.bus)
     run_role(evaluator, process.bus, process.stop, idle_seconds=EVALUATOR_IDLE_SECONDS)

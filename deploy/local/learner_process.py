@@ -2,16 +2,18 @@
 
 import ssl
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 import torch
 
+from rmc.common.bus.protocol import Bus
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.process.role import run_role
+from rmc.common.replay import Replay
 from rmc.common.shard import Shard
 from rmc.deploy.local.role_process import Process, RunConnection, until_taken
 from rmc.deploy.run import tls
@@ -32,12 +34,9 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
     context = tls.client_context(place.tls_folder) if place.tls_folder is not None else None
     clients = replay_clients(config, bus, secret, pinned, context)
     replay = clients[0] if len(clients) == 1 else ShardedReplay(clients, spec, batch, config.seed, pinned)
-    checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
     with process.starting(Learner.name):
-        learner = Learner(
-            spec, config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed, device,
-            config.policy_header(), thread_choices(config, cores(), device), two_processes(config, cores(), device),
-        )  # fmt: skip
+        threads, split = thread_choices(config, cores(), device), two_processes(config, cores(), device)
+        learner = make_learner(config, replay, bus, folder, device, threads, split)
     run_role(learner, bus, process.stop, lambda: learner.finished)
     for client in clients:
         client.close()
@@ -45,6 +44,17 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
         last = {"time": time.time(), **learner.metrics(), "finished": 1}
         with suppress(BusUnavailable, BusFull):  # its launcher waits for it, unless all is to stop
             until_taken(lambda: bus.emit(learner.name, last), learner.name, process.stop)
+
+
+def make_learner(
+    config: RunConfig, replay: Replay, bus: Bus, folder: Path, device: str, threads: Sequence[int], two_processes: bool
+) -> Learner:
+    """A run's learner, whose checkpoints lie in ``folder``; ``threads`` and ``two_processes`` as Learner takes them."""
+    checkpoints = CheckpointFolder(folder, config.learner.keep_checkpoints)
+    return Learner(
+        config.window_spec(), config.agent, config.update, config.learner, replay, bus, checkpoints, config.seed,
+        device, config.policy_header(), threads, two_processes,
+    )  # fmt: skip
 
 
 def replay_clients(

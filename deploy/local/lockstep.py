@@ -6,18 +6,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from rmc.actors.actor import Actor
-from rmc.actors.evaluator import Evaluator
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import Bus
-from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.make import make_env
+from rmc.common.env.wrappers import Env
 from rmc.common.metrics import BusyClock
 from rmc.common.process.role import METRICS_PERIOD, Role, StopSignal
-from rmc.deploy.local.actor_process import initial_priority
+from rmc.common.shard import WHOLE
+from rmc.deploy.local.actor_process import make_actor, make_evaluator
+from rmc.deploy.local.learner_process import make_learner
+from rmc.deploy.local.replay_process import make_server
 from rmc.deploy.run.config import RunConfig
-from rmc.learner.learner import Learner
-from rmc.replay_server.server import ReplayServer
 
 
 class Lockstep:
@@ -28,56 +27,25 @@ class Lockstep:
     """
 
     def __init__(self, config: RunConfig, folder: Path, device: str = "cpu") -> None:
-        spec, self.bus = config.window_spec(), MemoryBus()
-        self.server = ReplayServer(
-            spec,
-            config.replay,
-            folder / "replay",
-            config.seed,
-            config.total_steps,
-            config.actors,
-            config.slack_steps(),
-            self.bus,
-        )
+        self.bus = MemoryBus()
+        self.server = make_server(config, folder / "replay", self.bus, WHOLE)
         self.server.step()  # publishes what a resumed ring has seen, from which actors take their epochs
-        checkpoints = CheckpointFolder(folder / "checkpoints", config.learner.keep_checkpoints)
-        self.learner = Learner(
-            spec,
-            config.agent,
-            config.update,
-            config.learner,
-            self.server,
-            self.bus,
-            checkpoints,
-            config.seed,
-            device,
-            config.policy_header(),
-        )
-        ticks = itertools.count()  # timers count calls, so that no clock decides anything
-        self.actors = [
-            Actor(
-                index,
-                config.seed,
-                lambda: make_env(config.env, privileged=config.agent.privileged_critic),
-                spec,
-                config.agent,
-                config.actor,
-                self.bus,
-                clock=lambda: float(next(ticks)),
-                priority_fn=initial_priority(config, index),
-            )
-            for index in range(config.actors)
-        ]
-        self.evaluator = (
-            self._evaluator(config, clock=lambda: float(next(ticks))) if config.evaluator.episodes else None
-        )
+        self.learner = make_learner(config, self.server, self.bus, folder / "checkpoints", device, (), False)
+        ticks = itertools.count()
+
+        def clock() -> float:
+            """Timers count calls, so that no clock decides anything."""
+            return float(next(ticks))
+
+        def env() -> Env:
+            return make_env(config.env, privileged=config.agent.privileged_critic)
+
+        self.actors = [make_actor(config, index, env, self.bus, clock) for index in range(config.actors)]
+        uncut = replace(config, evaluator=replace(config.evaluator, evaluation_seconds=0.0))
+        plays = config.evaluator.episodes > 0
+        self.evaluator = make_evaluator(uncut, lambda: make_env(config.env), self.bus, clock) if plays else None
         self._last_checkpoint = self.learner.last_checkpoint
         self._restart_due = False
-
-    def _evaluator(self, config: RunConfig, clock: Callable[[], float]) -> Evaluator:
-        uncut = replace(config.evaluator, evaluation_seconds=0.0)  # no clock decides this, either
-        missing = config.layout.missing
-        return Evaluator(config.seed, lambda: make_env(config.env), config.agent, uncut, self.bus, clock, missing)
 
     @property
     def roles(self) -> list[Role]:

@@ -2,14 +2,22 @@
 
 from pathlib import Path
 
+from rmc.common.bus.protocol import Bus
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import run_role
 from rmc.common.shard import Shard
 from rmc.deploy.local.role_process import Process, RunConnection
 from rmc.deploy.run import tls
+from rmc.deploy.run.config import RunConfig
 from rmc.replay_server.process import ReplayProcess
 from rmc.replay_server.server import ReplayServer
 from rmc.replay_server.socket_server import SocketServer
+
+
+def make_server(config: RunConfig, folder: Path, bus: Bus, shard: Shard) -> ReplayServer:
+    """A run's replay server, whose ring lies in ``folder``."""
+    spec, slack = config.window_spec(), config.slack_steps()
+    return ReplayServer(spec, config.replay, folder, config.seed, config.total_steps, config.actors, slack, bus, shard)
 
 
 def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> None:
@@ -21,10 +29,7 @@ def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> N
         raise ConfigError("--shard", index, f"the run has replay servers 0 to {shard.count - 1}")
     context = tls.server_context(place.tls_folder) if place.tls_folder is not None else None
     with process.starting(shard.role):
-        server = ReplayServer(
-            spec, config.replay, folder, config.seed, config.total_steps, config.actors, config.slack_steps(),
-            process.bus, shard,
-        )  # fmt: skip
+        server = make_server(config, folder, process.bus, shard)
         sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size, context)
         process.bus.announce_replay(server.owner, sockets.address)
     run_role(ReplayProcess(server, sockets), process.bus, process.stop, idle_seconds=0.0)
