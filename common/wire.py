@@ -44,7 +44,6 @@ class Kind(IntEnum):
     FINISHED = 7  # server -> client: all steps are in and the ratio is spent
     PRIORITIES = 8  # client -> server: serials (int64) | priorities (float32); no reply
     STATISTICS = 9  # client -> server, and its reply: counts (int64) | sums | sums of squares (float64)
-    STATS = 10  # client -> server, and its reply: the server's counters
     ERROR = 11  # server -> client: why the connection ends; fenced: its HMAC that a newer learner has come
     EPISODE = 12  # client -> server: serial, and its reply: count, then rows
     SHARE = 13  # client -> server: batch_size, and its reply, with a descriptor where memory can be shared

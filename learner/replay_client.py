@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rmc.common.errors import AuthenticationError, FencedError, MessageError, RmcError
+from rmc.common.errors import AuthenticationError, FencedError, MessageError
 from rmc.common.replay import EMPTY_SAMPLE, EPISODE_BYTES, ObservationStatistics, Sample, SampleStatus
 from rmc.common.shared_batches import SharedBatches
 from rmc.common.window import Rows, WindowSpec
@@ -165,7 +165,7 @@ class ReplayClient:
         """Running observation statistics; None while the server is away."""
         counts = self._spec.counts
         try:
-            body = self._ask(Kind.STATISTICS, {})[1]
+            body = self._ask(Kind.STATISTICS, {})
             count = np.frombuffer(body, np.int64, counts).copy()
             if (count < 0).any():
                 raise MessageError("count", f"{count.min()}, want a whole number from 0 on")
@@ -178,20 +178,13 @@ class ReplayClient:
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode from its start to that one; None where not all, or the server, are there."""
         try:
-            _, body = self._ask(Kind.EPISODE, {"serial": serial})
+            body = self._ask(Kind.EPISODE, {"serial": serial})
             return np.frombuffer(body, self._spec.dtype).copy() if len(body) else None
         except AWAY as error:
             log.warning("no episode from the replay server: %s", error)
             return None
 
-    def stats(self) -> dict[str, Any]:
-        """The server's counters. Raises RmcError while it is away."""
-        try:
-            return self._ask(Kind.STATS, {})[0]
-        except AWAY as error:
-            raise RmcError(f"the replay server is away: {error}") from None
-
-    def _ask(self, kind: Kind, question: dict[str, Any]) -> tuple[dict[str, Any], memoryview]:
+    def _ask(self, kind: Kind, question: dict[str, Any]) -> memoryview:
         connection = self._control = self._control or self._open_control()
         try:
             if self._batches is not None:
@@ -204,7 +197,7 @@ class ReplayClient:
             connection.close()
             self._control = None
             raise
-        return meta, body
+        return body
 
     def _open_control(self) -> ReplayConnection:
         address = self._address()

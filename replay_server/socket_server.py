@@ -198,8 +198,6 @@ class SocketServer:
             self._share(connection, frame.meta.get("batch_size"))
         elif frame.kind is Kind.EPISODE:
             self._episode(connection, frame.meta.get("serial"))
-        elif frame.kind is Kind.STATS:
-            connection.send(Kind.STATS, self._server.stats())
         else:
             raise MessageError("kind", f"{frame.kind.name} is not a request")
 

@@ -79,8 +79,7 @@ class LocalRun:
 
     def tend(self) -> None:
         """Start again what died: roles, and the embedded Redis. Raises RoleDied."""
-        if self._sockets.renew():
-            log.warning("%s was removed; it is made again", self._sockets.path)
+        self._sockets.renew()
         if self._server is not None:
             self._server.tend()
         self._end_unreachable()

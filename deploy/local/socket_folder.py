@@ -1,6 +1,7 @@
 """The temporary folder of a run's sockets: private, short, locked while its launcher lives."""
 
 import fcntl
+import logging
 import os
 import shutil
 import tempfile
@@ -13,6 +14,7 @@ from rmc.deploy.redis.server import SOCKET_PATH_LIMIT
 PREFIX = "rmc-sockets-"
 LONGEST_NAME = "replay-9999.sock"
 USUAL = (Path("/tmp"), Path("/var/tmp"))  # where TMPDIR is too long
+log = logging.getLogger(__name__)
 
 
 class SocketFolder:
@@ -50,6 +52,7 @@ class SocketFolder:
         if self._lock is not None:
             os.close(self._lock)
         self._lock = lock
+        log.warning("%s was removed; it is made again", self.path)
         return True
 
     def close(self) -> None:

@@ -154,8 +154,7 @@ class ClusterRun:
 
     def tend(self) -> None:
         """Hear every host, and place what is not. Raises RoleDied."""
-        if self._sockets.renew():
-            log.warning("%s was removed; it is made again", self._sockets.path)
+        self._sockets.renew()
         self._server.tend()
         self._registration.tend()
         for role_handle in list(self._hosts.values()):

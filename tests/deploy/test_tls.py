@@ -74,7 +74,7 @@ def test_batches_and_priorities_travel_encrypted(served: Served, folder: Path) -
         assert (rows["reward"][:, 0] == rows["serial"]).all()
         client.update_priorities(rows["serial"].copy(), np.full(batch, 7.0, np.float32))
     assert client.statistics().count == 600 * SPEC.train
-    assert client.stats()["max_priority"] == 7.0
+    assert served.replay.stats()["max_priority"] == 7.0
     client.close()
 
 

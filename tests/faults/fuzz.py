@@ -123,7 +123,7 @@ def request(raw: bytes) -> None:
     if not ASKED.known:
         ASKED.connect()
         ASKED.prove()
-    kind = Kind(raw[0] % len(Kind) + 1) if raw else Kind.STATS
+    kind = [*Kind][raw[0] % len(Kind)] if raw else Kind.STATISTICS
     ASKED.say(kind, raw[1:], b"".join(PRIORITIES) if kind is Kind.PRIORITIES else b"")
 
 
@@ -142,7 +142,7 @@ def published(raw: bytes) -> None:
 
 def _request(kind: Kind, meta: dict[str, int]) -> bytes:
     packed: bytes = msgpack.packb(meta)
-    return bytes([kind - 1]) + packed
+    return bytes([[*Kind].index(kind)]) + packed
 
 
 torch.manual_seed(0)

@@ -84,9 +84,9 @@ def draw_everything(client: ReplayClient, steps: int) -> np.ndarray:
         assert sample.rows is not None
         for row in sample.rows.copy():
             windows[int(row["serial"])] = row
-        if sample.env_steps >= steps and len(windows) == client.stats()["windows"]:
+        if sample.env_steps >= steps and len(windows) == sample.windows:
             return np.array([windows[serial] for serial in sorted(windows)])
-    raise AssertionError(f"{len(windows)} windows after {SECONDS} s; the server has {client.stats()}")
+    raise AssertionError(f"{len(windows)} windows after {SECONDS} s; the server has {sample.windows}")
 
 
 def test_each_step_is_trained_once(client: ReplayClient) -> None:

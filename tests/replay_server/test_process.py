@@ -74,7 +74,8 @@ def test_windows_in_batches_out_and_metrics(redis_url: str, run_name: str, tmp_p
         assert sample.rows is not None
         assert (sample.rows["reward"][:, 0] == sample.rows["serial"]).all()
         client.update_priorities(sample.rows["serial"].copy(), np.full(16, 5.0, np.float32))
-        until(lambda: client.stats()["max_priority"] == 5.0)
+        client.statistics()  # sends what is enqueued
+        until(lambda: running.server.stats()["max_priority"] == 5.0)
         until(lambda: bus.records({"replay": "0"})[0][-1:] and bus.records({"replay": "0"})[0][-1]["windows"] == 50)
         record = bus.records({"replay": "0"})[0][-1]
         assert record["env_steps"] == 200
