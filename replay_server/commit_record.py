@@ -67,6 +67,16 @@ class Progress:
         """How many windows may be sampled."""
         return self.next_serial - self.valid_from
 
+    @property
+    def inserted(self) -> int:
+        """Environment steps inserted since this ring began, which is where the limiter counts from."""
+        return self.env_steps - self.begun_env_steps
+
+    @property
+    def drawn(self) -> int:
+        """Trained steps drawn since this ring began, from all shards."""
+        return self.drawn_steps + self.elsewhere_steps - self.begun_drawn_steps
+
     def is_after(self, other: "Progress") -> bool:
         """Whether something was taken in or drawn here that the other, of the same ring, does not know of."""
         news = (actor not in other.streams or at.id > other.streams[actor].id for actor, at in self.streams.items())

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rmc.common.bus.protocol import Ack, Bus, ReplayOwner, Version
+from rmc.common.bus.protocol import Bus, ReplayOwner, Version
 from rmc.common.metrics import Means, Rate
 from rmc.common.replay import EPISODE_BYTES, ObservationStatistics, Sample, SampleStatus
 from rmc.common.shard import WHOLE, Shard
 from rmc.common.window import Rows, WindowSpec
 from rmc.replay_server.commit_record import Progress, decode_published
 from rmc.replay_server.config import ReplayConfig
+from rmc.replay_server.credit import Credit
 from rmc.replay_server.episode import find_episode
 from rmc.replay_server.observation_sums import observation_sums
 from rmc.replay_server.rate_limiter import RateLimiter
@@ -28,7 +29,6 @@ from rmc.replay_server.stream_reader import IngestBatch, StreamReader
 log = logging.getLogger(__name__)
 PRIORITY_FLOOR = 1e-6  # so that every window keeps a chance
 LOOK_SECONDS = 0.1  # between looks at which weights are the newest: each waits for Redis
-REPUBLISH_PERIOD = 5.0  # seconds between repeats of all acks, in case Redis lost its data
 
 
 class ReplayServer:
@@ -55,7 +55,6 @@ class ReplayServer:
         self._seed, self._shard = seed, shard
         self._own_actors = [actor for actor in range(actors) if shard.owns(actor)]
         self._share = len(self._own_actors) / actors  # of all that is collected
-        self._slack_steps = shard.part(slack_steps, actors)
         self._reader = StreamReader(spec, bus, actors, shard)
         self._store = open_store(folder, spec, -(-config.capacity // shard.count), config.priority_exponent)
         try:
@@ -72,10 +71,9 @@ class ReplayServer:
             config.replay_ratio / self._share,  # a shard's steps are a share, what is drawn from all is the whole
             shard.part(config.warmup_steps, actors),
             shard.part(total_steps, actors) - self._store.ring.progress.begun_env_steps,
-            self._slack_steps,
+            shard.part(slack_steps, actors),
         )
-        self._published: dict[int, Ack] = {}
-        self._republish_at = 0.0
+        self._credit = Credit(bus, self.owner, self._limiter, self._own_actors)
         self._owes_acks = False  # of what was taken in when Redis went away
         self._buffers = [np.empty(0, spec.dtype)] * 2
         self._waiting_for, self._waiting_since = "", 0.0  # the learner, at the limiter
@@ -136,7 +134,7 @@ class ReplayServer:
         if progress.replay_ratio != replay_ratio:
             progress.replay_ratio = replay_ratio
             progress.begun_drawn_steps = progress.drawn_steps + progress.elsewhere_steps
-            progress.begun_env_steps = progress.env_steps - min(self._inserted, warmup_steps)
+            progress.begun_env_steps = progress.env_steps - min(progress.inserted, warmup_steps)
 
     # -- in ---------------------------------------------------------------------------------------------
 
@@ -146,7 +144,7 @@ class ReplayServer:
         if batch is not None:
             self._owes_acks = True
             self._insert(batch)
-        self._publish(at_once=self._owes_acks)
+        self._credit.publish(self._store.ring.progress, self._owes_acks or bool(self._waiting_for))
         self._owes_acks = False
         if batch is None:
             return False
@@ -181,48 +179,6 @@ class ReplayServer:
             self._means.add("policy_lag_mean", float(lag.mean()))
             self._means.add("policy_lag_max", float(lag.max()))
 
-    # -- credit -----------------------------------------------------------------------------------------
-
-    def _acks(self) -> dict[int, Ack]:
-        """What every actor seen so far has committed, and how far it may step."""
-        progress = self._store.ring.progress
-        shares = self._limiter.shares(self._inserted, self._drawn, len(self._own_actors))
-        granted = dict(zip(self._own_actors, shares, strict=True))
-        final = self._limiter.is_final(self._drawn)
-        return {
-            actor: Ack(at.id, at.settled_steps + granted.get(actor, 0), final) for actor, at in progress.streams.items()
-        }
-
-    @property
-    def _inserted(self) -> int:
-        """Environment steps inserted since this ring began, which is where the limiter counts from."""
-        return self._store.ring.progress.env_steps - self._store.ring.progress.begun_env_steps
-
-    @property
-    def _drawn(self) -> int:
-        """Trained steps drawn since this ring began, from all shards."""
-        progress = self._store.ring.progress
-        return progress.drawn_steps + progress.elsewhere_steps - progress.begun_drawn_steps
-
-    def _publish(self, at_once: bool) -> None:
-        """Publish acks that changed. Small changes wait, unless the learner does: then actors need all there is.
-
-        The clock only ever repeats what was published, so that in lockstep it decides nothing.
-        """
-        if not self._published or time.monotonic() >= self._republish_at:
-            self._republish_at = time.monotonic() + REPUBLISH_PERIOD
-            self.bus.commit(self.owner, self._published or self._acks(), self._store.ring.progress.publish())
-        acks = {actor: ack for actor, ack in self._acks().items() if self._published.get(actor) != ack}
-        quantum = max(1, self._slack_steps // (8 * len(self._own_actors)))
-        at_once = at_once or bool(self._waiting_for)
-        if acks and (at_once or any(self._grown(actor, ack) >= quantum for actor, ack in acks.items())):
-            self.bus.commit(self.owner, acks, self._store.ring.progress.publish())
-            self._published.update(acks)
-
-    def _grown(self, actor: int, ack: Ack) -> int:
-        before = self._published.get(actor)
-        return ack.granted_steps - (before.granted_steps if before is not None else 0)
-
     # -- out --------------------------------------------------------------------------------------------
 
     def register_learner(self, epoch: int) -> None:
@@ -236,7 +192,7 @@ class ReplayServer:
         """
         progress, tree = self._store.ring.progress, self._store.tree
         progress.elsewhere_steps = max(progress.elsewhere_steps, drawn_elsewhere_steps)
-        draw = self._limiter.status(self._inserted, self._drawn, batch_size * self.spec.train)
+        draw = self._limiter.status(progress.inserted, progress.drawn, batch_size * self.spec.train)
         if draw is SampleStatus.BATCH and tree.total == 0.0:
             draw = SampleStatus.WAIT
         self._note_waiting(draw)
@@ -280,7 +236,7 @@ class ReplayServer:
         return self._buffers[0][:batch_size]
 
     def _note_waiting(self, status: SampleStatus) -> None:
-        warming_up = self._inserted < self._limiter.warmup_steps
+        warming_up = self._store.ring.progress.inserted < self._limiter.warmup_steps
         waiting_for = ("warm-up" if warming_up else "env_steps") if status is SampleStatus.WAIT else ""
         if waiting_for != self._waiting_for:
             self._waiting_for, self._waiting_since = waiting_for, time.monotonic()
@@ -323,9 +279,9 @@ class ReplayServer:
             "ring_capacity": self._store.ring.capacity,
             "draws": progress.draws,
             "drawn_steps": progress.drawn_steps,
-            "replay_ratio": limiter.ratio(self._inserted, self._drawn) * self._share,
-            "replay_ratio_off": int(not limiter.is_held(self._inserted, self._drawn)),
-            "credit_steps": max(0, limiter.limit(self._drawn) - self._inserted),
+            "replay_ratio": limiter.ratio(progress.inserted, progress.drawn) * self._share,
+            "replay_ratio_off": int(not limiter.is_held(progress.inserted, progress.drawn)),
+            "credit_steps": max(0, limiter.limit(progress.drawn) - progress.inserted),
             "learner_waiting_for": self._waiting_for,
             "learner_waiting_s": time.monotonic() - self._waiting_since if self._waiting_for else 0.0,
             "max_priority": progress.max_priority,
@@ -345,7 +301,8 @@ class ReplayServer:
 
     def waiting_for(self) -> str:
         """``windows`` from the actors where nothing may be drawn before more come, else ``draws`` by the learner."""
-        return "windows" if self._limiter.status(self._inserted, self._drawn, 0) is SampleStatus.WAIT else "draws"
+        progress = self._store.ring.progress
+        return "windows" if self._limiter.status(progress.inserted, progress.drawn, 0) is SampleStatus.WAIT else "draws"
 
     def checkpoint(self) -> None:
         """Make everything durable: a server opened here afterwards goes on as this one would."""
