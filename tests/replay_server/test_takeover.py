@@ -204,7 +204,7 @@ def test_what_another_redis_held_is_read_once_the_older_server_is_fenced(
     assert new.owner.epoch == 5
     assert new.stats()["windows"] == 5
     with pytest.raises(FencedError):
-        old.bus.commit(old.owner, old._acks())
+        old.bus.commit(old.owner, {}, old._store.ring.progress.publish())
 
 
 def test_a_power_cut_loses_the_end_of_a_ring_alone(make: Make, bus: MemoryBus, tmp_path: Path) -> None:
