@@ -21,7 +21,8 @@ class ConfigError(RmcError):
     """Something the user can change. The message is one line: option, value, fix."""
 
     def __init__(self, field: str, value: object, fix: str) -> None:
-        super().__init__(f"{field}={value!r}: {fix}")
+        shown = field if field.isprintable() else repr(field)  # a stranger's key
+        super().__init__(f"{shown}={value!r}: {fix}")
         self.field, self.value, self.fix = field, value, fix
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rmc.common.errors import RmcError
+from rmc.common.errors import ConfigError, RmcError
 from tests.faults import fuzz_files
 from tests.faults.fuzz_files import FILES, read_changed
 
@@ -47,6 +47,16 @@ def test_changed_files_are_shown_or_refused_in_a_line() -> None:
 def test_files_that_once_were_a_traceback(file: str, text: str, view: fuzz_files.View, tmp_path: Path) -> None:
     run = fuzz_files.old_run(tmp_path, "format-2")
     look(run / file, text, view, run)
+
+
+def test_an_option_with_a_line_break_in_its_name_is_refused_in_a_line(tmp_path: Path) -> None:
+    run = fuzz_files.old_run(tmp_path, "format-2")
+    config = run / "config.json"
+    config.write_text(config.read_text().replace('"chunk_seconds"', '"chunk_seco\\nds"'))
+    with pytest.raises(ConfigError) as caught:
+        fuzz_files.configured(run)
+    assert "chunk_seco\\nds'=0.5: no such option in this version" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
