@@ -10,7 +10,7 @@ STUDY = Study(
     "flicker",
     {
         "RMC": "train ENV --flicker 0.5",
-        "RMC, policy at every update": "train ENV --flicker 0.5 --policy-delay 1",
+        "RMC, policy at every update": "train ENV --flicker 0.5 --head-input hidden --policy-delay 1",
         "RMC, target critics": before("--flicker 0.5"),
         "SAC, 4 frames": "baseline sac ENV --flicker 0.5 --frame-stack 4",
         "RecurrentPPO": "baseline recurrent-ppo ENV --flicker 0.5",

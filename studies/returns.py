@@ -5,7 +5,8 @@ from studies.study import Scale, Study, before
 ENVS = ("Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Walker2d-v5", "HumanoidStandup-v5")
 OURS = {
     "RMC": "train ENV",
-    "RMC, policy at every update": "train ENV --policy-delay 1",
+    "RMC, h alone": "train ENV --head-input hidden",
+    "RMC, policy at every update": "train ENV --head-input hidden --policy-delay 1",
     "RMC, target critics": before(),
     "RMC, not averaged": before("--policy-ema-updates 0"),
     "RMC paper": "train ENV --preset paper",

@@ -38,9 +38,9 @@ TINY_OURS = f"{TINY} --hidden 16 --embedding 16 --heads 16 16 --warmup-steps 200
 
 def before(words: str = "") -> str:
     """Words of ``robust`` as it was before batch norm, and these: target critics, 8 windows, a replay ratio of 48, the
-    policy at every update.
+    policy at every update, heads that read h alone.
     """
-    sizes = {"--batch-size": "8", "--replay-ratio": "48", "--policy-delay": "1"}
+    sizes = {"--batch-size": "8", "--replay-ratio": "48", "--policy-delay": "1", "--head-input": "hidden"}
     unsaid = [f"{option} {value}" for option, value in sizes.items() if option not in words]
     return " ".join(["train ENV --no-critic-batch-norm", *unsaid, words])
 

@@ -20,7 +20,9 @@ def robust(env: EnvConfig) -> RunConfig:
     return RunConfig(
         env=env,
         preset="robust",
-        agent=AgentConfig(normalize_observations=True, impute_missing=True, critic_batch_norm=True),
+        agent=AgentConfig(
+            head_input="hidden+observation", normalize_observations=True, impute_missing=True, critic_batch_norm=True
+        ),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=96.0, priority_exponent=0.0),
         update=UpdateConfig(scheme=3, policy_ema_updates=2_000, policy_delay=2),
@@ -34,7 +36,7 @@ def memory(env: EnvConfig) -> RunConfig:
     return replace(
         base,
         preset="memory",
-        agent=replace(base.agent, gate_init="chrono", critic_batch_norm=False),
+        agent=replace(base.agent, gate_init="chrono", head_input="hidden", critic_batch_norm=False),
         actor=replace(base.actor, state_strategy="episode"),
         replay=replace(base.replay, capacity=10_000, replay_ratio=48.0),
         update=replace(base.update, scheme=1, policy_delay=1),
