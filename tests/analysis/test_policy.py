@@ -1,6 +1,7 @@
 """A policy outside of training: in a user's own loop, and as an ONNX file."""
 
 import dataclasses
+import importlib.util
 import json
 from pathlib import Path
 from typing import Any
@@ -173,7 +174,8 @@ def test_export_says_what_is_wrong_in_one_line(
     assert "use latest, best or one of [7]" in capsys.readouterr().err
     assert main.run(["export", str(run.path), "--out", "/proc/policy.onnx"]) == 2
     assert "cannot be written" in capsys.readouterr().err
-    monkeypatch.setattr("rmc.analysis.export.NEEDED", ("no_such_package",))
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "onnxscript" else there(name))
     assert main.run(["export", str(run.path)]) == 2
     assert "pip install -e '.[onnx]' in /" in capsys.readouterr().err
 
