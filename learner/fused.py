@@ -44,7 +44,7 @@ class FusedAgent(Agent):
 
     @torch.no_grad()
     def impute(self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """As ``Agent.fill``, which it is without a memory, or where the embedding has no plain layer."""
+        """As ``Agent.impute``, which it is without a memory, or where the embedding has no plain layer."""
         c = self.config
         if not (c.embedding and applies(observation)) or c.layer_norm or c.head_input == "observation":
             return super().impute(observation, missing, prev_action, state)

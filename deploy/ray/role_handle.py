@@ -20,8 +20,8 @@ log = logging.getLogger(__name__)
 class RoleHandle:
     """A role's host as the launcher sees it: asked how it is again and again, without waiting for it."""
 
-    def __init__(self, name: str, handle: Any, cpus: float, env_timeout: float = 0.0) -> None:
-        self.name, self.handle, self.cpus = name, handle, cpus
+    def __init__(self, name: str, handle: Any, env_timeout: float = 0.0) -> None:
+        self.name, self.handle = name, handle
         self.report: Report | None = None  # the newest; None until the first
         self.restarts = 0
         self.dead = ""  # for good, and why: somebody killed it, or it could not begin

@@ -127,7 +127,7 @@ class ClusterRun:
     def _place_all(self) -> None:
         for name, place in places(self.config, self._folder.name, self._device, self._encrypted).items():
             if name not in self._hosts:
-                self._hosts[name] = RoleHandle(name, self._create(name, place), place.cpus, place.command.env_timeout)
+                self._hosts[name] = RoleHandle(name, self._create(name, place), place.command.env_timeout)
                 self._hosts[name].handle.stopping.remote(False)  # one that was found may have heard otherwise
 
     def _create(self, name: str, place: RolePlacement) -> Any:

@@ -22,6 +22,7 @@ from rmc.common.process import parent_death
 from rmc.deploy.redis.users import LAUNCHER, RedisUsers
 from rmc.deploy.run import tls
 
+log = logging.getLogger(__name__)
 START_SECONDS = 10.0
 STOP_SECONDS = 2.0
 ANSWER_SECONDS = 1.0  # of one call; a server that stands still is asked again
@@ -48,9 +49,6 @@ def server_binary() -> str:
         raise ConfigError(
             "--redis-url", None, f"no Redis found ({error}); install valkey or redis, or give a URL"
         ) from None
-
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ NODE = {"NodeManagerAddress": "10.0.0.2"}
 
 
 def actor(index: int, node: str = "10.0.0.2", pid: int | None = 1) -> RoleHandle:
-    handle = RoleHandle(f"actor-{index}", None, 1.0)
+    handle = RoleHandle(f"actor-{index}", None)
     handle.report = Report("", node, pid, None, "", b"", 0, "")
     return handle
 
