@@ -29,7 +29,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from rmc.actors.config import EvaluatorConfig
 from rmc.actors.evaluator import evaluation_metrics, first_start, play_episodes
 from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, read, validate
-from rmc.analysis.evaluation import FINAL_EPISODES, Progress, Watch, missing_shares
+from rmc.analysis.evaluation import FINAL_EPISODES, EvaluationProgress, Watch, missing_shares
 from rmc.common.env.make import env_layout, make_env
 from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError, first_line
@@ -285,7 +285,7 @@ class _Run(BaseCallback):
 
     def _play(self, episodes: int, final: bool) -> dict[str, Any]:
         opponent, seed = SB3Adapter(self._model, _scaled_by(self._vec)), first_start(self.config.seed, final)
-        watch = Progress(self._console, f"evaluation at step {self.steps:,}")
+        watch = EvaluationProgress(self._console, f"evaluation at step {self.steps:,}")
         seconds = EvaluatorConfig.evaluation_seconds
         return evaluation_metrics(
             play_episodes(opponent, lambda: make_env(self.config.env), episodes, seed, seconds, watch)

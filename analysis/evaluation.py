@@ -26,7 +26,7 @@ SAY_SECONDS = 10.0  # between lines that an evaluation goes on
 Watch = Callable[[Rollout], None]
 
 
-class Progress:
+class EvaluationProgress:
     """Prints now and then how far an evaluation is."""
 
     def __init__(self, console: Console, what: str) -> None:

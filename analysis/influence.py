@@ -35,7 +35,7 @@ class Influence:
     action: Doubles  # (K,)
 
 
-class Replay:
+class ReplayedEpisode:
     """A recorded episode, and what the agent makes of it if one observation were another."""
 
     def __init__(self, agent: Agent, episode: Episode) -> None:
@@ -83,7 +83,7 @@ class Replay:
 @torch.no_grad()
 def influence(agent: Agent, episodes: list[Episode]) -> tuple[Influence, Influence]:
     """Of the episodes' first observations, by their deviation from episode to episode; and of later ones, by all's."""
-    replays = [Replay(agent, episode) for episode in episodes[:EPISODES]]
+    replays = [ReplayedEpisode(agent, episode) for episode in episodes[:EPISODES]]
     spreads = [
         _spread(torch.cat([part[0] for part in parts])) for parts in zip(*(r.outputs for r in replays), strict=True)
     ]
@@ -95,7 +95,7 @@ def influence(agent: Agent, episodes: list[Episode]) -> tuple[Influence, Influen
     )
 
 
-def _deviation(replays: list[Replay], steps: slice) -> Tensor:
+def _deviation(replays: list[ReplayedEpisode], steps: slice) -> Tensor:
     """(O,) of what was seen at those steps of all episodes."""
     values = torch.cat([replay.observations[steps] for replay in replays])
     seen = torch.cat([~replay.missing[steps] for replay in replays]).expand_as(values)
@@ -109,7 +109,7 @@ def _spread(values: Tensor) -> Tensor:
     return values.var(0).sum().sqrt()
 
 
-def _of_starts(starts: list[tuple[Replay, int]], deviation: Tensor, spreads: list[Tensor]) -> Influence:
+def _of_starts(starts: list[tuple[ReplayedEpisode, int]], deviation: Tensor, spreads: list[Tensor]) -> Influence:
     """``deviation`` (O,) is what each dimension is changed by."""
     starts = [(one, start) for one, start in starts if start + 1 < one.steps and not one.missing[start].all()]
     left = np.array([replay.steps - 1 - start for replay, start in starts])
@@ -121,7 +121,7 @@ def _of_starts(starts: list[tuple[Replay, int]], deviation: Tensor, spreads: lis
 
 
 def _of_start(
-    replay: Replay, start: int, deviation: Tensor, spreads: list[Tensor], delays: tuple[int, ...]
+    replay: ReplayedEpisode, start: int, deviation: Tensor, spreads: list[Tensor], delays: tuple[int, ...]
 ) -> list[Doubles]:
     """(K,) for each quantity, of its most changed dimension; NaN where the episode is over."""
     change = _changes(replay, start, deviation)
@@ -133,7 +133,7 @@ def _of_start(
     return rows
 
 
-def _changes(replay: Replay, start: int, deviation: Tensor) -> Tensor:
+def _changes(replay: ReplayedEpisode, start: int, deviation: Tensor) -> Tensor:
     """(D, O), one dimension each, towards zero, so that normalised it stays within its clip; what is missing stays."""
     deviation = deviation.where(~replay.missing[start].expand_as(deviation), 0.0)
     change = torch.diag(torch.where(replay.observations[start] > 0, -deviation, deviation))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rmc.analysis.episodes import Episode
-from rmc.analysis.influence import Replay
+from rmc.analysis.influence import ReplayedEpisode
 from rmc.common.agent import Agent, squashed_sample
 
 HORIZONS = 3.0  # of 1 / (1 - gamma) steps, left out at a cut: 5 % of a return is then the critics' own guess
@@ -30,7 +30,7 @@ def value_bias(agent: Agent, episodes: list[Episode], gamma: float) -> ValueBias
     """Of all steps whose return is known; None where there is none. Curiosity is not counted."""
     expected, came = [], []
     for episode in episodes:
-        replay = Replay(agent, episode)
+        replay = ReplayedEpisode(agent, episode)
         q = replay.outputs[1][0, :, 0]
         unknown = 0.0 if episode.terminated else HORIZONS / (1.0 - gamma) if gamma < 1.0 else math.inf
         known = max(0, len(q) - round(min(unknown, len(q))))

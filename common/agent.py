@@ -183,7 +183,7 @@ class ObservationImputer(nn.Module):
         return observation + change.float()
 
 
-class Policy(nn.Module):
+class GaussianPolicy(nn.Module):
     """Squashed Gaussian with a state-dependent standard deviation."""
 
     def __init__(self, inputs: int, action_dim: int, config: AgentConfig) -> None:
@@ -226,7 +226,7 @@ class Agent(nn.Module):
         features = self.memory.skip_dim + (config.hidden if config.head_input != "observation" else 0)
         self.world_model = WorldModel(features, obs_dim, action_dim, config)
         self.critic = TwinQ(features + privileged, action_dim, config)
-        self.policy = Policy(features, action_dim, config)
+        self.policy = GaussianPolicy(features, action_dim, config)
         self.log_alpha = nn.Parameter(torch.zeros(()))
         self.next_frame = ObservationImputer(obs_dim, action_dim, config) if config.impute_missing else None
         self.privileged_normalizer = Normalizer(privileged, config.normalize_observations) if privileged else None

@@ -18,7 +18,7 @@ UNHEARD_SECONDS = 30.0  # of a role that has not spoken yet: it imports, and mak
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class EvaluationStatus:
     """Deterministic episodes of one checkpoint; None is what the record did not say."""
 
     return_mean: float
@@ -45,8 +45,8 @@ class RunStatus:
         self.env, self.preset, self.seed, self.total_steps = env, preset, seed, total_steps
         self.replay_ratio = replay_ratio
         self.roles: dict[str, dict[str, Any]] = {}
-        self.last: Evaluation | None = None
-        self.best: Evaluation | None = None
+        self.last: EvaluationStatus | None = None
+        self.best: EvaluationStatus | None = None
         self.final_steps: int | None = None  # once the run has its result
         self.heard = "*"  # which roles speak all the time; of a baseline the launcher alone
         self._pace = Pace()
@@ -79,7 +79,7 @@ class RunStatus:
             return
         deviation = deviation if is_finite(deviation) else None
         at = _steps(record.get("eval_env_steps"))
-        self.last = Evaluation(float(score), deviation, _steps(record["eval_update"]), at)
+        self.last = EvaluationStatus(float(score), deviation, _steps(record["eval_update"]), at)
         if self.best is None or self.last.return_mean > self.best.return_mean:
             self.best = self.last
 

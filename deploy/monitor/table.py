@@ -12,7 +12,7 @@ from rich.text import Text
 
 from rmc.deploy.monitor.figures import number, time_and_eta
 from rmc.deploy.monitor.notices import count, notices, waits
-from rmc.deploy.monitor.run_status import Evaluation, RunStatus
+from rmc.deploy.monitor.run_status import EvaluationStatus, RunStatus
 
 SIDE_WIDTH = 120  # from which the roles stand beside the figures
 LABEL = 13  # columns of a figure's name
@@ -90,7 +90,7 @@ def _essentials(status: RunStatus) -> list[Fact]:
     ]
 
 
-def _evaluation(evaluation: Evaluation | None) -> str:
+def _evaluation(evaluation: EvaluationStatus | None) -> str:
     if evaluation is None:
         return number(None)
     steps = evaluation.env_steps

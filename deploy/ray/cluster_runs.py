@@ -7,7 +7,7 @@ from typing import Any
 import ray
 
 from rmc.common.errors import ConfigError
-from rmc.deploy.ray.launcher_actor import RunSummary
+from rmc.deploy.ray.launcher_actor import ClusterRunSummary
 from rmc.deploy.ray.role_actor import NAMESPACE
 
 ANSWER_SECONDS = 10.0  # of a launcher, which may be taking in a checkpoint
@@ -15,15 +15,15 @@ AWAY_SECONDS = 30.0  # a launcher that was killed begins again within that
 LOOK_SECONDS = 0.5
 
 
-def summaries() -> dict[str, RunSummary | None]:
+def summaries() -> dict[str, ClusterRunSummary | None]:
     """Of every run by its name; None where its launcher does not answer."""
     return {name: _asked(launcher.summary, ANSWER_SECONDS) for name, launcher in sorted(_launchers().items())}
 
 
-def stop(run: str) -> RunSummary:
+def stop(run: str) -> ClusterRunSummary:
     """End a run in order, and wait until it has; how far it was. Raises ConfigError."""
     name = _full_name(run)
-    summary: RunSummary | None = _asked(_launchers()[name].summary, AWAY_SECONDS)
+    summary: ClusterRunSummary | None = _asked(_launchers()[name].summary, AWAY_SECONDS)
     seconds: float | None = _asked(_launchers()[name].end, AWAY_SECONDS)
     if summary is None or seconds is None:
         raise ConfigError("RUN", run, f"its launcher does not answer for {AWAY_SECONDS:.0f} s; try again")

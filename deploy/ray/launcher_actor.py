@@ -24,7 +24,7 @@ RECENT_BYTES = 1 << 18  # of a run's metrics
 
 
 @dataclass(frozen=True)
-class RunSummary:
+class ClusterRunSummary:
     """A run that is trained on a cluster, as ``rmc list`` shows it."""
 
     env: str
@@ -83,7 +83,7 @@ class LauncherActor(RoleActor):
                 remove_placement_group(ray.util.get_placement_group(name))
         ray.kill(own, no_restart=True)
 
-    def summary(self) -> RunSummary:
+    def summary(self) -> ClusterRunSummary:
         """How the run is. Raises ConfigError where its folder is damaged."""
         folder = RunFolder(self._folder)
         status, past_starts = recorded_status(folder, RECENT_BYTES), starts(folder)
@@ -93,7 +93,7 @@ class LauncherActor(RoleActor):
         actors = sum(role.startswith("actor-") for role in heard)
         since = past_starts[-1].time if past_starts else None
         place = socket.gethostname(), str(folder.path)
-        return RunSummary(status.env, status.env_steps, status.total_steps, address, actors, since, *place)
+        return ClusterRunSummary(status.env, status.env_steps, status.total_steps, address, actors, since, *place)
 
     def end(self) -> float:
         """Ask the run's launcher to end it in order; the seconds that this may take."""

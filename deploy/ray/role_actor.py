@@ -46,7 +46,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Report:
+class RoleReport:
     """How a host's role is."""
 
     incarnation: str
@@ -160,7 +160,7 @@ class RoleActor:
             time.sleep(LAST_WORDS_SECONDS)
             os._exit(1)
 
-    def report(self, incarnation: str, log_start: int) -> Report:
+    def report(self, incarnation: str, log_start: int) -> RoleReport:
         """How the role is, and its log from there on; of another life's, from this one's start on."""
         start = log_start if incarnation == self._incarnation else self._role.log_start
         log = b""
@@ -168,7 +168,7 @@ class RoleActor:
             file.seek(start)
             log = file.read(LOG_BYTES)
         words = self._role.last_words() if self._status else ""
-        return Report(
+        return RoleReport(
             self._incarnation, ray.util.get_node_ip_address(), self._role.pid, self._status, words, log,
             start + len(log), self.trouble,
         )  # fmt: skip

@@ -11,7 +11,7 @@ import ray
 
 from rmc.deploy.local.fork_server import open_log
 from rmc.deploy.local.supervisor import QuickDeaths
-from rmc.deploy.ray.role_actor import Report
+from rmc.deploy.ray.role_actor import RoleReport
 
 POLL_SECONDS = 0.5  # between questions to each host
 log = logging.getLogger(__name__)
@@ -22,7 +22,7 @@ class RoleHandle:
 
     def __init__(self, name: str, handle: Any, env_timeout: float = 0.0) -> None:
         self.name, self.handle = name, handle
-        self.report: Report | None = None  # the newest; None until the first
+        self.report: RoleReport | None = None  # the newest; None until the first
         self.restarts = 0
         self.dead = ""  # for good, and why: somebody killed it, or it could not begin
         self.waits_since = time.monotonic()  # for a CPU, or to be started again; unless it runs
@@ -69,7 +69,7 @@ class RoleHandle:
             self.waits_since = time.monotonic() if self.running else self.waits_since
             self.report = dataclasses.replace(self.report, pid=None) if self.report else None
 
-    def _hear(self, report: Report, logs: Path) -> None:
+    def _hear(self, report: RoleReport, logs: Path) -> None:
         if self.report is None or report.incarnation != self.report.incarnation:
             self.restarts += self._began_at > 0
             self._began_at = time.monotonic()
@@ -85,7 +85,7 @@ class RoleHandle:
             self._death_noted = report.incarnation
             self._note_death(report)
 
-    def _note_death(self, report: Report) -> None:
+    def _note_death(self, report: RoleReport) -> None:
         assert report.status is not None
         lived = time.monotonic() - self._began_at
         self._deaths.note(report.status, lived, report.last_words, f" on {report.node}")

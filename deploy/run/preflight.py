@@ -119,8 +119,11 @@ def check_device(device: str) -> None:
     if device.startswith("cuda"):
         import torch  # takes a second, which no other check needs
 
-        if not torch.cuda.is_available():
+        count, number = torch.cuda.device_count(), int(device.removeprefix("cuda").lstrip(":") or 0)
+        if not count:
             raise ConfigError("--device", device, "PyTorch sees no CUDA device; use --device cpu")
+        if number >= count:
+            raise ConfigError("--device", device, f"PyTorch sees {count}; take cuda:0 to cuda:{count - 1}")
 
 
 def two_processes(config: RunConfig, cores: int, device: str = "cpu") -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from rmc.analysis import curves, env_check, export, history, memory_picture, video, world_model_picture
-from rmc.analysis.evaluation import Progress, evaluate_policy
+from rmc.analysis.evaluation import EvaluationProgress, evaluate_policy
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.analysis.policy_file import read_policy
@@ -43,7 +43,7 @@ def evaluate(command: run_options.Evaluate) -> int:
     env = policy.header.env
     if command.video is not None:
         video.prepare(env, command.video)
-    watch = Progress(Console(stderr=True), str(command.run))
+    watch = EvaluationProgress(Console(stderr=True), str(command.run))
     for probability in command.flicker or (None,):
         _say_played(command, evaluate_policy(policy, command.episodes, probability, command.seconds, watch))
     if command.video is not None:
@@ -63,7 +63,7 @@ def _evaluate_baseline(command: run_options.Evaluate) -> int:
     _check_baselines(str(folder.path))
     from rmc.analysis import baselines
 
-    watch = Progress(Console(stderr=True), str(command.run))
+    watch = EvaluationProgress(Console(stderr=True), str(command.run))
     for flicker in command.flicker or (None,):
         _say_played(command, baselines.evaluate(folder, command.episodes, flicker, command.seconds, watch))
     return 0

@@ -12,7 +12,7 @@ from rich.table import Table
 from rmc.deploy.monitor.figures import duration, number
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.ray import cluster_runs, launcher
-from rmc.deploy.ray.launcher_actor import RunSummary
+from rmc.deploy.ray.launcher_actor import ClusterRunSummary
 
 
 def list_runs(address: str, as_json: bool) -> int:
@@ -42,7 +42,7 @@ def _joined(address: str) -> Iterator[None]:
         yield
 
 
-def _table(summaries: dict[str, RunSummary | None]) -> Table:
+def _table(summaries: dict[str, ClusterRunSummary | None]) -> Table:
     drawn = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     for name in ("run", "env", "steps", "learner", "actors", "time", "folder"):
         right = name in ("steps", "actors", "time")
@@ -52,7 +52,7 @@ def _table(summaries: dict[str, RunSummary | None]) -> Table:
     return drawn
 
 
-def _cells(one: RunSummary) -> list[str]:
+def _cells(one: ClusterRunSummary) -> list[str]:
     trained_s = None if one.since is None else time.time() - one.since
     steps = number(one.env_steps, ",")
     return [one.env, steps, one.learner or "none", str(one.actors), duration(trained_s), f"{one.host}:{one.folder}"]

@@ -23,7 +23,7 @@ from rmc.sweep.grid import Grid, grid_jobs, is_finished, make_job
 from rmc.sweep.index import NAME, Index
 from rmc.sweep.job import TRIAL, Job
 from rmc.sweep.local_runs import LocalRuns
-from rmc.sweep.pool import OVER, Ending, Place, Plan, conduct, drop_replay
+from rmc.sweep.pool import OVER, Ending, Place, SweepPlan, conduct, drop_replay
 from rmc.sweep.spec import Range, Search, Spec, read_grid, read_ranges, read_seeds, read_spec
 from rmc.sweep.table import result_table, run_line
 
@@ -90,7 +90,7 @@ def corner_jobs(spec: Spec, search: Search, folder: Path) -> list[Job]:
 class Work:
     """What a start of a sweep has to do."""
 
-    plan: Plan
+    plan: SweepPlan
     jobs: list[Job]  # that are known; a search's grow
     todo: list[Job]  # that are not over; of a search's new ones only the folders are known
     total: int

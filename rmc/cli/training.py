@@ -176,7 +176,7 @@ def _before(config: RunConfig, folder: RunFolder, console: Console) -> dict[str,
     number, files = CheckpointFolder(folder.checkpoints).latest() or (0, {})
     policy = files[POLICY] if files and number == 0 else evaluation.initial_policy(config)
     header, seconds = config.policy_header(), config.evaluator.evaluation_seconds
-    progress = evaluation.Progress(console, "before training")
+    progress = evaluation.EvaluationProgress(console, "before training")
     played = evaluation.evaluate_blob(header, policy, evaluation.FINAL_EPISODES, None, seconds, progress)
     folder.write_initial(played)
     return played
@@ -185,10 +185,10 @@ def _before(config: RunConfig, folder: RunFolder, console: Console) -> dict[str,
 def _result(
     config: RunConfig, folder: RunFolder, monitor: Monitor, before: dict[str, Any], console: Console
 ) -> dict[str, Any]:
-    from rmc.analysis.evaluation import FINAL_EPISODES, Progress, evaluate_policy
+    from rmc.analysis.evaluation import FINAL_EPISODES, EvaluationProgress, evaluate_policy
     from rmc.analysis.policy_file import read_policy
 
-    progress, seconds = Progress(console, "after training"), config.evaluator.evaluation_seconds
+    progress, seconds = EvaluationProgress(console, "after training"), config.evaluator.evaluation_seconds
     after = evaluate_policy(read_policy(folder.path), FINAL_EPISODES, None, seconds, progress)
     return {
         **after,

@@ -21,12 +21,12 @@ class LocalRuns:
         """Whether a part of the cores is free."""
         return bool(self._free)
 
-    def start(self, job: Job) -> "LocalRun":
+    def start(self, job: Job) -> "RunProcess":
         """Start one on a part of the cores."""
-        return LocalRun(job, self._free.pop(0), self._free)
+        return RunProcess(job, self._free.pop(0), self._free)
 
 
-class LocalRun:
+class RunProcess:
     """A process that ends with this one."""
 
     def __init__(self, job: Job, part: set[int], free: list[set[int]]) -> None:

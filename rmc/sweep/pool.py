@@ -53,7 +53,7 @@ class Place(Protocol):
         """Start one; it goes on with what its folder has."""
 
 
-class Plan(Protocol):
+class SweepPlan(Protocol):
     """Which runs there are."""
 
     def next(self) -> Job | None:
@@ -95,7 +95,7 @@ class _AtWork:
 
 
 def conduct(
-    plan: Plan, place: Place, stop: StopSignal, begun: Callable[[Job], None], ended: Callable[[Job, Ending], None]
+    plan: SweepPlan, place: Place, stop: StopSignal, begun: Callable[[Job], None], ended: Callable[[Job, Ending], None]
 ) -> None:
     """Run all of a plan; with a stop signal no other one starts, and those at work end in order."""
     at_work: list[_AtWork] = []

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from rmc.analysis import memory_picture
 from rmc.analysis.episodes import Episode, HiddenPart, Player, hidden_parts, recorded, remembered
-from rmc.analysis.influence import Replay, _changes, influence
+from rmc.analysis.influence import ReplayedEpisode, _changes, influence
 from rmc.analysis.memory_picture import Remembered, remember, tables
 from rmc.analysis.memory_probe import Samples, _of_part, explained, probes, samples
 from rmc.common.agent import Agent
@@ -87,7 +87,7 @@ def test_differences_are_those_of_two_whole_passes(agent: str, tmp_path: Path) -
     network = Agent(3, 1, config.agent).eval()
     with closing(Player(folder, network, config, "latest")) as player:
         episode = player.play()
-    replay, delays = Replay(network, episode), torch.tensor([0, 1, 4, 9])
+    replay, delays = ReplayedEpisode(network, episode), torch.tensor([0, 1, 4, 9])
     starts = [start for start in (0, 1, 5, 8, 13, 19) if not episode.missing[0, start]]
     assert len(starts) >= 3
     change = torch.tensor([[0.0, 0.5, 0.0], [-1.0, 0.0, 0.0]])
@@ -197,7 +197,7 @@ def test_what_is_missing_is_not_changed(of_memory_env: list[Episode]) -> None:
     size = episode.observation.shape[2]
     missing = torch.zeros(1, episode.missing.shape[1], size, dtype=torch.bool)
     missing[0, 0, 0] = True
-    replay = Replay(built(ASLEEP), dataclasses.replace(episode, missing=missing))
+    replay = ReplayedEpisode(built(ASLEEP), dataclasses.replace(episode, missing=missing))
     change = _changes(replay, 0, torch.ones(size))
     assert not change[:, 0].any()
     assert (change[1:, 1:].abs().sum(1) > 0).all()

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from rmc.analysis.episodes import Episode
-from rmc.analysis.influence import Replay
+from rmc.analysis.influence import ReplayedEpisode
 from rmc.analysis.value_bias import value_bias
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
@@ -40,7 +40,7 @@ def test_of_a_terminated_episode_all_steps_count(agent: Agent, episode: Episode)
     assert found.steps == STEPS
     assert found.came == pytest.approx(np.mean(returns), rel=1e-5)
     with torch.no_grad():
-        assert found.expected == pytest.approx(Replay(agent, episode).outputs[1].mean().item(), rel=1e-5)
+        assert found.expected == pytest.approx(ReplayedEpisode(agent, episode).outputs[1].mean().item(), rel=1e-5)
 
 
 def test_of_one_that_was_cut_the_last_steps_are_left_out(agent: Agent, episode: Episode) -> None:

@@ -3,7 +3,7 @@
 import pytest
 
 from rmc.deploy.ray.placement import actors_in_the_way
-from rmc.deploy.ray.role_actor import Report
+from rmc.deploy.ray.role_actor import RoleReport
 from rmc.deploy.ray.role_handle import RoleHandle
 
 NODE = {"NodeManagerAddress": "10.0.0.2"}
@@ -11,7 +11,7 @@ NODE = {"NodeManagerAddress": "10.0.0.2"}
 
 def actor(index: int, node: str = "10.0.0.2", pid: int | None = 1) -> RoleHandle:
     handle = RoleHandle(f"actor-{index}", None)
-    handle.report = Report("", node, pid, None, "", b"", 0, "")
+    handle.report = RoleReport("", node, pid, None, "", b"", 0, "")
     return handle
 
 

@@ -8,13 +8,21 @@ from types import SimpleNamespace
 
 import psutil
 import pytest
+import torch
 
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, WindowConfig
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.preflight import DISK_RESERVE, check_batch_fits, check_machine, check_ring_fits, ring_bytes
+from rmc.deploy.run.preflight import (
+    DISK_RESERVE,
+    check_batch_fits,
+    check_device,
+    check_machine,
+    check_ring_fits,
+    ring_bytes,
+)
 from rmc.deploy.run.presets import robust
 
 
@@ -45,6 +53,17 @@ def test_a_batch_of_long_windows_that_no_memory_holds_is_refused_with_the_larges
         check_batch_fits(run(990, most + 1))
     with pytest.raises(ConfigError, match="take fewer steps a window"):
         check_batch_fits(dataclasses.replace(run(9_990, 1), agent=AgentConfig(hidden=4_096)))
+
+
+def test_a_gpu_that_is_not_there_is_refused_with_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    for device in ("cpu", "cuda", "cuda:0", "cuda:1"):
+        check_device(device)
+    with pytest.raises(ConfigError, match=r"^--device='cuda:2': PyTorch sees 2; take cuda:0 to cuda:1$"):
+        check_device("cuda:2")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(ConfigError, match=r"^--device='cuda:0': PyTorch sees no CUDA device; use --device cpu$"):
+        check_device("cuda:0")
 
 
 def test_a_run_is_refused_so_before_it_starts_but_on_a_gpu(memory: int, tmp_path, monkeypatch) -> None:
