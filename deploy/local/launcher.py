@@ -3,7 +3,7 @@
 import logging
 import signal
 import time
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from rmc.common.bus.redis_bus import RedisBus
@@ -18,13 +18,11 @@ from rmc.deploy.local.role_command import (
     replay_command,
 )
 from rmc.deploy.local.role_environment import URL_VARIABLE
-from rmc.deploy.local.socket_folder import SocketFolder
 from rmc.deploy.local.supervisor import STOP_SECONDS, Supervisor
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.redis.connect import PATIENCE_VARIABLE, connect
 from rmc.deploy.redis.registration import Registration
-from rmc.deploy.redis.server import RedisServer
-from rmc.deploy.redis.users import LAUNCHER, RedisUsers
+from rmc.deploy.redis.run_redis import RunRedis
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
@@ -46,44 +44,25 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
     return [*replays, learner, *evaluator_commands(config, run), *actor_commands(config, run)]
 
 
-def _redis(config: RunConfig, folder: RunFolder, sockets: Path) -> RedisServer:
-    return RedisServer(sockets, users=RedisUsers(folder.name, folder.secret(), config.roles()))
-
-
 class LocalRun:
     """A run's processes between ``start`` and ``close``."""
 
     def __init__(self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str) -> None:
-        self._leave = ExitStack()
-        self._sockets = SocketFolder()
-        self._leave.callback(self._sockets.close)
-        try:
-            self._server = None if redis_url else self._leave.enter_context(_redis(config, folder, self._sockets.path))
-            self.bus = connect(redis_url or self._url(LAUNCHER), folder.name)
-            self._registration = Registration(config, folder, self.bus)
-        except BaseException:
-            self._leave.close()
-            raise
+        self._redis = RunRedis(config, folder, redis_url)
+        self.bus, self._is_users = self._redis.bus, redis_url is not None
         self._shards = config.shards()
         self._listening: dict[str, tuple[int | None, float]] = {}  # who listened, and when it was seen last
         self.supervisor = Supervisor(
-            commands(config, folder, self._sockets.path, device),
-            lambda role: {URL_VARIABLE: redis_url or self._url(role), PATIENCE_VARIABLE: str(OUTAGE_SECONDS)},
+            commands(config, folder, self._redis.sockets, device),
+            lambda role: {URL_VARIABLE: self._redis.url(role), PATIENCE_VARIABLE: str(OUTAGE_SECONDS)},
             folder.logs,
             lambda role: CheckpointFolder(folder.checkpoints).patience(0.0) if role == "learner" else 0.0,
         )
 
-    def _url(self, user: str) -> str:
-        assert self._server is not None
-        return self._server.url(user)
-
     def tend(self) -> None:
         """Start again what died: roles, and the embedded Redis. Raises RoleDied."""
-        self._sockets.renew()
-        if self._server is not None:
-            self._server.tend()
+        self._redis.tend()
         self._end_unreachable()
-        self._registration.tend()
         self.supervisor.tend()
 
     def _end_unreachable(self) -> None:
@@ -94,7 +73,7 @@ class LocalRun:
         for shard in self._shards:
             role, socket, now = (
                 self.supervisor.roles[shard.role],
-                self._sockets.path / f"{shard.role}.sock",
+                self._redis.sockets / f"{shard.role}.sock",
                 time.monotonic(),
             )
             pid, since = self._listening.get(shard.role, (role.pid, now))
@@ -115,11 +94,11 @@ class LocalRun:
         """End everything; nothing is left but the run's folder."""
         try:
             self.supervisor.stop()
-            self._registration.keep()
-            if self._server is None:
+            self._redis.keep()
+            if self._is_users:
                 _expire(self.bus)
         finally:
-            self._leave.close()
+            self._redis.close()
 
 
 def _expire(bus: RedisBus) -> None:

@@ -9,8 +9,8 @@ from rmc.analysis.doctor import examine
 from rmc.analysis.needs import Need, needs
 from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
-from rmc.deploy.local.socket_folder import place_for_sockets
 from rmc.deploy.local.trial import TRAINED_SECONDS, run_trial, trial_config
+from rmc.deploy.redis.socket_folder import place_for_sockets
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import this_machine
 from rmc.deploy.run.launch_options import LaunchOptions

@@ -11,9 +11,9 @@ from rich.console import Console
 from rmc.cli.ending import print_end
 from rmc.cli.signals import signals_caught
 from rmc.common.process.role import StopSignal
-from rmc.deploy.local.socket_folder import place_for_sockets
 from rmc.deploy.monitor import attach
 from rmc.deploy.ray import launcher, placement
+from rmc.deploy.redis.socket_folder import place_for_sockets
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions

@@ -13,12 +13,12 @@ from rmc.common.checkpoint import POLICY, CheckpointFolder
 from rmc.common.errors import ConfigError, EnvFault, RmcError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local import launcher
-from rmc.deploy.local.socket_folder import place_for_sockets
 from rmc.deploy.local.supervisor import EXIT_CONFIG
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.monitor.output import Output
 from rmc.deploy.monitor.tracker import start_tracker
 from rmc.deploy.redis.connect import connect
+from rmc.deploy.redis.socket_folder import place_for_sockets
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions

@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from rmc.common.errors import ConfigError, RoleDied
-from rmc.deploy.local import socket_folder
-from rmc.deploy.local.socket_folder import LONGEST_NAME, SocketFolder, place_for_sockets, sweep
+from rmc.deploy.redis import socket_folder
 from rmc.deploy.redis.server import SOCKET_PATH_LIMIT, RedisServer
+from rmc.deploy.redis.socket_folder import LONGEST_NAME, SocketFolder, place_for_sockets, sweep
 
 ODD = "a#b?c%d e\"f\\g'h+ü&@*[i]"
 HOLDER = """
 import sys
-from rmc.deploy.local.socket_folder import SocketFolder
+from rmc.deploy.redis.socket_folder import SocketFolder
 held = SocketFolder()
 print(held.path, flush=True)
 sys.stdin.read()

@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from rmc.common.process.watchdog import HUNG_STATUS
-from rmc.deploy.local.socket_folder import sweep
+from rmc.deploy.redis.socket_folder import sweep
 from tests.integration.running import Training, alive
 from tests.integration.spawning_env import SPAWNED
 

@@ -1,0 +1,186 @@
+"""The hosts of a run's roles on a Ray cluster: named, detached Ray actors, and the groups that keep their CPUs."""
+
+import logging
+import os
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import ray
+from ray.util.placement_group import placement_group, remove_placement_group
+from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
+
+from rmc.common.errors import RoleDied
+from rmc.common.shard import WHOLE
+from rmc.deploy.local.role_environment import URL_VARIABLE
+from rmc.deploy.local.supervisor import QUICK_DEATHS
+from rmc.deploy.ray.placement import SHARD_CPUS, RolePlacement, bundle, places
+from rmc.deploy.ray.ring_nodes import RingLocations
+from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name
+from rmc.deploy.ray.role_handle import RoleHandle
+from rmc.deploy.redis.connect import PATIENCE_VARIABLE
+from rmc.deploy.run import tls
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder
+
+LOST_SECONDS = 120.0  # within which a role's host may be lost for good twice
+PATIENCE_SECONDS = 120.0  # of a role that starts while launcher and Redis are being started again
+CLOSE_SECONDS, CLEAR_SECONDS = 10.0, 5.0  # for hosts to end, and to remove what is left on their nodes
+NOTICE_SECONDS = 2.0  # for them to hear that the run ends
+log = logging.getLogger(__name__)
+
+
+class Hosts:
+    """Those of one run, by role. ``url`` tells with which URL a role connects to the run's Redis."""
+
+    def __init__(self, folder: RunFolder, device: str, encrypted: bool, url: Callable[[str], str]) -> None:
+        self._folder, self._device, self._encrypted, self._url = folder, device, encrypted, url
+        self._ring_locations = RingLocations(folder)
+        self._handles: dict[str, RoleHandle] = {}
+        self._groups: dict[str, Any] = {}
+        self._bundles: dict[str, int] = {}  # of the replay servers' group
+        self._lost: dict[str, list[float]] = {}  # when hosts died for good, by role
+
+    def start(self, config: RunConfig) -> None:
+        """Place every role, or find again those that an earlier launcher of the run has placed."""
+        near = self._ring_locations.node(WHOLE.role)
+        self._groups["learner"] = self._group("learner", [bundle(config, self._device)], "STRICT_PACK", near)
+        if config.replay.replay_shards > 1:  # a ring stays on its node: so does its server
+            roles = [shard.role for shard in config.shards()]
+            self._groups["replay"] = self._group("replay", [{"CPU": SHARD_CPUS}] * len(roles), "SPREAD")
+            self._bundles = self._ring_locations.bundles(self._groups["replay"], roles)
+        self.place(config)
+
+    def _group(self, name: str, bundles: list[dict[str, float]], strategy: str, near: str | None = None) -> Any:
+        name = actor_name(self._folder.name, name)
+        try:
+            return ray.util.get_placement_group(name)
+        except ValueError:
+            return placement_group(
+                bundles, strategy=strategy, name=name, lifetime="detached", _soft_target_node_id=near
+            )
+
+    def _places(self, config: RunConfig) -> dict[str, RolePlacement]:
+        return places(config, self._folder.name, self._device, self._encrypted)
+
+    def end_left(self, config: RunConfig) -> None:
+        """End those of an earlier launcher: they would never find a Redis that could not have its port again."""
+        for name in self._places(config):
+            with suppress(ValueError):
+                ray.kill(ray.get_actor(actor_name(self._folder.name, name), NAMESPACE), no_restart=True)
+
+    def place(self, config: RunConfig) -> None:
+        """Give every role that has no host one."""
+        for name, place in self._places(config).items():
+            if name not in self._handles:
+                self._handles[name] = RoleHandle(name, self._create(name, place), place.command.env_timeout)
+                self._handles[name].handle.stopping.remote(False)  # one that was found may have heard otherwise
+
+    def _create(self, name: str, place: RolePlacement) -> Any:
+        strategy: Any = "SPREAD"
+        if place.group:
+            strategy = PlacementGroupSchedulingStrategy(
+                self._groups[place.group], placement_group_bundle_index=self._bundles.get(name, 0)
+            )
+        options = ray.remote(place.kind).options(
+            name=actor_name(self._folder.name, name), namespace=NAMESPACE, lifetime="detached", get_if_exists=True,
+            max_restarts=-1, num_cpus=place.cpus, num_gpus=place.gpus, scheduling_strategy=strategy,
+        )  # fmt: skip
+        environment = {URL_VARIABLE: f"file:{{scratch}}/redis-url-{name}", PATIENCE_VARIABLE: str(PATIENCE_SECONDS)}
+        return options.remote(Task(self._folder.name, place.command, environment, self._secrets(name), os.getcwd()))
+
+    def _secrets(self, name: str) -> dict[str, bytes]:
+        """Files of a role's, by name; roles on one node share the folder that they are in."""
+        secrets = {f"redis-url-{name}": self._url(name).encode()}
+        if name == "learner" or name.startswith("replay"):
+            secrets["secret"] = self._folder.secret()
+        if self._encrypted:
+            files = (tls.CERTIFICATE, tls.KEY) if name.startswith("replay") else (tls.CERTIFICATE,)
+            secrets |= {file: (self._folder.path / file).read_bytes() for file in files}
+        return secrets
+
+    def ask(self) -> None:
+        """Hear every one, and let go of those that are dead. Raises RoleDied."""
+        for one in list(self._handles.values()):
+            one.ask(self._folder.logs)
+            if one.dead:
+                self._forget_dead(one)
+            elif one.name.startswith("replay") and one.running:
+                self._ring_locations.note(one.name, one.node)
+
+    def _forget_dead(self, one: RoleHandle) -> None:
+        """Of a host that Ray does not start again: the next ``place`` makes another."""
+        log.warning("the host of %s is gone: %s", one.name, one.dead)
+        del self._handles[one.name]
+        now = time.monotonic()
+        lost = [when for when in self._lost.get(one.name, []) if now - when < LOST_SECONDS]
+        self._lost[one.name] = [*lost, now]
+        if len(lost) + 1 >= QUICK_DEATHS:
+            raise RoleDied(f"the host of {one.name} could not be held:\n{one.dead}")
+
+    def end(self, one: RoleHandle) -> None:
+        """At once; its CPU is free for others."""
+        ray.kill(one.handle, no_restart=True)
+        self._handles.pop(one.name)
+
+    def restart_replay(self) -> None:
+        """Let the replay servers begin anew, with the config of now."""
+        for name, one in self._handles.items():
+            if name.startswith("replay"):
+                one.handle.restart.remote()
+
+    def actors(self) -> list[RoleHandle]:
+        """Those with the lowest numbers first."""
+        actors = [one for name, one in self._handles.items() if name.startswith("actor-")]
+        return sorted(actors, key=lambda one: int(one.name.removeprefix("actor-")))
+
+    def restarts(self) -> dict[str, int]:
+        """How often each role was started again."""
+        return {name: one.restarts for name, one in self._handles.items()}
+
+    def waiting(self) -> list[str]:
+        """Roles that run nowhere now."""
+        return [name for name, one in self._handles.items() if not one.running]
+
+    def finished(self) -> bool:
+        """Whether the learner has ended in order, and its last checkpoint is on the head."""
+        learner = self._handles.get("learner")
+        return learner is not None and learner.report is not None and learner.report.status == 0
+
+    # -- the end --------------------------------------------------------------------------------------
+
+    def tell_stop(self) -> None:
+        """That the run ends: what ends now is not started again."""
+        told = [one.handle.stopping.remote(True) for one in self._handles.values() if one.running]
+        _wait(told, NOTICE_SECONDS)
+
+    def all_ended(self) -> bool:
+        """Whether no role runs, and what each left is put away, as last heard; they are asked again."""
+        for one in self._handles.values():
+            with suppress(RoleDied):
+                one.ask(self._folder.logs)
+        return not any(one.awaited for one in self._handles.values())
+
+    def close(self, over: bool, saving: float) -> None:
+        """End all; of a run that is ``over`` nothing is left on the nodes. ``saving``: seconds of a checkpoint."""
+        _wait([one.handle.close.remote() for one in self._handles.values() if one.awaited], CLOSE_SECONDS + saving)
+        if over and not self._kept_elsewhere():
+            heard = [one for one in self._handles.values() if one.report is not None]
+            _wait([one.handle.clear.remote() for one in heard], CLEAR_SECONDS)
+        for one in self._handles.values():
+            ray.kill(one.handle, no_restart=True)
+        for group in self._groups.values():
+            remove_placement_group(group)
+
+    def _kept_elsewhere(self) -> bool:
+        """Whether something of the run is on a node alone, where its hosts share a folder."""
+        troubled = [one for one in self._handles.values() if one.trouble]
+        for one in troubled:
+            log.warning("what %s left stays on %s: %s", one.name, one.node, one.trouble)
+        return bool(troubled)
+
+
+def _wait(replies: list[Any], seconds: float) -> None:
+    if replies:
+        ray.wait(replies, num_returns=len(replies), timeout=seconds)
