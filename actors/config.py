@@ -25,15 +25,15 @@ class ActorConfig:
     stride: int = 0
     """Steps between window starts. Below --trained-steps windows overlap; 0 means --trained-steps."""
     state_strategy: Literal["zero", "stored", "burn-in", "episode"] = "burn-in"
-    """What a window's memory starts from: zeros; the actor's stored state; that state, then burned in; or zeros at the
-    episode's start. In the last case the window is the whole episode, up to the time limit."""
+    """A window's first memory state. zero: zeros. stored: the actor's. burn-in: the actor's, some steps before.
+    episode: zeros; the window is the whole episode, up to the time limit."""
     reward_scale: float = 1.0
-    """Rewards are multiplied by this to learn from; returns are told as the environment gives them."""
+    """Factor on the rewards that are learnt from; reported returns are unscaled."""
     refresh_steps: int = 400
-    """Environment steps of an actor between two looks at the newest weights."""
+    """Environment steps of an actor between two checks for new weights."""
     chunk_windows: int = 16
     """Windows sent in one entry."""
     chunk_seconds: float = 0.5
-    """A chunk that is not full is sent after so long."""
+    """Seconds after which an incomplete entry is sent."""
     unacked_bytes: int = 64 << 20
     """Maximum bytes of unacknowledged windows; the actor pauses there."""

@@ -1,4 +1,4 @@
-"""``rmc check-env``: plays an environment at random and says what the agent will make of it, and what to mend."""
+"""``rmc check-env``: plays an environment at random and says what the agent will make of it, and what to fix."""
 
 import time
 import warnings
@@ -85,7 +85,7 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
         console.print(line, soft_wrap=True)
     env.close()
     sound = not _faults(lines)
-    console.print("it can be trained on" if sound else "mend the fault first")
+    console.print("it can be trained on" if sound else "fix the fault first")
     return 0 if sound else 1
 
 

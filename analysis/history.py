@@ -76,9 +76,9 @@ def _object(line: bytes, place: str, names: Sequence[str]) -> dict[str, Any]:
     try:
         value = json.loads(line)
     except (ValueError, RecursionError) as error:
-        raise ConfigError("RUNS", place, f"not JSON ({error}); mend the line, or remove it") from None
+        raise ConfigError("RUNS", place, f"not JSON ({error}); fix the line, or remove it") from None
     if not isinstance(value, dict) or not value.keys() >= set(names):
-        raise ConfigError("RUNS", place, f"must be an object with {', '.join(names)}; mend the line, or remove it")
+        raise ConfigError("RUNS", place, f"must be an object with {', '.join(names)}; fix the line, or remove it")
     return value
 
 
@@ -87,14 +87,14 @@ def _of_line(raw: dict[str, Any], place: str) -> History:
         known = {name: value for name, value in raw.items() if name != "transitions"}  # of older lines
         history = History(**{**known, "evaluations": [Evaluation(**one) for one in raw["evaluations"]]})
     except TypeError as error:
-        raise ConfigError("RUNS", place, f"not a history ({error}); mend the line, or remove it") from None
+        raise ConfigError("RUNS", place, f"not a history ({error}); fix the line, or remove it") from None
     numbers: list[Any] = [history.seed, history.env_steps, history.updates, history.wall_s]
     numbers += [] if history.initial_return is None else [history.initial_return]
     numbers += [value for one in history.evaluations for value in dataclasses.astuple(one)]
     texts = history.agent, history.env, history.commit
     named = all(isinstance(text, str) for text in texts) and isinstance(history.finished, bool)
     if not (history.evaluations and all(map(is_finite, numbers)) and named):
-        fix = "not a history (its evaluations, numbers and names); mend the line, or remove it"
+        fix = "not a history (its evaluations, numbers and names); fix the line, or remove it"
         raise ConfigError("RUNS", place, fix)
     return history
 

@@ -31,7 +31,7 @@ def stalled(vitals: Vitals, _: RunConfig) -> Finding | None:
         return None
     waits = [f"{role} for {reason}" for role in vitals.roles if (reason := vitals.waiting_for(role))]
     measured = f"no step and no update for {still:.0f} s ({', '.join(waits) or 'nobody says what it waits for'})"
-    return Finding("deadlock", measured, "rmc stop saves the run and rmc resume goes on with it; logs/ may say why")
+    return Finding("deadlock", measured, "rmc stop saves the run and rmc resume continues it; logs/ may say why")
 
 
 def _still_seconds(vitals: Vitals) -> float:

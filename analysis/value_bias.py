@@ -1,4 +1,4 @@
-"""What the critics expect beside what came: too much of it, and the policy climbs errors.
+"""What the critics expect beside what came: too much of it, and the policy maximises errors.
 
 Shapes: T steps of an episode.
 """

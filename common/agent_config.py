@@ -21,7 +21,7 @@ class AgentConfig:
     heads: tuple[int, int] = (400, 300)
     """Hidden layers of every head."""
     gate_init: Literal["uniform", "chrono"] = "uniform"
-    """Initial bias of the GRU's update gates: PyTorch's, or chrono: time constants of 2 to T steps, T a window's."""
+    """Initial bias of the GRU's update gates. uniform: PyTorch's. chrono: time constants up to a window's length."""
     layer_norm: bool = False
     """LayerNorm between the embedding's Linear and its ReLU."""
     head_input: HeadInput = "hidden"

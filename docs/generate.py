@@ -39,8 +39,8 @@ WHEN = {
     "seed": "for every repetition",
     "total_steps": "always: it is the length of the run, and also where a finished one goes on to",
     "actors": "when the learner waits for experience; on two cores one actor is enough",
-    "run_dir": "to name a run, and to go on with one",
-    "if_exists": "`fail` or `new` where a script must not go on with an old run by chance",
+    "run_dir": "to name a run, and to continue one",
+    "if_exists": "`fail` or `new` where a script must not continue an old run by chance",
     "init_from": "to begin with what another run has [learnt](warm-start.md); for a new run alone",
     "init_parts": "`memory+world-model` for another reward, `policy` to begin with what acts",
     "launcher": "`ray` for several machines, `lockstep` for the same bits again, `manual` to start the roles yourself",
@@ -105,9 +105,10 @@ WHEN = {
     "alpha_learning_rate": "up where exploration stays high for too long",
     "gamma": "up for goals further away than 100 steps, down for nearer ones",
     "polyak": "up for slower, steadier targets; of use with `--no-critic-batch-norm`, or an `ema` memory",
-    "clip_norm": "where single batches throw training off (`grad_norm` in the metrics); 40 cost [return](results.md)",
+    "clip_norm": "where single batches throw training off (`grad_norm` in the metrics); "
+    "40 cost return in a trial (`studies/notebook.md`)",
     "scheme": "to repeat the paper's table 1, where 1 is best; in our "
-    "[results](results.md) 3 is ahead of 1 with half of the frames blank, else level",
+    "[results](results.md) 3 is ahead of 1 with half of the frames missing, else level",
     "policy_through_q": "with schemes 4 to 6",
     "update_order": "`alternate` for algorithm 1 as printed, at five times the forwards "
     "(four with `--no-impute-missing`)",
@@ -126,7 +127,7 @@ WHEN = {
     "publish_updates": "rarely",
     "checkpoint_steps": "down to see more evaluations",
     "keep_checkpoints": "up to go back further; the best is always kept",
-    "precision": "`fp32` to rule rounding out, at half to 0.7 of the speed where the CPU has bfloat16",
+    "precision": "`fp32` to avoid rounding; an update then runs at 0.37 to 0.56 of the speed on a CPU with bfloat16",
     "threads": "1 to leave a core to other runs; more where cores are free",
     "evaluation_seconds": "up where an episode takes minutes",
     "episodes": "up for less noise in what is called the best checkpoint; 0 where one environment alone can exist",

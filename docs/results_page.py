@@ -131,7 +131,7 @@ def draw() -> None:
     """A panel an environment, a line a seed; published figures are crosses."""
     from matplotlib.figure import Figure
 
-    long = [row for table in ("returns", "half_blank") for row in rows(table) if row.steps >= 300_000]
+    long = [row for table in ("returns", "half_missing") for row in rows(table) if row.steps >= 300_000]
     panels = {env: list(own) for env, own in groupby(long, key=lambda row: row.env)}
     figure = Figure(figsize=(3.6 * len(panels), 3.8), layout="constrained")
     handles: dict[str, Any] = {}

@@ -28,7 +28,7 @@ class UpdateConfig:
     target_memory: Literal["online", "ema"] = "online"
     """Which memory gives the next state that a target's Q reads."""
     policy_q: Literal["first", "min"] = "min"
-    """Which critic the policy climbs: Q_1 (the paper) or the smaller of both."""
+    """Which Q the policy maximises: Q_1 (the paper) or the smaller of the two."""
     curiosity: float = 0.0
     """beta_0, weight of the curiosity reward at the start; 0 switches it off."""
     curiosity_scale: Literal["raw", "std"] = "raw"
@@ -42,8 +42,8 @@ class UpdateConfig:
     """In schemes 4 to 6: the policy's loss also reaches the memory by the state that Q reads, not by the policy's
     own input alone."""
     update_order: Literal["joint", "alternate"] = "joint"
-    """All losses from the parameters as they stood, in one step; or one after the other. In turn, each starts from
-    what the one before left, with an optimiser of its own (algorithm 1 as printed)."""
+    """joint: one step from all losses together. alternate: one loss after the other, each with an optimiser of its own
+    (algorithm 1 as printed)."""
     model_norm: Literal["l1", "l2"] = "l1"
     """How the world model's error is measured, as loss and as curiosity."""
     policy_delay: int = 1

@@ -132,7 +132,7 @@ class _Heads(torch.autograd.Function):
         x, share, w1, w2, w3, *kept = ctx.saved_tensors
         input_norm, kept = (kept[:2], kept[2:]) if ctx.normed else ([], kept)
         wants_features, wants_action, _, _, wants_weights, *_ = ctx.needs_input_grad
-        # of the inputs only those asked for: where the policy climbs Q, that is the action alone
+        # of the inputs only those asked for: where the policy maximises Q, that is the action alone
         columns = slice(0 if wants_features else ctx.split, x.shape[1] if wants_action else ctx.split)
         dx, gradients = torch.zeros_like(x[:, columns]), _Gradients.empty([w1, w2, w3], ctx.normed)
         size = len(kept) // (2 * len(w1))

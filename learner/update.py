@@ -158,7 +158,7 @@ class JointUpdate:
             next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:].detach())
             y = losses.td_target(r + beta * model.curiosity, c.gamma, d, next_value, m, c.n_step)
             z_actor = z_policy if c.policy_through_q else z.detach()
-            climbed = critic_input(z_actor[:, :-1], privileged[:, :-1]), pi[:, :-1]
+            judged = critic_input(z_actor[:, :-1], privileged[:, :-1]), pi[:, :-1]
 
         log_pi, td_error = log_pi[:, :-1], (q.detach() - y).abs().mean(0)
         loss_values = {
@@ -166,7 +166,7 @@ class JointUpdate:
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
         if batch.plan.trains_policy:
-            loss_values["policy_loss"] = losses.policy_loss(log_pi, self._frozen_q(*climbed), alpha, m)
+            loss_values["policy_loss"] = losses.policy_loss(log_pi, self._frozen_q(*judged), alpha, m)
         reported = {"policy_loss": self.policy_loss.clone()} | detached(loss_values)
         trace = Trace(reported, alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m)
         return loss_values, ValuePass(losses.priority(td_error, c.eta, m), value_metrics(trace, beta))
@@ -185,7 +185,7 @@ class JointUpdate:
         return q, next_q.detach()
 
     def _frozen_q(self, read: Tensor, action: Tensor) -> Tensor:
-        """(B, L_t) Q that the policy climbs, by parameters without gradient."""
+        """(B, L_t) Q that the policy maximises, by parameters without gradient."""
         frozen = {name: value.detach() for name, value in self.agent.critic.named_parameters()}
         with self._autocast():
             q: Tensor = functional_call(self.agent.critic, frozen, (read, action))

@@ -8,7 +8,7 @@ class ReplayConfig:
     """The replay server's options."""
 
     capacity: int = 70_000
-    """Windows kept; the oldest make room."""
+    """Windows kept; the oldest are overwritten."""
     replay_ratio: float = 128.0
     """Trained steps drawn per new environment step, from the end of the warm-up on."""
     warmup_steps: int = 5_000

@@ -33,14 +33,14 @@ def train(
     track_video_every: int | None = None,
     metrics_port: int | None = None,
 ) -> dict[str, Any]:
-    """Train a run to its ``total_steps``, or go on with the one in ``run_dir``; its ``result.json``.
+    """Train a run to its ``total_steps``, or continue the one in ``run_dir``; its ``result.json``.
 
     A new run begins with the networks and the normaliser of the run or ``RUN:CHECKPOINT`` in ``init_from``, or with
     those of ``init_parts``. Progress goes to standard output. Call it from the main thread: Ctrl-C ends the run in
     order. With the launcher ``local``, the roles are processes of their own, which import the environment by its id.
 
     Raises ConfigError for options that cannot work, before anything starts; RoleDied where a role keeps dying;
-    KeyboardInterrupt where the run was stopped, which ``resume`` goes on with.
+    KeyboardInterrupt where the run was stopped, which ``resume`` continues.
     """
     options = LaunchOptions(
         Path(run_dir),
@@ -71,7 +71,7 @@ def resume(
     redis_url: str | None = None,
     metrics_port: int | None = None,
 ) -> dict[str, Any]:
-    """Go on with the run in ``run_dir``; its ``result.json``. What is None stays as it was at the last start.
+    """Continue the run in ``run_dir``; its ``result.json``. What is None stays as it was at the last start.
 
     Other options that may change are given to ``train``, with the run's whole config. Raises as ``train`` does.
     """
@@ -95,7 +95,7 @@ def _train(config: RunConfig, options: LaunchOptions) -> dict[str, Any]:
     if status == STOPPED:
         raise KeyboardInterrupt
     result = folder.result()
-    assert result is not None  # written by every run that ends in order
+    assert result is not None  # written by every run that ends cleanly
     return result
 
 

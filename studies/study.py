@@ -1,4 +1,4 @@
-"""Runs a study: several agents, several seeds each, a line of results a run; the same command goes on with it.
+"""Runs a study: several agents, several seeds each, a line of results a run; the same command continues it.
 
     python -m studies.NAME [--scale smoke|small|full] [--env ENV ...] [--only AGENT ...] [--seeds 1 2 3] [--jobs 2]
     python -m studies.NAME --steps 300000 …
@@ -136,7 +136,7 @@ class Study:
         except ConfigError as error:
             sys.exit(f"studies.{self.name}: {error}")
         except KeyboardInterrupt:
-            sys.exit(f"studies.{self.name}: interrupted; the same command goes on with it")
+            sys.exit(f"studies.{self.name}: interrupted; the same command continues it")
 
     def played(self, scale: str, jobs: Sequence[Job], after: Play) -> Path:
         """The file of its lines, one for each finished run; plays those that it lacks. Raises ConfigError."""

@@ -104,7 +104,7 @@ class Bus(Protocol):
     def take_epoch(self, role: str, floor: int = 0) -> int:
         """A new epoch of this role, larger than ``floor`` and than any taken before.
 
-        At most ``MAX_EPOCH_GAP`` above ``floor``: more was counted by a stranger, and the counter is mended.
+        At most ``MAX_EPOCH_GAP`` above ``floor``: more was counted by a stranger, and the counter is fixed.
         """
 
     def check_room(self, role: str) -> None:

@@ -78,7 +78,7 @@ class RedisBus(RedisConnection):
             return floor
 
     def check_room(self, role: str) -> None:
-        with suppress(ConfigError):  # no number: who takes an epoch next mends it, or says so
+        with suppress(ConfigError):  # no number: who takes an epoch next fixes it, or says so
             self.call(lambda: self.redis.incrby(self.key("epoch", role), 0))  # a write that changes nothing
 
     def current_epoch(self, role: str) -> int:

@@ -14,7 +14,7 @@ from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RmcError
 KEYS = "rmc:"  # how every key of ours begins
 FULL = {"OOM", "MISCONF", "NOREPLICAS"}  # no memory, no disk for its log, or too few replicas for a write
 FIXES = {  # of answers that do not pass; others do: somebody's script, a failover, a cluster that moves slots
-    "ERR": "mend that, or give another Redis",
+    "ERR": "fix that, or give another Redis",
     "WRONGTYPE": "another program uses this key; delete it, or give another database",
     "NOPERM": "let this user do that",
     "ASK": "it is a part of a cluster; give a Redis that is none",

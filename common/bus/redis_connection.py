@@ -44,7 +44,7 @@ class RedisConnection:
             if not all(0 < pool.connection_kwargs.get(name, 1) < TIMEOUT_LIMIT for name in TIMEOUTS):
                 raise ValueError
         except (ValueError, TypeError, redis.exceptions.RedisError):  # whose words may quote a password
-            raise ConfigError("--redis-url", shown(url), "its options are no good; mend what follows ?") from None
+            raise ConfigError("--redis-url", shown(url), "its options are no good; fix what follows ?") from None
         self.url, self.prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
         self._repeat: Callable[[Callable[[], Any]], Any] | None = None

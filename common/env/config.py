@@ -32,7 +32,7 @@ class EnvConfig:
     frame_stack: int = 1
     """Newest observations that make one, oldest first; a missing frame among them is an ordinary one."""
     action_repeat: int = 1
-    """Steps of the environment for one of the agent's; rewards are added up. Other options count the agent's steps."""
+    """Environment steps per agent step; rewards are added up. All other options but --time-limit count agent steps."""
     time_limit: int = 0
     """Steps of the environment after which an episode is cut off; 0 keeps the environment's own limit."""
     env_timeout: float = 60.0

@@ -151,7 +151,7 @@ def further_env(make_env: Callable[[], Env], what: str) -> Env:
 
 
 def first_env(config: EnvConfig, privileged: bool = False) -> Env:
-    """``make_env`` where nothing runs yet: whatever the environment raises is the user's to mend, as a ConfigError."""
+    """``make_env`` where nothing runs yet: whatever the environment raises is the user's to fix, as a ConfigError."""
     try:
         return make_env(config, privileged=privileged)
     except EnvFault as fault:

@@ -32,7 +32,7 @@ class Role(Protocol):
         """Flat metrics since the last call."""
 
     def close(self) -> None:
-        """End in order: save what must be saved, leave nothing behind."""
+        """End cleanly: save what must be saved, leave nothing behind."""
 
 
 class StopSignal:

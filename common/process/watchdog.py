@@ -44,7 +44,7 @@ class EnvCall:
         frame = sys._current_frames().get(self.thread)
         at = traceback.extract_stack(frame)[-1] if frame is not None else None
         place = f" ({Path(at.filename).name}, line {at.lineno})" if at is not None else ""
-        fix = "mend it, or raise --env-timeout"
+        fix = "fix it, or raise --env-timeout"
         return f"ENV={self.env_id!r}: {self.name} has not returned for {self.seconds:g} s{place}; {fix}"
 
 

@@ -87,7 +87,7 @@ class LocalRun:
                 role.signal(signal.SIGKILL)
 
     def finished(self) -> bool:
-        """Whether the learner has ended in order."""
+        """Whether the learner has ended cleanly."""
         return self.supervisor.roles["learner"].finished
 
     def close(self) -> None:

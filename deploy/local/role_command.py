@@ -16,7 +16,7 @@ class RoleCommand:
     words: tuple[str, ...]
     single_thread: bool = True
     forked: bool = True  # if of a single thread: by the fork server, which has torch in memory
-    ends: bool = False  # in order, once the run is done; any other that ends unasked is started again
+    ends: bool = False  # cleanly, once the run is done; any other that ends unasked is started again
     env_timeout: float = 0.0  # seconds, of one that plays: what it hung for is no part of its life
 
 

@@ -22,8 +22,8 @@ from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inher
 # So many deaths of a role's own in a row, each within so long of its start, end the run.
 QUICK_DEATHS, QUICK_SECONDS = 3, 60.0
 FIRST_BACKOFF, LONGEST_BACKOFF = 0.25, 10.0  # seconds before a role is started again, doubled at each quick death
-STOP_SECONDS = 3.5  # for the roles to end in order; then they are killed
-EXIT_CONFIG = 2  # the exit status of an error that starting again cannot mend
+STOP_SECONDS = 3.5  # for the roles to end cleanly; then they are killed
+EXIT_CONFIG = 2  # the exit status of an error that starting again cannot fix
 TRACEBACK_BYTES = 8192
 NO_PROCESS = errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE  # for now
 log = logging.getLogger(__name__)
@@ -173,7 +173,7 @@ class Supervisor:
     ) -> None:
         """``environment`` is of each role by its name, beside this process's own.
 
-        ``patience``, asked at the end, is how many seconds a role may need to end in order, if more than is usual.
+        ``patience``, asked at the end, is how many seconds a role may need to end cleanly, if more than is usual.
         """
         self._patience = patience
         self._fork_server = (

@@ -58,15 +58,13 @@ def launcher_pid(folder: RunFolder) -> int:
     while (trainer := folder.trainer()) is None:
         if time.monotonic() >= deadline:
             folder.settings()
-            raise ConfigError(
-                "RUN", str(folder.path), f"nobody trains it now; {resume_command(folder)} goes on with it"
-            )
+            raise ConfigError("RUN", str(folder.path), f"nobody trains it now; {resume_command(folder)} continues it")
         time.sleep(LOOK_SECONDS)
     return trainer
 
 
 def stop(folder: RunFolder) -> int:
-    """Ask the launcher to end the run in order, and wait until it has; its exit status. Raises ConfigError."""
+    """Ask the launcher to end the run cleanly, and wait until it has; its exit status. Raises ConfigError."""
     trainer = launcher_pid(folder)
     if (host := folder.trainer_host()) not in ("", socket.gethostname()):
         raise ConfigError("RUN", str(folder.path), f"is trained on {host}; stop it there")

@@ -10,7 +10,7 @@ from rmc.deploy.run.tracking import Tracking
 
 
 class TrackioRun:
-    """Called as the run's folder and the tracker's id: Trackio goes on with a run by its name."""
+    """Called as the run's folder and the tracker's id: Trackio continues a run by its name."""
 
     def __init__(self, folder: RunFolder, tracking: Tracking) -> None:
         self._run = trackio.init(

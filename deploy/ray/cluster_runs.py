@@ -21,7 +21,7 @@ def summaries() -> dict[str, ClusterRunSummary | None]:
 
 
 def stop(run: str) -> ClusterRunSummary:
-    """End a run in order, and wait until it has; how far it was. Raises ConfigError."""
+    """End a run cleanly, and wait until it has; how far it was. Raises ConfigError."""
     name = _full_name(run)
     summary: ClusterRunSummary | None = _asked(_launchers()[name].summary, AWAY_SECONDS)
     seconds: float | None = _asked(_launchers()[name].end, AWAY_SECONDS)

@@ -144,7 +144,7 @@ class Hosts:
         return [name for name, one in self._handles.items() if not one.running]
 
     def finished(self) -> bool:
-        """Whether the learner has ended in order, and its last checkpoint is on the head."""
+        """Whether the learner has ended cleanly, and its last checkpoint is on the head."""
         learner = self._handles.get("learner")
         return learner is not None and learner.report is not None and learner.report.status == 0
 

@@ -96,7 +96,7 @@ class LauncherActor(RoleActor):
         return ClusterRunSummary(status.env, status.env_steps, status.total_steps, address, actors, since, *place)
 
     def end(self) -> float:
-        """Ask the run's launcher to end it in order; the seconds that this may take."""
+        """Ask the run's launcher to end it cleanly; the seconds that this may take."""
         if self._role.pid is not None:
             with suppress(ProcessLookupError):  # it has just ended
                 os.kill(self._role.pid, signal.SIGTERM)

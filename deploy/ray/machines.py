@@ -36,7 +36,7 @@ def up(path: Path, console: Console) -> None:
     deadline = time.monotonic() + UP_SECONDS
     while (alive := _alive(path)) < expected:
         if time.monotonic() > deadline:
-            fix = "look at the workers' setup by ray monitor, and mend or take them out of the file"
+            fix = "look at the workers' setup by ray monitor, and fix or take them out of the file"
             raise RmcError(f"{path}: {alive} of {expected} nodes are there after {UP_SECONDS:.0f} s; {fix}")
         time.sleep(LOOK_SECONDS)
     console.print(f"{alive} nodes are up; ray attach {path} goes to the head", soft_wrap=True)

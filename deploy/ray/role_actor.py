@@ -120,13 +120,13 @@ class RoleActor:
         """Before the role starts."""
 
     def flush_artifacts(self) -> None:
-        """After it has ended in order."""
+        """After it has ended cleanly."""
 
     def tend(self) -> None:
         """Once in a while meanwhile."""
 
     def patience(self) -> float:
-        """The seconds that it has to end in order."""
+        """The seconds that it has to end cleanly."""
         return STOP_SECONDS
 
     def log_folder(self) -> Path:
@@ -178,7 +178,7 @@ class RoleActor:
         shutil.rmtree(self.scratch, ignore_errors=True)
 
     def restart(self) -> None:
-        """End the role in order and start it again, because the run's config has changed."""
+        """End the role cleanly and start it again, because the run's config has changed."""
         self._replaced = True
         self._end()
         self._watcher.join()  # it must not take the new process's absence, or its presence, for the old one's end

@@ -40,7 +40,7 @@ from rmc.deploy.run.folder import RunFolder
 NODES_SECONDS = 2.0  # between looks for nodes that came
 LEARNER_PENDING_SECONDS = 8.0  # without a node for the learner, after which actors make room
 GIVE_WAY_SECONDS = 300.0  # without a node for another run's learner, after which actors are placed all the same
-STOP_SECONDS = 20.0  # for all roles to end in order and for the last checkpoint to reach the head
+STOP_SECONDS = 20.0  # for all roles to end cleanly and for the last checkpoint to reach the head
 FIRST_PORT, LAST_PORT = 6380, 6479  # for Redis; 6379 is Ray's
 log = logging.getLogger(__name__)
 
@@ -183,7 +183,7 @@ def train(
             time.sleep(TICK_SECONDS)
         run.stop("stopped by its launcher" if stop.requested else "finished")
         monitor.watch(run.bus)  # what the roles said last
-        over = monitor.learner_finished()  # one that was stopped has ended in order, too
+        over = monitor.learner_finished()  # one that was stopped has ended cleanly, too
         return over
     finally:
         run.close(over)

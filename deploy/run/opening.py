@@ -169,7 +169,7 @@ def forget_start(folder: RunFolder) -> None:
 
 
 def _taken_up(folder: RunFolder, config: RunConfig, if_exists: IfExists, options: LaunchOptions) -> RunConfig:
-    """The config that a run had which goes on with this one. Raises ConfigError where it may not."""
+    """The config that a run had which continues this one. Raises ConfigError where it may not."""
     if if_exists == "fail":
         raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")
     before = folder.config()

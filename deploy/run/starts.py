@@ -81,7 +81,7 @@ def starts(folder: RunFolder) -> list[Start]:
 
 
 def resume_command(folder: RunFolder) -> str:
-    """What to type in a shell to go on with a run."""
+    """What to type in a shell to continue a run."""
     return f"rmc resume {shlex.quote(str(folder.path))}"
 
 

@@ -28,7 +28,7 @@ def list_runs(address: str, as_json: bool) -> int:
 
 
 def stop(run: str, address: str) -> int:
-    """End a run of a cluster in order."""
+    """End a run of a cluster cleanly."""
     with _joined(address):
         summary = cluster_runs.stop(run)
     terminal().print(f"{run} has ended; its folder is {summary.folder} on {summary.host}", soft_wrap=True)

@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 def train(command: train_options.Train) -> int:
-    """Train a run, or go on with one."""
+    """Train a run, or continue one."""
     warn_of_password(command.redis_url or "")
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     if command.dry_run:
@@ -95,7 +95,7 @@ def attach(command: run_options.Attach) -> int:
 
 
 def stop(command: run_options.Stop) -> int:
-    """End a run in order."""
+    """End a run cleanly."""
     if command.ray_address is not None:
         _check_ray(command.ray_address)
         from rmc.cli import cluster_commands

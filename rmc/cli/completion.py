@@ -7,7 +7,7 @@ import sys
 from rmc.cli import parser
 from rmc.cli.run_options import Completion
 
-# What the option parser's library writes, and what is mended in it.
+# What the option parser's library writes, and what is fixed in it.
 MENDED = {
     # each line of a description was a candidate; and options were, for a word that has not begun
     "        print(completion)\n": """        if completion[:1] != '-' or ''.join(words[current_index:])[:1] == '-':

@@ -52,7 +52,7 @@ def _read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(OPTION, str(path), f"cannot be read ({error.strerror}); give a TOML file") from None
     except ValueError as error:  # no TOML, or no UTF-8
-        raise ConfigError(OPTION, str(path), f"is not TOML ({error}); mend it") from None
+        raise ConfigError(OPTION, str(path), f"is not TOML ({error}); fix it") from None
 
 
 def _check(path: Path, name: str, value: Any, names: Sequence[str]) -> None:

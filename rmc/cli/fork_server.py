@@ -111,7 +111,7 @@ def _lead_group(pid: int) -> None:
 
 if __name__ == "__main__":
     parent_death.exit_with_parent(int(os.environ.pop(parent_death.PARENT_VARIABLE)))
-    for number in (signal.SIGINT, signal.SIGTERM):  # roles end in order first
+    for number in (signal.SIGINT, signal.SIGTERM):  # roles end cleanly first
         signal.signal(number, signal.SIG_IGN)
     try:
         serve(socket.socket(fileno=int(sys.argv[1])))

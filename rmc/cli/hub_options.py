@@ -22,7 +22,7 @@ class Push:
     license: str | None = None
     """What the model card says, like mit or cc-by-4.0; by default nothing."""
     private: bool = False
-    """Make a repository that others cannot see, where it is not there."""
+    """Make the repository private, if it is new."""
 
 
 @dataclass(frozen=True)

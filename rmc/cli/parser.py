@@ -93,7 +93,7 @@ def parse(words: list[str]) -> Any:
 
 
 def _defaults_of_run(words: list[str], env: str, command: Any) -> dict[str, Any] | None:
-    """Those of the run that the command goes on with, None where it begins one. Raises ConfigError, SystemExit."""
+    """Those of the run that the command continues, None where it begins one. Raises ConfigError, SystemExit."""
     folder = _known_run(command)
     if folder is None:
         return None
@@ -114,7 +114,7 @@ def _defaults(config: RunConfig, launch: LaunchOptions) -> dict[str, Any]:
 
 
 def _known_run(command: Any) -> RunFolder | None:
-    """The run that the command goes on with. Raises ConfigError where it must, and there is none."""
+    """The run that the command continues. Raises ConfigError where it must, and there is none."""
     if not isinstance(command, train_options.Train) or command.run_dir is None or command.if_exists != "resume":
         return None
     folder = RunFolder(command.run_dir)

@@ -60,7 +60,7 @@ def _play(role: ActorRole | EvaluatorRole, place: RunConnection) -> None:
 def launch(command: LauncherRole) -> int:
     """Be the launcher of a run on Ray."""
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends it in order while no role is there yet, too
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends it cleanly while no role is there yet, too
     folder = RunFolder(command.run)
     config = folder.config()
     folder.lock()

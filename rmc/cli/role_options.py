@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 @dataclass(frozen=True)
 class LauncherRole:
-    """Be the launcher of a run on Ray; rmc train starts it on the head."""
+    """Run the launcher of a run on Ray; rmc train starts it on the head."""
 
     run: Positional[Path]
     """The run's folder."""
@@ -81,7 +81,7 @@ class EvaluatorRole(_Role):
 
 @dataclass(frozen=True)
 class Role:
-    """Be one role of a run in this process: rmc train starts them, or you do, with --launcher manual."""
+    """Run one role of a run in this process: rmc train starts them, or you do, with --launcher manual."""
 
     role: (
         Annotated[ActorRole, tyro.conf.subcommand("actor")]

@@ -60,7 +60,7 @@ class Inspect:
 
 @dataclass(frozen=True)
 class CheckEnv:
-    """Play an environment at random, and say whether it can be trained on and what to mend."""
+    """Play an environment at random, and say whether it can be trained on and what to fix."""
 
     env: EnvOptions
     steps: int = 2_000
@@ -75,7 +75,7 @@ class Baseline(BaselineConfig):
     """Which one."""
     env: EnvOptions
     run_dir: Path | None = None
-    """The run's folder; by default runs/<env>__<algorithm>-<settings>__<seed>__<time>. rmc resume goes on with it."""
+    """The run's folder; by default runs/<env>__<algorithm>-<settings>__<seed>__<time>. rmc resume continues it."""
 
     def config(self) -> BaselineConfig:
         """The run's config."""
@@ -84,7 +84,7 @@ class Baseline(BaselineConfig):
 
 @dataclass(frozen=True)
 class ResumeBaseline(Baseline):
-    """Go on with a baseline's run: all that is not said is as it was."""
+    """Continue a baseline's run; options that are not given keep their values."""
 
     algorithm: Suppress[Algorithm]
     env: KnownEnvOptions
@@ -92,7 +92,7 @@ class ResumeBaseline(Baseline):
 
 
 def resuming_baseline(folder: RunFolder) -> ResumeBaseline:
-    """The command that goes on with such a run, and changes nothing. Raises ConfigError."""
+    """The command that continues such a run, and changes nothing. Raises ConfigError."""
     config = baseline_settings.read(folder)
     return ResumeBaseline(**vars(config) | known_run(config.env))
 
@@ -161,7 +161,7 @@ class Watch:
     runs: Positional[tuple[Path, ...]]
     """Runs, folders that hold some at any depth, or quoted patterns like 'runs/*'."""
     host: str = "127.0.0.1"
-    """The address to serve at. Any but this machine's own takes a token, which the printed URL has."""
+    """The address to serve at. Any but loopback requires the token that the printed URL has."""
     port: int = 8000
     """The port to serve at; 0 takes a free one."""
 
@@ -176,7 +176,7 @@ class Attach:
 
 @dataclass(frozen=True)
 class Stop:
-    """End a run in order; rmc resume goes on with it."""
+    """End a run cleanly; rmc resume continues it."""
 
     run: Positional[Path]
     """The run's folder; with --ray-address its name, as rmc list shows it."""
@@ -186,7 +186,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class Cluster:
-    """Bring the machines of a Ray cluster up, or take them down, and see that all of them are."""
+    """Start or stop the machines of a Ray cluster, and check that all of them did."""
 
     action: Positional[Literal["up", "down"]]
     """What to do."""
@@ -196,7 +196,7 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Completion:
-    """Print what makes a shell complete rmc's commands, options and folders."""
+    """Print a shell's completion script: commands, options, folders."""
 
     shell: Positional[Literal["bash", "zsh", "fish"]]
     """Which shell."""

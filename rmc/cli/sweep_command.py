@@ -173,7 +173,7 @@ def _warn_of_empty_rings(todo: list[Job]) -> None:
     empty = [job.name for job in begun if not RunFolder(job.folder).replay.exists()]
     if empty:
         names = ", ".join(empty)
-        log.warning("without their replay ring, these go on with --warmup-steps that are not trained on: %s", names)
+        log.warning("without their replay ring, these continue with --warmup-steps that are not trained on: %s", names)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 @dataclass(frozen=True)
 class Sweep:
-    """Train many runs: a grid's values with each seed, or a search; the same command goes on with it.
+    """Train many runs: a grid's values with each seed, or a search; the same command continues it.
 
     Options of rmc train that every run has come after ENV or SPEC, as they do there.
     """

@@ -56,7 +56,7 @@ def known_run(env: EnvConfig) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Train:
-    """Train an agent, or go on with a run. --help shows the basic options, --help-all all of them."""
+    """Train an agent, or continue a run. --help shows the basic options, --help-all all of them."""
 
     env: EnvOptions
     window: WindowConfig
@@ -79,16 +79,16 @@ class Train:
     run_dir: Path | None = None
     """The run's folder; by default runs/<env>__<preset>__<seed>__<time>."""
     if_exists: IfExists = "resume"
-    """What to do if the run's folder is there: go on, refuse, or take a new one beside it."""
+    """If the run's folder is there. resume: continue it. fail: refuse. new: take a new folder beside it."""
     init_from: str | None = None
     """RUN or RUN:CHECKPOINT whose networks and normaliser it begins with."""
     init_parts: InitParts = "all"
     """Networks to copy: all; memory, world model and imputer; or memory, policy and imputer."""
     launcher: Launcher = "local"
-    """Processes on this machine; on a Ray cluster; every role in one thread, the same seed giving the same bits; or
-    by hand."""
+    """local: processes on this machine. ray: a Ray cluster. lockstep: one thread, reproducible to the bit. manual: you
+    start the roles."""
     device: str = "cpu"
-    """The learner's device: cpu or cuda."""
+    """The learner's device: cpu, cuda or cuda:N."""
     redis_url: str | None = None
     """A Redis of your own: unix:///path, redis://host:port, rediss://… or file:PATH, which holds such a line; by
     default an embedded one."""
@@ -137,7 +137,7 @@ def from_config(config: RunConfig, launch: LaunchOptions) -> Train:
 
 @dataclass(frozen=True)
 class Resume(Train):
-    """Go on with a run. Options that are not given keep their values. --help shows the basic options, --help-all all of
+    """Continue a run. Options that are not given keep their values. --help shows the basic options, --help-all all of
     them; behind RUN they show the run's own values as defaults."""
 
     env: KnownEnvOptions
@@ -149,5 +149,5 @@ class Resume(Train):
 
 
 def resuming(config: RunConfig, launch: LaunchOptions) -> Resume:
-    """The command that goes on with such a run, and changes nothing."""
+    """The command that continues such a run, and changes nothing."""
     return Resume(**vars(from_config(config, launch)) | known_run(config.env))

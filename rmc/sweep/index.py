@@ -16,7 +16,7 @@ from rmc.sweep.pool import Ending, State
 
 NAME = "sweep.jsonl"
 COLUMNS = ("run", "state", "words", "seed", "values", "return", "env_steps", "seconds", "reason")
-BY_HAND = "mend or remove its line"
+BY_HAND = "fix or remove its line"
 
 
 class Index:

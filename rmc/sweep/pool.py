@@ -1,4 +1,4 @@
-"""Runs side by side: starts what there is room for, ends in order, and tells how each ended."""
+"""Runs side by side: starts what there is room for, ends cleanly, and tells how each ended."""
 
 import shutil
 import time
@@ -34,7 +34,7 @@ class Run(Protocol):
         """Its exit status, once it has one and all that it left is in the job's folder; negative after a signal."""
 
     def stop(self) -> None:
-        """Ask it to end in order; does not wait."""
+        """Ask it to end cleanly; does not wait."""
 
     def kill(self) -> None:
         """End it now."""
@@ -50,7 +50,7 @@ class Place(Protocol):
         """Whether another one fits now."""
 
     def start(self, job: Job) -> Run:
-        """Start one; it goes on with what its folder has."""
+        """Start one; it continues from what its folder has."""
 
 
 class SweepPlan(Protocol):
@@ -97,7 +97,7 @@ class _AtWork:
 def conduct(
     plan: SweepPlan, place: Place, stop: StopSignal, begun: Callable[[Job], None], ended: Callable[[Job, Ending], None]
 ) -> None:
-    """Run all of a plan; with a stop signal no other one starts, and those at work end in order."""
+    """Run all of a plan; with a stop signal no other one starts, and those at work end cleanly."""
     at_work: list[_AtWork] = []
     try:
         while True:

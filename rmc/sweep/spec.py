@@ -117,7 +117,7 @@ def read_spec(path: Path, words: Sequence[str]) -> Spec:
     except OSError as error:
         raise ConfigError("SPEC", str(path), f"{error.strerror}; give a .toml file or an environment") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError("SPEC", str(path), f"not TOML ({error}); mend it") from None
+        raise ConfigError("SPEC", str(path), f"not TOML ({error}); fix it") from None
     _check_keys("", raw, KEYS)
     if not isinstance(raw.get("env"), str):
         raise ConfigError("env", raw.get("env"), f'write an environment into {path}, like env = "HalfCheetah-v5"')

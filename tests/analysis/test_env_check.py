@@ -140,7 +140,7 @@ def test_faults_are_named(fault, words, capsys):
     status, text = checked(f"tests.broken_env:Broken-{fault}-v0", capsys)
     assert status == 1
     assert words in text
-    assert "mend the fault first" in text
+    assert "fix the fault first" in text
 
 
 def test_what_cannot_be_made_is_one_line(capsys):

@@ -15,7 +15,7 @@ from rmc.deploy.run.presets import debug
 from tests.analysis.test_world_model_picture import make_run
 
 ENV = "tests.hanging_env:HangsAsTold-v0"
-LINE = r"rmc: ENV='{}': {} has not returned for {} s \(hanging_env\.py, line \d+\); mend it, or raise --env-timeout\n"
+LINE = r"rmc: ENV='{}': {} has not returned for {} s \(hanging_env\.py, line \d+\); fix it, or raise --env-timeout\n"
 
 
 def check_ends(words: list[str], place: str, call: str, seconds: float) -> None:

@@ -143,7 +143,7 @@ def test_a_baseline_takes_its_own_options(tmp_path: Path, capsys: pytest.Capture
     assert "--gamma" in complaint(["resume", str(folder.path), "--gamma", "0.9"], capsys)
     assert main.run(["resume", str(folder.path), "--help"]) == 0
     assert "(default: 700)" in " ".join(capsys.readouterr().out.split())
-    assert "rmc resume goes on with it" in complaint(["train", "--run-dir", str(folder.path)], capsys)
+    assert "rmc resume continues it" in complaint(["train", "--run-dir", str(folder.path)], capsys)
 
 
 @pytest.mark.parametrize(

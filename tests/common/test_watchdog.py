@@ -11,7 +11,7 @@ import pytest
 from rmc.common.process.watchdog import HUNG_STATUS
 
 IMPORTS = "import ctypes, os, time\nfrom rmc.common.process.watchdog import *\n"
-LINE = "rmc: ENV='Mine-v0': step has not returned for 0.5 s (<string>, line 5); mend it, or raise --env-timeout\n"
+LINE = "rmc: ENV='Mine-v0': step has not returned for 0.5 s (<string>, line 5); fix it, or raise --env-timeout\n"
 STUCK = "def stuck(): ctypes.PyDLL(None).sleep(50)\nwith call: stuck()"
 WATCHED = "start()\ncall = EnvCall('Mine-v0', 'step', 0.5)\n"
 

@@ -39,7 +39,7 @@ ENDS = "#!/bin/sh\ntrap 'exit 0' TERM\nwhile :; do sleep 0.05; done\n"
 
 @pytest.fixture
 def program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """In a role's place: it ends in order when it is told to."""
+    """In a role's place: it ends cleanly when it is told to."""
     path = tmp_path / "program"
     path.write_text(ENDS)
     path.chmod(0o700)

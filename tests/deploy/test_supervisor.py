@@ -18,7 +18,7 @@ from rmc.deploy.local.supervisor import RoleProcess, Supervisor
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A program in Python's place that ends at once and in order, as a role does after SIGTERM."""
+    """A program in Python's place that ends at once, cleanly, as a role does after SIGTERM."""
     program = tmp_path / "program"
     program.write_text("#!/bin/sh\nexit 0\n")
     program.chmod(0o700)

@@ -1,4 +1,4 @@
-"""A run in real trackers: what arrives, that a resume goes on with it, and that no tracker's trouble is the run's."""
+"""A run in real trackers: what arrives, that a resume continues it, and that no tracker's trouble is the run's."""
 
 import json
 import logging

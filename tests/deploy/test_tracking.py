@@ -1,4 +1,4 @@
-"""Which tracker follows a run is chosen once, and goes on with the run's folder."""
+"""Which tracker follows a run is chosen once, and stays with the run's folder."""
 
 import dataclasses
 import importlib.util

@@ -172,6 +172,7 @@ def test_the_docs_name_options_that_exist(capsys: pytest.CaptureFixture[str]) ->
         "--shm-size",
         "--exclude",
     }  # of others
+    there.add("--version")  # alone
     there |= {"--alone", "--scale", "--seeds", "--only", "--env", "--play", "--draw"}  # of benchmarks and studies
     for text in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
         named = set(re.findall(r"`[^`\n]*?(--[a-z][a-z-]*[a-z])", text.read_text()))

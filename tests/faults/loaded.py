@@ -171,7 +171,7 @@ class Loaded(Training):
         super().close()
 
     def end(self) -> Judgement:
-        """Stop it in order, and judge what its ring holds."""
+        """Stop it cleanly, and judge what its ring holds."""
         self.witness.stop()
         self.interrupt()
         return judge(self.folder, self.witness.acks)

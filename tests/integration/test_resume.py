@@ -1,4 +1,4 @@
-"""The command that a stopped run prints goes on with it, typed as it is printed; what it changes counts from there."""
+"""The command that a stopped run prints continues it, typed as it is printed; what it changes counts from there."""
 
 import itertools
 import json

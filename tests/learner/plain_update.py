@@ -172,8 +172,8 @@ class PlainUpdate:
                     seen = row["missing"][t + 1] == 0
                     sums["F"] += self.by_flag((expected - self.seen(row, t + 1)).abs(), seen)
                 pi, log_pi = self.sample(self.reaching("P", z), noise[b, t - self.burn_in])
-                climbed = self.reaching("P", z) if c.policy_through_q else z.detach()
-                q_pi = twin_q(agent.critic, self.critics_z(row, t, climbed), pi, frozen=True)
+                judged = self.reaching("P", z) if c.policy_through_q else z.detach()
+                q_pi = twin_q(agent.critic, self.critics_z(row, t, judged), pi, frozen=True)
                 sums["P"].append(alpha * log_pi - (q_pi[0] if c.policy_q == "first" else q_pi.min()))
                 sums["T"].append(-agent.log_alpha * (log_pi.detach() - agent.action_dim))
             errors.append(window)

@@ -181,7 +181,7 @@ def test_error_by_observation_dimension():
     assert make(PAPER)(to_batch(rows), BETA).observation_unexplained.shape == (0,)
 
 
-def test_policy_climbs_the_critic_it_is_told_to():
+def test_policy_maximises_the_critic_it_is_told_to():
     first, smaller = make(PAPER, policy_q="first"), make(PAPER, policy_q="min")
     a, b = (u(to_batch(random_rows(8)), BETA).metrics["policy_loss"].item() for u in (first, smaller))
     assert b > a  # min Q <= Q_1, so the loss is larger

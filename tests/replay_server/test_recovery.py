@@ -120,7 +120,7 @@ def test_killed_again_and_again_amid_inserts(redis_url: str, run_name: str, tmp_
 
 
 def finish(bus: RedisBus, url: str, run: str, folder: Path, senders: list[Sender]) -> None:
-    """A last life that is ended in order: everything ever sent has been taken in once."""
+    """A last life that is ended cleanly: everything ever sent has been taken in once."""
     sent = [sender.marks for sender in senders]
     assert sum(sent) > 2 * CAPACITY  # the ring went round
     child = start(url, run, folder)

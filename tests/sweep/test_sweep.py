@@ -89,7 +89,7 @@ def test_a_killed_run_is_told_the_other_goes_on_and_the_same_command_resumes(tmp
     assert log.count("run folder") == 2
     with Sweeping(folder, *words, "--total-steps", "2700") as sweep:
         assert sweep.finish() == 0, sweep.text()
-    assert "without their replay ring, these go on with --warmup-steps that are not trained on: seed=1, seed=2" in (
+    assert "without their replay ring, these continue with --warmup-steps that are not trained on: seed=1, seed=2" in (
         sweep.text()
     )
 

@@ -7,12 +7,12 @@ begins with nothing. With ``--jobs 1``, the runs that others begin with are trai
 from studies.study import Study
 
 STUDY = Study(
-    "half_blank",
+    "half_missing",
     {
         "all seen": "train ENV",
-        "half blank": "train ENV --flicker 0.5",
-        "half blank, after all seen": "train ENV --flicker 0.5 --init-from 'RUN:all seen'",
-        "half blank, with its memory": "train ENV --flicker 0.5 --init-from 'RUN:all seen' "
+        "half missing": "train ENV --flicker 0.5",
+        "half missing, after all seen": "train ENV --flicker 0.5 --init-from 'RUN:all seen'",
+        "half missing, with its memory": "train ENV --flicker 0.5 --init-from 'RUN:all seen' "
         "--init-parts memory+world-model",
     },
 )
