@@ -36,7 +36,7 @@ def expanded(path: Path) -> list[Path]:
 
 def run_folders(folder: Path) -> Iterator[Path]:
     """Those of rmc train, rmc baseline and sweeps, however deep; nothing below a run is looked at."""
-    for path, below, files in os.walk(folder):
+    for path, below, files in os.walk(folder, onerror=lambda error: log.warning("%s (left out)", error)):
         if "checkpoints" in below and not {"config.json", "metrics.jsonl", ".lock"}.isdisjoint(files):
             below.clear()
             yield Path(path)

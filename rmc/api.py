@@ -1,16 +1,23 @@
 """What the commands ``rmc train``, ``rmc resume`` and ``rmc evaluate`` do, as functions for scripts and notebooks."""
 
+import os
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import gymnasium
+
 from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_policy
 from rmc.analysis.policy_file import read_policy
 from rmc.cli import training
+from rmc.cli.analysis_commands import evaluate_baseline
+from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.local.role_environment import PATH_VARIABLE
 from rmc.deploy.monitor.view import terminal
-from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.config import RunConfig, checked
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions, Tracker
 from rmc.deploy.run.starts import last_launch
@@ -19,12 +26,15 @@ from rmc.deploy.run.state import STOPPED
 
 def train(
     config: RunConfig,
-    run_dir: str | Path,
+    run_dir: str | Path | None = None,
     *,
     launcher: Launcher = "local",
     device: str = "cpu",
     if_exists: IfExists = "resume",
     redis_url: str | None = None,
+    ray_address: str = "auto",
+    all_cpus: bool = False,
+    tls: bool = False,
     init_from: str | Path | None = None,
     init_parts: InitParts = "all",
     track: Tracker | Literal["off"] | None = None,
@@ -32,22 +42,26 @@ def train(
     track_tags: Sequence[str] = (),
     track_video_every: int | None = None,
     metrics_port: int | None = None,
+    metrics_host: str = "127.0.0.1",
 ) -> dict[str, Any]:
-    """Train a run to its ``total_steps``, or continue the one in ``run_dir``; its ``result.json``.
+    """Train a run to its ``total_steps``, or continue the one in ``run_dir``; its ``result.json`` and ``run_dir``.
 
     A new run begins with the networks and the normaliser of the run or ``RUN:CHECKPOINT`` in ``init_from``, or with
-    those of ``init_parts``. Progress goes to standard output. Call it from the main thread: Ctrl-C ends the run in
-    order. With the launcher ``local``, the roles are processes of their own, which import the environment by its id.
+    those of ``init_parts``. Progress goes to standard output. Call it from the main thread: Ctrl-C ends the run
+    cleanly. With the launcher ``local``, the roles are processes of their own, which import the environment by its id.
 
     Raises ConfigError for options that cannot work, before anything starts; RoleDied where a role keeps dying;
     KeyboardInterrupt where the run was stopped, which ``resume`` continues.
     """
     options = LaunchOptions(
-        Path(run_dir),
+        None if run_dir is None else Path(run_dir),
         if_exists,
         launcher,
-        device,
+        str(device),
         redis_url,
+        ray_address,
+        all_cpus,
+        tls,
         init_from=None if init_from is None else str(init_from),
         init_parts=init_parts,
         track=track,
@@ -55,6 +69,7 @@ def train(
         track_tags=tuple(track_tags),
         track_video_every=track_video_every,
         metrics_port=metrics_port,
+        metrics_host=metrics_host,
     )
     return _train(config, options)
 
@@ -71,7 +86,7 @@ def resume(
     redis_url: str | None = None,
     metrics_port: int | None = None,
 ) -> dict[str, Any]:
-    """Continue the run in ``run_dir``; its ``result.json``. What is None stays as it was at the last start.
+    """Continue the run in ``run_dir``; as ``train`` gives it. What is None stays as it was at the last start.
 
     Other options that may change are given to ``train``, with the run's whole config. Raises as ``train`` does.
     """
@@ -91,18 +106,36 @@ def _not_none(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _train(config: RunConfig, options: LaunchOptions) -> dict[str, Any]:
+    config = checked(config)
+    if options.launcher != "lockstep":
+        _check_importable(config.env)
     folder, status = training.train(config, options, terminal())
     if status == STOPPED:
         raise KeyboardInterrupt
     result = folder.result()
     assert result is not None  # written by every run that ends cleanly
-    return result
+    return result | {"run_dir": str(folder.path)}
+
+
+def _check_importable(env: EnvConfig) -> None:
+    """The roles' processes know no environment of this script's own. Raises ConfigError for such a one."""
+    script = getattr(sys.modules["__main__"], "__file__", None)
+    if script is not None:  # where modules beside it are, which this one can import
+        os.environ[PATH_VARIABLE] = str(Path(script).resolve().parent)
+    spec = gymnasium.registry.get(env.id)
+    factory = spec.entry_point if spec is not None else None
+    module = factory.partition(":")[0] if isinstance(factory, str) else getattr(factory, "__module__", "")
+    if module == "__main__":
+        fix = f'move it into a module and name it "module:{env.id}", or take launcher="lockstep"'
+        raise ConfigError("ENV", env.id, f"is registered in this script, which the roles do not import; {fix}")
 
 
 def evaluate(
     run: str | Path, episodes: int = FINAL_EPISODES, *, checkpoint: str = "latest", flicker: float | None = None
 ) -> dict[str, Any]:
     """Play deterministic episodes with a policy's file, or a run's ``latest``, ``best`` or numbered checkpoint.
+
+    A run of ``rmc baseline`` has its latest alone.
 
     ``flicker`` is the probability of a missing observation, by default the run's own. The keys are those of
     ``rmc evaluate --json``: ``eval_return_mean``, ``eval_return_std``, ``eval_episodes``, ``env_steps`` and more.
@@ -113,4 +146,6 @@ def evaluate(
         raise ConfigError("episodes", episodes, "take 1 to 10_000")
     if flicker is not None and not 0.0 <= flicker <= 1.0:
         raise ConfigError("flicker", flicker, "take a probability from 0 to 1")
+    if Path(run).is_dir() and RunFolder(Path(run)).is_baseline():
+        return evaluate_baseline(RunFolder(Path(run)), checkpoint, episodes, flicker)
     return evaluate_policy(read_policy(run, checkpoint), episodes, flicker)

@@ -215,6 +215,8 @@ def find_spec(env_id: str) -> EnvSpec:
     except gym.error.Error:
         close = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
         fix = f"did you mean {', '.join(close)}?" if close else "use a gymnasium id or module:EnvId-v0"
+        if close and not module:
+            fix = f"{fix} One of your own is module:{name}"
         fault = f"{module} registers no {name} (gymnasium.register)" if module else "no such environment"
         raise ConfigError("ENV", env_id, f"{fault}; {fix}") from None
 

@@ -142,6 +142,17 @@ def from_json(text: str | bytes) -> RunConfig:
     return from_dict(RunConfig, migrated(_read(text)), "config.json ")
 
 
+def checked(config: RunConfig) -> RunConfig:
+    """The same, as it would come out of ``config.json``. Raises ConfigError for a value of a wrong type or choice."""
+    if not isinstance(config, RunConfig):
+        raise ConfigError("config", config, "take a RunConfig, like one of rmc.presets")
+    try:
+        raw = json.loads(json.dumps(dataclasses.asdict(config)))
+    except TypeError as error:
+        raise ConfigError("config", type(config).__name__, f"a value in it is not JSON's ({error})") from None
+    return from_dict(RunConfig, raw, "")
+
+
 def to_registration(config: RunConfig) -> bytes:
     """The config as JSON for the roles: with it a role knows the environment's sizes without making one."""
     return json.dumps(dataclasses.asdict(config) | {"layout": dataclasses.asdict(config.layout)}).encode()

@@ -62,8 +62,10 @@ class RunFolder:
         """
         try:
             raw = read_object(self.path / "config.json")
-        except OSError:
+        except (FileNotFoundError, NotADirectoryError):
             raise ConfigError("RUN", str(self.path), "no config.json there; give the folder of a run") from None
+        except OSError as error:
+            raise ConfigError("RUN", str(self.path), f"config.json cannot be read ({error.strerror})") from None
         try:
             settings: dict[str, Any] = migrated(raw)
             return settings

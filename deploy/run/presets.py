@@ -10,15 +10,19 @@ from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
 
 
-def preset_config(name: Preset, env: EnvConfig) -> RunConfig:
-    """A preset's RunConfig for an environment."""
+def preset_config(name: Preset, env: EnvConfig | str) -> RunConfig:
+    """A preset's RunConfig for an environment, by its config or its id."""
     return {"robust": robust, "memory": memory, "paper": paper, "debug": debug}[name](env)
 
 
-def robust(env: EnvConfig) -> RunConfig:
-    """The default: what has been learnt since the paper."""
+def _env(env: EnvConfig | str) -> EnvConfig:
+    return EnvConfig(env) if isinstance(env, str) else env
+
+
+def robust(env: EnvConfig | str) -> RunConfig:
+    """The default: the paper's agent with later improvements."""
     return RunConfig(
-        env=env,
+        env=_env(env),
         preset="robust",
         agent=AgentConfig(
             head_input="hidden+observation", normalize_observations=True, impute_missing=True, critic_batch_norm=True
@@ -30,7 +34,7 @@ def robust(env: EnvConfig) -> RunConfig:
     )
 
 
-def memory(env: EnvConfig) -> RunConfig:
+def memory(env: EnvConfig | str) -> RunConfig:
     """For what is seen once and needed long after: whole episodes as windows, a memory that begins by holding on."""
     base = robust(env)
     return replace(
@@ -44,10 +48,10 @@ def memory(env: EnvConfig) -> RunConfig:
     )
 
 
-def paper(env: EnvConfig) -> RunConfig:
+def paper(env: EnvConfig | str) -> RunConfig:
     """What the paper and its authors' code say."""
     return RunConfig(
-        env=env,
+        env=_env(env),
         preset="paper",
         agent=AgentConfig(embedding=0, grounding=False),
         actor=ActorConfig(envs_per_actor=8),
@@ -56,10 +60,10 @@ def paper(env: EnvConfig) -> RunConfig:
     )
 
 
-def debug(env: EnvConfig) -> RunConfig:
+def debug(env: EnvConfig | str) -> RunConfig:
     """Small and short: every part runs, within a minute on two cores."""
     return RunConfig(
-        env=env,
+        env=_env(env),
         preset="debug",
         total_steps=4_000,
         agent=AgentConfig(hidden=32, embedding=32, heads=(64, 64)),

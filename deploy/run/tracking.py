@@ -82,7 +82,7 @@ def kept_tracking(path: Path) -> Tracking | None:
     """That of a run's folder, None where it has none. Raises ConfigError where the file is damaged."""
     try:
         settings = read_object(_file(path))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except ConfigError:
         settings = {}

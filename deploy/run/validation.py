@@ -1,11 +1,11 @@
 """Which configurations make no sense, judged in one place."""
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 from rmc.common.bus.redis_url import shown
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, WindowConfig, option
-from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions, Tracker
 
 _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no range
     "seed": (0, 2**63 - 1),
@@ -111,9 +111,23 @@ def validate_windows(config: RunConfig) -> None:
         raise ConfigError("--burn-in", window.burn_in, fix)
 
 
+def _choices(kind: Any) -> tuple[str, ...]:
+    """Of a Literal, or a union of several."""
+    parts = get_args(kind)
+    return parts if all(isinstance(part, str) for part in parts) else sum(map(_choices, parts), ())
+
+
 def validate_launch(config: RunConfig, options: LaunchOptions) -> None:
     """Raises ConfigError for options that the launcher has no use for, or lacks."""
-    launcher = options.launcher
+    launcher, track = options.launcher, options.track or "off"
+    for name, value, kind in (
+        ("--launcher", launcher, Launcher),
+        ("--if-exists", options.if_exists, IfExists),
+        ("--init-parts", options.init_parts, InitParts),
+        ("--track", track, Tracker | Literal["off"]),
+    ):
+        if value not in (choices := _choices(kind)):
+            raise ConfigError(name, value, f"take {', '.join(choices)}")
     if launcher == "ray" and options.redis_url is not None:
         raise ConfigError("--redis-url", shown(options.redis_url), "a run on Ray has a Redis of its own, on the head")
     if launcher != "ray" and options.all_cpus:

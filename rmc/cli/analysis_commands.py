@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from rmc.analysis import curves, env_check, export, history, memory_picture, video, world_model_picture
-from rmc.analysis.evaluation import EvaluationProgress, evaluate_policy
+from rmc.analysis.evaluation import EvaluationProgress, Watch, evaluate_policy
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.analysis.policy_file import read_policy
@@ -57,16 +57,28 @@ def evaluate(command: run_options.Evaluate) -> int:
 def _evaluate_baseline(command: run_options.Evaluate) -> int:
     if command.video is not None:
         raise ConfigError("--video", str(command.video), "only runs of rmc train are filmed; leave it")
-    if command.checkpoint != "latest":
-        raise ConfigError("--checkpoint", command.checkpoint, "a baseline keeps its last state only; use latest")
-    folder = RunFolder(command.run)
+    folder, watch = RunFolder(command.run), EvaluationProgress(Console(stderr=True), str(command.run))
+    for flicker in command.flicker or (None,):
+        played = evaluate_baseline(folder, command.checkpoint, command.episodes, flicker, command.seconds, watch)
+        _say_played(command, played)
+    return 0
+
+
+def evaluate_baseline(
+    folder: RunFolder,
+    checkpoint: str,
+    episodes: int,
+    flicker: float | None,
+    seconds: float = 0.0,
+    watch: Watch = lambda _: None,
+) -> dict[str, Any]:
+    """Deterministic episodes of a baseline's last state, as ``evaluate_policy`` gives them. Raises ConfigError."""
+    if checkpoint != "latest":
+        raise ConfigError("--checkpoint", checkpoint, "a baseline keeps its last state only; use latest")
     _check_baselines(str(folder.path))
     from rmc.analysis import baselines
 
-    watch = EvaluationProgress(Console(stderr=True), str(command.run))
-    for flicker in command.flicker or (None,):
-        _say_played(command, baselines.evaluate(folder, command.episodes, flicker, command.seconds, watch))
-    return 0
+    return baselines.evaluate(folder, episodes, flicker, seconds, watch)
 
 
 def _say_played(command: run_options.Evaluate, played: dict[str, Any]) -> None:

@@ -9,13 +9,14 @@ import sys
 
 from rmc.common.process import descendants, watchdog
 from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
-from rmc.deploy.local.role_environment import SINGLE_THREAD
+from rmc.deploy.local.role_environment import PATH_VARIABLE, SINGLE_THREAD
 from rmc.deploy.monitor import output
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
-PLAYS = {"train", "resume", "sweep", "baseline", "check-env", "evaluate", "inspect"}  # environments, in this process
+PLAYS = {"train", "resume", "sweep", "baseline", "check-env", "evaluate", "inspect", "report", "role"}  # environments
 SHARED_MEMORY = "/dev/shm"
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
+UNREADABLE = {errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EROFS}  # of a path that a user has given
 CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 
 
@@ -57,9 +58,9 @@ def run(words: list[str]) -> int:
     _choose_temporary_folder()
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
     try:
-        folder = os.getcwd()
-        if folder not in sys.path:  # a user's own environments, last, so that they cannot shadow ours
-            sys.path.append(folder)
+        # a user's own environments, last, so that they cannot shadow ours
+        own = [os.getcwd(), *filter(None, [os.environ.get(PATH_VARIABLE)])]
+        sys.path += [folder for folder in own if folder not in sys.path]
     except FileNotFoundError:
         if parent is None:  # a role is given whole paths
             return _complain("the working folder is gone; cd to one that is there", CONFIG_STATUS)
@@ -76,9 +77,11 @@ def run(words: list[str]) -> int:
             raise  # the supervisor shows its traceback
         return _complain(str(error), FAILED_STATUS)
     except OSError as error:
-        if error.errno not in NO_ROOM:
+        if error.errno in NO_ROOM:
+            return _complain(f"{error.filename or 'disk'}: {error.strerror}; make room and try again", FAILED_STATUS)
+        if words[0] == "role" or error.errno not in UNREADABLE or error.filename is None:
             raise
-        return _complain(f"{error.filename or 'disk'}: {error.strerror}; make room and try again", FAILED_STATUS)
+        return _complain(f"{os.fsdecode(error.filename)}: {error.strerror}; give another, or its rights", CONFIG_STATUS)
 
 
 def _choose_temporary_folder() -> None:

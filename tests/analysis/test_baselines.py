@@ -15,6 +15,7 @@ import torch
 from gymnasium.spaces import Box
 from rich.console import Console
 
+from rmc import api
 from rmc.analysis.baseline_settings import Algorithm, BaselineConfig, Settings, choose, read
 from rmc.analysis.baselines import evaluate, train
 from rmc.analysis.history import of_run
@@ -77,6 +78,11 @@ def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):
     assert seen["eval_return_mean"] == result["eval_return_mean"]
     assert (blind["eval_flicker"], blind["env_steps"]) == (1.0, result["env_steps"])
     assert rmc(["evaluate", str(tmp_path / "run"), "--checkpoint", "best"]) == 2
+    assert api.evaluate(tmp_path / "run", flicker=0.0)["eval_return_mean"] == result["eval_return_mean"]
+    with pytest.raises(ConfigError, match="a baseline keeps its last state only"):
+        api.evaluate(tmp_path / "run", checkpoint="best")
+    with pytest.raises(ConfigError, match="is a baseline's run; rmc resume continues it"):
+        api.resume(tmp_path / "run")
 
 
 def test_a_stop_signal_is_heard_and_nothing_is_lost(tmp_path):

@@ -1,6 +1,7 @@
 """The command line: its flags, and that every error is one line and exit status 2 before anything starts."""
 
 import dataclasses
+import errno
 import json
 import math
 import os
@@ -239,6 +240,29 @@ def test_a_full_disk_is_one_line(
     monkeypatch.setattr(main, "_parse_and_run", full)
     assert main.run(["train"]) == 1
     assert capsys.readouterr().err == "rmc: disk: No space left on device; make room and try again\n"
+
+
+def test_a_path_of_somebody_else_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def refused(path: Path, *_: Any, **__: Any) -> Any:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "exists", refused)  # root may look everywhere
+    words = [*DEBUG, "--run-dir", str(tmp_path / "theirs")]
+    assert f"{tmp_path / 'theirs' / 'config.json'}: Permission denied; give another" in complaint(words, capsys)
+    monkeypatch.undo()
+    monkeypatch.setattr(Path, "read_bytes", refused)
+    (tmp_path / "config.json").write_text("{}")
+    assert f"RUN='{tmp_path}': config.json cannot be read (Permission denied)" in complaint(
+        ["stats", str(tmp_path)], capsys
+    )
+
+
+def test_a_file_in_place_of_a_run_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert "is there and is no run's folder" in complaint([*DEBUG, "--run-dir", str(tmp_path / "file")], capsys)
+    assert "file/run" in complaint([*DEBUG, "--run-dir", str(tmp_path / "file" / "run")], capsys)
 
 
 @pytest.mark.parametrize("words", [DEBUG, ["stats", "run"], ["--help"]])

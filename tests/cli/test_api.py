@@ -1,0 +1,91 @@
+"""``rmc.train``, ``rmc.resume``, ``rmc.evaluate``: what cannot work is one line before anything starts."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import rmc
+from rmc.deploy.local.role_environment import PATH_VARIABLE
+
+CONFIG = rmc.presets.debug("InvertedPendulum-v5")
+
+
+def test_a_preset_takes_an_id_as_well() -> None:
+    for preset in (rmc.presets.robust, rmc.presets.memory, rmc.presets.paper, rmc.presets.debug):
+        assert preset("Ant-v5") == preset(rmc.EnvConfig("Ant-v5"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"total_steps": 1e5}, r"total_steps=100000.0: must be int"),
+        ({"seed": "1"}, r"seed='1': must be int"),
+        ({"env": "Ant-v5"}, r"env='Ant-v5': must be an object"),
+        ({"agent": dataclasses.replace(CONFIG.agent, head_input="all")}, r"agent.head_input='all': must be one of"),
+        ({"agent": dataclasses.replace(CONFIG.agent, heads=(8, 8, 8))}, r"agent.heads=\[8, 8, 8\]: must be tuple"),
+        ({"actors": np.int64(2)}, r"config='RunConfig': a value in it is not JSON's \(.*int64"),
+    ],
+)
+def test_a_value_of_a_wrong_type_is_named(changes: dict[str, Any], line: str, tmp_path: Path) -> None:
+    with pytest.raises(rmc.ConfigError, match=f"^{line}"):
+        rmc.train(dataclasses.replace(CONFIG, **changes), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({"launcher": "locla"}, "--launcher='locla': take local, ray, lockstep, manual"),
+        ({"if_exists": "overwrite"}, "--if-exists='overwrite': take resume, fail, new"),
+        ({"track": "mlflow"}, "--track='mlflow': take wandb, trackio, off"),
+        ({"init_parts": "half"}, r"--init-parts='half': take all, memory\+world-model, policy"),
+    ],
+)
+def test_a_choice_that_there_is_none_of_is_refused(options: dict[str, Any], line: str, tmp_path: Path) -> None:
+    with pytest.raises(rmc.ConfigError, match=f"^{line}$"):
+        rmc.train(CONFIG, tmp_path / "run", **options)
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_no_config_is_refused() -> None:
+    with pytest.raises(rmc.ConfigError, match=r"^config='Ant-v5': take a RunConfig"):
+        rmc.train("Ant-v5")  # type: ignore[arg-type]
+
+
+class Mine(gymnasium.Env):  # type: ignore[type-arg]
+    """Never made."""
+
+
+def test_an_environment_of_the_script_itself_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(Mine, "__module__", "__main__")
+    monkeypatch.setenv(PATH_VARIABLE, "")
+    gymnasium.register("Mine-v0", entry_point=Mine)
+    try:
+        for launcher in ("local", "ray"):
+            with pytest.raises(
+                rmc.ConfigError, match=r"^ENV='Mine-v0': is registered in this script.*\"module:Mine-v0\""
+            ):
+                rmc.train(rmc.presets.debug("Mine-v0"), tmp_path / "run", launcher=launcher)  # type: ignore[arg-type]
+    finally:
+        del gymnasium.registry["Mine-v0"]
+    assert os.environ[PATH_VARIABLE] == str(Path(sys.modules["__main__"].__file__ or "").resolve().parent)
+
+
+def test_a_role_finds_modules_beside_the_script_that_trains(tmp_path: Path) -> None:
+    (tmp_path / "beside.py").write_text(
+        "import gymnasium as gym\ngym.register('Beside-v0', entry_point='gymnasium.envs.classic_control:PendulumEnv')\n"
+    )
+    words = [sys.executable, "-P", "-m", "rmc.cli.main", "check-env", "beside:Beside-v0", "--steps", "2"]
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for path, status in ((str(tmp_path), 0), ("", 2)):
+        environment = os.environ | {PATH_VARIABLE: path}
+        done = subprocess.run(words, cwd=elsewhere, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == status, done.stderr
