@@ -262,7 +262,8 @@ class Actor:
                 self._faults[i] = error
         self._mark_non_finite()
         for i in self._faults:
-            self._steps -= self._builder.forget(i) + 1
+            self._builder.end_before(i)
+            self._steps -= 1
         ended = self._builder.add(
             action, state, self._version.update, self._config.reward_scale * self._reward, self._observation,
             self._missing, self._terminated, self._truncated, self._privileged,
@@ -295,7 +296,7 @@ class Actor:
             self._terminated[i] = self._truncated[i] = False
 
     def _replace_environment(self, i: int, error: Exception) -> None:
-        """A broken episode is dropped and counted, its environment made anew.
+        """A broken episode is counted and ends with the step before, its environment is made anew.
 
         Raises the error where environments break at the start of one episode after the other: they always will.
         """

@@ -12,8 +12,8 @@ class EvaluatorConfig:
     """Episodes per evaluation, played with the policy's mean, one after the other. 0 evaluates before and after
     training alone, with no evaluator beside the actors."""
     evaluation_seconds: float = 300.0
-    """Time limit of an evaluation, in seconds; 0 is none. Finished episodes count; if none finished, the first one's
-    return so far."""
+    """Time limit of an evaluation, in seconds; 0 is none, as in lockstep. Finished episodes count; if none finished,
+    the first one's return so far."""
 
 
 @dataclass(frozen=True)

@@ -87,15 +87,11 @@ class WindowBuilder:
         self._start[env] = self._time
         self._block[env] = self._covered[env] = 0
 
-    def forget(self, env: int) -> int:
-        """Drop an episode whose next step must not be trusted; ``add``, then ``begin`` must follow.
-
-        Returns how many of its steps were in no finished window yet.
-        """
-        lost = int(self._time - self._start[env] - self._covered[env])
+    def end_before(self, env: int) -> None:
+        """Truncate an episode whose next step must not be trusted; ``add``, then ``begin`` must follow."""
+        self._finish(env, terminated=False)
         self._start[env] = self._time + 1
         self._block[env] = self._covered[env] = 0
-        return lost
 
     def add(
         self,

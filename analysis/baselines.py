@@ -9,7 +9,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from rmc.actors.config import EvaluatorConfig
-from rmc.actors.evaluator import evaluation_metrics, first_start, play_episodes
+from rmc.actors.evaluator import Rollout, evaluation_metrics, first_start, play_episodes
 from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, read, validate
 from rmc.analysis.evaluation import FINAL_EPISODES, EvaluationProgress, Watch, missing_shares
 from rmc.common.env.make import env_layout, make_env
@@ -73,13 +73,15 @@ def _set_torch(config: BaselineConfig) -> None:
 
 
 def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: StopSignal) -> int:
-    with closing(_Run(config, folder, console)) as run:
-        run.train(stop)
-        if stop.requested:
-            console.print(f"stopped at environment step {run.steps:,}; to go on:")
-            console.print(f"  {resume_command(folder)}", soft_wrap=True)
-            return STOPPED
-        result = run.result()
+    result, steps = None, 0
+    with suppress(_Stopped), closing(_Run(config, folder, console, stop)) as run:
+        run.train()
+        steps = run.steps
+        result = None if stop.requested else run.result()
+    if result is None:
+        console.print(f"stopped at environment step {steps:,}; to go on:")
+        console.print(f"  {resume_command(folder)}", soft_wrap=True)
+        return STOPPED
     folder.write_result(result)
     mean, deviation = result["eval_return_mean"], result["eval_return_std"]
     console.print(f"after training: return {mean:,.1f} ± {deviation:,.1f}; {folder.result_file}")
@@ -176,12 +178,16 @@ class SB3Adapter:
         return action.astype(np.float32), state
 
 
-class _Run(BaseCallback):
-    """A model between its environment and its folder: evaluates, records, saves, stops."""
+class _Stopped(Exception):
+    """Amid an evaluation, by the signal."""
 
-    def __init__(self, config: BaselineConfig, folder: RunFolder, console: Console) -> None:
+
+class _Run(BaseCallback):
+    """A model between its environment and its folder: evaluates, records, saves, stops. Raises _Stopped."""
+
+    def __init__(self, config: BaselineConfig, folder: RunFolder, console: Console, stop: StopSignal) -> None:
         super().__init__()
-        self.config, self.folder, self._console = config, folder, console
+        self.config, self.folder, self._console, self._stop = config, folder, console, stop
         choice = choose(config.algorithm, config.settings, config.env.id)
         self._vec, self._model = self._load(choice)
         self._began, self._wall_before = time.monotonic(), wall_seconds(folder.metrics)
@@ -252,12 +258,12 @@ class _Run(BaseCallback):
 
     # -- training ---------------------------------------------------------------------------------------
 
-    def train(self, stop: StopSignal) -> None:
+    def train(self) -> None:
         """To the end or the signal; what is not saved then is saved."""
-        self._stop = stop
         missing = self.config.total_steps - self.steps
         if missing > 0:
-            self._model.learn(missing, self, reset_num_timesteps=False, log_interval=None)
+            with suppress(_Stopped):
+                self._model.learn(missing, self, reset_num_timesteps=False, log_interval=None)
         self._save()
         self._write_progress()
 
@@ -285,7 +291,13 @@ class _Run(BaseCallback):
 
     def _play(self, episodes: int, final: bool) -> dict[str, Any]:
         opponent, seed = SB3Adapter(self._model, _scaled_by(self._vec)), first_start(self.config.seed, final)
-        watch = EvaluationProgress(self._console, f"evaluation at step {self.steps:,}")
+        progress = EvaluationProgress(self._console, f"evaluation at step {self.steps:,}")
+
+        def watch(rollout: Rollout) -> None:
+            progress(rollout)
+            if self._stop.requested:
+                raise _Stopped
+
         seconds = EvaluatorConfig.evaluation_seconds
         return evaluation_metrics(
             play_episodes(opponent, lambda: make_env(self.config.env), episodes, seed, seconds, watch)

@@ -22,7 +22,7 @@ class SampleStatus(Enum):
 
 @dataclass(frozen=True)
 class Sample:
-    """One draw. ``rows`` and ``weights`` are None unless ``draw`` is BATCH.
+    """One draw. ``rows`` and ``weights`` are None unless ``status`` is BATCH.
 
     ``rows`` may be a view into a buffer that the next draw but one overwrites. What was drawn is in proportion to
     ``weights``, priority ** exponent each, of ``total_weight`` over all ``windows``.

@@ -14,6 +14,7 @@ Integers are signed because torch views them in place (see ``learner/batch.py``)
 """
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -104,6 +105,13 @@ class WindowSpec:
     def trained_steps(self, rows: Rows) -> int:
         """Real trained steps in all rows, what a draw spends of the replay ratio."""
         return int((rows["last"] - self.burn_in).sum())
+
+
+def joined(parts: Sequence[Rows], spec: WindowSpec) -> Rows:
+    """All rows in one array; whole ones are copied, with their padding, not fields."""
+    block = np.dtype((np.void, spec.dtype.itemsize))
+    rows: Rows = np.concatenate([np.empty(0, block), *(part.view(block) for part in parts)]).view(spec.dtype)
+    return rows
 
 
 def row_dtype(fields: list[Field], checksum: bool) -> np.dtype[np.void]:

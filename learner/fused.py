@@ -93,9 +93,10 @@ def _impute(
     seen, before = observation.clone(), state[:, size:]
     by_step = (x.transpose(0, 1) for x in (seen, missing, prev_action.to(BF16), inputs))
     for o, was_missing, a, x in zip(*by_step, strict=True):
-        second = relu_layer(relu_layer(torch.cat([low, before.to(BF16), a], 1), w1, b1), w2, b2)
-        expected = torch.mm(second, w3).float().add_(b3).add_(before).clamp_(-NORMALIZED_CLIP, NORMALIZED_CLIP)
-        torch.where(was_missing, expected.mul_((before != 0).any(1, keepdim=True)), o, out=o)
+        if was_missing.any():
+            second = relu_layer(relu_layer(torch.cat([low, before.to(BF16), a], 1), w1, b1), w2, b2)
+            expected = torch.mm(second, w3).float().add_(b3).add_(before).clamp_(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+            torch.where(was_missing, expected.mul_((before != 0).any(1, keepdim=True)), o, out=o)
         x[:, : agent.obs_dim] = o
         gi, gh = torch.mm(relu_layer(x.contiguous(), w_embed, b_embed), wi), torch.mm(low, wh)
         kernels.gru_step(bits(gi), bits(gh), bi, bh, h, gate_cache, h, bits(low))

@@ -72,6 +72,7 @@ class Learner:
         self.updates = self.env_steps = self.last_checkpoint = self._checkpoint_steps = 0
         self.finished = self._fenced = self._diverged = self._evaluation_due = False
         self._observed_before = ObservationStatistics.none(spec)  # by the run that this one began with
+        self._policy_learnt = False  # by that run
         self._waiting = ""
         self._largest_reward = 0.0  # that was learnt from, as it was scaled
         self._look_at = 0.0  # when to ask next whether Redis still has the weights
@@ -179,7 +180,9 @@ class Learner:
     def publish(self) -> None:
         """Broadcast the policy with the newest observation statistics frozen into it. Raises FencedError."""
         self._freeze_statistics()
-        blob, version = self._serialize_finite(self.agent.broadcast_weights()), Version(self.epoch, self.updates)
+        blob = self._serialize_finite(self.agent.broadcast_weights())
+        number = self.updates or int(self._policy_learnt)  # with 0 actors do not ask the policy
+        version = Version(self.epoch, number)
         self.bus.publish_weights(version, blob)
         self._published = version
 
@@ -256,7 +259,12 @@ class Learner:
         self._check_finite(state)  # critics or moments may be spoilt while the policy, for one more update, is not
         policy = self._serialize_finite(self.update.average.policy_weights(), self._metadata())
         progress = LearnerProgress(
-            self.updates, self.env_steps, self.epoch, self._threads.chosen, self._observed_before
+            self.updates,
+            self.env_steps,
+            self.epoch,
+            self._threads.chosen,
+            self._observed_before,
+            self._policy_learnt,
         )
         self.checkpoints.save(self.updates, pack(state, policy, progress))
         self.checkpoints.note_save(time.monotonic() - began)
@@ -283,6 +291,7 @@ class Learner:
         self.env_steps = self._checkpoint_steps = progress.env_steps
         self._threads.take_up(progress.threads)
         self._observed_before = progress.observed_before or self._observed_before
+        self._policy_learnt = progress.policy_learnt
         self._next_checkpoint = self._after(self.env_steps)
         log.info("resumed at update %d, environment step %d", self.updates, self.env_steps)
         return progress.epoch

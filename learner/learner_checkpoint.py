@@ -15,6 +15,7 @@ from rmc.common.checkpoint import POLICY, PROGRESS, STATE
 from rmc.common.replay import ObservationStatistics
 from rmc.learner.update import JointUpdate
 
+COUNTED = ("updates", "env_steps", "epoch", "threads", "policy_learnt")
 NOT_OURS = (pickle.UnpicklingError, EOFError, RuntimeError, LookupError, ValueError, TypeError, AttributeError)
 
 
@@ -27,10 +28,11 @@ class LearnerProgress:
     epoch: int
     threads: int = 0  # that its trial has chosen, 0 before
     observed_before: ObservationStatistics | None = None  # by the run that this one began with
+    policy_learnt: bool = False  # by that run
 
     def encode(self) -> bytes:
         """As JSON, with the time."""
-        numbers: dict[str, Any] = {name: getattr(self, name) for name in ("updates", "env_steps", "epoch", "threads")}
+        numbers: dict[str, Any] = {name: getattr(self, name) for name in COUNTED}
         if self.observed_before is not None and self.observed_before.count.any():
             numbers["observed_before"] = self.observed_before.to_json()
         return json.dumps(numbers | {"time": time.time()}).encode()
@@ -46,6 +48,7 @@ class LearnerProgress:
             int(numbers["epoch"]),
             int(numbers.get("threads", 0)),
             None if before is None else ObservationStatistics.from_json(before),
+            bool(numbers.get("policy_learnt", False)),
         )
 
 

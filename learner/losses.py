@@ -66,7 +66,7 @@ def td_target(reward: Tensor, gamma: float, d: Tensor, next_value: Tensor, m: Te
     """
     y = reward + gamma * (1.0 - d) * next_value
     next_is_real = functional.pad(m[:, 1:], (0, 1)) > 0
-    for _ in range(n - 1):
+    for _ in range(min(n, m.shape[1]) - 1):
         after = torch.where(next_is_real, functional.pad(y[:, 1:], (0, 1)), next_value)
         y = reward + gamma * (1.0 - d) * after
     return y.detach()

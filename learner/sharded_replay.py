@@ -13,14 +13,14 @@ import torch
 from numpy.typing import NDArray
 
 from rmc.common.replay import EMPTY_SAMPLE, ObservationStatistics, Replay, Sample, SampleStatus
-from rmc.common.window import Rows, WindowSpec
+from rmc.common.window import Rows, WindowSpec, joined
 
 
 class _Stock:
     """Windows that a shard has drawn and that are in no batch yet."""
 
     def __init__(self, replay: Replay, spec: WindowSpec, chunk: int) -> None:
-        self.replay, self.last = replay, EMPTY_SAMPLE
+        self.replay, self.last, self._spec = replay, EMPTY_SAMPLE, spec
         self._chunk = chunk  # windows of one draw
         self._rows: Rows = np.empty(0, spec.dtype)
         self._weights = np.empty(0)
@@ -31,7 +31,7 @@ class _Stock:
             self.last = self.replay.sample(self._chunk, drawn_elsewhere_steps)
             if self.last.rows is None or self.last.weights is None:
                 return self.last.status
-            self._rows = np.concatenate([self._rows, self.last.rows])
+            self._rows = joined([self._rows, self.last.rows], self._spec)
             self._weights = np.concatenate([self._weights, self.last.weights])
         return SampleStatus.BATCH
 

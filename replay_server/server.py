@@ -192,12 +192,12 @@ class ReplayServer:
         """
         progress, tree = self._store.ring.progress, self._store.tree
         progress.elsewhere_steps = max(progress.elsewhere_steps, drawn_elsewhere_steps)
-        draw = self._limiter.status(progress.inserted, progress.drawn, batch_size * self.spec.train)
-        if draw is SampleStatus.BATCH and tree.total == 0.0:
-            draw = SampleStatus.WAIT
-        self._note_waiting(draw)
-        if draw is not SampleStatus.BATCH:
-            return Sample(draw, None, None, tree.total, progress.windows, progress.env_steps, progress.drawn_steps)
+        status = self._limiter.status(progress.inserted, progress.drawn, batch_size * self.spec.train)
+        if status is SampleStatus.BATCH and tree.total == 0.0:
+            status = SampleStatus.WAIT
+        self._note_waiting(status)
+        if status is not SampleStatus.BATCH:
+            return Sample(status, None, None, tree.total, progress.windows, progress.env_steps, progress.drawn_steps)
         rows = self._buffer(batch_size) if out is None else out
         slots = self._draw_into(rows)
         if slots is None:
@@ -206,7 +206,7 @@ class ReplayServer:
         progress.drawn_steps += self.spec.trained_steps(rows)
         self._store.ring.commit()
         values = tree.values(slots)
-        return Sample(draw, rows, values, tree.total, progress.windows, progress.env_steps, progress.drawn_steps)
+        return Sample(status, rows, values, tree.total, progress.windows, progress.env_steps, progress.drawn_steps)
 
     def _draw_into(self, rows: Rows) -> Slots | None:
         """Fill (B,) rows with sound windows and give their slots; None where none are left."""

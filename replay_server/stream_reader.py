@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rmc.common.bus.protocol import MAX_EPOCH_GAP, Bus, Entry, EntryId, actor_role
 from rmc.common.errors import BusFull, MessageError
 from rmc.common.shard import WHOLE, Shard
-from rmc.common.window import Rows, WindowSpec
+from rmc.common.window import Rows, WindowSpec, joined
 from rmc.common.wire import decode_rows, max_entry_bytes
 from rmc.replay_server.commit_record import StreamPosition
 from rmc.replay_server.row_check import FAULTS, row_faults
@@ -154,9 +154,7 @@ class StreamReader:
     def _stamped(self, entries: list[Entry], bodies: list[Rows | None]) -> Rows:
         """All bodies as one array; the origin comes from the entry ids, whatever the sender wrote."""
         parts = [(entry, body) for entry, body in zip(entries, bodies, strict=True) if body is not None and len(body)]
-        block = np.dtype((np.void, self.spec.dtype.itemsize))  # copies whole rows rather than fields
-        blocks = [np.empty(0, block), *(body.view(block) for _, body in parts)]
-        rows: Rows = np.concatenate(blocks).view(self.spec.dtype)
+        rows = joined([body for _, body in parts], self.spec)
         counts = [len(body) for _, body in parts]
         starts = np.cumsum([0, *counts[:-1]]) if counts else np.zeros(0, np.int64)
         rows["actor"] = np.repeat([entry.actor for entry, _ in parts], counts)

@@ -47,6 +47,18 @@ class HangingEnv(BrokenEnv):
         return super().step(action)
 
 
+class EarlyEnv(CountingEnv):
+    """Breaks in the third step of each of its episodes."""
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self._length = 5
+        observation, reward, *_, info = super().step(action)
+        if self._step == 3:
+            raise RuntimeError("the simulation is unstable")
+        return observation, reward, False, False, info
+
+
 for _fault in FAULTS:
     gym.register(f"Broken-{_fault}-v0", entry_point=BrokenEnv, kwargs={"fault": _fault})
+gym.register("Early-v0", entry_point=EarlyEnv)
 gym.register("Hanging-v0", entry_point=HangingEnv)

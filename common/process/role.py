@@ -57,6 +57,7 @@ class Heartbeat:
         self._role, self._bus, self._clock = role, bus, clock
         self.outage = OutageLog(role.name)
         self._next_metrics = self._next_stop = 0.0
+        self._unsent: dict[str, Any] = {}  # taken from the role, which does not say it twice
 
     def stop_requested(self) -> bool:
         """Whether the bus says so; while Redis is away the role goes on with what needs none."""
@@ -68,7 +69,7 @@ class Heartbeat:
                     return True
             if now >= self._next_metrics:
                 self._next_metrics = now + METRICS_PERIOD
-                self._bus.emit(self._role.name, self.metrics())
+                self._emit(self._unsent or self._metrics())
                 self.outage.end()
         except (BusUnavailable, BusFull) as error:
             self.outage.begin(error)
@@ -76,8 +77,24 @@ class Heartbeat:
             self._next_stop = self._next_metrics = time.monotonic() + RECONNECT_SLEEP
         return False
 
-    def metrics(self) -> dict[str, Any]:
-        """What the role has to say now."""
+    def close(self) -> None:
+        """Close the role, and say what it has to say last: it may be that a Redis that hangs must delay nothing."""
+        with suppress(BusUnavailable, BusFull):
+            if self._unsent:  # older than what the role hands out as it closes
+                self._emit(self._unsent)
+        try:
+            last = self._metrics()
+        finally:
+            self._role.close()
+        with suppress(BusUnavailable, BusFull):
+            self._emit(last)
+
+    def _emit(self, record: dict[str, Any]) -> None:
+        self._unsent = record
+        self._bus.emit(self._role.name, record)
+        self._unsent = {}
+
+    def _metrics(self) -> dict[str, Any]:
         refused = {"refused_values": self._bus.refused.total()}
         return {"time": time.time(), **self._role.metrics(), **refused, **self._clock.shares()}
 
@@ -108,8 +125,7 @@ def run_role(
                 time.sleep(RECONNECT_SLEEP)
                 pulse.outage.begin(error)
                 clock.wait("redis")
-        last = pulse.metrics()
-    finally:
+    except BaseException:
         role.close()
-    with suppress(BusUnavailable, BusFull):  # said last, so that a Redis that hangs delays nothing
-        bus.emit(role.name, last)
+        raise
+    pulse.close()

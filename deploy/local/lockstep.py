@@ -45,14 +45,22 @@ class Lockstep:
         plays = config.evaluator.episodes > 0
         self.evaluator = make_evaluator(uncut, lambda: make_env(config.env), self.bus, clock) if plays else None
         self._last_checkpoint = self.learner.last_checkpoint
-        self._restart_due = False
+        self._restart_due = self._playing = False
 
     @property
     def roles(self) -> list[Role]:
         return [self.learner, self.server, *self.actors, *([self.evaluator] if self.evaluator else [])]
 
+    @property
+    def finished(self) -> bool:
+        """Whether all is trained, and the last checkpoint evaluated."""
+        return self.learner.finished and not self._playing
+
     def step(self) -> None:
-        """One update, or one round of collection where none is due."""
+        """One update, or one round of collection where none is due; after a checkpoint one step of its evaluation."""
+        if self._playing and self.evaluator is not None:
+            self._playing = self.evaluator.step()
+            return
         if self._restart_due:
             self._restart_due = False
             for actor in self.actors:
@@ -68,10 +76,8 @@ class Lockstep:
     def _after_checkpoint(self) -> None:
         """Save the ring beside the learner; the actors begin anew in the next step, as those of a resumed run do."""
         self._last_checkpoint = self.learner.last_checkpoint
-        while self.evaluator is not None and self.evaluator.step():
-            pass
         self.server.checkpoint()
-        self._restart_due = True
+        self._restart_due, self._playing = True, self.evaluator is not None
 
     def emit_metrics(self, clock: BusyClock) -> None:
         """Of every role; all have one thread, and so its shares."""
@@ -89,7 +95,7 @@ def train(config: RunConfig, folder: Path, watch: Callable[[Bus], None], stop: S
     run = Lockstep(config, folder, device)
     clock, due = BusyClock(), 0.0
     try:
-        while not run.learner.finished and not stop.requested:
+        while not run.finished and not stop.requested:
             run.step()
             clock.busy()
             if time.monotonic() >= due:

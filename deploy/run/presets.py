@@ -44,7 +44,7 @@ def memory(env: EnvConfig | str) -> RunConfig:
         actor=replace(base.actor, state_strategy="episode"),
         replay=replace(base.replay, capacity=10_000, replay_ratio=48.0),
         update=replace(base.update, scheme=1, policy_delay=1),
-        learner=replace(base.learner, batch_size=8),
+        learner=replace(base.learner, batch_size=8, publish_updates=10),  # one of long windows is worth many steps
     )
 
 

@@ -132,4 +132,4 @@ def _progress(spec: WindowSpec, agent: Agent, env_steps: int, parts: InitParts) 
         count[spec.obs_dim :] = 0  # what critics alone read is new
     total, total_square = mean * count, (std.square() + mean.square()) * count
     before = ObservationStatistics(count.numpy(), total.numpy(), total_square.numpy())
-    return LearnerProgress(0, 0, 0, observed_before=before)
+    return LearnerProgress(0, 0, 0, observed_before=before, policy_learnt="policy.".startswith(PARTS[parts]))

@@ -1,6 +1,7 @@
 """The actor over an in-process bus and over a real Redis: each step once, in order, within its credit."""
 
 import contextlib
+import dataclasses
 import itertools
 import re
 from collections.abc import Callable
@@ -25,7 +26,7 @@ from rmc.common.errors import BusFull, BusUnavailable, FencedError
 from rmc.common.window import Rows, WindowSpec
 from rmc.common.wire import decode_rows
 from tests.actors.support import join_rows
-from tests.broken_env import FAULTS
+from tests.broken_env import BREAKS_AT, FAULTS
 from tests.counting_env import ACTION_DIM, OBS_DIM, CountingEnv, Step, audit
 from tests.learner.rows import step_valid
 
@@ -463,8 +464,26 @@ def test_a_broken_episode_is_dropped_and_training_goes_on(fault: str) -> None:
     assert np.isfinite(rows["observation"]).all()
     assert actor.metrics()["broken_episodes"] > 10
     sent = {step.step for step in counts.trained if step.episode % 3 == 2}
-    assert {0, SPEC.train - 1} <= sent
+    assert sent == set(range(BREAKS_AT - 1))  # those before the one that broke
     actor.close()
+
+
+def test_an_environment_that_always_breaks_early_is_learnt_from_up_to_there() -> None:
+    """Whatever its strategy, what was sound reaches the replay, as of an episode that was cut off."""
+    for strategy in ("burn-in", "episode"):
+        bus = MemoryBus()
+        publish(bus, 0)
+        config = dataclasses.replace(CONFIG, state_strategy=strategy)  # type: ignore[arg-type]
+        clock: Callable[[], float] = itertools.count().__next__
+        actor = Actor(0, 1, lambda: make_env(EnvConfig("tests.broken_env:Early-v0")), SPEC, AGENT, config, bus, clock)
+        reader = Reader(bus)
+        play(bus, actor, reader, 300)
+        rows = reader.rows()
+        counts = audit(rows, SPEC)
+        assert counts.new_steps >= 300
+        assert {step.step for step in counts.trained} == {0, 1}
+        assert not rows["terminated"].any()
+        actor.close()
 
 
 def test_what_critics_are_not_asked_to_read_is_the_environments_own_affair() -> None:

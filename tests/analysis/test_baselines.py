@@ -85,10 +85,23 @@ def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):
         api.resume(tmp_path / "run")
 
 
+class StopOnce(StopSignal):
+    """Requested from when on a file is there."""
+
+    def __init__(self, path: Path):
+        self._path = path
+
+    @property
+    def requested(self) -> bool:
+        return self._path.exists()
+
+
 def test_a_stop_signal_is_heard_and_nothing_is_lost(tmp_path):
     stop, folder = StopSignal(), tmp_path / "run"
     stop.requested = True
-    assert run(config(), folder, stop) == 130
+    assert run(config(), folder, stop) == 130  # amid the first evaluation
+    assert not (folder / "initial.json").exists()
+    assert run(config(), folder, StopOnce(folder / "initial.json")) == 130
     assert RunFolder(folder).result() is None
     (state,) = (folder / "checkpoints").iterdir()
     assert json.loads((state / "progress.json").read_text())["env_steps"] == 1
@@ -100,8 +113,8 @@ def test_a_stop_signal_is_heard_and_nothing_is_lost(tmp_path):
 
 def test_rmc_resume_goes_on_with_it(tmp_path, capsys):
     """The command that a stopped one prints; what is not said is as it was, also of an older version's run."""
-    folder, stop = tmp_path / "run", StopSignal()
-    stop.requested = True
+    folder = tmp_path / "run"
+    stop = StopOnce(folder / "initial.json")
     settings = config("td3", env=EnvConfig("InvertedPendulum-v5", flicker=0.5), seed=3)
     assert train(settings, folder, Console(width=400), stop) == 130
     (printed,) = re.findall(r"to go on:\n  rmc (.*)\n", capsys.readouterr().out)

@@ -65,17 +65,16 @@ class Mine(gymnasium.Env):  # type: ignore[type-arg]
 
 def test_an_environment_of_the_script_itself_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(Mine, "__module__", "__main__")
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", str(tmp_path / "script.py"), raising=False)
     monkeypatch.setenv(PATH_VARIABLE, "")
     gymnasium.register("Mine-v0", entry_point=Mine)
     try:
         for launcher in ("local", "ray"):
-            with pytest.raises(
-                rmc.ConfigError, match=r"^ENV='Mine-v0': is registered in this script.*\"module:Mine-v0\""
-            ):
+            with pytest.raises(rmc.ConfigError, match=r"^ENV='Mine-v0': is registered in this script.*module:Mine-v0"):
                 rmc.train(rmc.presets.debug("Mine-v0"), tmp_path / "run", launcher=launcher)  # type: ignore[arg-type]
     finally:
         del gymnasium.registry["Mine-v0"]
-    assert os.environ[PATH_VARIABLE] == str(Path(sys.modules["__main__"].__file__ or "").resolve().parent)
+    assert os.environ[PATH_VARIABLE] == str(tmp_path.resolve())
 
 
 def test_a_role_finds_modules_beside_the_script_that_trains(tmp_path: Path) -> None:

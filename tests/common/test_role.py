@@ -81,3 +81,42 @@ def test_the_last_state_is_said_after_closing():
     run_role(role, bus, stop)
     assert role.closed
     assert bus.records({"counting": "0"})[0][-1]["taken"] == 7
+
+
+class Forgetful(Counting):
+    """Says each number once."""
+
+    def metrics(self) -> dict[str, float]:
+        self.said = getattr(self, "said", 0) + 1
+        return {"said": self.said}
+
+
+class FullAtTimes(MemoryBus):
+    """Refuses some records."""
+
+    def __init__(self, refused: set[int]):
+        super().__init__()
+        self.tries, self.refused_tries = 0, refused
+
+    def emit(self, role, record):
+        self.tries += 1
+        if self.tries in self.refused_tries:
+            raise BusFull("as told")
+        super().emit(role, record)
+
+
+@pytest.mark.parametrize("refused", [set(), {1}, {1, 2}, {2}, {1, 3}])
+def test_what_could_not_be_sent_is_sent_later_and_in_order(monkeypatch, refused):
+    monkeypatch.setattr("rmc.common.process.role.METRICS_PERIOD", 0.02)
+    monkeypatch.setattr("rmc.common.process.role.RECONNECT_SLEEP", 0.02)
+    stop, bus = StopSignal(), FullAtTimes(refused)
+    role = Forgetful(stop, 0, BusUnavailable)
+    run_role(role, bus, stop, lambda: bus.tries >= 5)
+    said = [record["said"] for record in bus.records({"counting": "0"})[0]]
+    assert said == list(range(1, role.said + 1))
+
+
+def test_what_is_still_unsent_at_the_end_comes_before_the_last_word(monkeypatch):
+    stop, bus = StopSignal(), FullAtTimes({1})
+    run_role(Forgetful(stop, 7), bus, stop)
+    assert [record["said"] for record in bus.records({"counting": "0"})[0]] == [1, 2]

@@ -75,6 +75,9 @@ def test_the_first_published_weights_are_the_sources(parts: InitParts, source: R
     for _ in range(2):  # the second is a learner that was killed before its first checkpoint
         run = Lockstep(OTHER, folder.path)
         first = published(run)
+        version = run.bus.latest_version()
+        assert version is not None
+        assert (version.update > 0) == (parts != "memory+world-model")  # with 0 actors do not ask the policy
         run.close()
         assert first.keys() == ours.keys()
         for name, value in first.items():

@@ -98,3 +98,15 @@ def test_batches_that_are_cut_give_the_same_bits_across_a_stop(tmp_path, monkeyp
     assert 1 < stopped.learner.updates < straight.learner.updates
     assert min(lengths) < config.window_spec().steps == max(lengths)
     assert_same(straight, run(config, tmp_path / "stopped"))
+
+
+def test_an_evaluation_is_played_step_by_step_between_which_a_signal_is_heard(tmp_path):
+    lockstep = Lockstep(CONFIG, tmp_path)
+    while not lockstep.learner.last_checkpoint:
+        lockstep.step()
+    updates = lockstep.learner.updates
+    for _ in range(20):  # an episode has more
+        lockstep.step()
+    assert not lockstep.finished
+    assert lockstep.learner.updates == updates
+    lockstep.close()
