@@ -17,7 +17,7 @@ from rmc.common.window import Rows, WindowSpec
 from rmc.learner import losses
 from rmc.learner.batch import Plan, has_missing, longest_steps, view_batch
 from rmc.learner.config import UpdateConfig
-from rmc.learner.unroll import impute, unroll
+from rmc.learner.unroll import impute_and_unroll
 
 
 class InitialPriority:
@@ -45,8 +45,7 @@ class InitialPriority:
         agent, steps = self._agent, batch.trained
         m = batch.step_valid[:, steps].float()
         o = agent.normalizer(batch.observation, batch.missing)
-        o = impute(agent, o, batch)
-        z = agent.features(unroll(agent.memory, o, batch))
+        z = agent.features(impute_and_unroll(agent, o, batch)[1])
         read = critic_input(z, agent.normalized_privileged(batch.privileged[:, steps]))
         mean, log_std = agent.policy(z)
         pi, log_pi = squashed_sample(mean, log_std, torch.randn(mean.shape, generator=self._generator))

@@ -10,9 +10,20 @@ from rmc.common.agent import Agent, Memory, MemoryOutput
 from rmc.learner.batch import Batch
 
 
-def unroll(memory: Memory, o: Tensor, batch: Batch) -> MemoryOutput:
-    """(B, L_t + 1, ·) from the stored state, which starts the trained part itself where the burn-in is padding."""
-    steps, hidden = batch.trained, _burned_in(memory, o, batch)
+def impute_and_unroll(agent: Agent, o: Tensor, batch: Batch) -> tuple[Tensor, MemoryOutput]:
+    """(B, L + 1, O) with missing frames filled where configured, and the memory along them: (B, L_t + 1, ·)."""
+    hidden = None
+    if agent.next_frame is not None and batch.plan.has_missing:
+        o, hidden = _impute(agent, o, batch)
+    return o, unroll(agent.memory, o, batch, hidden)
+
+
+def unroll(memory: Memory, o: Tensor, batch: Batch, hidden: Tensor | None = None) -> MemoryOutput:
+    """(B, L_t + 1, ·) from the stored state, which starts the trained part itself where the burn-in is padding.
+
+    ``hidden`` is what the burn-in has come to where that is known, (B, H).
+    """
+    steps, hidden = batch.trained, _burned_in(memory, o, batch) if hidden is None else hidden
     remembered: MemoryOutput = memory(o[:, steps], batch.missing[:, steps], batch.prev_action[:, steps], hidden)
     return remembered
 
@@ -29,14 +40,12 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch) -> Tensor:
     return torch.where(batch.burned_in.unsqueeze(1), burned, hidden)
 
 
-def impute(agent: Agent, o: Tensor, batch: Batch) -> Tensor:
-    """(B, L + 1, O) with missing frames filled where configured, along the states that ``unroll`` goes through."""
-    if agent.next_frame is None or not batch.plan.has_missing:
-        return o
+def _impute(agent: Agent, o: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
+    """(B, L + 1, O) filled along the states that ``unroll`` goes through, and (B, H) after the burn-in."""
 
     def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:
         return agent.impute(o[:, steps], batch.missing[:, steps], batch.prev_action[:, steps], state)
 
     past, state = part(slice(batch.burn_in), batch.state)
     state = torch.where(batch.burned_in.unsqueeze(1), state, batch.state)
-    return torch.cat([past, part(batch.trained, state)[0]], 1)
+    return torch.cat([past, part(batch.trained, state)[0]], 1), state[:, : agent.config.hidden]

@@ -25,7 +25,7 @@ from rmc.learner.diagnostics import Trace, model_metrics, unexplained_change, va
 from rmc.learner.fused import fuse
 from rmc.learner.optimizers import adam, by_optimizer, polyak_update
 from rmc.learner.policy_average import PolicyAverage
-from rmc.learner.unroll import impute, unroll
+from rmc.learner.unroll import impute_and_unroll, unroll
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 MODEL_PARTS = ("memory", "world_model", "next_frame")
@@ -118,8 +118,7 @@ class JointUpdate:
             o = agent.normalizer(batch.observation, batch.missing)
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
-            o = impute(agent, o, batch)
-            memory = unroll(agent.memory, o, batch)
+            o, memory = impute_and_unroll(agent, o, batch)
             z = self._to_bf16(agent.features(memory))
 
             # Prediction, and curiosity from its error

@@ -24,7 +24,7 @@ from rmc.common.window import Rows
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.learner.batch import Batch, clear_padding, view_batch
-from rmc.learner.unroll import impute, unroll
+from rmc.learner.unroll import impute_and_unroll
 from rmc.replay_server.ring import Ring
 
 RIDGE = 1e-5  # of the probe, times its number of steps
@@ -74,8 +74,7 @@ def seen_by(checkpoint: Path, config: RunConfig, batch: Batch) -> Seen:
     spec = config.window_spec()
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
     agent.load_state_dict(torch.load(checkpoint / STATE, weights_only=True)["agent"])
-    o = impute(agent, agent.normalizer(batch.observation, batch.missing), batch)
-    remembered = unroll(agent.memory, o, batch)
+    o, remembered = impute_and_unroll(agent, agent.normalizer(batch.observation, batch.missing), batch)
     parts = remembered.hidden, agent.features(remembered), o[:, spec.burn_in :]
     return Seen(agent, *(part[:, :-1].flatten(0, 1) for part in parts))
 

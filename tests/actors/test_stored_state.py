@@ -11,7 +11,7 @@ from rmc.actors.window_builder import WindowBuilder
 from rmc.common.agent_config import AgentConfig
 from rmc.common.window import Rows, WindowSpec
 from rmc.learner.batch import Batch, view_batch
-from rmc.learner.unroll import impute, unroll
+from rmc.learner.unroll import impute_and_unroll
 from tests.actors.support import join_rows
 from tests.actors.test_policy_runner import ACTION_DIM, OBS_DIM, make_agent, make_runner
 
@@ -74,8 +74,8 @@ def relearned(agent_name: str, rows: Rows, spec: WindowSpec) -> tuple[Batch, tor
     agent = AGENTS[agent_name]
     raw = torch.from_numpy(rows.view(np.uint8).reshape(len(rows), -1))
     batch = view_batch(raw, torch.ones(len(rows)), spec)
-    o = impute(agent, agent.normalizer(batch.observation, batch.missing), batch)
-    return batch, unroll(agent.memory, o, batch).hidden
+    o = agent.normalizer(batch.observation, batch.missing)
+    return batch, impute_and_unroll(agent, o, batch)[1].hidden
 
 
 @settings(max_examples=40, deadline=None)
