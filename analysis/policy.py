@@ -10,6 +10,7 @@
 Shapes: N episodes side by side, O observation, A action, S state, M flags of what is missing.
 """
 
+import reprlib
 from pathlib import Path
 from typing import Any, Literal, overload
 
@@ -29,12 +30,13 @@ Units = Literal["agent", "environment"]
 UNITS = ("agent", "environment")
 
 
-def load_policy(source: str | Path, checkpoint: str = "latest") -> "Policy":
+def load_policy(source: str | Path, checkpoint: str = "latest", seed: int = 0) -> "Policy":
     """The policy of a file, of ``hf://owner/name``, or of a run's ``latest``, ``best`` or numbered checkpoint.
 
-    A file is all that it takes: neither its run nor the module of its environment need be there. Raises ConfigError.
+    A file is all that it takes: neither its run nor the module of its environment need be there. ``seed`` is for
+    actions that explore. Raises ConfigError.
     """
-    return Policy(read_policy(source, checkpoint))
+    return Policy(read_policy(source, checkpoint), seed)
 
 
 class Policy:
@@ -102,14 +104,14 @@ class Policy:
         """
         if units not in UNITS:
             raise ConfigError("units", units, f"use one of {UNITS}")
-        rows, absent = self._read(observation, missing)
+        rows, absent, one = self._read(observation, missing)
         runner = self._begin(len(rows))
         shape = self._prev_action.shape
         noise = self._rng.standard_normal(shape, np.float32) if explore else None
         action, state = runner.act(rows, self._prev_action, absent, self._state, noise)
         self._prev_action, self._state[:] = action, state
         result = action.copy() if units == "agent" else self._in_environment(action)
-        return result if np.ndim(observation) == 2 else result[0]
+        return result[0] if one else result
 
     def _begin(self, rows: int) -> PolicyRunner:
         """What acts in so many episodes; new ones begin after ``reset``."""
@@ -127,10 +129,14 @@ class Policy:
             return scaled.astype(np.result_type(*(part.dtype for part in parts)))
         return scaled.astype(parts[0].dtype).reshape(len(action), *parts[0].shape)
 
-    def _read(self, observation: ArrayLike, missing: bool | BoolArray) -> tuple[Floats, BoolArray]:
-        """(N, O), and (N, M) what counts as missing. Raises ConfigError; nothing is remembered of it then."""
-        rows = self._rows(observation)
-        absent = self._absent(np.array(missing, bool), rows, one=np.ndim(observation) == 1)
+    def _read(self, observation: ArrayLike, missing: bool | BoolArray) -> tuple[Floats, BoolArray, bool]:
+        """(N, O), (N, M) what counts as missing, and whether it is one observation alone.
+
+        Raises ConfigError; nothing is remembered of it then.
+        """
+        raw = self._numbers(observation)
+        rows, one = self._rows(raw), raw.ndim == 1
+        absent = self._absent(np.array(missing, bool), rows, one)
         odd = ~np.isfinite(rows) & ~absent
         if odd.any():
             if not self.header.agent.impute_missing:
@@ -138,7 +144,7 @@ class Policy:
                 values = dict(zip(places, rows[odd].tolist(), strict=True))
                 raise ConfigError("observation", values, "give finite numbers, or missing=True where there is none")
             absent |= odd if absent.shape == odd.shape else odd.any(1, keepdims=True)
-        return rows, absent
+        return rows, absent, one
 
     def _absent(self, missing: BoolArray, rows: Floats, one: bool) -> BoolArray:
         """Flags as they were given -> (N, M); ``one`` row was given as (O,). Raises ConfigError."""
@@ -151,10 +157,19 @@ class Policy:
             raise ConfigError("missing", f"of shape {missing.shape}", fix)
         return np.broadcast_to(missing.reshape(-1, 1), (count, flags)).copy()
 
-    def _rows(self, observation: ArrayLike) -> Floats:
+    def _numbers(self, observation: ArrayLike) -> Floats:
+        """As an array; (O,) where it has the environment's own shape. Raises ConfigError."""
+        try:
+            with np.errstate(over="ignore"):  # infinity, which is judged later
+                raw = np.asarray(observation, np.float32)
+        except (TypeError, ValueError):
+            fix = f"give {self.header.obs_dim} numbers, as policy.make_env() or gymnasium.spaces.flatten does"
+            raise ConfigError("observation", reprlib.repr(observation), fix) from None
+        as_environment = raw.shape == self.header.layout.observations[0].shape and raw.size == self.header.obs_dim
+        return raw.ravel() if as_environment and raw.shape[:1] != (1,) else raw  # (1, O) is that of N = 1
+
+    def _rows(self, raw: Floats) -> Floats:
         """(O,) or (N, O) -> (N, O). Raises ConfigError."""
-        with np.errstate(over="ignore"):  # infinity, which is judged later
-            raw = np.asarray(observation, np.float32)
         size = self.header.obs_dim
         if raw.ndim not in (1, 2) or raw.shape[-1] != size or not len(raw):
             fix = f"the policy reads shape {(size,)}, or (N, {size}) of N episodes"

@@ -33,6 +33,10 @@ class PolicyFile:
     blob: bytes
     """Safetensors of its weights; a header in there may know less than ``header``."""
 
+    def with_timeout(self, seconds: float) -> "PolicyFile":
+        """The same, with another time for a call into its environment."""
+        return replace(self, header=replace(self.header, env=replace(self.header.env, env_timeout=seconds)))
+
     def encode(self) -> bytes:
         """The file's contents, its header the one here."""
         return safetensors.torch.save(safetensors.torch.load(self.blob), self.header.metadata())

@@ -23,7 +23,7 @@ from rmc.common.errors import ConfigError, EnvFault
 from rmc.common.extra import check_installed
 from rmc.common.whole_file import written_whole
 
-VIDEOS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
+VIDEOS = (".mp4", ".mkv", ".mov", ".avi")  # that hold H.264
 BACKENDS = ("egl", "osmesa", "glfw")  # MuJoCo's, the ones that need no screen first
 RENDERERS = {"mujoco", "OpenGL", "glfw", "dm_control"}  # packages, and gymnasium's folder of MuJoCo's environments
 PROBE = "import sys; from rmc.analysis.video import probe; probe(sys.argv[1])"

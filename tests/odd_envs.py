@@ -1,4 +1,4 @@
-"""Environments that the agent cannot learn in."""
+"""Environments of odd spaces; in most the agent cannot learn."""
 
 from typing import Any
 
@@ -13,8 +13,19 @@ class Odd(gym.Env[Any, Any]):
         self.observation_space, self.action_space = observation, action
 
 
+class Column(gym.Env[Any, Any]):
+    """It can be learnt in: a vector that stands upright."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (2, 1), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return np.zeros((2, 1), np.float32), {}
+
+
 _VECTOR = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
 _IMAGE = gym.spaces.Box(0, 255, (8, 8, 3), np.uint8)
 _UNBOUNDED = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
 gym.register("OddImage-v0", lambda: Odd(_IMAGE, _VECTOR))
 gym.register("OddUnbounded-v0", lambda: Odd(_VECTOR, _UNBOUNDED))
+gym.register("Column-v0", lambda: Column())

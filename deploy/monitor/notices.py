@@ -5,10 +5,10 @@ from statistics import mean
 from typing import Any
 
 from rmc.deploy.monitor.figures import number
-from rmc.deploy.monitor.run_status import RunStatus
+from rmc.deploy.monitor.run_status import WAITING_SHARE, RunStatus
 
 MOST_SILENT = 3  # that are named
-WAITING_SHARE = 0.5  # from which a role is said to wait
+STALLED_SECONDS = 60.0  # after which a run in which all wait is said to hang
 
 
 def notices(status: RunStatus) -> dict[str, str]:
@@ -18,6 +18,7 @@ def notices(status: RunStatus) -> dict[str, str]:
     texts = {
         "not running": "" if status.is_over else status.get("launcher", "not_running"),
         "silent": _silent(status),
+        "deadlock": _deadlock(status.stalled_s),
         "not saved": status.get("learner", "checkpoint_error"),
         "damaged": _damaged(status),
         "replay ratio": f"far from {status.replay_ratio:g}, see the troubleshooting page" if off else "",
@@ -50,6 +51,10 @@ def _damaged(status: RunStatus) -> str:
     counts = {"windows of the ring": status.replay("damaged_windows", sum)}
     counts["newer checkpoints"] = status.get("learner", "damaged_checkpoints")
     return ", ".join(f"{number(count, ',')} {name}" for name, count in counts.items() if count)
+
+
+def _deadlock(seconds: float) -> str:
+    return f"no step and no update for {seconds:,.0f} s, see rmc doctor" if seconds > STALLED_SECONDS else ""
 
 
 def _silent(status: RunStatus) -> str:

@@ -14,6 +14,7 @@ MOST_NAMES = 1000
 LARGEST_STEP = 2**63 - 1  # that TensorBoard takes
 SILENT_SECONDS = 5.0  # after which a role's silence is shown; it speaks every second
 LAUNCHER_SECONDS = 15.0  # the same of the launcher, which speaks every 5
+WAITING_SHARE = 0.5  # from which a role is said to wait
 UNHEARD_SECONDS = 30.0  # of a role that has not spoken yet: it imports, and makes its environments
 
 
@@ -50,6 +51,10 @@ class RunStatus:
         self.final_steps: int | None = None  # once the run has its result
         self.heard = "*"  # which roles speak all the time; of a baseline the launcher alone
         self._pace = Pace()
+        self._counted, self._moved_at = (
+            (0, 0),
+            0.0,
+        )  # steps and updates, and when they last grew
 
     @property
     def is_over(self) -> bool:
@@ -69,6 +74,9 @@ class RunStatus:
         else:  # afresh: another thread may be going through the old one
             self.roles = {**self.roles, role: dict(new)}
         self.take_evaluation(record)
+        counted = self.env_steps, int(_number(self.get("learner", "updates")))
+        if counted != self._counted or not self._moved_at:
+            self._counted, self._moved_at = counted, _number(self.get("learner", "time"))
         if role.startswith("replay") and "env_steps" in record and _number(self.get("learner", "updates_per_s")) > 0:
             self._pace.note(_number(record.get("time")), self.env_steps)
 
@@ -98,6 +106,15 @@ class RunStatus:
             for role, seconds in sorted(quiet.items())
             if seconds > (LAUNCHER_SECONDS if role == "launcher" else SILENT_SECONDS)
         }
+
+    @property
+    def stalled_s(self) -> float:
+        """Seconds without a step and an update while learner, replay servers and actors all wait; 0 where one works."""
+        said = {role: record for role, record in self._of_this_start().items() if role not in ("launcher", "evaluator")}
+        work = [role for role, record in said.items() if _number(record.get("waiting_share")) < WAITING_SHARE]
+        if work or self.is_over or self.silent() or self.get("learner", "waiting_for") in (None, "disk"):
+            return 0.0
+        return max(0.0, _number(self.get("learner", "time")) - self._moved_at)
 
     def _of_this_start(self) -> dict[str, dict[str, Any]]:
         """The roles that have spoken since the launcher's newest start: one before may have had others."""

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import socket
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -14,6 +15,7 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.replay_server import ring
 
+CONTAINER_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 DISK_RESERVE = 256 << 20  # bytes left for checkpoints, metrics and logs
 
 
@@ -76,26 +78,35 @@ def check_ring_fits(config: RunConfig, run_dir: Path) -> None:
         rest = f"{_gb(free_disk)} are free, {_gb(DISK_RESERVE)} of which are left for checkpoints and logs"
         fix = f"take at most {most(room)}" if most(room) else "make room"
         raise ConfigError("--capacity", capacity, f"takes {_gb(size)} of disk, {rest}; {fix}")
-    memory = psutil.virtual_memory().total
+    memory = _memory_limit()
     if size > memory:
         fault = f"takes {_gb(size)} of {_gb(memory)} memory; take at most {most(memory)}"
         raise ConfigError("--capacity", capacity, fault)
 
 
 def check_batch_fits(config: RunConfig) -> None:
-    """Raises ConfigError where an update's batch is larger than the machine's memory, by the least that it can take.
+    """Raises ConfigError where an update's batch is larger than the free memory, by the least that it can take.
 
     That is its rows, and of each trained step what the way back reads: the GRU's gates and state in float32, and in
     bfloat16 the hidden layers of world model, policy, and both critics of two actions. ``--dry-run`` measures the rest.
     """
     spec, heads, size = config.window_spec(), config.agent.heads, config.learner.batch_size
     step = 4 * 5 * config.agent.hidden + 2 * 6 * sum(heads)
-    window, memory = spec.dtype.itemsize + spec.train * step, psutil.virtual_memory().total
+    window, memory = spec.dtype.itemsize + spec.train * step, min(_memory_limit(), psutil.virtual_memory().available)
     if size * window <= memory:
         return
-    fault = f"an update of windows of {spec.steps} steps takes {_gb(size * window)} of {_gb(memory)} memory"
+    fault = f"an update of windows of {spec.steps} steps takes {_gb(size * window)} of {_gb(memory)} free memory"
     fix = f"take at most {memory // window}" if memory >= window else "take fewer steps a window"
     raise ConfigError("--batch-size", size, f"{fault}; {fix}")
+
+
+def _memory_limit() -> int:
+    """Bytes of the machine, or of the container that this is in."""
+    memory = int(psutil.virtual_memory().total)
+    for path in CONTAINER_LIMITS:
+        with suppress(OSError, ValueError):  # no such version of cgroups, or "max"
+            memory = min(memory, int(path.read_text()))
+    return memory
 
 
 def _gb(size: int) -> str:

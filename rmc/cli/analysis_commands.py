@@ -40,6 +40,8 @@ def evaluate(command: run_options.Evaluate) -> int:
     if command.run.is_dir() and RunFolder(command.run).is_baseline():
         return _evaluate_baseline(command)
     policy = read_policy(command.run, command.checkpoint)
+    if command.env_timeout is not None:
+        policy = policy.with_timeout(command.env_timeout)
     env = policy.header.env
     if command.video is not None:
         video.prepare(env, command.video)

@@ -32,6 +32,8 @@ class Evaluate:
     checkpoint: Checkpoint = "latest"
     video: Path | None = None
     """Also write an episode to this file, like episode.mp4, with the first of the flicker probabilities."""
+    env_timeout: float | None = None
+    """Timeout of a call into the environment, in seconds; by default the run's own."""
     json: bool = False
     """Print one line of JSON."""
 

@@ -126,8 +126,25 @@ def test_an_observation_of_another_shape_is_refused(tmp_path: Path, observation:
         policy.act(observation)
 
 
+@pytest.mark.parametrize("observation", [{"x": [1.0]}, (np.ones(3), {}), "text", [[1.0], [1.0, 2.0]]])
+def test_what_are_no_numbers_is_refused_with_how_to_get_them(tmp_path: Path, observation: Any) -> None:
+    policy = load_policy(make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1").path)
+    with pytest.raises(ConfigError, match=r"^observation=.*: give 3 numbers, as policy.make_env\(\) or"):
+        policy.act(observation)
+
+
+def test_an_observation_may_have_the_environments_own_shape(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", AGENTS["robust"], "tests.odd_envs:Column-v0").path
+    column = np.array([[0.1], [0.2]], np.float32)
+    assert (load_policy(run).act(column) == load_policy(run).act(column.ravel())).all()
+    assert load_policy(run).act(column).ndim == 1
+
+
 def test_exploring_actions_vary_and_are_seeded(run: RunFolder) -> None:
     observation = np.ones(3, np.float32)
+    assert load_policy(run.path).act(observation, explore=True) != load_policy(run.path, seed=1).act(
+        observation, explore=True
+    )
     actions = [[load_policy(run.path).act(observation, explore=explore) for _ in range(2)] for explore in (False, True)]
     assert actions[0][0] == actions[0][1]
     assert actions[1][0] == actions[1][1]

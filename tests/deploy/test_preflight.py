@@ -30,7 +30,7 @@ from rmc.deploy.run.presets import robust
 def memory(monkeypatch: pytest.MonkeyPatch) -> int:
     """Bytes of a machine that has little of it."""
     size = 200_000_000
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(total=size))
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(total=size, available=size))
     return size
 
 
@@ -53,6 +53,24 @@ def test_a_batch_of_long_windows_that_no_memory_holds_is_refused_with_the_larges
         check_batch_fits(run(990, most + 1))
     with pytest.raises(ConfigError, match="take fewer steps a window"):
         check_batch_fits(dataclasses.replace(run(9_990, 1), agent=AgentConfig(hidden=4_096)))
+
+
+def test_a_containers_memory_is_what_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from rmc.deploy.run import preflight
+
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(preflight, "CONTAINER_LIMITS", (limit, tmp_path / "none"))
+    for text in (None, "max\n", str(1 << 62)):
+        if text is not None:
+            limit.write_text(text)
+        check_batch_fits(run(990, 8))
+    limit.write_text("1000000\n")
+    with pytest.raises(ConfigError, match=r"^--batch-size=8: .* of 0.001 GB free memory; take "):
+        check_batch_fits(run(990, 8))
+    config = run(15, 8)
+    large = dataclasses.replace(config, replay=dataclasses.replace(config.replay, capacity=100_000))
+    with pytest.raises(ConfigError, match=r"^--capacity=100000: takes .* of 0.001 GB memory; take at most \d+$"):
+        check_ring_fits(large, tmp_path)
 
 
 def test_a_gpu_that_is_not_there_is_refused_with_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,11 +2,13 @@
 
 import io
 import time
+from typing import Any
 
 import pytest
 from rich.console import Console
 
 from rmc.deploy.monitor import run_status
+from rmc.deploy.monitor.notices import notices
 from rmc.deploy.monitor.plain_line import line
 from rmc.deploy.monitor.run_status import RunStatus
 from rmc.deploy.monitor.table import table
@@ -121,6 +123,32 @@ def test_no_end_is_told_before_the_learner_learns_or_while_no_steps_come() -> No
     for second in range(30, 60):
         of.take({"role": "replay", "time": now + second, "env_steps": 3_000})
     assert of.eta_s is None
+
+
+def waiting_status(seconds: int, **learner: Any) -> RunStatus:
+    """All wait, and no counter has moved for so long."""
+    of, now = RunStatus("Env-v0", "debug", 0, 100_000, 1.0), time.time()
+    of.take({"role": "learner", "time": now - seconds - 1, "updates": 39, "waiting_share": 0.0, "waiting_for": ""})
+    waits: dict[str, dict[str, Any]] = {"replay": {"env_steps": 7}, "actor-0": {}, "learner": {"updates": 40}}
+    for ago in range(seconds, -1, -1):
+        for role, counts in waits.items():
+            said = {"waiting_share": 1.0, "waiting_for": "the other", **counts}
+            of.take({"role": role, "time": now - ago, **said, **(learner if role == "learner" else {})})
+    return of
+
+
+def test_a_run_in_which_all_wait_and_nothing_moves_is_said_to_hang() -> None:
+    assert notices(waiting_status(65))["deadlock"] == "no step and no update for 65 s, see rmc doctor"
+    assert "deadlock" in line(waiting_status(65))
+    for of in (
+        waiting_status(55),
+        waiting_status(65, waiting_share=0.2),  # it works
+        waiting_status(65, waiting_for="disk"),  # which is said elsewhere
+    ):
+        assert "deadlock" not in notices(of)
+    moving = waiting_status(65)
+    moving.take({"role": "replay", "time": time.time(), "env_steps": 8})
+    assert "deadlock" not in notices(moving)
 
 
 def test_the_time_goes_on_until_the_run_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
