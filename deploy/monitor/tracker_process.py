@@ -63,13 +63,19 @@ def main() -> None:
 
 
 def _begin(folder: RunFolder, tracking: Tracking, notify: Notify) -> TrackedRun:
-    if tracking.tracker == "wandb":
-        from rmc.deploy.monitor import wandb_run  # extras, and slow to import
+    match tracking.tracker:  # extras, and slow to import
+        case "wandb":
+            from rmc.deploy.monitor import wandb_run
 
-        return wandb_run.WandbRun(folder, tracking, notify)
-    from rmc.deploy.monitor import trackio_run
+            return wandb_run.WandbRun(folder, tracking, notify)
+        case "trackio":
+            from rmc.deploy.monitor import trackio_run
 
-    return trackio_run.TrackioRun(folder, tracking)
+            return trackio_run.TrackioRun(folder, tracking)
+        case "mlflow":
+            from rmc.deploy.monitor import mlflow_run
+
+            return mlflow_run.MlflowRun(folder, tracking)
 
 
 def _notify_first_warning(notify: Notify) -> None:

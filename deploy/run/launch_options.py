@@ -6,7 +6,7 @@ from typing import Literal
 
 IfExists = Literal["resume", "fail", "new"]
 Launcher = Literal["local", "ray", "lockstep", "manual"]
-Tracker = Literal["wandb", "trackio"]
+Tracker = Literal["wandb", "trackio", "mlflow"]
 InitParts = Literal["all", "memory+world-model", "policy"]
 
 

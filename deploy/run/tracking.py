@@ -53,7 +53,7 @@ def choose_tracking(options: LaunchOptions) -> Tracking | None:
 def _refuse_without_tracker(options: LaunchOptions) -> None:
     for name in ("track_project", "track_tags", "track_video_every"):
         if value := getattr(options, name):
-            raise ConfigError(option(name), value, "say which tracker: --track wandb or --track trackio")
+            raise ConfigError(option(name), value, "say which tracker: --track wandb, trackio or mlflow")
 
 
 def _check(tracker: str, project: str, tags: tuple[str, ...], video_every: int) -> None:

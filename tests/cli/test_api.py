@@ -44,7 +44,7 @@ def test_a_value_of_a_wrong_type_is_named(changes: dict[str, Any], line: str, tm
     [
         ({"launcher": "locla"}, "--launcher='locla': take local, ray, lockstep, manual"),
         ({"if_exists": "overwrite"}, "--if-exists='overwrite': take resume, fail, new"),
-        ({"track": "mlflow"}, "--track='mlflow': take wandb, trackio, off"),
+        ({"track": "neptune"}, "--track='neptune': take wandb, trackio, mlflow, off"),
         ({"init_parts": "half"}, r"--init-parts='half': take all, memory\+world-model, policy"),
     ],
 )

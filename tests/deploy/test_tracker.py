@@ -14,6 +14,7 @@ from typing import Any
 import psutil
 import pytest
 from imageio_ffmpeg import write_frames
+from mlflow import MlflowClient
 
 from rmc.analysis.evaluation import initial_policy
 from rmc.common.checkpoint import CheckpointFolder
@@ -135,6 +136,33 @@ def test_trackio_has_the_run_over_its_starts(
     assert (tmp_path / "trackio" / "media" / film["video"]["file_path"]).stat().st_size > 100
     about = json.loads(config)
     assert (about["env"]["id"], about["tags"]) == ("InvertedPendulum-v5", ["a", "b"])
+
+
+@pytest.mark.filterwarnings("ignore::sqlalchemy.exc.SADeprecationWarning")  # MLflow's own
+def test_mlflow_has_the_run_over_its_starts(
+    folder: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = f"sqlite:///{tmp_path}/mlflow.db"
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", store)
+    monkeypatch.chdir(tmp_path)  # where videos go
+    for env_steps, end in ((700, {"state": "stopped"}), (1500, {**RESULT, "video": video(folder.path / "video.mp4")})):
+        tracker = started(folder, "mlflow")
+        trained(folder, env_steps, env_steps / 100)
+        tracker.close(end)
+    assert not caplog.messages
+    client = MlflowClient(store)
+    experiment = client.get_experiment_by_name("my-project")
+    assert experiment is not None
+    (run,) = client.search_runs([experiment.experiment_id])
+    assert (run.info.run_name, run.info.status) == ("first", "FINISHED")
+    assert run.data.tags.keys() >= {"a", "b"}
+    assert run.data.params["env.id"] == "InvertedPendulum-v5"
+    returns = client.get_metric_history(run.info.run_id, "Main/evaluation_return")
+    assert [(one.step, one.value) for one in returns] == [(700, 7.0), (1500, 15.0)]
+    assert run.data.metrics["Main/q_loss"] == 0.5
+    assert run.data.metrics["result/eval_return_mean"] == 11.5
+    film = client.download_artifacts(run.info.run_id, "videos/1500/video.mp4")
+    assert Path(film).read_bytes() == (folder.path / "video.mp4").read_bytes()
 
 
 @pytest.mark.parametrize("name", [pytest.param("wandb", marks=pytest.mark.long), "trackio"])

@@ -76,7 +76,7 @@ def test_it_can_be_left(folder: RunFolder) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["{", "[]", "{}", '{"tracker": "mlflow", "project": "x", "tags": [], "id": "y"}', NEGATIVE]
+    "text", ["{", "[]", "{}", '{"tracker": "neptune", "project": "x", "tags": [], "id": "y"}', NEGATIVE]
 )
 def test_a_damaged_note_is_named(folder: RunFolder, text: str) -> None:
     (folder.path / "tracking.json").write_text(text)
