@@ -24,6 +24,7 @@ from rmc.common.env.layout import ActionScale
 from rmc.common.env.wrappers import Env, Floats
 from rmc.common.errors import ConfigError
 from rmc.common.policy_header import PolicyHeader
+from rmc.common.process import watchdog
 from rmc.common.window import BoolArray
 
 Units = Literal["agent", "environment"]
@@ -63,6 +64,7 @@ class Policy:
 
         Raises ConfigError where its module cannot be imported, or its sizes are others now.
         """
+        watchdog.warn()
         return policy_env(self.header, self.header.env)
 
     def reset(self, index: int | None = None) -> None:

@@ -15,6 +15,7 @@ from rmc.cli import training
 from rmc.cli.analysis_commands import evaluate_baseline
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.common.process import watchdog
 from rmc.deploy.local.role_environment import PATH_VARIABLE
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig, checked
@@ -107,6 +108,7 @@ def _not_none(values: dict[str, Any]) -> dict[str, Any]:
 
 def _train(config: RunConfig, options: LaunchOptions) -> dict[str, Any]:
     config = checked(config)
+    watchdog.warn()
     if options.launcher != "lockstep":
         _check_importable(config.env)
     folder, status = training.train(config, options, terminal())
@@ -146,6 +148,7 @@ def evaluate(
         raise ConfigError("episodes", episodes, "take 1 to 10_000")
     if flicker is not None and not 0.0 <= flicker <= 1.0:
         raise ConfigError("flicker", flicker, "take a probability from 0 to 1")
+    watchdog.warn()
     if Path(run).is_dir() and RunFolder(Path(run)).is_baseline():
         return evaluate_baseline(RunFolder(Path(run)), checkpoint, episodes, flicker)
     return evaluate_policy(read_policy(run, checkpoint), episodes, flicker)

@@ -1,6 +1,8 @@
 """Ends a process in which an environment's call hangs, and says which one."""
 
 import faulthandler
+import logging
+import math
 import os
 import signal
 import sys
@@ -13,7 +15,9 @@ from typing import Self
 
 from rmc.common.process import descendants
 
+log = logging.getLogger(__name__)
 LOOK_SECONDS = 0.1
+WARNER = "rmc-env-warnings"  # the thread
 STDERR = 2  # an environment may have put something else in sys.stderr's place
 HUNG_STATUS = 3  # of a process that ended so
 SLACK = 1.1  # of the time that a call has, until it counts as one that cannot even be told
@@ -57,6 +61,23 @@ def start() -> None:
         signal.signal(signal.SIGTSTP, _suspend)
     EnvCall.watched = True
     threading.Thread(target=_watch, daemon=True, name="watchdog").start()
+
+
+def warn() -> None:
+    """From now on, where this process is not ours alone, a call that hangs is a warning, once."""
+    if not EnvCall.watched and WARNER not in {thread.name for thread in threading.enumerate()}:
+        threading.Thread(target=_warn, daemon=True, name=WARNER).start()
+
+
+def _warn() -> None:
+    watched, looks = EnvCall.current, 0
+    while True:
+        time.sleep(LOOK_SECONDS)
+        call = EnvCall.current
+        looks = looks + 1 if call is watched else 0
+        watched = call
+        if call is not None and looks == math.ceil(call.seconds / LOOK_SECONDS):
+            log.warning(call.describe())
 
 
 def _watch() -> None:

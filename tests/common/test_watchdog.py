@@ -57,6 +57,13 @@ def test_calls_that_return_may_be_many_and_time_between_them_does_not_count() ->
     )[:2] == (0, "")
 
 
+def test_in_a_users_own_process_it_is_a_warning_once_and_nothing_ends() -> None:
+    status, output, _ = run("warn()\nwarn()\ncall = EnvCall('Mine-v0', 'step', 0.5)\n\nwith call: time.sleep(2)")
+    assert (status, output) == (0, LINE.removeprefix("rmc: ").replace("line 5", "line 7"))
+    quick = "for _ in range(12):\n    with EnvCall('', 'reset', 0.5): time.sleep(0.1)"
+    assert run(f"warn()\n{quick}")[:2] == (0, "")
+
+
 def test_a_process_that_does_not_start_it_is_not_watched() -> None:
     assert run("with EnvCall('Mine-v0', 'step', 0.2): time.sleep(1.0)")[:2] == (0, "")
 
