@@ -22,6 +22,7 @@ IN_TRAINING: tuple[Diagnosis, ...] = (
     host_faults.oversubscribed,
     host_faults.stolen,
     host_faults.little_memory,
+    run_faults.diverging,
     run_faults.stale_weights,
     run_faults.oversized_ring,
 )

@@ -11,6 +11,7 @@ SILENT_SECONDS = 30.0  # without a word; roles speak every second
 PLAYED = 0.75  # of the checkpoints: fewer evaluations leave holes in the curve
 STALE_UPDATES = 1_000  # of lag; docs/metrics.md calls tens to hundreds healthy
 HALF_FULL, WORTH_WINDOWS = 0.5, 10_000  # of a ring, when a smaller one is worth a word
+TOO_MUCH = 10.0  # times what critics can rightly expect: early on they hold an entropy that was worth more
 WARM_UP_SECONDS = 300.0  # that are left of it
 
 
@@ -104,6 +105,19 @@ def stale_weights(vitals: Vitals, config: RunConfig) -> Finding | None:
     smaller = max(1, int(now * STALE_UPDATES / lag / 2))
     measured = f"windows came from a policy {lag:,.0f} updates old on average"
     return Finding("stale weights", measured, f"{name} {smaller} in place of {now} brings newer ones")
+
+
+def diverging(vitals: Vitals, config: RunConfig) -> Finding | None:
+    """Critics that expect more than the largest reward and entropy, for ever, would give."""
+    reward, gamma = vitals.last("learner", "largest_reward"), config.update.gamma
+    if not reward or gamma == 1.0 or config.update.curiosity:
+        return None
+    bonus = vitals.last("learner", "alpha") * abs(vitals.last("learner", "entropy"))
+    most, expected = (reward + bonus) / (1.0 - gamma), vitals.last("learner", "q_mean")
+    if abs(expected) <= TOO_MUCH * most:
+        return None
+    measured = f"they expect {expected:,.4g}; rewards of {reward:.3g} and the entropy's bonus make {most:,.4g} at most"
+    return Finding("critics diverge", measured, "--learning-rate, a third of it, in a new run")
 
 
 def oversized_ring(vitals: Vitals, config: RunConfig) -> Finding | None:

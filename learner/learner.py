@@ -310,6 +310,7 @@ class Learner:
             "checkpoint_error": self._checkpoint_error,
             "damaged_checkpoints": self._damaged_checkpoints,
             "threads": self._threads.chosen * self._processes,
+            "largest_reward": self._largest_reward,
             **self._metrics.take(self.updates),
         }
 

@@ -189,6 +189,19 @@ def test_stale_weights_name_the_option_that_ages_them() -> None:
     assert run_faults.stale_weights(vitals(replay={"policy_lag_mean": 160.0}), CONFIG) is None
 
 
+def test_critics_that_expect_what_no_rewards_can_give() -> None:
+    learner = {"largest_reward": 4.0, "alpha": 0.1, "entropy": -6.0, "q_mean": 5_000.0}
+    finding = run_faults.diverging(vitals(learner=learner), CONFIG)
+    assert str(finding) == (
+        "critics diverge: they expect 5,000; rewards of 4 and the entropy's bonus make 460 at most; "
+        "--learning-rate, a third of it, in a new run"
+    )
+    for sound in ({"q_mean": 450.0}, {"q_mean": -450.0}, {"largest_reward": 0.0}):
+        assert run_faults.diverging(vitals(learner=learner | sound), CONFIG) is None
+    curious = dataclasses.replace(CONFIG, update=dataclasses.replace(CONFIG.update, curiosity=0.5))
+    assert run_faults.diverging(vitals(learner=learner), curious) is None  # its reward is not on record
+
+
 def test_a_ring_that_never_fills() -> None:
     short = dataclasses.replace(CONFIG, total_steps=100_000)
     little = vitals(replay={"env_steps": 50_000, "ring_fill": 0.05})
