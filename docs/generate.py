@@ -30,7 +30,7 @@ PLACEMENT = [
     "run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls", "metrics_port",
     "metrics_host", "dry_run",
 ]  # fmt: skip
-TRACKING = ["track", "track_project", "track_tags", "track_video_every"]
+TRACKING = ["video_every", "track", "track_project", "track_tags"]
 BEGINNING = ["init_from", "init_parts"]
 # When a user should touch an option; what it does is said where it is defined.
 WHEN = {
@@ -52,7 +52,7 @@ WHEN = {
     "track": "to compare runs in a web service, or to keep their videos",
     "track_project": "to keep kinds of runs apart",
     "track_tags": "to find runs again",
-    "track_video_every": "to see how the policy changes; each film takes a core for some seconds, at low priority",
+    "video_every": "to see how the policy changes; each film takes a core for some seconds, at low priority",
     "metrics_port": "to watch runs with [Prometheus and Grafana](watching.md#prometheus-and-grafana)",
     "metrics_host": "where Prometheus runs on another machine, or outside of the container",
     "dry_run": "before a long run, or on a machine that is new to it",

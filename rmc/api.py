@@ -41,7 +41,7 @@ def train(
     track: Tracker | Literal["off"] | None = None,
     track_project: str | None = None,
     track_tags: Sequence[str] = (),
-    track_video_every: int | None = None,
+    video_every: int | None = None,
     metrics_port: int | None = None,
     metrics_host: str = "127.0.0.1",
 ) -> dict[str, Any]:
@@ -68,7 +68,7 @@ def train(
         track=track,
         track_project=track_project,
         track_tags=tuple(track_tags),
-        track_video_every=track_video_every,
+        video_every=video_every,
         metrics_port=metrics_port,
         metrics_host=metrics_host,
     )

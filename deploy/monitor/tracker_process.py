@@ -42,6 +42,19 @@ class TrackedRun(Protocol):
         """Log the end, with ``env_steps``, and return when all has arrived."""
 
 
+class _Nowhere:
+    """In a tracker's place where films are all that is asked for."""
+
+    def log(self, values: dict[str, Any], env_steps: int) -> None:
+        pass
+
+    def log_video(self, video: Path, env_steps: int) -> None:
+        pass
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        pass
+
+
 def main() -> None:
     """The entry point: a run's folder, and from which byte of its metrics on."""
     output = os.fdopen(os.dup(1), "w", buffering=1)
@@ -76,6 +89,8 @@ def _begin(folder: RunFolder, tracking: Tracking, notify: Notify) -> TrackedRun:
             from rmc.deploy.monitor import mlflow_run
 
             return mlflow_run.MlflowRun(folder, tracking)
+        case "videos":
+            return _Nowhere()
 
 
 def _notify_first_warning(notify: Notify) -> None:

@@ -27,6 +27,6 @@ class LaunchOptions:
     track: Tracker | Literal["off"] | None = None
     track_project: str | None = None
     track_tags: tuple[str, ...] = ()
-    track_video_every: int | None = None
+    video_every: int | None = None
     metrics_port: int | None = None
     metrics_host: str = "127.0.0.1"

@@ -1,4 +1,4 @@
-"""Which tracker follows a run: chosen on the command line, kept in the run's folder for when it goes on."""
+"""Who follows a run, a tracker or films alone: chosen on the command line, kept in the run's folder."""
 
 import dataclasses
 import json
@@ -7,7 +7,7 @@ import re
 import secrets
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
@@ -17,6 +17,7 @@ from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions, Tracker
 
 PROJECT = "rmc"
+VIDEOS: Literal["videos"] = "videos"  # in a tracker's place: films alone
 LONGEST_TAG = 64  # characters that wandb takes
 log = logging.getLogger(__name__)
 
@@ -25,7 +26,7 @@ log = logging.getLogger(__name__)
 class Tracking:
     """A run as its tracker knows it; the ``id`` stays over all starts."""
 
-    tracker: Tracker
+    tracker: Tracker | Literal["videos"]
     project: str
     tags: tuple[str, ...]
     id: str
@@ -36,28 +37,32 @@ def choose_tracking(options: LaunchOptions) -> Tracking | None:
     """What the options ask for; where they say nothing, what the run's folder has. Raises ConfigError."""
     resumes = options.run_dir is not None and options.if_exists == "resume"
     before = kept_tracking(options.run_dir) if options.run_dir is not None and resumes else None
-    if options.track == "off":
-        return None
-    tracker = options.track or (before.tracker if before else None)
-    if tracker is None:
+    before = before if options.track != "off" else None
+    tracker = options.track if options.track != "off" else None
+    tracker = tracker or (before.tracker if before else VIDEOS)
+    if tracker == VIDEOS:
         _refuse_without_tracker(options)
-        return None
     project = options.track_project or (before.project if before else PROJECT)
     tags = options.track_tags or (before.tags if before else ())
-    every = options.track_video_every if options.track_video_every is not None else before.video_every if before else 0
+    every = options.video_every if options.video_every is not None else before.video_every if before else 0
+    if tracker == VIDEOS and not every:
+        return None
     _check(tracker, project, tags, every)
     same = before is not None and (before.tracker, before.project) == (tracker, project)
     return Tracking(tracker, project, tags, before.id if same and before else secrets.token_hex(4), every)
 
 
 def _refuse_without_tracker(options: LaunchOptions) -> None:
-    for name in ("track_project", "track_tags", "track_video_every"):
+    for name in ("track_project", "track_tags"):
         if value := getattr(options, name):
             raise ConfigError(option(name), value, "say which tracker: --track wandb, trackio or mlflow")
 
 
 def _check(tracker: str, project: str, tags: tuple[str, ...], video_every: int) -> None:
-    check_installed(tracker, (tracker,), "--track", tracker)
+    if tracker == VIDEOS:
+        check_installed("video", ("imageio_ffmpeg",), "--video-every", video_every)
+    else:
+        check_installed(tracker, (tracker,), "--track", tracker)
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", project):
         fix = "take up to 100 letters, digits, and _ . - after the first"
         raise ConfigError("--track-project", project, fix)
@@ -65,9 +70,7 @@ def _check(tracker: str, project: str, tags: tuple[str, ...], video_every: int) 
         if not (tag.isprintable() and 1 <= len(tag) <= LONGEST_TAG):
             raise ConfigError("--track-tags", tag, f"take tags of 1 to {LONGEST_TAG} characters")
     if video_every < 0:
-        raise ConfigError(
-            "--track-video-every", video_every, "take 1 or more evaluations, or 0 for the final one alone"
-        )
+        raise ConfigError("--video-every", video_every, "take 1 or more evaluations, or 0 for the final one alone")
 
 
 def keep_tracking(folder: RunFolder, tracking: Tracking | None) -> None:
@@ -96,7 +99,7 @@ def _is_whole(settings: dict[str, Any]) -> bool:
     tags, every = settings["tags"] if isinstance(settings.get("tags"), list) else [None], settings.get("video_every", 0)
     texts = settings.get("project"), settings.get("id"), *tags
     whole = isinstance(every, int) and every >= 0 and all(isinstance(text, str) for text in texts)
-    return whole and settings.get("tracker") in get_args(Tracker)
+    return whole and settings.get("tracker") in (*get_args(Tracker), VIDEOS)
 
 
 def _file(path: Path) -> Path:

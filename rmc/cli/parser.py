@@ -67,7 +67,12 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "role": (role_options.Role, Action("role_commands", "run_role")),
 }
 ACTIONS = dict(COMMANDS.values()) | {run_options.ResumeBaseline: COMMANDS["baseline"][1]}
-RENAMED = {"fill-blanks": "impute-missing", "blank-flag": "missing-flag", "policy-average": "policy-ema-updates"}
+RENAMED = {
+    "fill-blanks": "impute-missing",
+    "blank-flag": "missing-flag",
+    "policy-average": "policy-ema-updates",
+    "track-video-every": "video-every",
+}
 
 
 def parse(words: list[str]) -> Any:

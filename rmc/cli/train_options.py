@@ -105,8 +105,8 @@ class Train:
     """The tracker's project, by default rmc."""
     track_tags: tuple[str, ...] = ()
     """The run's tags in the tracker."""
-    track_video_every: int | None = None
-    """Film every Nth evaluated checkpoint for the tracker; 0, the default, films the final policy alone."""
+    video_every: int | None = None
+    """Film every Nth evaluated checkpoint, and the final policy. With a tracker the default is the final one alone."""
     metrics_port: int | None = None
     """Serve the run's metrics to Prometheus on this port, at /metrics; by default on none."""
     metrics_host: str = "127.0.0.1"

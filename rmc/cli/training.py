@@ -122,19 +122,19 @@ def _metrics_served(folder: RunFolder, monitor: Monitor, options: LaunchOptions)
 
 
 def _video(config: RunConfig, folder: RunFolder, console: Console) -> str | None:
-    """The final policy filmed for the run's tracker, where that can be done here; else why not is said."""
+    """The final policy filmed, where that can be done here; else why not is said."""
     from rmc.analysis import video  # imports torch
     from rmc.analysis.policy import load_policy
 
     out = folder.path / "video.mp4"
     try:
         video.prepare(config.env, out)
-        console.print("filming an episode for the tracker; Ctrl-C leaves it out")
+        console.print("filming an episode; Ctrl-C leaves it out")
         video.record(load_policy(folder.path), config.env, config.seed, out)
     except KeyboardInterrupt:
         return None
     except (ConfigError, EnvFault, OSError) as error:
-        console.print(f"no video for the tracker: {error}", soft_wrap=True)
+        console.print(f"no video: {error}", soft_wrap=True)
         return None
     return str(out)
 

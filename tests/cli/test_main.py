@@ -35,7 +35,7 @@ TRAIN_FLAGS = """
     --preset --seed --total-steps --actors --flicker --drop-sensors --flicker-burst --delay --hide --noise
     --frame-stack --action-repeat --time-limit --env-timeout --env-kwargs
     --config --run-dir --if-exists --launcher --device --redis-url --ray-address --all-cpus --tls
-    --track --track-project --track-tags --track-video-every --metrics-port --metrics-host --dry-run
+    --track --track-project --track-tags --video-every --metrics-port --metrics-host --dry-run
     --burn-in --trained-steps
     --hidden --embedding --heads --gate-init --layer-norm --head-input --critic-batch-norm --privileged-critic
     --normalize-observations --grounding

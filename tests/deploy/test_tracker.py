@@ -165,7 +165,7 @@ def test_mlflow_has_the_run_over_its_starts(
     assert Path(film).read_bytes() == (folder.path / "video.mp4").read_bytes()
 
 
-@pytest.mark.parametrize("name", [pytest.param("wandb", marks=pytest.mark.long), "trackio"])
+@pytest.mark.parametrize("name", [pytest.param("wandb", marks=pytest.mark.long), "trackio", "videos"])
 def test_every_second_evaluated_checkpoint_is_filmed(
     name: Any, folder: RunFolder, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -177,7 +177,11 @@ def test_every_second_evaluated_checkpoint_is_filmed(
         assert not (folder.path / "videos").exists()
         trained(folder, env_steps, 1.0)
         time.sleep(3.0)
-    films = "wandb/offline-run-*/files/media/videos/*.mp4" if name == "wandb" else "../trackio/media/**/*.mp4"
+    films = {
+        "wandb": "wandb/offline-run-*/files/media/videos/*.mp4",
+        "trackio": "../trackio/media/**/*.mp4",
+        "videos": "videos/*.mp4",
+    }[name]
     deadline = time.monotonic() + 60.0
     while not (arrived := list(folder.path.glob(films))):
         assert time.monotonic() < deadline, (folder.logs / "tracker.log").read_text()

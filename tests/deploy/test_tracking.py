@@ -37,16 +37,23 @@ def test_a_new_run_is_in_no_tracker_unless_asked(folder: RunFolder) -> None:
 
 
 def test_how_often_it_is_filmed_goes_on_with_the_run(folder: RunFolder) -> None:
-    keep_tracking(folder, chosen(folder, track="wandb", track_video_every=3))
-    for words, every in (({}, 3), ({"track_video_every": 0}, 0), ({"track": "trackio"}, 3)):
+    keep_tracking(folder, chosen(folder, track="wandb", video_every=3))
+    for words, every in (({}, 3), ({"video_every": 0}, 0), ({"track": "trackio"}, 3)):
         tracking = chosen(folder, **words)
         assert tracking is not None
         assert tracking.video_every == every
-    with pytest.raises(ConfigError, match=r"^--track-video-every=-1: take 1 or more evaluations, or 0"):
-        chosen(folder, track_video_every=-1)
+    with pytest.raises(ConfigError, match=r"^--video-every=-1: take 1 or more evaluations, or 0"):
+        chosen(folder, video_every=-1)
+    assert chosen(folder, track="off") is None
     keep_tracking(folder, None)
-    with pytest.raises(ConfigError, match=r"^--track-video-every=2: say which tracker: --track wandb or"):
-        chosen(folder, track_video_every=2)
+    alone = chosen(folder, video_every=2)
+    assert alone is not None
+    assert (alone.tracker, alone.video_every) == ("videos", 2)
+    keep_tracking(folder, alone)
+    assert kept_tracking(folder.path) == chosen(folder) == alone  # a run that goes on is filmed further
+    assert chosen(folder, video_every=0) is None
+    with pytest.raises(ConfigError, match=r"^--track-tags=.*: say which tracker: --track wandb"):
+        chosen(folder, track_tags=("a",))
 
 
 def test_what_a_version_before_has_kept_is_read(folder: RunFolder) -> None:
