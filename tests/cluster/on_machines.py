@@ -1,7 +1,7 @@
 """``ray up`` on three machines: a run learns on them, loses processes, networks and nodes, and is taken down.
 
 The machines are namespaces of this one (``machines.py``). Not collected by ``make test``: ``make test-cluster`` makes
-five rounds with every cut, and ``.ci/run`` one with the short cut and without the training to a return.
+five rounds with every cut.
 """
 
 import json
