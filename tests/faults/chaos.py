@@ -36,6 +36,7 @@ SIZES = ("--actors", str(ACTORS), "--capacity", "500", "--checkpoint-steps", "10
 OPTIONS = (*SMALL, *FAST, *DATA, "--alpha-learning-rate", "5e-3", *SIZES, "--replay-ratio", str(RATIO))
 TICK_SECONDS, LOOK_SECONDS, SETTLED_SECONDS = 0.02, 5.0, 20.0  # SETTLED: a life's memory and files count from then on
 PATIENCE, AGAIN_SECONDS = 600.0, 1.0  # for what must come; until who did not come up is started again
+REDIS_TRIES, STAYED_SECONDS = 5, 10.0  # to start it, and for how long it must stay
 WHOLE_BESIDE = 2  # whole checkpoints beside one that is damaged
 DAMAGED_ROWS, CUT_BYTES = 3, 200
 REFUSED = r"rmc: (--redis-url=|--capacity=.* make room|.*No space left)"  # a start amid a fault: nothing has happened
@@ -66,7 +67,7 @@ class Chaos:
         self._redis_at = self._launch_at = self._look_at = 0.0  # no sooner than then
         self._command: tuple[str, ...] = ()
         self._run: Loaded | None = None
-        self._killed, self._said_before = False, 0
+        self._killed, self._said_before, self._redis_tries = False, 0, 0
 
     # -- from the beginning to the end ------------------------------------------------------------------
 
@@ -147,11 +148,8 @@ class Chaos:
 
     def _tend(self) -> None:
         now = time.monotonic()
-        if now >= self._redis_at and self._redis.process.poll() is not None:
-            self.weights_went_back += went_back(self.witness.versions)
-            self.witness.redis_came_back()
-            self._redis.launch()
-            self._redis_at = now + AGAIN_SECONDS
+        if now >= self._redis_at:
+            self._tend_redis(now)
         if self._run is not None and self._run.process.poll() is not None:
             self._note_end(self._run)
         if self._run is None and now >= self._launch_at:
@@ -160,6 +158,22 @@ class Chaos:
         if now >= self._look_at and self._run is not None:
             self._look_at = now + LOOK_SECONDS
             self._look(self._run)
+
+    def _tend_redis(self, now: float) -> None:
+        """Start it again; one that does not come up, as its log is torn amid a full disk, without that log."""
+        if self._redis.process.poll() is None:
+            self._redis_tries *= now < self._redis_at + STAYED_SECONDS
+            return
+        if self._redis_tries == REDIS_TRIES:
+            self._say(redis=self._redis.log_text()[-1000:])
+            self.happened["torn log", REDIS] += 1
+            shutil.rmtree(self._redis.folder / "appendonlydir", ignore_errors=True)
+            self._redis_tries = 0
+        self._redis_tries += 1
+        self.weights_went_back += went_back(self.witness.versions)
+        self.witness.redis_came_back()
+        self._redis.launch()
+        self._redis_at = now + AGAIN_SECONDS
 
     def _start(self) -> None:
         """By ``rmc train`` as ever, if no other command was given."""
