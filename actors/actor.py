@@ -364,7 +364,7 @@ class Actor:
         if self._builder.count:
             rows = self._builder.take()
             if self._priority_fn is not None:
-                learnt = rows["weights_update"] > 0  # what the first weights think of a window says nothing
+                learnt = rows["weights_update"] > 1  # what untrained critics say means nothing
                 rows["initial_priority"] = np.where(learnt, self._priority_fn(rows), 0.0)
             self._unacked.put(rows)
         self._send()

@@ -349,6 +349,7 @@ def evaluate(
     flicker: float | None = None,
     seconds: float = 0.0,
     watch: Watch = lambda _: None,
+    env_timeout: float | None = None,
 ) -> dict[str, Any]:
     """Deterministic episodes of what a baseline's run saved last, as ``evaluate_policy``. Raises ConfigError."""
     config, states = read(folder), _states(folder)
@@ -358,6 +359,7 @@ def evaluate(
     _set_torch(config)
     progress = read_object(states[-1] / PROGRESS, "env_steps", "updates")
     env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
+    env = env if env_timeout is None else dataclasses.replace(env, env_timeout=env_timeout)
     bare: VecEnv = DummyVecEnv([lambda: make_env(env)])
     scales = states[-1] / SCALES
     with _reading(states[-1]):

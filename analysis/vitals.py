@@ -112,11 +112,12 @@ def _is_share(value: Any) -> TypeGuard[float]:
 def _newest(records: Iterable[Record], span: float) -> list[Record]:
     """Those of the newest span of the newest start."""
     kept: list[Record] = []
+    end = 0.0  # a record that could not be sent at once comes later
     for record in records:
         if not is_finite(record.get("time")):
             continue
-        if kept and record["time"] - kept[-1]["time"] > NEW_START_SECONDS:
+        if kept and record["time"] - end > NEW_START_SECONDS:
             kept.clear()
         kept.append(record)
-    end = max((record["time"] for record in kept), default=0.0)
+        end = max(end, record["time"])
     return [record for record in kept if record["time"] >= end - span]

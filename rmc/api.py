@@ -16,11 +16,10 @@ from rmc.cli.analysis_commands import evaluate_baseline
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.common.process import watchdog
-from rmc.deploy.local.role_environment import PATH_VARIABLE
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig, checked
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions, Tracker
+from rmc.deploy.run.launch_options import PATH_VARIABLE, IfExists, InitParts, Launcher, LaunchOptions, Tracker
 from rmc.deploy.run.starts import last_launch
 from rmc.deploy.run.state import STOPPED
 

@@ -78,15 +78,15 @@ class Heartbeat:
         return False
 
     def close(self) -> None:
-        """Close the role, and say what it has to say last: it may be that a Redis that hangs must delay nothing."""
-        with suppress(BusUnavailable, BusFull):
-            if self._unsent:  # older than what the role hands out as it closes
-                self._emit(self._unsent)
+        """Close the role, whatever happens, and then say what it has to say last."""
         try:
+            with suppress(BusUnavailable, BusFull):
+                if self._unsent:  # older than what the role hands out as it closes
+                    self._emit(self._unsent)
             last = self._metrics()
         finally:
             self._role.close()
-        with suppress(BusUnavailable, BusFull):
+        with suppress(BusUnavailable, BusFull):  # last, so that a Redis that hangs delays nothing
             self._emit(last)
 
     def _emit(self, record: dict[str, Any]) -> None:

@@ -32,7 +32,7 @@ class EnvCall:
 
     def __init__(self, env_id: str, name: str, seconds: float) -> None:
         self.env_id, self.name, self.seconds = env_id, name, seconds
-        self.thread = threading.get_ident()
+        self.thread, self.over = threading.get_ident(), False
 
     def __enter__(self) -> Self:
         self._outer, EnvCall.current = EnvCall.current, self
@@ -41,6 +41,7 @@ class EnvCall:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.over = True  # another thread may put it back
         EnvCall.current = self._outer
 
     def describe(self) -> str:
@@ -76,7 +77,7 @@ def _warn() -> None:
         call = EnvCall.current
         looks = looks + 1 if call is watched else 0
         watched = call
-        if call is not None and looks == math.ceil(call.seconds / LOOK_SECONDS):
+        if call is not None and not call.over and looks == math.ceil(call.seconds / LOOK_SECONDS):
             log.warning(call.describe())
 
 

@@ -5,7 +5,6 @@ import sys
 from collections.abc import Sequence
 
 SINGLE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-PATH_VARIABLE = "RMC_PATH"  # folder of the script that trains, whose modules the roles may import
 SECRET_VARIABLE, URL_VARIABLE = "RMC_SECRET", "RMC_REDIS_URL"  # each for one role: what it starts does not inherit it
 
 

@@ -15,6 +15,7 @@ LARGEST_STEP = 2**63 - 1  # that TensorBoard takes
 SILENT_SECONDS = 5.0  # after which a role's silence is shown; it speaks every second
 LAUNCHER_SECONDS = 15.0  # the same of the launcher, which speaks every 5
 WAITING_SHARE = 0.5  # from which a role is said to wait
+PAUSE_SECONDS = 30.0  # of the learner, after which what it waited before counts no more
 UNHEARD_SECONDS = 30.0  # of a role that has not spoken yet: it imports, and makes its environments
 
 
@@ -51,10 +52,7 @@ class RunStatus:
         self.final_steps: int | None = None  # once the run has its result
         self.heard = "*"  # which roles speak all the time; of a baseline the launcher alone
         self._pace = Pace()
-        self._counted, self._moved_at = (
-            (0, 0),
-            0.0,
-        )  # steps and updates, and when they last grew
+        self._counted, self._moved_at, self._spoke_at = (0, 0), 0.0, 0.0  # steps and updates, when they last grew
 
     @property
     def is_over(self) -> bool:
@@ -74,11 +72,16 @@ class RunStatus:
         else:  # afresh: another thread may be going through the old one
             self.roles = {**self.roles, role: dict(new)}
         self.take_evaluation(record)
-        counted = self.env_steps, int(_number(self.get("learner", "updates")))
-        if counted != self._counted or not self._moved_at:
-            self._counted, self._moved_at = counted, _number(self.get("learner", "time"))
+        self._note_movement(_number(self.get("learner", "time")))
         if role.startswith("replay") and "env_steps" in record and _number(self.get("learner", "updates_per_s")) > 0:
             self._pace.note(_number(record.get("time")), self.env_steps)
+
+    def _note_movement(self, spoke_at: float) -> None:
+        """When the counters last grew, by the learner's clock; a pause of it, as between starts, does not count."""
+        counted = self.env_steps, int(_number(self.get("learner", "updates")))
+        if counted != self._counted or spoke_at - self._spoke_at > PAUSE_SECONDS:
+            self._counted, self._moved_at = counted, spoke_at
+        self._spoke_at = spoke_at
 
     def take_evaluation(self, record: dict[str, Any]) -> None:
         """Take in what a record says of an evaluation, if it is one: half of an evaluation is none."""

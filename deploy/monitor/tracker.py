@@ -15,6 +15,7 @@ from typing import Any
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import PATH_VARIABLE
 from rmc.deploy.run.tracking import Tracking, kept_tracking
 
 FINISH_SECONDS = 30.0  # for what was logged last to arrive
@@ -40,7 +41,8 @@ class Tracker:
         self._ended = False
         read_from = folder.metrics.stat().st_size if folder.metrics.exists() else 0
         words = [sys.executable, "-P", "-m", "rmc.deploy.monitor.tracker_process", str(folder.path), str(read_from)]
-        environment = {name: value for name, value in os.environ.items() if not name.startswith("RMC_")}
+        own = {name for name in os.environ if name.startswith("RMC_") and name != PATH_VARIABLE}
+        environment = {name: value for name, value in os.environ.items() if name not in own}
         with self._log.open("ab") as errors:
             self._process = subprocess.Popen(
                 words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, env=environment,

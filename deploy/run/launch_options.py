@@ -7,6 +7,7 @@ from typing import Literal
 IfExists = Literal["resume", "fail", "new"]
 Launcher = Literal["local", "ray", "lockstep", "manual"]
 Tracker = Literal["wandb", "trackio", "mlflow"]
+PATH_VARIABLE = "RMC_PATH"  # folder of the script that trains, whose modules the run's processes may import
 InitParts = Literal["all", "memory+world-model", "policy"]
 
 

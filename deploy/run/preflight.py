@@ -130,7 +130,8 @@ def check_device(device: str) -> None:
     if device.startswith("cuda"):
         import torch  # takes a second, which no other check needs
 
-        count, number = torch.cuda.device_count(), int(device.removeprefix("cuda").lstrip(":") or 0)
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0  # the driver may be too old
+        number = int(device.removeprefix("cuda").lstrip(":") or 0)
         if not count:
             raise ConfigError("--device", device, "PyTorch sees no CUDA device; use --device cpu")
         if number >= count:

@@ -38,9 +38,10 @@ def choose_tracking(options: LaunchOptions) -> Tracking | None:
     resumes = options.run_dir is not None and options.if_exists == "resume"
     before = kept_tracking(options.run_dir) if options.run_dir is not None and resumes else None
     before = before if options.track != "off" else None
-    tracker = options.track if options.track != "off" else None
-    tracker = tracker or (before.tracker if before else VIDEOS)
-    if tracker == VIDEOS:
+    tracker: Tracker | Literal["videos"] = before.tracker if before else VIDEOS
+    if options.track is not None and options.track != "off":
+        tracker = options.track
+    if tracker == VIDEOS and options.track != "off":
         _refuse_without_tracker(options)
     project = options.track_project or (before.project if before else PROJECT)
     tags = options.track_tags or (before.tags if before else ())

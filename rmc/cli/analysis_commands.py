@@ -61,7 +61,9 @@ def _evaluate_baseline(command: run_options.Evaluate) -> int:
         raise ConfigError("--video", str(command.video), "only runs of rmc train are filmed; leave it")
     folder, watch = RunFolder(command.run), EvaluationProgress(Console(stderr=True), str(command.run))
     for flicker in command.flicker or (None,):
-        played = evaluate_baseline(folder, command.checkpoint, command.episodes, flicker, command.seconds, watch)
+        played = evaluate_baseline(
+            folder, command.checkpoint, command.episodes, flicker, command.seconds, watch, command.env_timeout
+        )
         _say_played(command, played)
     return 0
 
@@ -73,6 +75,7 @@ def evaluate_baseline(
     flicker: float | None,
     seconds: float = 0.0,
     watch: Watch = lambda _: None,
+    env_timeout: float | None = None,
 ) -> dict[str, Any]:
     """Deterministic episodes of a baseline's last state, as ``evaluate_policy`` gives them. Raises ConfigError."""
     if checkpoint != "latest":
@@ -80,7 +83,7 @@ def evaluate_baseline(
     _check_baselines(str(folder.path))
     from rmc.analysis import baselines
 
-    return baselines.evaluate(folder, episodes, flicker, seconds, watch)
+    return baselines.evaluate(folder, episodes, flicker, seconds, watch, env_timeout)
 
 
 def _say_played(command: run_options.Evaluate, played: dict[str, Any]) -> None:

@@ -11,6 +11,12 @@ from rmc.common.env.config import check_kwargs, write_kwargs
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import option_words
 
+RENAMED = {
+    "fill-blanks": "impute-missing",
+    "blank-flag": "missing-flag",
+    "policy-average": "policy-ema-updates",
+    "track-video-every": "video-every",
+}  # for one more version
 OPTION, KWARGS = "--config", "--env-kwargs"
 
 
@@ -22,7 +28,8 @@ def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
     path = _named(words)
     if path is None:
         return words, ""
-    options = {name.replace("-", "_"): value for name, value in _read(path).items()}
+    read = {name.replace("_", "-"): value for name, value in _read(path).items()}
+    options = {RENAMED.get(name, name).replace("-", "_"): value for name, value in read.items()}
     env, kwargs = options.pop("env", ""), options.pop("env_kwargs", {})
     if not isinstance(env, str):
         raise ConfigError(f"{OPTION} {path}: env", env, 'write the environment\'s id, like env = "HalfCheetah-v5"')

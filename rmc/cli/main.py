@@ -9,8 +9,9 @@ import sys
 
 from rmc.common.process import descendants, watchdog
 from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
-from rmc.deploy.local.role_environment import PATH_VARIABLE, SINGLE_THREAD
+from rmc.deploy.local.role_environment import SINGLE_THREAD
 from rmc.deploy.monitor import output
+from rmc.deploy.run.launch_options import PATH_VARIABLE
 
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
 PLAYS = {"train", "resume", "sweep", "baseline", "check-env", "evaluate", "inspect", "report", "role"}  # environments
@@ -79,7 +80,8 @@ def run(words: list[str]) -> int:
     except OSError as error:
         if error.errno in NO_ROOM:
             return _complain(f"{error.filename or 'disk'}: {error.strerror}; make room and try again", FAILED_STATUS)
-        if words[0] == "role" or error.errno not in UNREADABLE or error.filename is None:
+        begun = words[0] == "role" or output.Output.log is not None
+        if begun or error.errno not in UNREADABLE or not isinstance(error.filename, str | bytes):
             raise
         return _complain(f"{os.fsdecode(error.filename)}: {error.strerror}; give another, or its rights", CONFIG_STATUS)
 

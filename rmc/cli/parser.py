@@ -14,7 +14,7 @@ from typing import Annotated, Any, cast, get_args, get_type_hints
 import tyro
 
 from rmc.cli import hub_options, role_options, run_options, sweep_options, train_options
-from rmc.cli.config_file import KWARGS, with_file
+from rmc.cli.config_file import KWARGS, RENAMED, with_file
 from rmc.cli.help_text import ALL_OPTIONS, BASIC, only_basic
 from rmc.cli.numerals import NUMERALS
 from rmc.common.env.config import EnvConfig
@@ -67,12 +67,6 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "role": (role_options.Role, Action("role_commands", "run_role")),
 }
 ACTIONS = dict(COMMANDS.values()) | {run_options.ResumeBaseline: COMMANDS["baseline"][1]}
-RENAMED = {
-    "fill-blanks": "impute-missing",
-    "blank-flag": "missing-flag",
-    "policy-average": "policy-ema-updates",
-    "track-video-every": "video-every",
-}
 
 
 def parse(words: list[str]) -> Any:

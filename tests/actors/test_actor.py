@@ -450,8 +450,8 @@ def make_broken(bus: Bus, env: str) -> Actor:
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_broken_episode_is_dropped_and_training_goes_on(fault: str) -> None:
-    """What was sent of it before is sound; nothing of the step that broke is, and it costs no credit."""
+def test_a_broken_episode_ends_with_the_step_before_and_training_goes_on(fault: str) -> None:
+    """What was seen of it before is sound; nothing of the step that broke is, and it costs no credit."""
     bus = MemoryBus()
     publish(bus, 0)
     actor, reader = make_broken(bus, f"Broken-{fault}-v0"), Reader(bus)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import rmc
-from rmc.deploy.local.role_environment import PATH_VARIABLE
+from rmc.deploy.run.launch_options import PATH_VARIABLE
 
 CONFIG = rmc.presets.debug("InvertedPendulum-v5")
 
@@ -88,3 +88,12 @@ def test_a_role_finds_modules_beside_the_script_that_trains(tmp_path: Path) -> N
         environment = os.environ | {PATH_VARIABLE: path}
         done = subprocess.run(words, cwd=elsewhere, env=environment, capture_output=True, text=True, check=False)
         assert done.returncode == status, done.stderr
+
+
+def test_without_a_folder_the_result_names_the_one_that_was_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = rmc.train(dataclasses.replace(CONFIG, total_steps=600), launcher="lockstep")
+    assert Path(result["run_dir"]).parent == tmp_path / "runs"
+    assert rmc.resume(result["run_dir"])["env_steps"] == result["env_steps"] == 600

@@ -3,7 +3,7 @@
 import pytest
 
 from rmc.common.bus.memory_bus import MemoryBus
-from rmc.common.errors import BusFull, BusUnavailable
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError
 from rmc.common.process.role import StopSignal, run_role
 
 
@@ -103,6 +103,19 @@ class FullAtTimes(MemoryBus):
         if self.tries in self.refused_tries:
             raise BusFull("as told")
         super().emit(role, record)
+
+
+def test_it_is_closed_even_where_the_bus_refuses_its_last_words():
+    class Refusing(FullAtTimes):
+        def emit(self, role, record):
+            self.tries += 1
+            raise BusFull("as told") if self.tries == 1 else ConfigError("key", "x", "as told")
+
+    stop = StopSignal()
+    role = Counting(stop, 7)
+    with pytest.raises(ConfigError):
+        run_role(role, Refusing(set()), stop)
+    assert role.closed
 
 
 @pytest.mark.parametrize("refused", [set(), {1}, {1, 2}, {2}, {1, 3}])

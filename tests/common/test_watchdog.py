@@ -60,6 +60,12 @@ def test_calls_that_return_may_be_many_and_time_between_them_does_not_count() ->
 def test_in_a_users_own_process_it_is_a_warning_once_and_nothing_ends() -> None:
     status, output, _ = run("warn()\nwarn()\ncall = EnvCall('Mine-v0', 'step', 0.5)\n\nwith call: time.sleep(2)")
     assert (status, output) == (0, LINE.removeprefix("rmc: ").replace("line 5", "line 7"))
+    threads = (  # that leave in the order in which they came
+        "import threading\ndef play(after, seconds):\n    time.sleep(after)\n"
+        "    with EnvCall('', 'reset', 0.5): time.sleep(seconds)\n"
+        "for one in [threading.Thread(target=play, args=(0.1 * i, 0.3)) for i in range(3)]: one.start()\ntime.sleep(2)"
+    )
+    assert run(f"warn()\n{threads}")[:2] == (0, "")
     quick = "for _ in range(12):\n    with EnvCall('', 'reset', 0.5): time.sleep(0.1)"
     assert run(f"warn()\n{quick}")[:2] == (0, "")
 

@@ -74,12 +74,13 @@ def test_a_containers_memory_is_what_counts(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_gpu_that_is_not_there_is_refused_with_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     for device in ("cpu", "cuda", "cuda:0", "cuda:1"):
         check_device(device)
     with pytest.raises(ConfigError, match=r"^--device='cuda:2': PyTorch sees 2; take cuda:0 to cuda:1$"):
         check_device("cuda:2")
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match=r"^--device='cuda:0': PyTorch sees no CUDA device; use --device cpu$"):
         check_device("cuda:0")
 

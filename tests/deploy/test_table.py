@@ -146,6 +146,10 @@ def test_a_run_in_which_all_wait_and_nothing_moves_is_said_to_hang() -> None:
         waiting_status(65, waiting_for="disk"),  # which is said elsewhere
     ):
         assert "deadlock" not in notices(of)
+    resumed = waiting_status(65)  # an hour later it goes on, with the counters of before
+    for second in range(40):
+        resumed.take({"role": "learner", "time": time.time() + 3_600 + second, "updates": 40, "waiting_share": 1.0})
+    assert resumed.stalled_s < 45
     moving = waiting_status(65)
     moving.take({"role": "replay", "time": time.time(), "env_steps": 8})
     assert "deadlock" not in notices(moving)

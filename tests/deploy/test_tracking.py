@@ -44,7 +44,7 @@ def test_how_often_it_is_filmed_goes_on_with_the_run(folder: RunFolder) -> None:
         assert tracking.video_every == every
     with pytest.raises(ConfigError, match=r"^--video-every=-1: take 1 or more evaluations, or 0"):
         chosen(folder, video_every=-1)
-    assert chosen(folder, track="off") is None
+    assert chosen(folder, track="off", track_project="x") is None
     keep_tracking(folder, None)
     alone = chosen(folder, video_every=2)
     assert alone is not None
