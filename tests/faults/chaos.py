@@ -60,13 +60,13 @@ class Chaos:
         self.unexpected: list[str] = []  # what a launcher said that ended though nobody had killed it
         self.looks: dict[str, Looks] = {role: [] for role in (LAUNCHER, *ROLES)}
         self.launchers: list[int] = []
-        self.redis_proxy, self.replay_proxy = tcp_proxy(redis.socket), Interposed(self._replay_socket)
+        self._run: Loaded | None = None
+        self.redis_proxy, self.replay_proxy = tcp_proxy(redis.socket), Interposed(self._replay_socket)  # looks at once
         self._redis, self._disks, self._log = redis, disks, log.open("w")
         self._undo: list[tuple[float, int, Callable[[], None]]] = []
         self._number, self._full = count(), set[str]()
         self._redis_at = self._launch_at = self._look_at = 0.0  # no sooner than then
         self._command: tuple[str, ...] = ()
-        self._run: Loaded | None = None
         self._killed, self._said_before, self._redis_tries = False, 0, 0
 
     # -- from the beginning to the end ------------------------------------------------------------------
