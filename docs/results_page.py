@@ -23,7 +23,7 @@ README, RESULTS, PICTURE = HERE.parent / "README.md", HERE / "results.md", HERE 
 BEGIN, END = "<!-- returns: begin -->\n", "<!-- returns: end -->"
 HEAD = {
     RESULTS: "| environment | agent | steps | return | each seed | wall time, s | public SAC (`-v4`) |",
-    README: "| agent | return | wall time |",
+    README: "| agent | seeds | return | wall time |",
 }
 IN_README = {
     "`robust`": "RMC, preset `robust`",
@@ -101,9 +101,11 @@ def _readme() -> Iterator[str]:
     for row in long:
         if row.agent in IN_README:
             minutes = [round(one.wall_s / 60) for one in row.evaluations()]
-            yield f"| {IN_README[row.agent]} | {_return(row)} | {min(minutes)} to {max(minutes)} minutes |"
+            span = " to ".join(dict.fromkeys((str(min(minutes)), str(max(minutes)))))
+            time = f"{span} minutes" + (f", beside {row.beside}" if row.beside else "")
+            yield f"| {IN_README[row.agent]} | {len(row.runs)} | {_return(row)} | {time} |"
     public = next(row.public for row in long if row.public is not None)
-    yield f"| public SAC on HalfCheetah-v4, mean of 10 seeds | {_number(public)} | – |"
+    yield f"| public SAC on HalfCheetah-v4 | 10 | {_number(public)} | – |"
 
 
 def _return(row: Row) -> str:
