@@ -19,6 +19,7 @@ from rmc.cli import main, parser, train_options
 from rmc.cli.training import open_folder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.monitor.output import Output
 from rmc.deploy.redis.connect import PATIENCE_VARIABLE
 from rmc.deploy.run.config import to_json
 from rmc.deploy.run.folder import RunFolder
@@ -61,7 +62,7 @@ OTHER_FLAGS = {
         "--ray-address",
     ],
     "resume": RESUME_FLAGS,
-    "evaluate": ["--episodes", "--seconds", "--flicker", "--checkpoint", "--video", "--json"],
+    "evaluate": ["--episodes", "--seconds", "--flicker", "--checkpoint", "--video", "--env-timeout", "--json"],
     "export": ["--out", "--checkpoint"],
     "inspect": ["--out", "--checkpoint"],
     "hub push": ["--checkpoint", "--license", "--private"],
@@ -156,7 +157,7 @@ def test_a_wrong_option_is_one_short_line(words: str, said: str, capsys: pytest.
         ([*DEBUG, "--device", "tpu"], "--device"),
         ([*DEBUG, "--preset", "best"], "--preset"),
         ([*DEBUG, "--sede", "1"], "--sede"),
-        ([*DEBUG, "--track", "mlflow"], "--track"),
+        ([*DEBUG, "--track", "neptune"], "--track"),
         ([*DEBUG, "--track-project", "mine"], "--track-project='mine': say which tracker"),
         ([*DEBUG, "--track-tags", "a", "b"], "--track-tags"),
         ([*DEBUG, "--track", "wandb", "--track-project", "a/b"], "--track-project='a/b'"),
@@ -248,10 +249,12 @@ def test_a_path_of_somebody_else_is_one_line(
     def refused(path: Path, *_: Any, **__: Any) -> Any:
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
+    monkeypatch.setattr(Output, "log", None)  # of a run that another test began
     monkeypatch.setattr(Path, "exists", refused)  # root may look everywhere
     words = [*DEBUG, "--run-dir", str(tmp_path / "theirs")]
     assert f"{tmp_path / 'theirs' / 'config.json'}: Permission denied; give another" in complaint(words, capsys)
     monkeypatch.undo()
+    monkeypatch.setattr(Output, "log", None)
     monkeypatch.setattr(Path, "read_bytes", refused)
     (tmp_path / "config.json").write_text("{}")
     assert f"RUN='{tmp_path}': config.json cannot be read (Permission denied)" in complaint(
