@@ -165,7 +165,9 @@ def test_mlflow_has_the_run_over_its_starts(
     assert Path(film).read_bytes() == (folder.path / "video.mp4").read_bytes()
 
 
-@pytest.mark.parametrize("name", [pytest.param("wandb", marks=pytest.mark.long), "trackio", "videos"])
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(one, marks=pytest.mark.long) for one in ("wandb", "trackio")), "videos"]
+)
 def test_every_second_evaluated_checkpoint_is_filmed(
     name: Any, folder: RunFolder, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
