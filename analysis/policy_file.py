@@ -159,6 +159,7 @@ def _of_older_run(folder: RunFolder, files: dict[str, bytes]) -> PolicyFile:
         raise MessageError("damaged progress", f"{PROGRESS}: {error}") from None
     folder.check_sizes(config.env.id, config.sizes())
     header = replace(config.policy_header(), env_steps=progress["env_steps"], updates=progress["updates"])
+    _check_shapes(header, _shapes(files[POLICY]))
     _check_weights(header, files[POLICY])
     return PolicyFile(header, files[POLICY])
 

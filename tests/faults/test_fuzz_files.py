@@ -60,17 +60,21 @@ def test_an_option_with_a_line_break_in_its_name_is_refused_in_a_line(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "view"),
+    ("name", "option", "value", "view"),
     [
-        ("update.learning_rate", HUGE, fuzz_files.configured),
-        ("env", "7", fuzz_files.acted),
+        ("format-2", "update.learning_rate", HUGE, fuzz_files.configured),
+        ("format-2", "env", "7", fuzz_files.acted),
+        ("format-1-b", "agent.hidden", str(2**63), fuzz_files.best),
+        ("format-1-b", "agent.hidden", "65536", fuzz_files.acted),
     ],
 )
-def test_options_that_once_were_a_traceback(option: str, value: str, view: fuzz_files.View, tmp_path: Path) -> None:
-    run = fuzz_files.old_run(tmp_path, "format-2")
+def test_options_that_once_were_a_traceback(
+    name: str, option: str, value: str, view: fuzz_files.View, tmp_path: Path
+) -> None:
+    run = fuzz_files.old_run(tmp_path, name)
     settings = json.loads((run / "config.json").read_bytes())
-    *parts, name = option.split(".")
-    (settings[parts[0]] if parts else settings)[name] = json.loads(value)
+    *parts, key = option.split(".")
+    (settings[parts[0]] if parts else settings)[key] = json.loads(value)
     look(run / "config.json", json.dumps(settings), view, run)
 
 

@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
-from rmc.deploy.local.lockstep import Lockstep
+from rmc.common.process.role import StopSignal
+from rmc.deploy.local.lockstep import Lockstep, train
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.presets import debug
 from rmc.learner.batch import update_steps
@@ -110,3 +112,10 @@ def test_an_evaluation_is_played_step_by_step_between_which_a_signal_is_heard(tm
     assert not lockstep.finished
     assert lockstep.learner.updates == updates
     lockstep.close()
+
+
+def test_the_last_checkpoint_is_evaluated_too(tmp_path):
+    said: list[dict[str, float]] = []
+    train(CONFIG, tmp_path, lambda bus: said.extend(bus.records({"evaluator": "0"})[0]), StopSignal())
+    evaluated = {record["eval_update"] for record in said if "eval_update" in record}
+    assert evaluated >= set(CheckpointFolder(tmp_path / "checkpoints").numbers())  # the newest are kept
