@@ -21,6 +21,7 @@ from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import from_dict
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.migrations import FORMAT, migrated
+from rmc.deploy.run.validation import validate
 
 EVALUATED = ("return_mean", "return_std", "episodes")
 
@@ -153,6 +154,7 @@ def _of_run(folder: RunFolder, checkpoint: str) -> PolicyFile:
 def _of_older_run(folder: RunFolder, files: dict[str, bytes]) -> PolicyFile:
     """Of one whose policies have no headers: its environment is made. Raises ConfigError, MessageError."""
     config = folder.config()
+    validate(config)
     try:
         progress = {name: int(json.loads(files[PROGRESS])[name]) for name in ("env_steps", "updates")}
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:

@@ -66,6 +66,7 @@ def test_an_option_with_a_line_break_in_its_name_is_refused_in_a_line(tmp_path: 
         ("format-2", "env", "7", fuzz_files.acted),
         ("format-1-b", "agent.hidden", str(2**63), fuzz_files.best),
         ("format-1-b", "agent.hidden", "65536", fuzz_files.acted),
+        ("format-1-b", "env.frame_stack", str(10**30), fuzz_files.best),
     ],
 )
 def test_options_that_once_were_a_traceback(
