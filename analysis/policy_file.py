@@ -73,7 +73,9 @@ def decode(blob: bytes) -> PolicyFile:
     if facts is None:
         raise MessageError("no policy", f"its metadata has no {METADATA_KEY}; give the folder of its run")
     header = _header(facts)
-    _check_shapes(header, shapes)
+    difference = _difference(header, shapes)
+    if difference:
+        raise MessageError("other sizes than its header's", f"{difference}; copy it again")
     _check_weights(header, blob)
     return PolicyFile(header, blob)
 
@@ -116,8 +118,8 @@ def _header(facts: Any) -> PolicyHeader:
     return header
 
 
-def _check_shapes(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> None:
-    """Before any memory is taken for what a header says. Raises MessageError."""
+def _difference(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> str:
+    """From what a header says; empty where none. Takes no memory for its sizes. Raises MessageError."""
     try:
         with torch.device("meta"):
             agent = Agent(header.obs_dim, header.action_dim, header.agent, header.layout.missing)
@@ -127,8 +129,8 @@ def _check_shapes(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> N
         raise MessageError("damaged header", fault) from None
     for name in sorted(expected.keys() | shapes.keys()):
         if expected.get(name) != shapes.get(name):
-            fault = f"{name} has shape {shapes.get(name)}, its header says {expected.get(name)}; copy it again"
-            raise MessageError("other sizes than its header's", fault)
+            return f"{name} has shape {shapes.get(name)}, its header says {expected.get(name)}"
+    return ""
 
 
 def _check_weights(header: PolicyHeader, blob: bytes) -> None:
@@ -161,7 +163,8 @@ def _of_older_run(folder: RunFolder, files: dict[str, bytes]) -> PolicyFile:
         raise MessageError("damaged progress", f"{PROGRESS}: {error}") from None
     folder.check_sizes(config.env.id, config.sizes())
     header = replace(config.policy_header(), env_steps=progress["env_steps"], updates=progress["updates"])
-    _check_shapes(header, _shapes(files[POLICY]))
+    if _difference(header, _shapes(files[POLICY])):
+        raise MessageError("weights", "not a policy of this run (its networks have other sizes)")
     _check_weights(header, files[POLICY])
     return PolicyFile(header, files[POLICY])
 
