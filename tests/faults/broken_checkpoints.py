@@ -67,4 +67,4 @@ class Said(logging.Handler):
 
 
 if __name__ == "__main__":
-    at_length(__doc__, 200, break_checkpoints)
+    at_length(__doc__, break_checkpoints, tries=200)

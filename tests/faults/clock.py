@@ -64,4 +64,4 @@ def hours_away(run: Loaded) -> int:
 
 
 if __name__ == "__main__":
-    at_length(__doc__, 3, move_clock)
+    at_length(__doc__, move_clock, tries=3)

@@ -137,4 +137,4 @@ def cannot_log(run: Loaded, server: LoggedRedis) -> None:
 
 
 if __name__ == "__main__":
-    at_length(__doc__, 3, fill_disks)
+    at_length(__doc__, fill_disks, tries=3)

@@ -108,4 +108,4 @@ def _words(run: Loaded, role: str) -> list[str]:
 
 
 if __name__ == "__main__":
-    at_length(__doc__, 1, freeze_all)
+    at_length(__doc__, freeze_all, tries=1)

@@ -218,4 +218,4 @@ def fuzz(count: int, seed: int = 0) -> Row:
 
 if __name__ == "__main__":
     logging.disable(logging.WARNING)  # of every refusal
-    at_length(__doc__, 1_000_000, lambda tries, folder: iter([fuzz(tries)]))
+    at_length(__doc__, lambda tries, folder: iter([fuzz(tries)]), tries=1_000_000)

@@ -315,4 +315,4 @@ def forbid(event: str, args: tuple[Any, ...]) -> None:
 if __name__ == "__main__":
     logging.disable(logging.WARNING)
     sys.addaudithook(forbid)
-    at_length(__doc__, 1_000_000, lambda tries, folder: fuzz(tries))
+    at_length(__doc__, lambda tries, folder: fuzz(tries), tries=1_000_000)

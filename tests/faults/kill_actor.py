@@ -47,4 +47,4 @@ def _repeated_starts(folder: Path) -> int:
 
 
 if __name__ == "__main__":
-    at_length(__doc__, 50, kill_actors)
+    at_length(__doc__, kill_actors, tries=50)

@@ -73,4 +73,4 @@ def on_disk(place: Path) -> Kept:
 
 
 if __name__ == "__main__":
-    at_length(__doc__, 5, kill_everything)
+    at_length(__doc__, kill_everything, tries=5)

@@ -42,4 +42,4 @@ def kill_learners(tries: int, folder: Path) -> Iterator[Row]:
 
 
 if __name__ == "__main__":
-    at_length(__doc__, 20, kill_learners)
+    at_length(__doc__, kill_learners, tries=20)

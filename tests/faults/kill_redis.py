@@ -122,4 +122,4 @@ def both(tries: int, folder: Path) -> Iterator[Row]:
 
 
 if __name__ == "__main__":
-    at_length(__doc__, 20, both)
+    at_length(__doc__, both, tries=20)

@@ -82,4 +82,4 @@ def all_of_them(tries: int, folder: Path) -> Iterator[Row]:
 
 
 if __name__ == "__main__":
-    at_length(__doc__, 20, all_of_them)
+    at_length(__doc__, all_of_them, tries=20)

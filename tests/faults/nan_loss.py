@@ -74,4 +74,4 @@ def _finite(state: Any) -> bool:
 
 
 if __name__ == "__main__":
-    at_length(__doc__, 5, force_nan)
+    at_length(__doc__, force_nan, tries=5)

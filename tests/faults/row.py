@@ -42,13 +42,14 @@ class Row:
         print(json.dumps(dataclasses.asdict(self)), flush=True)
 
 
-def at_length(doc: str | None, tries: int, fault: Callable[[int, Path], Iterator[Row]]) -> None:
-    """A script: ``fault`` with so many tries, or ``--tries``, in a folder of its own; ends with 1 if a row failed."""
+def at_length(doc: str | None, fault: Callable[..., Iterator[Row]], **numbers: int) -> None:
+    """A script: ``fault`` in a folder of its own, with these numbers or its options; ends with 1 if a row failed."""
     parser = argparse.ArgumentParser(description=doc)
-    parser.add_argument("--tries", type=int, default=tries)
-    options, passed = parser.parse_args(), True
+    for name, default in numbers.items():
+        parser.add_argument(f"--{name}", type=int, default=default)
+    options, passed = vars(parser.parse_args()), True
     with tempfile.TemporaryDirectory(prefix="rmc-fault-") as place:
-        for row in fault(options.tries, Path(place)):
+        for row in fault(folder=Path(place), **options):
             row.keep()
             passed = passed and row.passed
     sys.exit(0 if passed else 1)

@@ -54,4 +54,4 @@ def _waits_for(run: Loaded, role: str) -> str:
 
 
 if __name__ == "__main__":
-    at_length(__doc__, 1, slow_down)
+    at_length(__doc__, slow_down, tries=1)
