@@ -6,12 +6,14 @@ import importlib
 import inspect
 import itertools
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from rmc.cli.train_options import Train
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import option
 from rmc.deploy.run.presets import paper, robust
+from rmc.deploy.run.validation import RANGES
 
 PAGE = Path(__file__).parent / "configuration.md"
 TITLES = {
@@ -25,7 +27,8 @@ TITLES = {
     "learner": "The learner",
     "evaluator": "Evaluation",
 }
-HEAD, RULE = "| option | default | what it is | when to touch it |", "|---|---|---|---|"
+HEAD, RULE = "| option | takes | default | what it is | when to touch it |", "|---|---|---|---|---|"
+ENDLESS = 1e9  # an upper limit from which on nobody meets it
 PLACEMENT = [
     "run_dir", "if_exists", "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls", "metrics_port",
     "metrics_host", "dry_run",
@@ -150,7 +153,7 @@ def page() -> str:
     for part, title in TITLES.items():
         lines += ["", f"## {title}", "", HEAD, RULE]
         configs = (defaults, paper_config) if part == "run" else (getattr(defaults, part), getattr(paper_config, part))
-        lines += _rows(*configs)
+        lines += _rows(*configs, f"{part}." * (part != "run"))
         if part == "run":
             lines += ["", "Which of them may change when a run goes on: [Resume a run](resume.md#what-may-change)."]
             lines += ["", "## Where it runs", "", HEAD, RULE, *_launch_rows(PLACEMENT)]
@@ -159,25 +162,40 @@ def page() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _rows(defaults: Any, paper_config: Any) -> list[str]:
-    help_texts = _docstrings(type(defaults))
+def _rows(defaults: Any, paper_config: Any, section: str) -> list[str]:
+    """Of a part's options; ``section`` is what comes before their names in RANGES."""
+    help_texts, hints = _docstrings(type(defaults)), get_type_hints(type(defaults))
     rows = []
     for item in dataclasses.fields(defaults):
         value, other = getattr(defaults, item.name), getattr(paper_config, item.name)
         if dataclasses.is_dataclass(value) or item.name == "id":
             continue
         default = _text(value) if value == other or item.name == "preset" else f"{_text(value)} ({_text(other)})"
-        rows.append(f"| `{option(item.name)}` | {default} | {help_texts[item.name]} | {WHEN[item.name]} |")
+        takes = _takes(hints[item.name], RANGES.get(section + item.name))
+        rows.append(f"| `{option(item.name)}` | {takes} | {default} | {help_texts[item.name]} | {WHEN[item.name]} |")
     return rows
 
 
 def _launch_rows(names: list[str]) -> list[str]:
     help_texts = _docstrings(Train)
     defaults = {item.name: item.default for item in dataclasses.fields(Train)}
+    takes = {name: _takes(hint, None) for name, hint in get_type_hints(Train).items()}
     return [
-        f"| `--{name.replace('_', '-')}` | {_text(defaults[name])} | {help_texts[name]} | {WHEN[name]} |"
+        f"| `--{name.replace('_', '-')}` | {takes[name]} | {_text(defaults[name])} | {help_texts[name]} | {WHEN[name]} |"
         for name in names
     ]
+
+
+def _takes(hint: Any, limits: tuple[float, float] | None) -> str:
+    """The values of a type, or the least and the most; empty where a text is taken."""
+    if limits is not None:
+        low, high = (_text(int(limit) if limit == int(limit) else limit) for limit in limits)
+        return f"{low} to {high}" if limits[1] < ENDLESS else f"at least {low}"
+    if hint is bool:
+        return "on, off"
+    of_union = [_takes(one, None) for one in get_args(hint) if get_origin(hint) in (Union, UnionType)]
+    choices = get_args(hint) if get_origin(hint) is Literal else filter(None, of_union)
+    return ", ".join(map(str, choices))
 
 
 def _docstrings(kind: type[Any]) -> dict[str, str]:

@@ -7,7 +7,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, WindowConfig, option
 from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions, Tracker
 
-_RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no range
+RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no range
     "seed": (0, 2**63 - 1),
     "total_steps": (1, 2**53),
     "actors": (1, 4096),
@@ -61,7 +61,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no 
 
 def validate(config: RunConfig) -> None:
     """Raises ConfigError for the first value that makes no sense; the one place that judges numbers."""
-    for path, (low, high) in _RANGES.items():
+    for path, (low, high) in RANGES.items():
         value: Any = config
         for name in path.split("."):
             value = getattr(value, name)
