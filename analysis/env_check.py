@@ -146,7 +146,7 @@ def _nonsense(played: Played) -> Iterator[str]:
     observations = np.stack(played.observations)
     for name, values in (("observation", observations), ("reward", np.array(played.rewards))):
         if not np.isfinite(values).all():
-            yield f"fault: {name}s are not finite; such an episode is dropped and its environment made anew"
+            yield f"fault: {name}s are not finite; the episode ends a step before, and the environment is made anew"
     largest = max(map(abs, played.rewards), default=0.0)
     if float(np.finfo(np.float32).max) < largest < np.inf:
         yield f"fault: rewards reach {largest:.3g}, past what float32 holds (3e+38); scale them in the environment"

@@ -28,6 +28,7 @@ from rmc.common.extra import check_installed
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.validation import validate
 from rmc.learner.diagnostics import relative_l1_error
 from rmc.learner.losses import model_error
 
@@ -53,6 +54,7 @@ class Insight:
 
 def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     """The whole agent of a checkpoint, with its world model. Raises ConfigError."""
+    validate(config)
     spec = config.window_spec()
     folder.check_sizes(config.env.id, config.sizes())
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)

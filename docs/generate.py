@@ -10,6 +10,7 @@ from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from rmc.cli.train_options import Train
+from rmc.common.env.config import RANGES as ENV_RANGES
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import option
 from rmc.deploy.run.presets import paper, robust
@@ -165,13 +166,14 @@ def page() -> str:
 def _rows(defaults: Any, paper_config: Any, section: str) -> list[str]:
     """Of a part's options; ``section`` is what comes before their names in RANGES."""
     help_texts, hints = _docstrings(type(defaults)), get_type_hints(type(defaults))
+    limits = RANGES | {f"env.{name}": ends for name, ends in ENV_RANGES.items()}
     rows = []
     for item in dataclasses.fields(defaults):
         value, other = getattr(defaults, item.name), getattr(paper_config, item.name)
         if dataclasses.is_dataclass(value) or item.name == "id":
             continue
         default = _text(value) if value == other or item.name == "preset" else f"{_text(value)} ({_text(other)})"
-        takes = _takes(hints[item.name], RANGES.get(section + item.name))
+        takes = _takes(hints[item.name], limits.get(section + item.name))
         rows.append(f"| `{option(item.name)}` | {takes} | {default} | {help_texts[item.name]} | {WHEN[item.name]} |")
     return rows
 
@@ -180,10 +182,8 @@ def _launch_rows(names: list[str]) -> list[str]:
     help_texts = _docstrings(Train)
     defaults = {item.name: item.default for item in dataclasses.fields(Train)}
     takes = {name: _takes(hint, None) for name, hint in get_type_hints(Train).items()}
-    return [
-        f"| `--{name.replace('_', '-')}` | {takes[name]} | {_text(defaults[name])} | {help_texts[name]} | {WHEN[name]} |"
-        for name in names
-    ]
+    cells = {name: (takes[name], _text(defaults[name]), help_texts[name], WHEN[name]) for name in names}
+    return [f"| `{option(name)}` | {' | '.join(texts)} |" for name, texts in cells.items()]
 
 
 def _takes(hint: Any, limits: tuple[float, float] | None) -> str:

@@ -1,7 +1,9 @@
 """What the commands ``rmc train``, ``rmc resume`` and ``rmc evaluate`` do, as functions for scripts and notebooks."""
 
 import os
+import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +16,7 @@ from rmc.analysis.policy_file import read_policy
 from rmc.cli import training
 from rmc.cli.analysis_commands import evaluate_baseline
 from rmc.common.env.config import EnvConfig
+from rmc.common.env.make import DM_CONTROL, PYBULLET
 from rmc.common.errors import ConfigError
 from rmc.common.process import watchdog
 from rmc.deploy.monitor.view import terminal
@@ -53,6 +56,8 @@ def train(
     Raises ConfigError for options that cannot work, before anything starts; RoleDied where a role keeps dying;
     KeyboardInterrupt where the run was stopped, which ``resume`` continues.
     """
+    if isinstance(track_tags, str):
+        raise ConfigError("track_tags", track_tags, "take a list of texts")
     options = LaunchOptions(
         None if run_dir is None else Path(run_dir),
         if_exists,
@@ -93,7 +98,7 @@ def resume(
     folder = RunFolder(Path(run_dir))
     config, options = folder.config(), last_launch(folder, launcher)
     settings: dict[str, Any] = {"total_steps": total_steps, "actors": actors}
-    how: dict[str, Any] = {"device": device, "redis_url": redis_url, "metrics_port": metrics_port}
+    how: dict[str, Any] = {"device": device and str(device), "redis_url": redis_url, "metrics_port": metrics_port}
     if replay_ratio is not None:
         settings["replay"] = replace(config.replay, replay_ratio=replay_ratio)
     if learning_rate is not None:
@@ -107,6 +112,7 @@ def _not_none(values: dict[str, Any]) -> dict[str, Any]:
 
 def _train(config: RunConfig, options: LaunchOptions) -> dict[str, Any]:
     config = checked(config)
+    _check_call(options)
     watchdog.warn()
     if options.launcher != "lockstep":
         _check_importable(config.env)
@@ -118,6 +124,16 @@ def _train(config: RunConfig, options: LaunchOptions) -> dict[str, Any]:
     return result | {"run_dir": str(folder.path)}
 
 
+def _check_call(options: LaunchOptions) -> None:
+    """Raises ConfigError for what a command line could not say."""
+    if threading.current_thread() is not threading.main_thread():
+        raise ConfigError("train", threading.current_thread().name, "is no main thread, which alone hears Ctrl-C")
+    for name in ("video_every", "metrics_port"):
+        value = getattr(options, name)
+        if value is not None and type(value) is not int:
+            raise ConfigError(name, value, "take a whole number")
+
+
 def _check_importable(env: EnvConfig) -> None:
     """The roles' processes know no environment of this script's own. Raises ConfigError for such a one."""
     script = getattr(sys.modules["__main__"], "__file__", None)
@@ -126,9 +142,16 @@ def _check_importable(env: EnvConfig) -> None:
     spec = gymnasium.registry.get(env.id)
     factory = spec.entry_point if spec is not None else None
     module = factory.partition(":")[0] if isinstance(factory, str) else getattr(factory, "__module__", "")
-    if module == "__main__":
-        fix = f'move it into a module and name it "module:{env.id}", or take launcher="lockstep"'
-        raise ConfigError("ENV", env.id, f"is registered in this script, which the roles do not import; {fix}")
+    known = module.startswith("gymnasium.") or env.id.startswith((DM_CONTROL, PYBULLET))
+    if module == "__main__" or (module and not known and not _is_plugin(env.id)):
+        fix = f'name the module that registers it, "module:{env.id}", or take launcher="lockstep"'
+        raise ConfigError("ENV", env.id, f"is registered in this process alone, not in the roles' own; {fix}")
+
+
+def _is_plugin(env_id: str) -> bool:
+    """Whether every process knows it that imports gymnasium."""
+    code = "import gymnasium, sys; sys.exit(sys.argv[1] not in gymnasium.registry)"
+    return subprocess.run([sys.executable, "-c", code, env_id], capture_output=True, check=False).returncode == 0
 
 
 def evaluate(

@@ -8,6 +8,17 @@ from typing import Any, Literal
 
 from rmc.common.errors import ConfigError
 
+RANGES: dict[str, tuple[float, float]] = {  # of EnvConfig's numbers, both ends included
+    "flicker": (0, 1),
+    "drop_sensors": (0, 1),
+    "flicker_burst": (1, 1_000_000),
+    "delay": (0, 1_000_000),
+    "noise": (0, 1e12),
+    "frame_stack": (1, 1_000),
+    "action_repeat": (1, 10_000),
+    "time_limit": (0, 2**31),
+    "env_timeout": (0.1, 1e6),
+}
 PYTHONS = {"True": True, "False": False, "None": None}  # as Python writes what JSON writes otherwise
 
 
@@ -65,6 +76,20 @@ def read_kwargs(words: Sequence[str]) -> dict[str, Any]:
 def write_kwargs(kwargs: dict[str, Any]) -> list[str]:
     """Keywords as the words that ``read_kwargs`` reads."""
     return [f"{name}={_word(value)}" for name, value in kwargs.items()]
+
+
+def check_env_config(config: EnvConfig) -> None:
+    """Raises ConfigError for the first number or keyword that makes no sense."""
+    for name, limits in RANGES.items():
+        check_range(f"--{name.replace('_', '-')}", getattr(config, name), limits)
+    check_kwargs(config.env_kwargs)
+
+
+def check_range(option: str, value: float, limits: tuple[float, float]) -> None:
+    """Raises ConfigError where a number is not within; NaN is in no range."""
+    low, high = limits
+    if not low <= value <= high:
+        raise ConfigError(option, value, f"take a number from {low:,} to {high:,}".replace(",", "_"))
 
 
 def check_kwargs(kwargs: dict[str, Any]) -> None:

@@ -8,7 +8,6 @@ import importlib
 import importlib.util
 import inspect
 import logging
-import math
 import os
 import sys
 import warnings
@@ -22,7 +21,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from rmc.common.env.config import EnvConfig, check_kwargs
+from rmc.common.env.config import EnvConfig, check_env_config
 from rmc.common.env.describe import layout_of, shown, structure
 from rmc.common.env.faults import RAISED, call_env, describe_error, one_line
 from rmc.common.env.layout import EnvLayout
@@ -37,7 +36,6 @@ from rmc.common.extra import how_to_install
 
 log = logging.getLogger(__name__)
 DM_CONTROL, PYBULLET = "dm_control/", "pybullet/"
-SHORTEST_TIMEOUT = 0.1  # seconds
 
 
 def make_env(config: EnvConfig, render: bool = False, privileged: bool = False) -> Env:
@@ -47,7 +45,7 @@ def make_env(config: EnvConfig, render: bool = False, privileged: bool = False) 
     read, where there is anything. Raises ConfigError where it is unknown, or its spaces are none that
     the agent can learn in; EnvFault where it raises.
     """
-    _check_options(config)
+    check_env_config(config)
     _redirect_mujoco_warnings()
     with ApartCall(config.id, "make", config.env_timeout):
         spec = find_spec(config.id)
@@ -175,22 +173,6 @@ def env_layout(config: EnvConfig, privileged: bool = False) -> EnvLayout:
         fix = f'{config.id} gives no info["privileged"], and nothing is taken from what is seen; leave the option'
         raise ConfigError("--privileged-critic", True, fix)
     return layout
-
-
-def _check_options(config: EnvConfig) -> None:
-    for name in ("flicker", "drop_sensors"):
-        if not 0.0 <= getattr(config, name) <= 1.0:
-            raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), "a probability from 0 to 1")
-    if not 1.0 <= config.flicker_burst < math.inf:
-        raise ConfigError("--flicker-burst", config.flicker_burst, "a mean number of steps, 1 or more")
-    if not 0.0 <= config.noise < math.inf:
-        raise ConfigError("--noise", config.noise, "a standard deviation, 0 or more")
-    if not config.env_timeout >= SHORTEST_TIMEOUT:
-        raise ConfigError("--env-timeout", config.env_timeout, f"{SHORTEST_TIMEOUT} seconds or more")
-    for name, least in (("frame_stack", 1), ("action_repeat", 1), ("time_limit", 0), ("delay", 0)):
-        if getattr(config, name) < least:
-            raise ConfigError(f"--{name.replace('_', '-')}", getattr(config, name), f"{least} or more")
-    check_kwargs(config.env_kwargs)
 
 
 def _check_delay(config: EnvConfig, limit: int | None) -> None:

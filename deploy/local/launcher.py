@@ -80,7 +80,7 @@ class LocalRun:
             if socket.exists():
                 self._listening[shard.role] = role.pid, now
             elif pid != role.pid:
-                self._listening.pop(shard.role)
+                self._listening.pop(shard.role, None)
             elif now - since > UNREACHABLE_SECONDS:
                 log.warning("%s was removed; starting %s again", socket, shard.role)
                 self._listening.pop(shard.role)

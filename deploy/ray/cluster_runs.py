@@ -22,9 +22,9 @@ def summaries() -> dict[str, ClusterRunSummary | None]:
 
 def stop(run: str) -> ClusterRunSummary:
     """End a run cleanly, and wait until it has; how far it was. Raises ConfigError."""
-    name = _full_name(run)
-    summary: ClusterRunSummary | None = _asked(_launchers()[name].summary, AWAY_SECONDS)
-    seconds: float | None = _asked(_launchers()[name].end, AWAY_SECONDS)
+    name, launcher = _found(run)
+    summary: ClusterRunSummary | None = _asked(launcher.summary, AWAY_SECONDS)
+    seconds: float | None = _asked(launcher.end, AWAY_SECONDS)
     if summary is None or seconds is None:
         raise ConfigError("RUN", run, f"its launcher does not answer for {AWAY_SECONDS:.0f} s; try again")
     deadline = time.monotonic() + seconds
@@ -47,13 +47,13 @@ def _launchers() -> dict[str, Any]:
     return handles
 
 
-def _full_name(run: str) -> str:
-    """A run's name by itself, or by that of its folder where only one has such. Raises ConfigError."""
-    names = list(_launchers())
-    meant = [run] if run in names else [name for name in names if name.rpartition("-")[0] == run]
+def _found(run: str) -> tuple[str, Any]:
+    """A run's name and launcher, by its name or by that of its folder where only one has such. Raises ConfigError."""
+    launchers = _launchers()
+    meant = [run] if run in launchers else [name for name in launchers if name.rpartition("-")[0] == run]
     if len(meant) == 1:
-        return meant[0]
-    there = ", ".join(sorted(meant or names)) or "none"
+        return meant[0], launchers[meant[0]]
+    there = ", ".join(sorted(meant or launchers)) or "none"
     problem = "is the name of several; give one of:" if meant else "is not trained on this cluster; its runs:"
     raise ConfigError("RUN", run, f"{problem} {there}")
 

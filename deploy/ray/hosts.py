@@ -23,6 +23,7 @@ from rmc.deploy.redis.connect import PATIENCE_VARIABLE
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import users_path
 
 LOST_SECONDS = 120.0  # within which a role's host may be lost for good twice
 PATIENCE_SECONDS = 120.0  # of a role that starts while launcher and Redis are being started again
@@ -88,6 +89,7 @@ class Hosts:
             max_restarts=-1, num_cpus=place.cpus, num_gpus=place.gpus, scheduling_strategy=strategy,
         )  # fmt: skip
         environment = {URL_VARIABLE: f"file:{{scratch}}/redis-url-{name}", PATIENCE_VARIABLE: str(PATIENCE_SECONDS)}
+        environment |= users_path()
         return options.remote(Task(self._folder.name, place.command, environment, self._secrets(name), os.getcwd()))
 
     def _secrets(self, name: str) -> dict[str, bytes]:

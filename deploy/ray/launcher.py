@@ -24,7 +24,7 @@ from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.launch_options import LaunchOptions, users_path
 
 BEGIN_SECONDS = 60.0  # of the launcher's host
 
@@ -55,14 +55,18 @@ def joined(address: str, cpus: int | None = None) -> Iterator[None]:
         ray.shutdown()
 
 
-def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None:
-    """Start a run's launcher on this node, which must be the head. Raises ConfigError."""
-    context = ray.get_runtime_context()
+def check_on_head() -> None:
+    """Raises ConfigError where this node is not the cluster's head."""
     head = next((node for node in ray.nodes() if "node:__internal_head__" in node["Resources"]), None)
-    if head is None or head["NodeID"] != context.get_node_id():
+    if head is None or head["NodeID"] != ray.get_runtime_context().get_node_id():
         raise ConfigError(
             "--launcher", "ray", "this is not the cluster's head; run it there, by ray attach or ray exec"
         )
+
+
+def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None:
+    """Start a run's launcher on this node, which must be the head. Raises ConfigError."""
+    context = ray.get_runtime_context()
     for file in (tls.CERTIFICATE, tls.KEY):  # for the address that the head has now
         (folder.path / file).unlink(missing_ok=True)
     command = launcher_command(str(folder.path), context.gcs_address, options)
@@ -70,7 +74,7 @@ def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None
         name=actor_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
         max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
     )  # fmt: skip
-    task = Task(folder.name, command, {}, {}, os.getcwd())
+    task = Task(folder.name, command, users_path(), {}, os.getcwd())
     host = actor.remote(task, str(folder.path), config.learner.keep_checkpoints)
     try:
         ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)

@@ -64,7 +64,7 @@ def read(path: Path) -> dict[str, Any]:
     """A cluster's file. Raises ConfigError where it is none."""
     try:
         config = yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError) as error:
+    except (OSError, UnicodeError, yaml.YAMLError) as error:
         raise ConfigError("CONFIG", str(path), f"cannot be read ({' '.join(str(error).split())})") from None
     provider = config.get("provider") if isinstance(config, dict) else None
     if not isinstance(provider, dict) or "type" not in provider:

@@ -79,8 +79,8 @@ class RoleHandle:
             log.warning("%s: %s", self.name, report.trouble or "checkpoints reach the head again")
         self.report = report
         if report.log or not (logs / f"{self.name}.log").exists():
-            with suppress(OSError), open_log(logs / f"{self.name}.log") as file:  # a full disk is waited out
-                file.write(report.log)
+            with suppress(OSError), open_log(logs / f"{self.name}.log") as file:
+                file.write(report.log)  # lost where the disk is full
         if report.status and self._death_noted != report.incarnation:
             self._death_noted = report.incarnation
             self._note_death(report)

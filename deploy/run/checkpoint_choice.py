@@ -7,7 +7,7 @@ from rmc.deploy.run.folder import RunFolder
 
 def choose_checkpoint(folder: RunFolder, which: str) -> tuple[int, dict[str, bytes]]:
     """Its number and files, verified. Raises ConfigError where there is none or it is damaged."""
-    checkpoints = CheckpointFolder(folder.checkpoints)
+    checkpoints, which = CheckpointFolder(folder.checkpoints), str(which)
     number = _number(checkpoints, which)
     try:
         return number, checkpoints.load(number)

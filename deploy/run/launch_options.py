@@ -1,5 +1,6 @@
 """Where and on what a run runs, and what it begins with."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -9,6 +10,11 @@ Launcher = Literal["local", "ray", "lockstep", "manual"]
 Tracker = Literal["wandb", "trackio", "mlflow"]
 PATH_VARIABLE = "RMC_PATH"  # folder of the script that trains, whose modules the run's processes may import
 InitParts = Literal["all", "memory+world-model", "policy"]
+
+
+def users_path() -> dict[str, str]:
+    """The variable, for a process on another machine; empty where no script trains."""
+    return {PATH_VARIABLE: os.environ[PATH_VARIABLE]} if PATH_VARIABLE in os.environ else {}
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ def open_run(
     there = run_dir is not None and if_exists != "new" and (folder.path / "config.json").exists()
     before, initial = config, None
     if there:
-        before = _taken_up(folder, config, if_exists, options)
+        before = taken_up(folder, config, if_exists, options)
     else:
         validate_windows(config)
     if not there and options.init_from is not None:
@@ -95,15 +95,19 @@ def open_run(
         raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
     make(folder)
     folder.lock()
-    if not there:
-        forget_start(folder)
-    if initial is not None:  # before there is a config, without which it is no run
-        CheckpointFolder(folder.checkpoints).save(0, initial.files)
-    folder.reopen(config.total_steps)
-    note_start(folder, _changes(before, config), options, initial.origin if initial is not None else None)
-    folder.write_config(config)
-    folder.write_sizes(config.sizes())
-    folder.secret()
+    try:
+        if not there:
+            forget_start(folder)
+        if initial is not None:  # before there is a config, without which it is no run
+            CheckpointFolder(folder.checkpoints).save(0, initial.files)
+        folder.reopen(config.total_steps)
+        note_start(folder, _changes(before, config), options, initial.origin if initial is not None else None)
+        folder.write_config(config)
+        folder.write_sizes(config.sizes())
+        folder.secret()
+    except BaseException:  # a notebook lives on, and would keep the lock
+        folder.unlock()
+        raise
     return folder
 
 
@@ -168,7 +172,7 @@ def forget_start(folder: RunFolder) -> None:
     folder.history_file.unlink(missing_ok=True)
 
 
-def _taken_up(folder: RunFolder, config: RunConfig, if_exists: IfExists, options: LaunchOptions) -> RunConfig:
+def taken_up(folder: RunFolder, config: RunConfig, if_exists: IfExists, options: LaunchOptions) -> RunConfig:
     """The config that a run had which continues this one. Raises ConfigError where it may not."""
     if if_exists == "fail":
         raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")

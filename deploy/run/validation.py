@@ -3,23 +3,15 @@
 from typing import Any, Literal, get_args
 
 from rmc.common.bus.redis_url import shown
+from rmc.common.env.config import check_env_config, check_range
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, WindowConfig, option
 from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions, Tracker
 
-RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no range
+RANGES: dict[str, tuple[float, float]] = {  # both ends included
     "seed": (0, 2**63 - 1),
     "total_steps": (1, 2**53),
     "actors": (1, 4096),
-    "env.flicker": (0, 1),
-    "env.drop_sensors": (0, 1),
-    "env.flicker_burst": (1, 1_000_000),
-    "env.delay": (0, 1_000_000),
-    "env.noise": (0, 1e12),
-    "env.frame_stack": (1, 1_000),
-    "env.action_repeat": (1, 10_000),
-    "env.time_limit": (0, 2**31),
-    "env.env_timeout": (0.1, 1e6),
     "window.burn_in": (0, 10_000),
     "window.trained_steps": (1, 10_000),
     "agent.hidden": (1, 65_536),
@@ -61,12 +53,12 @@ RANGES: dict[str, tuple[float, float]] = {  # both ends included; NaN is in no r
 
 def validate(config: RunConfig) -> None:
     """Raises ConfigError for the first value that makes no sense; the one place that judges numbers."""
-    for path, (low, high) in RANGES.items():
+    check_env_config(config.env)
+    for path, limits in RANGES.items():
         value: Any = config
         for name in path.split("."):
             value = getattr(value, name)
-        if not low <= value <= high:
-            raise ConfigError(option(path), value, f"take a number from {low:,} to {high:,}".replace(",", "_"))
+        check_range(option(path), value, limits)
     if min(config.agent.heads) < 1:
         raise ConfigError("--heads", config.agent.heads, "take at least 1 unit a layer")
     if config.agent.layer_norm and not config.agent.embedding:
@@ -141,6 +133,8 @@ def validate_launch(config: RunConfig, options: LaunchOptions) -> None:
     if launcher == "lockstep" and config.replay.replay_shards > 1:
         fix = "a lockstep run has one; use --launcher local"
         raise ConfigError("--replay-shards", config.replay.replay_shards, fix)
+    if launcher == "ray" and options.device not in ("cpu", "cuda"):
+        raise ConfigError("--device", options.device, "take cpu or cuda; Ray says which GPU")
     if options.init_parts != "all" and options.init_from is None:
         raise ConfigError("--init-parts", options.init_parts, "say whose: give --init-from RUN, or leave it")
     if launcher == "manual" and options.redis_url is None:

@@ -112,6 +112,7 @@ def stop(command: run_options.Stop) -> int:
 
 def cluster(command: run_options.Cluster) -> int:
     """Bring a cluster up, or take it down."""
+    check_installed("ray", ("ray", "yaml"), "CONFIG", str(command.config))
     from rmc.deploy.ray import machines  # needs what only the extra "ray" installs
 
     act = machines.up if command.action == "up" else machines.down

@@ -10,11 +10,15 @@ from rmc.analysis.needs import Need, needs
 from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.trial import TRAINED_SECONDS, run_trial, trial_config
+from rmc.deploy.redis.connect import connect
 from rmc.deploy.redis.socket_folder import place_for_sockets
 from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.host import this_machine
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.preflight import check_learner
+from rmc.deploy.run.opening import taken_up
+from rmc.deploy.run.preflight import check_learner, check_port
+from rmc.deploy.run.tracking import choose_tracking
 from rmc.deploy.run.validation import validate, validate_launch, validate_windows
 
 FITS, NOT, SLOWER = "ok", "DOES NOT FIT", "slower"
@@ -28,6 +32,7 @@ def dry_run(config: RunConfig, options: LaunchOptions, console: Console) -> int:
     if options.launcher != "local":
         raise ConfigError("--dry-run", True, f"a trial needs --launcher local, not {options.launcher}")
     check_learner(config, options.device)
+    _check_start(config, options)
     place_for_sockets()
     from rmc.analysis import evaluation  # imports torch
 
@@ -45,6 +50,20 @@ def dry_run(config: RunConfig, options: LaunchOptions, console: Console) -> int:
     lacking = [row.what for row in rows if row.fits is False and row.is_needed]
     console.print(f"does not fit: {', '.join(lacking)}" if lacking else "it fits", soft_wrap=True)
     return 1 if lacking else 0
+
+
+def _check_start(config: RunConfig, options: LaunchOptions) -> None:
+    """What a start asks beside the machine. Raises ConfigError."""
+    check_port(options)
+    choose_tracking(options)
+    if options.redis_url is not None:
+        connect(options.redis_url, "check")
+    if options.run_dir is not None and options.if_exists != "new" and (options.run_dir / "config.json").exists():
+        taken_up(RunFolder(options.run_dir), config, options.if_exists, options)
+    elif options.init_from is not None:
+        from rmc.deploy.run import warm_start  # imports torch
+
+        warm_start.prepare(config, options.init_from, options.init_parts)
 
 
 def _table(rows: list[Need]) -> Table:

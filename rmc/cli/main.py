@@ -17,7 +17,9 @@ SINGLE_THREADED = {"actor", "replay", "evaluator"}
 PLAYS = {"train", "resume", "sweep", "baseline", "check-env", "evaluate", "inspect", "report", "role"}  # environments
 SHARED_MEMORY = "/dev/shm"
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
-UNREADABLE = {errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EROFS}  # of a path that a user has given
+UNREADABLE = {  # of a path that a user has given
+    errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP,
+}  # fmt: skip
 CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 
 

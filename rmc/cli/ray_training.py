@@ -4,6 +4,7 @@ import dataclasses
 import os
 import signal
 from collections.abc import Callable
+from contextlib import suppress
 from math import ceil
 
 from rich.console import Console
@@ -37,6 +38,7 @@ def train(config: RunConfig, options: LaunchOptions, console: Console) -> tuple[
 
 
 def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> tuple[RunFolder, int]:
+    launcher.check_on_head()
     if options.run_dir is not None and (options.run_dir / "secret").exists():
         launcher.check_not_there(RunFolder(options.run_dir))
     placement.check_room(config, options.device)
@@ -67,7 +69,8 @@ def _passes_on(stop: StopSignal, folder: RunFolder) -> Callable[[], bool]:
         nonlocal stopped
         if stop.requested and (trainer := folder.trainer()) not in (None, stopped):
             stopped = trainer
-            os.kill(trainer, signal.SIGTERM)
+            with suppress(ProcessLookupError):  # it has just ended
+                os.kill(trainer, signal.SIGTERM)
         return not launcher.is_there(folder)
 
     return gone

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rmc.analysis.report import check_report, write_report
 from rmc.analysis.report_run import ReportRun
-from rmc.analysis.run_paths import each_readable
+from rmc.analysis.run_paths import each_readable, expanded
 from rmc.cli import run_options
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import terminal
@@ -25,7 +25,8 @@ def report(command: run_options.Report) -> int:
 
 def _read(paths: Sequence[Path]) -> list[ReportRun]:
     """Each once; those that are no runs are told. Raises ConfigError where none is."""
-    reports = each_readable((path.resolve() for path in paths), ReportRun.read)
+    found = (path.resolve() for given in paths for path in expanded(given))
+    reports = each_readable(found, ReportRun.read)
     if not reports:
         raise ConfigError("RUNS", " ".join(map(str, paths)), "none of them is a run's folder")
     return reports

@@ -39,6 +39,8 @@ def sweep(command: Sweep) -> int:
     if command.jobs < 0:
         raise ConfigError("--jobs", command.jobs, "take 1 or more, or 0 for as many as fit")
     on_this_machine = command.launcher == "local"
+    if on_this_machine and command.ray_address != "auto":
+        raise ConfigError("--ray-address", command.ray_address, "give --launcher ray, or leave it")
     sweep_check.check_values(spec, on_this_machine)
     jobs = grid_jobs(spec, folder) if spec.search is None else corner_jobs(spec, spec.search, folder)
     checked = sweep_check.check_jobs(jobs, on_this_machine)

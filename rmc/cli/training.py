@@ -106,9 +106,11 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
         status = STOPPED
         raise
     finally:
-        if tracker is not None:
-            tracker.close(end)
-        folder.unlock(status)
+        try:
+            if tracker is not None:
+                tracker.close(end)
+        finally:  # a second Ctrl-C may end what a tracker still sends
+            folder.unlock(status)
     console.print(f"before training: {format_evaluation(before)}")
     return print_result(folder, console)
 

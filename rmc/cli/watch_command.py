@@ -45,8 +45,8 @@ def _listening(host: str, port: int) -> socket.socket:
     try:
         (family, _, _, _, address), *_ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
         return socket.create_server(address[:2], family=family)
-    except socket.gaierror as error:
-        raise ConfigError("--host", host, f"{error.strerror}; give an address of this machine") from None
+    except (socket.gaierror, UnicodeError):
+        raise ConfigError("--host", host, "is no address; give one of this machine, like 127.0.0.1") from None
     except OSError as error:
         reason = os.strerror(error.errno or 0)  # its own repeats the address
         raise ConfigError("--port", f"{host}:{port}", f"{reason}; give another, or 0 for a free one") from None

@@ -5,7 +5,6 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from rmc.common.process.file_lock import take_lock
@@ -22,8 +21,8 @@ class NodeRun:
     def __init__(self, words: tuple[str, ...], name: str, brought: Parcel, working_folder: str) -> None:
         leave_rays_worker(working_folder)
         base = private_folder(Path(tempfile.gettempdir()) / f"rmc-sweep-{os.getuid()}")
-        for abandoned in _abandoned(base):
-            shutil.rmtree(abandoned, ignore_errors=True)
+        for folder in filter(_is_abandoned, base.iterdir()):
+            shutil.rmtree(folder, ignore_errors=True)
         self._place = Path(tempfile.mkdtemp(dir=base))
         self._lock = take_lock(self._place / "lock")
         self._folder, self._log = self._place / name, self._place / "log"
@@ -49,11 +48,13 @@ class NodeRun:
         self._process.send_signal(signal.SIGTERM)
 
 
-def _abandoned(base: Path) -> Iterator[Path]:
-    """What killed sweeps have left there."""
-    for folder in base.iterdir():
+def _is_abandoned(folder: Path) -> bool:
+    """Whether a killed sweep has left it."""
+    try:
         begins = time.time() - folder.stat().st_mtime < BEGIN_SECONDS  # another one's may not be locked yet
         lock = None if begins else take_lock(folder / "lock", patience=0.0)
-        if lock is not None:
-            os.close(lock)
-            yield folder
+    except FileNotFoundError:  # another run has just removed it
+        return False
+    if lock is not None:
+        os.close(lock)
+    return lock is not None

@@ -23,7 +23,8 @@ class RayRuns:
 
     def __init__(self, cores: int, memory: int, gpus: int, at_once: int) -> None:
         """Raises ConfigError where no node can hold a run."""
-        self._cores, self._at_once, self._running = cores, at_once, 0
+        self._at_once, self._running = at_once, 0
+        self._bundle = {"CPU": cores, "memory": memory} | ({"GPU": gpus} if gpus else {})
         self._needs: dict[str, Any] = {
             "num_cpus": cores,
             "num_gpus": gpus,
@@ -31,13 +32,14 @@ class RayRuns:
             "scheduling_strategy": "SPREAD",
         }
         if not self.capacity():
-            fix = f"no node of the cluster has {cores} CPUs, which a run takes; start one that has"
+            resources = f"{cores} CPUs, {memory / 1e9:.2g} GB of memory{f' and {gpus} GPU' if gpus else ''}"
+            fix = f"no node of the cluster has {resources}, which a run takes; start one that has"
             raise ConfigError("--launcher", "ray", fix)
 
     def capacity(self) -> int:
         """How many runs the nodes hold, of those that are there now."""
-        nodes = (int(node["Resources"].get("CPU", 0.0)) for node in ray.nodes() if node["Alive"])
-        fit = sum(cpus // self._cores for cpus in nodes)
+        nodes = (node["Resources"] for node in ray.nodes() if node["Alive"])
+        fit = sum(min(int(has.get(name, 0.0) // amount) for name, amount in self._bundle.items()) for has in nodes)
         return min(fit, self._at_once) if self._at_once else fit
 
     def has_room(self) -> bool:

@@ -223,6 +223,11 @@ def test_what_it_cannot_do_is_one_line(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_folder_of_runs_means_all_of_them(trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "runs" / "seed-0")
+    assert "Report of seed-0" in written(tmp_path / "report.html", str(tmp_path / "runs"), "--no-video")
+
+
 def test_a_folder_that_is_no_run_is_left_out(trained: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     text = written(tmp_path / "report.html", str(trained), str(tmp_path / "nowhere"), "--no-video")
     assert "Report of seed-0" in text

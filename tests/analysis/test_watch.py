@@ -282,6 +282,7 @@ def test_counters_make_events_that_do_not_repeat(folder: RunFolder) -> None:
         (["RUN", "--port", "70000"], "--port='70000': must be between 0 and 65535"),
         (["RUN", "--port", "TAKEN"], "Address already in use; give another, or 0 for a free one"),
         (["RUN", "--host", "no host"], "--host='no host': "),
+        (["RUN", "--host", ".."], "--host='..': is no address"),
     ],
 )
 def test_what_it_cannot_do_is_one_line(

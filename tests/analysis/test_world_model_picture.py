@@ -136,6 +136,13 @@ def test_a_checkpoint_never_executes_code(
     assert not mark.exists()
 
 
+def test_networks_of_an_impossible_size_are_not_made(config: RunConfig, tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run", config)
+    huge = dataclasses.replace(config, agent=dataclasses.replace(config.agent, hidden=10**9))
+    with pytest.raises(ConfigError, match=r"--hidden=1000000000: take a number from 1"):
+        load_agent(folder, huge, "latest")
+
+
 @pytest.mark.parametrize("state", [[], {}, {"agent": None}, {"agent": {}}], ids=str)
 def test_another_runs_state_is_said_to_be_so(config: RunConfig, tmp_path: Path, state: object) -> None:
     folder, file = make_run(tmp_path / "run", config), io.BytesIO()

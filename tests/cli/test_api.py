@@ -1,9 +1,11 @@
 """``rmc.train``, ``rmc.resume``, ``rmc.evaluate``: what cannot work is one line before anything starts."""
 
 import dataclasses
+import errno
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 import rmc
+from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import PATH_VARIABLE
 
 CONFIG = rmc.presets.debug("InvertedPendulum-v5")
@@ -46,6 +49,9 @@ def test_a_value_of_a_wrong_type_is_named(changes: dict[str, Any], line: str, tm
         ({"if_exists": "overwrite"}, "--if-exists='overwrite': take resume, fail, new"),
         ({"track": "neptune"}, "--track='neptune': take wandb, trackio, mlflow, off"),
         ({"init_parts": "half"}, r"--init-parts='half': take all, memory\+world-model, policy"),
+        ({"metrics_port": "9000"}, "metrics_port='9000': take a whole number"),
+        ({"video_every": 1.0}, "video_every=1.0: take a whole number"),
+        ({"track_tags": "abc"}, "track_tags='abc': take a list of texts"),
     ],
 )
 def test_a_choice_that_there_is_none_of_is_refused(options: dict[str, Any], line: str, tmp_path: Path) -> None:
@@ -70,11 +76,41 @@ def test_an_environment_of_the_script_itself_is_refused(monkeypatch: pytest.Monk
     gymnasium.register("Mine-v0", entry_point=Mine)
     try:
         for launcher in ("local", "ray"):
-            with pytest.raises(rmc.ConfigError, match=r"^ENV='Mine-v0': is registered in this script.*module:Mine-v0"):
+            with pytest.raises(
+                rmc.ConfigError, match=r"^ENV='Mine-v0': is registered in this process .*module:Mine-v0"
+            ):
                 rmc.train(rmc.presets.debug("Mine-v0"), tmp_path / "run", launcher=launcher)  # type: ignore[arg-type]
     finally:
         del gymnasium.registry["Mine-v0"]
     assert os.environ[PATH_VARIABLE] == str(tmp_path.resolve())
+
+
+def test_an_id_that_only_this_process_knows_is_refused(tmp_path: Path) -> None:
+    """Its class is a module's, but no module is named that would register it."""
+    gymnasium.register("Mine-v1", entry_point="tests.memory_env:MemoryEnv")
+    try:
+        with pytest.raises(rmc.ConfigError, match=r"^ENV='Mine-v1': is registered in this process .*module:Mine-v1"):
+            rmc.train(rmc.presets.debug("Mine-v1"), tmp_path / "run")
+    finally:
+        del gymnasium.registry["Mine-v1"]
+
+
+def test_a_thread_is_refused_before_there_is_a_folder(tmp_path: Path) -> None:
+    """Only the main thread hears Ctrl-C."""
+    with ThreadPoolExecutor(1) as pool, pytest.raises(rmc.ConfigError, match="is no main thread"):
+        pool.submit(rmc.train, CONFIG, tmp_path / "run", launcher="lockstep").result()
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_start_that_fails_lets_the_next_one_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "write_config", full)
+        with pytest.raises(OSError, match="No space left"):
+            rmc.train(CONFIG, tmp_path / "run", launcher="lockstep")
+    RunFolder(tmp_path / "run").lock()
 
 
 def test_a_role_finds_modules_beside_the_script_that_trains(tmp_path: Path) -> None:

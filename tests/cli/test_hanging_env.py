@@ -59,4 +59,4 @@ def test_a_time_that_is_none_is_refused() -> None:
             capture_output=True, text=True, timeout=120, check=False,
         )  # fmt: skip
         assert done.returncode == 2
-        assert f"--env-timeout={float(value)}: 0.1 seconds or more" in done.stderr
+        assert f"--env-timeout={float(value)}: take a number from 0.1 to 1_000_000.0" in done.stderr

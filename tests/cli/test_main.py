@@ -160,6 +160,12 @@ def test_a_wrong_option_is_one_short_line(words: str, said: str, capsys: pytest.
         ([*DEBUG, "--track", "neptune"], "--track"),
         ([*DEBUG, "--track-project", "mine"], "--track-project='mine': say which tracker"),
         ([*DEBUG, "--track-tags", "a", "b"], "--track-tags"),
+        ([*DEBUG, "--dry-run", "--init-from", "nowhere"], "--init-from='nowhere': no such run"),
+        ([*DEBUG, "--dry-run", "--metrics-port", "99999"], "--metrics-port=99999: take a port"),
+        ([*DEBUG, "--dry-run", "--track-project", "mine"], "--track-project='mine': say which tracker"),
+        ([*DEBUG, "--run-dir", "x" * 300], "File name too long; give another"),
+        (["stats", "x" * 300], "File name too long"),
+        (["check-env", PENDULUM, "--env-timeout", "1e12"], "--env-timeout=1000000000000.0: take a number from 0.1"),
         ([*DEBUG, "--track", "wandb", "--track-project", "a/b"], "--track-project='a/b'"),
         ([*DEBUG, "--track", "trackio", "--track-tags", "x" * 65], "--track-tags"),
         ([*DEBUG, "--metrics-port", "0"], "--metrics-port=0: take a port from 1 to 65535"),
@@ -219,6 +225,7 @@ def test_a_redis_beside_ray_is_refused_without_its_password() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"launcher": "ray", "device": "cuda:1"}, "--device='cuda:1': take cpu or cuda; Ray says which GPU"),
         ({"ray_address": "head:6379"}, "--ray-address='head:6379': give --launcher ray, or leave it"),
         (
             {"launcher": "lockstep", "redis_url": "redis://user:hush@localhost:1"},

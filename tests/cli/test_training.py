@@ -17,6 +17,7 @@ from rmc.cli import main, training
 from rmc.cli.training import conduct
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import RoleDied
+from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.state import STOPPED
 from tests.analysis.test_policy import AGENTS, make_run
@@ -133,6 +134,26 @@ def test_a_stop_signal_amid_the_evaluations_stops_the_run(tmp_path, monkeypatch)
                 conduct(folder.config(), folder, placement, Console(quiet=True))
         assert folder.ended() == STOPPED
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_a_second_ctrl_c_amid_the_upload_leaves_no_lock(tmp_path, monkeypatch):
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
+
+    class Uploads:
+        def close(self, _):
+            raise KeyboardInterrupt
+
+        def __getattr__(self, name):
+            return lambda *_, **__: None
+
+    monkeypatch.setattr(training, "start_tracker", lambda *_: Uploads())
+    monkeypatch.setattr(training, "_launch", lambda *_: False)
+    folder.lock()
+    with pytest.raises(KeyboardInterrupt):
+        conduct(folder.config(), folder, placement, Console(quiet=True))
+    assert folder.ended() == STOPPED
+    RunFolder(folder.path).lock()
 
 
 def test_why_a_run_has_failed_stays_in_its_folder(tmp_path, monkeypatch):

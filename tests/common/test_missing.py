@@ -188,11 +188,11 @@ def test_the_order_is_noise_delay_sensors_frames_stack() -> None:
 @pytest.mark.parametrize(
     ("config", "says"),
     [
-        (EnvConfig(CHEETAH, drop_sensors=1.5), "--drop-sensors=1.5: a probability from 0 to 1"),
-        (EnvConfig(CHEETAH, drop_sensors=math.nan), "--drop-sensors=nan: a probability from 0 to 1"),
-        (EnvConfig(CHEETAH, flicker_burst=0.5), "--flicker-burst=0.5: a mean number of steps, 1 or more"),
-        (EnvConfig(CHEETAH, flicker_burst=math.inf), "--flicker-burst=inf: a mean number of steps, 1 or more"),
-        (EnvConfig(CHEETAH, delay=-1), "--delay=-1: 0 or more"),
+        (EnvConfig(CHEETAH, drop_sensors=1.5), "--drop-sensors=1.5: take a number from 0 to 1"),
+        (EnvConfig(CHEETAH, drop_sensors=math.nan), "--drop-sensors=nan: take a number from 0 to 1"),
+        (EnvConfig(CHEETAH, flicker_burst=0.5), "--flicker-burst=0.5: take a number from 1 to 1_000_000"),
+        (EnvConfig(CHEETAH, flicker_burst=math.inf), "--flicker-burst=inf: take a number from 1 to 1_000_000"),
+        (EnvConfig(CHEETAH, delay=-1), "--delay=-1: take a number from 0 to 1_000_000"),
         (EnvConfig(CHEETAH, delay=1000), "--delay=1000: an episode ends after 1000 steps; take fewer"),
         (EnvConfig(CHEETAH, delay=7, time_limit=20, action_repeat=3), "--delay=7: an episode ends after 7 steps"),
     ],

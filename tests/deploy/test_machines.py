@@ -70,8 +70,10 @@ def test_a_file_that_is_none_is_named(tmp_path: Path) -> None:
         odd.write_text(text)
         with pytest.raises(ConfigError, match=message):
             machines.read(odd)
-    with pytest.raises(ConfigError, match="cannot be read"):
-        machines.read(tmp_path / "absent.yaml")
+    odd.write_bytes(b"\xff\xfe\x00")
+    for file in (odd, tmp_path / "absent.yaml"):
+        with pytest.raises(ConfigError, match="cannot be read"):
+            machines.read(file)
 
 
 def test_the_token_is_made_and_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

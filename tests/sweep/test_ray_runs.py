@@ -2,6 +2,7 @@
 
 import io
 import os
+import shutil
 import tarfile
 import tempfile
 import time
@@ -12,6 +13,7 @@ import psutil
 import pytest
 
 from rmc.deploy.run.folder import RunFolder
+from rmc.sweep.node_run import _is_abandoned
 from rmc.sweep.parcel import pack, unpack
 from rmc.sweep.ray_runs import on_reserved_cores
 from tests.cluster.test_ray import leaves_nothing_behind
@@ -63,7 +65,7 @@ def test_a_stopped_and_a_lost_run_go_on_with_the_same_command(tmp_path: Path) ->
         host.kill()  # as a node that is gone
         assert sweep.finish() == 1
         assert not train.is_running()
-    assert "without their replay ring, these go on" in sweep.text()
+    assert "without their replay ring, these continue" in sweep.text()
     assert sweep.lines()["seed=0"]["state"] == "failed"
     assert "its node was lost" in sweep.lines()["seed=0"]["reason"]
     assert sweep.text().count("its node was lost") == 1
@@ -120,6 +122,50 @@ def test_a_copy_is_like_the_folder_and_only_what_changed_is_sent(tmp_path: Path)
         assert sorted(tar.getnames()) == ["checkpoints/2/policy", "metrics.jsonl"]
     with tarfile.open(fileobj=io.BytesIO(pack(source, later.stamps).tar)) as tar:
         assert tar.getnames() == []
+
+
+def test_the_lock_of_who_trains_there_and_no_ring_is_sent(tmp_path: Path) -> None:
+    (tmp_path / "replay-0").mkdir()
+    (tmp_path / "replay-0" / "ring").touch()
+    lock = tmp_path / ".lock"
+    lock.write_text("training 7 node")
+    assert pack(tmp_path, {}).stamps == {}
+    lock.write_text("ended 0")
+    assert list(pack(tmp_path, {}).stamps) == [".lock"]
+
+
+def test_a_copy_that_goes_back_is_not_sent_again(tmp_path: Path) -> None:
+    source, copy = tmp_path / "source", tmp_path / "copy"
+    source.mkdir()
+    for number in range(50):
+        (source / str(number)).touch()
+        os.utime(source / str(number), ns=(0, 1_795_000_000_123_456_789 + 7_001_003 * number))
+    unpack(pack(source, {}), copy, {})
+    with tarfile.open(fileobj=io.BytesIO(pack(copy, pack(source, {}).stamps).tar)) as tar:
+        assert tar.getnames() == []
+
+
+def test_folders_may_vanish_as_they_are_packed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
+    (tmp_path / "checkpoints" / "1" / "policy").touch()
+    scandir = os.scandir
+
+    def gone(path: str) -> object:
+        if str(path).endswith("1"):
+            shutil.rmtree(path)
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", gone)
+    assert pack(tmp_path, {}).stamps == {}
+
+
+def test_what_another_run_removes_is_not_looked_at(tmp_path: Path) -> None:
+    folder = tmp_path / "left"
+    assert not _is_abandoned(folder)
+    folder.mkdir()
+    assert not _is_abandoned(folder)  # it may just begin
+    os.utime(folder, (0.0, 0.0))
+    assert _is_abandoned(folder)
 
 
 def _content(folder: Path) -> dict[str, str]:

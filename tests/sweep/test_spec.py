@@ -155,6 +155,10 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(
         ([PENDULUM, "--grid", "grounding=true,false", "--no-grounding"], "grounding=[True, False]: is an option"),
         ([PENDULUM, "--jobs", "-1"], "--jobs=-1: take 1 or more"),
         ([PENDULUM, "--config", "f.toml", "--launcher", "ray"], "--config='--config f.toml': the nodes do not"),
+        (
+            [PENDULUM, "--preset", "debug", "--ray-address", "head:6379"],
+            "--ray-address='head:6379': give --launcher ray",
+        ),
         ([PENDULUM, "--config", "f.toml"], "--config='f.toml': cannot be read"),
         ([PENDULUM, "--trials", "3"], "--trials=3: is for a search"),
         (["spec.toml", "--seeds", "1"], "--seeds='1': belongs into spec.toml"),
