@@ -9,19 +9,20 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 
 from rmc.actors.config import ActorConfig
+from rmc.actors.env_pool import EnvPool
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.actors.unacked_entries import UnackedEntries
 from rmc.actors.window_builder import WindowBuilder
 from rmc.common.agent_config import AgentConfig
-from rmc.common.bus.protocol import Ack, Bus, Version
-from rmc.common.env.make import checked_reset, further_env, recreate_env
+from rmc.common.bus.protocol import TAKEN_OVER, UNTRAINED, Ack, Bus, Version
 from rmc.common.env.wrappers import Env, Floats
-from rmc.common.errors import BusFull, BusUnavailable, EnvFault, FencedError, MessageError
+from rmc.common.errors import BusFull, BusUnavailable, FencedError, MessageError
 from rmc.common.metrics import Means, Rate
 from rmc.common.window import Rows, WindowSpec
 
@@ -29,8 +30,7 @@ log = logging.getLogger(__name__)
 POLL_SECONDS = 0.02  # between looks at the bus while there is nothing to do but wait
 RESEND_SECONDS = 5.0  # without a new acknowledgement before everything unacknowledged is sent again
 DOUBT_SECONDS = 10.0  # that an older acknowledgement than the last is not believed; the replay repeats its own sooner
-BROKEN_STARTS = 5  # episodes in a row that an environment breaks in their first step before the actor gives up
-_NOISE = -1  # the place of the policy's noise among the environments' seeds
+_NOISE, _RATING = -1, -2  # seeds beside the environments': of exploration, and of how windows are rated
 
 
 class PriorityFn(Protocol):
@@ -38,6 +38,9 @@ class PriorityFn(Protocol):
 
     def load(self, blob: bytes) -> None:
         """Take over broadcast weights."""
+
+    def reseed(self, seed: int) -> None:
+        """Begin the random numbers anew, before the first call."""
 
     def __call__(self, rows: Rows) -> Floats:
         """(n,) windows -> (n,) priorities."""
@@ -76,22 +79,16 @@ class Actor:
         self.name = f"actor-{index}"
         self._index, self._seed, self._spec, self._config = index, seed, spec, config
         self._bus, self._clock, self._priority_fn = bus, clock, priority_fn
-        n = config.envs_per_actor
-        what = f"an environment of {self.name}'s {n}"
-        self._make_env, self._envs = make_env, [further_env(make_env, what) for _ in range(n)]
-        self._faults: dict[int, Exception] = {}  # of this step, by environment
-        self._broken = 0  # episodes that an environment's fault ended
-        self._broken_starts = [0] * n  # of each environment, in a row, at their start
-        self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, n, spec.missing)
-        self._observation = np.zeros((n, spec.obs_dim), np.float32)
-        self._reward = np.zeros(n, np.float32)
-        self._terminated, self._truncated = (np.zeros(n, np.bool_) for _ in range(2))
-        self._missing = np.zeros((n, spec.missing), np.bool_)
-        self._privileged = np.zeros((n, spec.privileged), np.float32) if spec.privileged else None
+        self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, config.envs_per_actor, spec.missing)
+        self._envs = EnvPool(make_env, config.envs_per_actor, spec, self.name)
         self._means, self._rate, self._episodes, self._resends = Means(), Rate(), 0, 0
         self._refused_weights = 0
         self._total_steps = 0
-        self._start_epoch()
+        try:
+            self._start_epoch()
+        except BaseException:
+            self._envs.close()
+            raise
 
     def restart(self) -> None:
         """Forget unfinished episodes and what was not sent, and begin a new epoch with new seeds and newest weights."""
@@ -114,11 +111,15 @@ class Actor:
         strategy, capacity = self._config.state_strategy, self._config.chunk_windows + n
         stride = self._config.stride or self._spec.train
         self._builder = WindowBuilder(self._spec, stride, n, capacity, store_states=strategy in ("stored", "burn-in"))
-        self._rng = np.random.default_rng(environment_seed(self._seed, self._index, epoch, _NOISE))
+        seed_of = partial(environment_seed, self._seed, self._index, epoch)
+        self._rng = np.random.default_rng(seed_of(_NOISE))
+        if self._priority_fn is not None:
+            self._priority_fn.reseed(seed_of(_RATING))
         self._returns = np.zeros(n)
         self._lengths = np.zeros(n, np.int64)
+        self._envs.restart(seed_of)
         for env in range(n):
-            self._begin_episode(env, environment_seed(self._seed, self._index, epoch, env))
+            self._begin_episode(env)
         with suppress(BusUnavailable, BusFull):  # the hello; ``step`` tries again
             self._unacked.send()
 
@@ -143,7 +144,7 @@ class Actor:
             "weights_update": self._version.update if self._version else -1,
             "unacked_entries": len(self._unacked),
             "resends": self._resends + self._unacked.resends,
-            "broken_episodes": self._broken,
+            "broken_episodes": self._envs.broken,
             "refused_weights": self._refused_weights,
         }
         return record | self._means.take()
@@ -152,8 +153,7 @@ class Actor:
         """Send finished windows if the bus takes them, and close the environments."""
         with suppress(BusUnavailable, BusFull, FencedError):
             self._flush()
-        for env in self._envs:
-            env.close()
+        self._envs.close()
 
     # Waiting: weights, credit, acknowledgements
 
@@ -253,102 +253,40 @@ class Actor:
         now, n = self._builder.now(), len(self._envs)
         noise = self._rng.standard_normal((n, self._spec.action_dim), np.float32)
         action, state = self._runner.act(*now, noise)
-        if self._version.update == 0:  # the policy has learnt nothing yet
+        if self._version.update == UNTRAINED:
             action = self._rng.uniform(-1.0, 1.0, action.shape).astype(np.float32)
-        for i in range(n):
-            try:
-                self._step_environment(i, action[i])
-            except Exception as error:
-                self._faults[i] = error
-        self._mark_non_finite()
-        for i in self._faults:
+        given, faults = self._envs.step(action)
+        for i in faults:
             self._builder.end_before(i)
             self._steps -= 1
-        ended = self._builder.add(
-            action, state, self._version.update, self._config.reward_scale * self._reward, self._observation,
-            self._missing, self._terminated, self._truncated, self._privileged,
-        )  # fmt: skip
+        scaled = given._replace(reward=self._config.reward_scale * given.reward)
+        ended = self._builder.add(action, state, self._version.update, scaled)
         self._next_poll = float("-inf")
         self._steps += n
         self._total_steps += n
-        self._returns += self._reward
+        self._returns += given.reward
         self._lengths += 1
-        for env_index in np.flatnonzero(ended).tolist():
-            self._end_episode(env_index)
-        while self._faults:
-            self._replace_environment(*self._faults.popitem())
-
-    def _step_environment(self, i: int, action: Floats) -> None:
-        observation, reward, terminated, truncated, info = self._envs[i].step(action)
-        self._observation[i], self._reward[i], self._missing[i] = observation, reward, info.get("missing", False)
-        self._terminated[i], self._truncated[i] = terminated, truncated
-        if self._privileged is not None:
-            self._privileged[i] = info["privileged"]
-
-    def _mark_non_finite(self) -> None:
-        """Whose observation or reward is not finite. What a broken environment left behind must not end an episode."""
-        if not (np.isfinite(self._observation).all() and np.isfinite(self._reward).all()):
-            sound = np.isfinite(self._observation).all(1) & np.isfinite(self._reward)
-            for i in np.flatnonzero(~sound).tolist():
-                self._faults.setdefault(i, EnvFault("the environment's observation or reward is not finite"))
-        for i in self._faults:
-            self._observation[i] = self._reward[i] = 0.0
-            self._terminated[i] = self._truncated[i] = False
-
-    def _replace_environment(self, i: int, error: Exception) -> None:
-        """A broken episode is counted and ends with the step before, its environment is made anew.
-
-        Raises the error where environments break at the start of one episode after the other: they always will.
-        """
-        log.warning("%s: environment %d broke in step %d of an episode: %s", self.name, i, self._lengths[i], error)
-        self._broken += 1
-        self._broken_starts[i] = self._broken_starts[i] + 1 if self._lengths[i] <= 1 else 0
-        if self._broken_starts[i] >= BROKEN_STARTS:
-            raise error
-        self._envs[i] = recreate_env(self._envs[i], self._make_env)
-        self._begin_episode(i, self._new_seed(i))
+        for env in np.flatnonzero(ended).tolist():
+            self._end_episode(env)
+        for env, error in faults.items():  # such an episode ends with the step before
+            self._envs.replace(env, error, int(self._lengths[env]))
+            self._begin_episode(env)
 
     def _end_episode(self, env: int) -> None:
         self._episodes += 1
-        self._broken_starts[env] = 0
         self._means.add("episode_return_mean", float(self._returns[env]))
         self._means.add("episode_length_mean", int(self._lengths[env]))
-        self._begin_episode(env, seed=None)
+        self._begin_episode(env)
 
-    def _new_seed(self, env: int) -> int:
-        """Of an environment made anew; no other of this epoch has it."""
-        return environment_seed(self._seed, self._index, self._unacked.epoch, len(self._envs) * self._broken + env)
-
-    def _begin_episode(self, env: int, seed: int | None) -> None:
-        """Raises what the environment raises where it breaks in a reset, and again when it was made anew."""
-        try:
-            observation, info = checked_reset(self._envs[env], seed)
-        except Exception as error:
-            log.warning("%s: environment %d broke in a reset: %s", self.name, env, error)
-            self._broken += 1
-            self._envs[env] = recreate_env(self._envs[env], self._make_env)
-            observation, info = checked_reset(self._envs[env], self._new_seed(env))
-        self._check_sizes(info)
-        privileged = None if self._privileged is None else info["privileged"]
-        self._builder.begin(env, observation, info.get("missing", False), privileged)
+    def _begin_episode(self, env: int) -> None:
+        self._builder.begin(env, *self._envs.begin(env))
         self._returns[env] = self._lengths[env] = 0
-
-    def _check_sizes(self, info: dict[str, Any]) -> None:
-        """Raises EnvFault where a first reset says otherwise than the run's layout what is missing or privileged."""
-        numbers = np.size(info.get("privileged", ())) if self._spec.privileged else 0  # else it is its own affair
-        for name, size, sizes in (
-            ("missing", np.size(info.get("missing", False)), (1, self._spec.missing)),
-            ("privileged", numbers, (self._spec.privileged,)),
-        ):
-            if size not in sizes:
-                fault = f'the environment\'s info["{name}"] has {size} values, when the run began {sizes[-1]}'
-                raise EnvFault(f"{fault}; give as many at every reset")
 
     def _cut_episodes(self) -> None:
         """The run's last steps are in: send what is open as if its time limit had come."""
         self._builder.cut()
         for env in range(len(self._envs)):
-            self._begin_episode(env, seed=None)
+            self._begin_episode(env)
         self._flush()
 
     # Sending
@@ -364,7 +302,7 @@ class Actor:
         if self._builder.count:
             rows = self._builder.take()
             if self._priority_fn is not None:
-                learnt = rows["weights_update"] > 1  # what untrained critics say means nothing
+                learnt = rows["weights_update"] > TAKEN_OVER  # what untrained critics say means nothing
                 rows["initial_priority"] = np.where(learnt, self._priority_fn(rows), 0.0)
             self._unacked.put(rows)
         self._send()

@@ -27,6 +27,17 @@ class Now(NamedTuple):
     state: Floats  # (N, S), the state before ``observation``
 
 
+class Transition(NamedTuple):
+    """A step of every environment; of an ended episode the observation is its final one."""
+
+    reward: Floats  # (N,)
+    observation: Floats  # (N, O)
+    missing: BoolArray  # (N, M)
+    terminated: BoolArray  # (N,)
+    truncated: BoolArray  # (N,)
+    privileged: Floats  # (N, P)
+
+
 class WindowBuilder:
     """Finished windows are written one after another into ``rows``; ``take`` hands them over.
 
@@ -93,38 +104,25 @@ class WindowBuilder:
         self._start[env] = self._time + 1
         self._block[env] = self._covered[env] = 0
 
-    def add(
-        self,
-        action: Floats,
-        state: Floats,
-        update: int,
-        reward: Floats,
-        observation: Floats,
-        missing: BoolArray,
-        terminated: BoolArray,
-        truncated: BoolArray,
-        privileged: Floats | None = None,
-    ) -> BoolArray:
-        """One step of every environment: (N, A), (N, S) state after ``now().observation``, (N,), (N, O), (N, M), (N,),
-        (N, P).
+    def add(self, action: Floats, state: Floats, update: int, step: Transition) -> BoolArray:
+        """One step of every environment: (N, A), (N, S) state after ``now().observation``, and what came of it.
 
-        ``observation`` is the true next one, of an ended episode its final one. Returns (N,) which episodes
-        have ended; ``begin`` must follow for each of them.
+        ``update`` is that of the weights that acted. Returns (N,) which episodes have ended; ``begin`` must follow for
+        each of them.
         """
         self._time += 1
         slot = self._time % self._slots
         self._prev_action[slot] = action
         self._state[slot] = state
         self._update[slot] = update
-        self._reward[slot] = reward
-        self._observation[slot] = observation
-        self._missing[slot] = missing
-        if privileged is not None:
-            self._privileged[slot] = privileged
-        ended = terminated | truncated
+        self._reward[slot] = step.reward
+        self._observation[slot] = step.observation
+        self._missing[slot] = step.missing
+        self._privileged[slot] = step.privileged
+        ended = step.terminated | step.truncated
         steps = self._time - self._start
         for env in np.flatnonzero(ended | (steps - self._block == self._spec.train)).tolist():
-            self._finish(env, bool(terminated[env]))
+            self._finish(env, bool(step.terminated[env]))
         return ended
 
     def cut(self) -> None:

@@ -88,7 +88,7 @@ class Learner:
         assert sample.rows is not None
         assert sample.weights is not None
         self.env_steps = sample.env_steps
-        weights = importance_weights(sample.weights, sample.total_weight, sample.windows, self._exponent)
+        weights = importance_weights(sample.weights, self._exponent)
         clear_padding(sample.rows, self.spec)
         raw = torch.from_numpy(sample.rows.view("u1").reshape(BATCH, -1))
         self.batch: Batch = view_batch(raw, torch.from_numpy(weights), self.spec)

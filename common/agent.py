@@ -211,7 +211,7 @@ def squashed_sample(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tenso
 class Agent(nn.Module):
     """The complete agent: memory, world model, critics, policy, temperature.
 
-    Actors use ``normalizer``, ``memory`` and ``policy``; ``next_frame`` where missing frames are filled, and
+    Actors are sent ``normalizer``, ``memory`` and ``policy``; ``next_frame`` where missing frames are filled, and
     ``critic`` where they rate their windows.
     """
 

@@ -18,6 +18,7 @@ from rmc.common.errors import CheckpointError, ConfigError
 from rmc.common.process.file_lock import take_lock
 from rmc.common.whole_file import write_synced, write_whole
 
+STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
 log = logging.getLogger(__name__)
 MANIFEST = "manifest.json"
 BEST = "best.json"
@@ -200,6 +201,3 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"

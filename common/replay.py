@@ -25,19 +25,18 @@ class Sample:
     """One draw. ``rows`` and ``weights`` are None unless ``status`` is BATCH.
 
     ``rows`` may be a view into a buffer that the next draw but one overwrites. What was drawn is in proportion to
-    ``weights``, priority ** exponent each, of ``total_weight`` over all ``windows``.
+    ``weights``, priority ** exponent each, of ``total_weight`` over all windows.
     """
 
     status: SampleStatus
     rows: Rows | None  # (B,)
     weights: NDArray[np.float64] | None  # (B,)
     total_weight: float
-    windows: int
     env_steps: int  # environment steps committed to the ring so far
     drawn_steps: int  # trained steps drawn so far
 
 
-EMPTY_SAMPLE = Sample(SampleStatus.WAIT, None, None, 0.0, 0, 0, 0)  # of a server that was not heard yet
+EMPTY_SAMPLE = Sample(SampleStatus.WAIT, None, None, 0.0, 0, 0)  # of a server that was not heard yet
 
 
 @dataclass(frozen=True)

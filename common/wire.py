@@ -39,7 +39,7 @@ class Kind(IntEnum):
     PROOF = 2  # client -> server: its nonce and HMAC, and the epoch of the learner that it is
     WELCOME = 3  # server -> client: its HMAC, window fingerprint
     SAMPLE = 4  # client -> server: batch_size, elsewhere (see ``Replay.sample``)
-    BATCH = 5  # server -> client: rows | weights (float64), with total_weight, windows, env_steps, drawn_steps
+    BATCH = 5  # server -> client: rows | weights (float64), with total_weight, env_steps, drawn_steps
     WAIT = 6  # server -> client: the limiter holds the draw back
     FINISHED = 7  # server -> client: all steps are in and the ratio is spent
     PRIORITIES = 8  # client -> server: serials (int64) | priorities (float32); no reply

@@ -5,7 +5,7 @@ Shapes: B batch, T steps, O observation, A action, S state, M flags of what is m
 
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ class Plan(NamedTuple):
     """What the host decides of an update before it runs, so that no device has to be asked."""
 
     steps: int  # of each window, L_b and up to L_t
-    has_missing: bool  # whether a frame may be missing
+    imputes: bool  # whether a frame may be missing, and is filled
     trains_imputer: bool
     trains_policy: bool
 
@@ -52,13 +52,10 @@ class Batch:
         return slice(self.burn_in, None)
 
 
-def importance_weights(
-    weights: NDArray[np.float64], total_weight: float, windows: int, exponent: float
-) -> NDArray[np.float32]:
-    """(N P(i))^-exponent / max, P(i) = weight / total_weight, N windows: (B,) -> (B,)."""
-    importance = (windows * weights / total_weight) ** -exponent
-    scaled: NDArray[np.float32] = (importance / importance.max()).astype(np.float32)
-    return scaled
+def importance_weights(weights: NDArray[np.float64], exponent: float) -> NDArray[np.float32]:
+    """(N P(i))^-exponent / max, N windows, P(i) in proportion to the weights, so that both cancel: (B,) -> (B,)."""
+    importance: NDArray[np.float32] = ((weights / weights.min()) ** -exponent).astype(np.float32)
+    return importance
 
 
 @cache
@@ -76,15 +73,19 @@ def _times(count: int, device: torch.device) -> Tensor:
     return torch.arange(count, dtype=torch.int32, device=device).unsqueeze(0)
 
 
+def _real(first: Any, last: Any, t: Any) -> tuple[Any, Any]:
+    """Which observations and steps of windows are no padding: (B, 1), (B, 1), (1, T + 1) -> (B, T + 1), (B, T)."""
+    observed = (first <= t) & (t <= last)
+    return observed, observed[:, :-1] & (t[:, :-1] < last)
+
+
 def clear_padding(rows: Rows, spec: WindowSpec) -> None:
     """Zero in place what is not real in (B,) rows, so that not even a NaN there can reach a sum or a gradient."""
     partial = np.flatnonzero((rows["first"] > 0) | (rows["last"] < spec.steps))
-    t = np.arange(spec.observations)
-    first, last = rows["first"][partial, None], rows["last"][partial, None]
-    unobserved = (t < first) | (t > last)
-    unstepped = (unobserved | (t == last))[:, :-1]
-    for absent, names in ((unobserved, ("observation", "missing", "privileged")), (unstepped, ("action", "reward"))):
-        window, step = np.nonzero(absent)
+    t = np.arange(spec.observations)[None]
+    observed, stepped = _real(rows["first"][partial, None], rows["last"][partial, None], t)
+    for real, names in ((observed, ("observation", "missing", "privileged")), (stepped, ("action", "reward"))):
+        window, step = np.nonzero(~real)
         for name in names:
             rows[name][partial[window], step] = 0
 
@@ -102,7 +103,7 @@ def longest_steps(raw: Tensor, spec: WindowSpec) -> int:
 
 
 def update_steps(raw: Tensor, spec: WindowSpec, number: int) -> int:
-    """Steps that update ``number`` runs over: the whole window's in a run's first, so that memory is short at once."""
+    """Steps that update ``number`` runs over: all of a window in a run's first: one too large ends at once."""
     return spec.steps if number == 1 else longest_steps(raw, spec)
 
 
@@ -135,8 +136,7 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec, plan: Plan | N
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
     prev_action.scatter_(1, first.long().view(-1, 1, 1).expand(-1, 1, prev.shape[1]), prev.unsqueeze(1))
     t = _times(steps + 1, raw.device)
-    observation_valid = (first.unsqueeze(1) <= t) & (t <= last)
-    step_valid = observation_valid[:, :-1] & (t[:, :-1] < last)
+    observation_valid, step_valid = _real(first.unsqueeze(1), last, t)
     ends = (t[:, :-1] == last - 1) & (field(integers, "terminated").unsqueeze(1) > 0)
     return Batch(
         observation=field(floats, "observation")[:, : steps + 1],

@@ -5,6 +5,7 @@ P privileged; n steps from an episode's start to a window's end.
 Staleness is R2D2's (Kapturowski et al., 2019, section 3), with Q of the actions that were taken.
 """
 
+import math
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -75,10 +76,12 @@ def relative_l1_error(error: Tensor, size: Tensor) -> Tensor:
 def latent_rank(hidden: Tensor) -> tuple[float, float]:
     """Effective rank, exp(entropy of the normalised singular values), and mean per-unit standard deviation.
 
-    ``hidden`` (..., H). A rank near 1 or a deviation near 0 is a collapsed latent.
+    ``hidden`` (..., H). A rank near 1 or a deviation near 0 is a collapsed latent; NaN is a diverged one.
     """
     flat = hidden.reshape(-1, hidden.shape[-1]).float()
     flat = flat - flat.mean(0)
+    if not flat.isfinite().all():  # which svdvals does not take; the learner says so where it publishes
+        return math.nan, math.nan
     p = torch.linalg.svdvals(flat)
     p = p / p.sum().clamp(min=1e-12)
     entropy = -(p * p.clamp(min=1e-12).log()).sum()

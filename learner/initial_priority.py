@@ -23,11 +23,15 @@ from rmc.learner.unroll import impute_and_unroll
 class InitialPriority:
     """Rows in, priorities out; on the CPU."""
 
-    def __init__(self, spec: WindowSpec, agent: AgentConfig, update: UpdateConfig, seed: int) -> None:
-        """``seed`` is for the actions that the policy is asked for. ``load`` must come first."""
+    def __init__(self, spec: WindowSpec, agent: AgentConfig, update: UpdateConfig) -> None:
+        """``reseed`` and ``load`` must come first."""
         self._spec, self._update = spec, update
         self._agent = Agent(spec.obs_dim, spec.action_dim, agent, spec.missing, spec.privileged)
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = torch.Generator()
+
+    def reseed(self, seed: int) -> None:
+        """Of the actions that the policy is asked for."""
+        self._generator.manual_seed(seed)
 
     def load(self, blob: bytes) -> None:
         """Take over what was broadcast, the safetensors of ``Agent.broadcast_weights()``. Raises MessageError."""

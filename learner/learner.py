@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
-from rmc.common.bus.protocol import Bus, Version
+from rmc.common.bus.protocol import TAKEN_OVER, UNTRAINED, Bus, Version
 from rmc.common.checkpoint import STATE, CheckpointFolder
 from rmc.common.errors import CheckpointError, FencedError, RmcError, first_line
 from rmc.common.policy_header import PolicyHeader
@@ -95,11 +95,15 @@ class Learner:
         self._metrics = LearnerMetrics(self.agent, spec, replay)
         self._returning: deque[tuple[NDArray[np.int64], HostCopy]] = deque()  # priorities, and of which windows
         checkpoints.lock()
-        floor = max(self._resume(), checkpoints.last_epoch())
-        self.epoch = bus.take_epoch(self.name, floor)
-        checkpoints.note_epoch(self.epoch)
-        replay.register_learner(self.epoch)
-        self.publish()
+        try:
+            floor = max(self._resume(), checkpoints.last_epoch())
+            self.epoch = bus.take_epoch(self.name, floor)
+            checkpoints.note_epoch(self.epoch)
+            replay.register_learner(self.epoch)
+            self.publish()
+        except BaseException:
+            checkpoints.unlock()
+            raise
 
     def step(self) -> bool:
         """Draw and update once, with all that is due after it. Raises FencedError where a newer learner has come."""
@@ -142,7 +146,7 @@ class Learner:
         assert values is not None
         clear_padding(rows, self.spec)
         self._largest_reward = max(self._largest_reward, float(np.abs(rows["reward"]).max()))
-        weights = importance_weights(values, sample.total_weight, sample.windows, self.config.importance_exponent)
+        weights = importance_weights(values, self.config.importance_exponent)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
         self._drawn.append(Drawn.of(rows, self.spec))
         number = self.updates + len(self._drawn)
@@ -179,10 +183,10 @@ class Learner:
 
     def publish(self) -> None:
         """Broadcast the policy with the newest observation statistics frozen into it. Raises FencedError."""
+        self._published = None  # until Redis has them
         self._freeze_statistics()
         blob = self._serialize_finite(self.agent.broadcast_weights())
-        number = self.updates or int(self._policy_learnt)  # with 0 actors do not ask the policy
-        version = Version(self.epoch, number)
+        version = Version(self.epoch, self.updates or (TAKEN_OVER if self._policy_learnt else UNTRAINED))
         self.bus.publish_weights(version, blob)
         self._published = version
 

@@ -33,12 +33,12 @@ AHEAD = 2  # draws in flight, so that the server gathers while the learner compu
 AWAY = (OSError, MessageError, AuthenticationError, ValueError, OverflowError)
 
 
-def _totals(meta: dict[str, Any]) -> tuple[float, int, int, int]:
-    """Total weight, windows, env_steps and drawn_steps of an answer to a draw. Raises MessageError."""
+def _totals(meta: dict[str, Any]) -> tuple[float, int, int]:
+    """Total weight, env_steps and drawn_steps of an answer to a draw. Raises MessageError."""
     total_weight = meta.get("total_weight")
     if type(total_weight) is not float or not 0.0 <= total_weight < float("inf"):
         raise MessageError("total_weight", f"{total_weight!r:.80}, want a finite number from 0.0 on")
-    return total_weight, _count(meta, "windows"), _count(meta, "env_steps"), _count(meta, "drawn_steps")
+    return total_weight, _count(meta, "env_steps"), _count(meta, "drawn_steps")
 
 
 def _count(meta: dict[str, Any], name: str) -> int:

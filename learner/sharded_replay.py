@@ -113,11 +113,10 @@ class ShardedReplay:
         self, status: SampleStatus, rows: Rows | None = None, weights: NDArray[np.float64] | None = None
     ) -> Sample:
         last = [stock.last for stock in self._stocks]
-        total_weight, windows, env_steps, drawn_steps = (
-            sum(getattr(sample, name) for sample in last)
-            for name in ("total_weight", "windows", "env_steps", "drawn_steps")
+        total_weight, env_steps, drawn_steps = (
+            sum(getattr(sample, name) for sample in last) for name in ("total_weight", "env_steps", "drawn_steps")
         )
-        return Sample(status, rows, weights, total_weight, windows, env_steps, drawn_steps)
+        return Sample(status, rows, weights, total_weight, env_steps, drawn_steps)
 
     def update_priorities(self, serials: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
         """Give priorities back to the shards that the windows came from."""

@@ -1,6 +1,6 @@
 """The memory over a window: burn-in, then the trained steps; missing observations imputed.
 
-Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, S state.
+Shapes: B batch, L_b burn-in, L_t trained steps, T both, O observation, A action, S state.
 """
 
 import torch
@@ -11,9 +11,9 @@ from rmc.learner.batch import Batch
 
 
 def impute_and_unroll(agent: Agent, o: Tensor, batch: Batch) -> tuple[Tensor, MemoryOutput]:
-    """(B, L + 1, O) with missing frames filled where configured, and the memory along them: (B, L_t + 1, ·)."""
+    """(B, T + 1, O) with missing frames filled where configured, and the memory along them: (B, L_t + 1, ·)."""
     hidden = None
-    if agent.next_frame is not None and batch.plan.has_missing:
+    if agent.next_frame is not None and batch.plan.imputes:
         o, hidden = _impute(agent, o, batch)
     return o, unroll(agent.memory, o, batch, hidden)
 
@@ -41,7 +41,7 @@ def _burned_in(memory: Memory, o: Tensor, batch: Batch) -> Tensor:
 
 
 def _impute(agent: Agent, o: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
-    """(B, L + 1, O) filled along the states that ``unroll`` goes through, and (B, H) after the burn-in."""
+    """(B, T + 1, O) filled along the states that ``unroll`` goes through, and (B, H) after the burn-in."""
 
     def part(steps: slice, state: Tensor) -> tuple[Tensor, Tensor]:
         return agent.impute(o[:, steps], batch.missing[:, steps], batch.prev_action[:, steps], state)

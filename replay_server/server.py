@@ -51,7 +51,7 @@ class ReplayServer:
         bus: Bus,
         shard: Shard = WHOLE,
     ) -> None:
-        self.spec, self.config, self.bus, self.name = spec, config, bus, shard.role
+        self.spec, self.bus, self.name = spec, bus, shard.role
         self._seed, self._shard = seed, shard
         self._own_actors = [actor for actor in range(actors) if shard.owns(actor)]
         self._share = len(self._own_actors) / actors  # of all that is collected
@@ -59,14 +59,11 @@ class ReplayServer:
         self._store = open_store(folder, spec, -(-config.capacity // shard.count), config.priority_exponent)
         try:
             epoch = self._take_over()
+            self._begin_epoch(epoch, config.replay_ratio, shard.part(config.warmup_steps, actors))
         except BaseException:
             self._store.close()
             raise
         self.owner = ReplayOwner(self.name, epoch)
-        self._store.ring.progress.replay_epoch = epoch
-        self._hold_ratio(config.replay_ratio, shard.part(config.warmup_steps, actors))
-        self._store.ring.commit()
-        self._store.ring.flush_commit()  # by its epoch this ring is known again after a power cut, too
         self._limiter = RateLimiter(
             config.replay_ratio / self._share,  # a shard's steps are a share, what is drawn from all is the whole
             shard.part(config.warmup_steps, actors),
@@ -127,6 +124,12 @@ class ReplayServer:
                 "%s: the ring of %d windows is lost; begins empty at environment step %d",
                 self.name, progress.next_serial, progress.env_steps,
             )  # fmt: skip
+
+    def _begin_epoch(self, epoch: int, replay_ratio: float, warmup_steps: int) -> None:
+        self._store.ring.progress.replay_epoch = epoch
+        self._hold_ratio(replay_ratio, warmup_steps)
+        self._store.ring.commit()
+        self._store.ring.flush_commit()  # by its epoch this ring is known again after a power cut, too
 
     def _hold_ratio(self, replay_ratio: float, warmup_steps: int) -> None:
         """A ratio other than before counts from here: nothing is owed for what was, and nobody waits for it."""
@@ -197,7 +200,7 @@ class ReplayServer:
             status = SampleStatus.WAIT
         self._note_waiting(status)
         if status is not SampleStatus.BATCH:
-            return Sample(status, None, None, tree.total, progress.windows, progress.env_steps, progress.drawn_steps)
+            return Sample(status, None, None, tree.total, progress.env_steps, progress.drawn_steps)
         rows = self._buffer(batch_size) if out is None else out
         slots = self._draw_into(rows)
         if slots is None:
@@ -206,7 +209,7 @@ class ReplayServer:
         progress.drawn_steps += self.spec.trained_steps(rows)
         self._store.ring.commit()
         values = tree.values(slots)
-        return Sample(status, rows, values, tree.total, progress.windows, progress.env_steps, progress.drawn_steps)
+        return Sample(status, rows, values, tree.total, progress.env_steps, progress.drawn_steps)
 
     def _draw_into(self, rows: Rows) -> Slots | None:
         """Fill (B,) rows with sound windows and give their slots; None where none are left."""

@@ -231,7 +231,7 @@ class SocketServer:
             sample = self._server.sample(batch_size, drawn_elsewhere_steps)
         else:
             sample = self._server.sample(batch_size, drawn_elsewhere_steps, shared.rows[shared.turn])
-        meta = {name: getattr(sample, name) for name in ("total_weight", "windows", "env_steps", "drawn_steps")}
+        meta = {name: getattr(sample, name) for name in ("total_weight", "env_steps", "drawn_steps")}
         if sample.rows is None or sample.weights is None:
             connection.send(Kind.FINISHED if sample.status is SampleStatus.FINISHED else Kind.WAIT, meta)
         elif shared is None or shared.batch_size != batch_size:

@@ -64,6 +64,9 @@ class Ack(NamedTuple):
     final: bool = False
 
 
+UNTRAINED, TAKEN_OVER = 0, 1  # a version's updates before the run's first: of new networks, of another run's
+
+
 class Version(NamedTuple):
     """A policy's version; readers take the highest."""
 

@@ -6,11 +6,9 @@ Shapes: O observation, M of what can be missing on its own: 1 for the frame, O f
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rmc.common.env.wrappers import CorruptObservation, Env, Floats
-
-BoolArray = NDArray[np.bool_]
+from rmc.common.window import BoolArray
 
 
 class Missing(CorruptObservation):

@@ -41,7 +41,7 @@ def make_actor(
     """A run's actor; it rates its own windows where the config says so."""
     spec, agent = config.window_spec(), config.agent
     actors_rate = agent.initial_priority == "actor"
-    priority = InitialPriority(spec, agent, config.update, config.seed + index) if actors_rate else None
+    priority = InitialPriority(spec, agent, config.update) if actors_rate else None
     return Actor(index, config.seed, make_env, spec, agent, config.actor, bus, clock, priority)
 
 

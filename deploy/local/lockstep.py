@@ -3,9 +3,11 @@
 import itertools
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from rmc.actors.actor import Actor
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import Bus
 from rmc.common.env.make import make_env
@@ -28,9 +30,19 @@ class Lockstep:
 
     def __init__(self, config: RunConfig, folder: Path, device: str = "cpu") -> None:
         self.bus = MemoryBus()
-        self.server = make_server(config, folder / "replay", self.bus, WHOLE)
-        self.server.step()  # publishes what a resumed ring has seen, from which actors take their epochs
-        self.learner = make_learner(config, self.server, self.bus, folder / "checkpoints", device, (), False)
+        with ExitStack() as opened:  # else a notebook would keep the locks of a start that failed
+            self.server = make_server(config, folder / "replay", self.bus, WHOLE)
+            opened.callback(self.server.close)
+            self.server.step()  # publishes what a resumed ring has seen, from which actors take their epochs
+            self.learner = make_learner(config, self.server, self.bus, folder / "checkpoints", device, (), False)
+            opened.callback(self.learner.checkpoints.unlock)
+            self._make_players(config, opened)
+            opened.pop_all()
+        self._last_checkpoint = self.learner.last_checkpoint
+        self._restart_due = self._playing = False
+
+    def _make_players(self, config: RunConfig, opened: ExitStack) -> None:
+        """Actors and evaluator; what they hold is closed with ``opened``."""
         ticks = itertools.count()
 
         def clock() -> float:
@@ -40,12 +52,13 @@ class Lockstep:
         def env() -> Env:
             return make_env(config.env, privileged=config.agent.privileged_critic)
 
-        self.actors = [make_actor(config, index, env, self.bus, clock) for index in range(config.actors)]
+        self.actors: list[Actor] = []
+        for index in range(config.actors):
+            self.actors.append(make_actor(config, index, env, self.bus, clock))
+            opened.callback(self.actors[-1].close)
         uncut = replace(config, evaluator=replace(config.evaluator, evaluation_seconds=0.0))
         plays = config.evaluator.episodes > 0
         self.evaluator = make_evaluator(uncut, lambda: make_env(config.env), self.bus, clock) if plays else None
-        self._last_checkpoint = self.learner.last_checkpoint
-        self._restart_due = self._playing = False
 
     @property
     def roles(self) -> list[Role]:

@@ -559,7 +559,7 @@ def test_a_reset_that_breaks_is_tried_once_more_on_a_new_environment() -> None:
             observation, info = self.env.reset(**options)
             return np.full_like(observation, np.nan), info
 
-    actor._envs[2] = BreaksAtReset(actor._envs[2])
+    actor._envs._envs[2] = BreaksAtReset(actor._envs._envs[2])
     play(bus, actor, reader, 1000)
     assert actor.metrics()["broken_episodes"] == 1
     assert audit(reader.rows(), SPEC).trained.total() == 1000

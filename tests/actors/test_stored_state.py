@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rmc.actors.window_builder import WindowBuilder
+from rmc.actors.window_builder import Transition, WindowBuilder
 from rmc.common.agent_config import AgentConfig
 from rmc.common.window import Rows, WindowSpec
 from rmc.learner.batch import Batch, view_batch
@@ -59,9 +59,9 @@ def play(
         states.append(hidden[:, :HIDDEN].copy())
         done, terminates = np.array([time % length == 0 for length in lengths]), rng.random(envs) < 0.5
         missing = rng.random((envs, spec.missing)) < 0.2
-        ended = builder.add(
-            action, hidden, 1, np.zeros(envs, np.float32), observe(time), missing, done & terminates, done & ~terminates
-        )
+        nothing, privileged = np.zeros(envs, np.float32), np.zeros((envs, spec.privileged), np.float32)
+        step = Transition(nothing, observe(time), missing, done & terminates, done & ~terminates, privileged)
+        ended = builder.add(action, hidden, 1, step)
         for env in np.flatnonzero(ended).tolist():
             builder.begin(env, observe(time)[env], missing=False)
         rows.append(builder.take().copy())

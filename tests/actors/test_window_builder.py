@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmc.actors.window_builder import WindowBuilder
+from rmc.actors.window_builder import Transition, WindowBuilder
 from rmc.common.window import Rows, WindowSpec
 from rmc.replay_server.row_check import row_faults
 from tests.actors.support import join_rows
@@ -62,11 +62,11 @@ def run(play: Play, steps: int, cut: bool = True, store_states: bool = True) -> 
         k += 1
         then = here + np.float32([0, 0, 1])
         done = np.array([k[env] == play.length(env, episode[env]) for env in range(envs)])
-        ended = builder.add(
-            action=-here, state=then, update=time, reward=k.astype(np.float32), observation=then,
-            missing=np.stack([_missing(one, play.spec) for one in k]), terminated=done & (k % 2 == 0),
-            truncated=done & (k % 2 == 1), privileged=_privileged(then, play.spec),
+        step = Transition(
+            reward=k.astype(np.float32), observation=then, missing=np.stack([_missing(one, play.spec) for one in k]),
+            terminated=done & (k % 2 == 0), truncated=done & (k % 2 == 1), privileged=_privileged(then, play.spec),
         )  # fmt: skip
+        ended = builder.add(action=-here, state=then, update=time, step=step)
         np.testing.assert_array_equal(ended, done)
         for env in np.flatnonzero(ended).tolist():
             episode[env], k[env] = episode[env] + 1, 0
@@ -194,7 +194,7 @@ def test_begin_forgets_an_open_window() -> None:
     zeros, no = np.zeros((1, 3), np.float32), np.zeros(1, np.bool_)
     seen = np.zeros((1, 1), np.bool_)
     builder.begin(0, name(0, 0, 0), missing=False)
-    builder.add(zeros, zeros, 0, zeros[:, 0], zeros, seen, no, no)
+    builder.add(zeros, zeros, 0, Transition(zeros[:, 0], zeros, seen, no, no, zeros[:, :0]))
     assert builder.open
     builder.begin(0, name(0, 1, 0), missing=False)
     assert not builder.open

@@ -154,7 +154,7 @@ PRIORITIES = (np.arange(8).tobytes(), np.ones(8, np.float32).tobytes())
 KINDS: dict[str, tuple[bytes, Reader]] = {
     "window": (encode_windows(make_rows(4), SPEC), window),
     "window, checksum right": (BODY, honest_window),
-    "batch": (encode_frame(Kind.BATCH, {"total_weight": 1.0, "windows": 4, "env_steps": 9}, (BODY,)) + BODY, frame),
+    "batch": (encode_frame(Kind.BATCH, {"total_weight": 1.0, "env_steps": 9}, (BODY,)) + BODY, frame),
     "priorities": (encode_frame(Kind.PRIORITIES, {"count": 8}, PRIORITIES) + b"".join(PRIORITIES), frame),
     "weights": (POLICY, weights),
     "proof": (LAWFUL_PROOF, proof),

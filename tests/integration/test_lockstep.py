@@ -8,6 +8,7 @@ import torch
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
+from rmc.common.errors import RmcError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local.lockstep import Lockstep, train
 from rmc.deploy.run.config import RunConfig
@@ -76,6 +77,26 @@ def test_stop_and_resume_gives_the_same_bits(straight, tmp_path):
     stopped = run(CONFIG, tmp_path, stop_after_checkpoints=2)
     assert 0 < stopped.learner.updates < straight.learner.updates
     assert_same(straight, run(CONFIG, tmp_path))
+
+
+def test_priorities_of_actors_are_the_same_across_a_stop_too(tmp_path):
+    """They take random actions, whose generator begins anew with each epoch."""
+    agent = dataclasses.replace(CONFIG.agent, initial_priority="actor")
+    config = dataclasses.replace(CONFIG, agent=agent, total_steps=1_000)
+    straight = run(config, tmp_path / "straight")
+    run(config, tmp_path / "stopped", stop_after_checkpoints=1)
+    assert_same(straight, run(config, tmp_path / "stopped"))
+
+
+def test_a_start_that_fails_leaves_no_lock(tmp_path, monkeypatch):
+    def fails(*_):
+        raise RmcError("cannot be made beside the others")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("rmc.deploy.local.lockstep.make_evaluator", fails)
+        with pytest.raises(RmcError, match="beside the others"):
+            Lockstep(CONFIG, tmp_path)
+    Lockstep(CONFIG, tmp_path).close()
 
 
 def test_the_ratio_and_the_total_are_kept(straight):

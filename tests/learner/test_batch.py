@@ -63,10 +63,10 @@ def test_importance_weights_against_the_formula():
     values = np.random.default_rng(0).exponential(size=20)
     mass, windows = 3.0 * values.sum(), 60
     expected = np.array([(windows * value / mass) ** -0.4 for value in values])
-    weights = importance_weights(values, mass, windows, 0.4)
+    weights = importance_weights(values, 0.4)
     np.testing.assert_allclose(weights, expected / expected.max(), rtol=1e-5)
     assert weights.dtype == np.float32
-    assert (importance_weights(values, mass, windows, 0.0) == 1).all()
+    assert (importance_weights(values, 0.0) == 1).all()
 
 
 @pytest.mark.parametrize("spec", [SPEC, BY_NUMBER])

@@ -36,7 +36,8 @@ def test_it_is_the_learners_own_priority(n_step: int, head_input: HeadInput, fil
         agent.log_alpha.fill_(-1.0)
     update = UpdateConfig(n_step=n_step, gamma=0.9, eta=0.6)
     spec = dataclasses.replace(sizes, state=config.state_size(SPEC.obs_dim))
-    priority_fn = InitialPriority(spec, config, update, seed=3)
+    priority_fn = InitialPriority(spec, config, update)
+    priority_fn.reseed(3)
     priority_fn.load(safetensors.torch.save(agent.broadcast_weights()))
     rows = random_rows(6, spec=spec)
     learner = make_update(agent, update, seed=3)
@@ -54,7 +55,7 @@ def test_critics_are_broadcast_only_where_they_are_needed() -> None:
 
 
 def test_weights_never_execute_code(tmp_path: Path) -> None:
-    priority_fn = InitialPriority(SPEC, AgentConfig(hidden=SPEC.state, heads=(5, 5)), UpdateConfig(), seed=3)
+    priority_fn = InitialPriority(SPEC, AgentConfig(hidden=SPEC.state, heads=(5, 5)), UpdateConfig())
     with pytest.raises(MessageError, match="not of this run"):
         priority_fn.load(hostile_state(tmp_path / "owned"))
     assert not (tmp_path / "owned").exists()

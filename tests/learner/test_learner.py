@@ -15,7 +15,7 @@ from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import EntryId
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.errors import CheckpointError, FencedError, RmcError
+from rmc.common.errors import BusUnavailable, CheckpointError, FencedError, RmcError
 from rmc.common.wire import encode_hello, encode_windows
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.learner.diagnostics import latent_rank
@@ -105,6 +105,21 @@ def test_weights_that_redis_forgot_are_out_again(setting):
     setting.bus._weights.clear()
     assert not setting.learner.step()
     assert setting.bus.latest_version() == (1, 0)
+
+
+def test_weights_that_an_outage_kept_back_are_sent_after_it(setting, monkeypatch):
+    """Redis may come back with the ones before."""
+
+    def away(*_):
+        raise BusUnavailable("connection refused")
+
+    monkeypatch.setattr(setting.bus, "publish_weights", away)
+    with pytest.raises(BusUnavailable):
+        setting.learner.publish()
+    sent = []
+    monkeypatch.setattr(setting.bus, "publish_weights", lambda version, _: sent.append(version))
+    assert not setting.learner.step()
+    assert sent == [(1, 0)]
 
 
 def test_weights_older_than_the_last_that_redis_has_are_replaced(setting):
@@ -403,6 +418,10 @@ def step_for_long(setting: Setting) -> None:
 )  # fmt: skip
 def test_large_values_are_finite(values, expected):
     assert all_finite(torch.tensor(values)) is expected
+
+
+def test_latent_rank_of_what_has_diverged_is_nan():
+    assert np.isnan(latent_rank(torch.full((4, 3), torch.nan))).all()
 
 
 def test_latent_rank_sees_a_collapse():

@@ -322,7 +322,7 @@ def update_of(update: JointUpdate, number: int, is_missing: bool) -> UpdateResul
     clear_padding(rows, WITH_FRAMES)
     raw = torch.from_numpy(rows.view("u1").reshape(8, -1))
     plan = update.plan(raw, WITH_FRAMES, number)
-    assert plan.has_missing == is_missing
+    assert plan.imputes == is_missing
     return update(view_batch(raw, torch.ones(8), WITH_FRAMES, plan), BETA)
 
 

@@ -89,6 +89,6 @@ def stored(server: ReplayServer) -> np.ndarray:
     """All windows that may be sampled, by serial."""
     progress = server._store.ring.progress
     serials = np.arange(progress.valid_from, progress.next_serial)
-    rows = server._store.ring.rows[serials % server.config.capacity]
+    rows = server._store.ring.rows[serials % server._store.ring.capacity]
     assert rows["serial"].tolist() == serials.tolist()
     return rows

@@ -241,12 +241,12 @@ def test_who_proves_nothing_ends_no_learner(
 
 @pytest.mark.parametrize("total_weight", ["x", None, [], True, float("nan"), float("inf"), -1.0])
 def test_a_draw_of_no_mass_is_an_outage(serve: Serve, total_weight: Any, caplog: pytest.LogCaptureFixture) -> None:
-    away_for(serve(), Sample(SampleStatus.WAIT, None, None, total_weight, 3, 12, 0), "total_weight", caplog)
+    away_for(serve(), Sample(SampleStatus.WAIT, None, None, total_weight, 12, 0), "total_weight", caplog)
 
 
 @pytest.mark.parametrize("count", ["3", None, {}, True, float("nan"), float("inf"), 1.5, -1])
 def test_a_draw_of_no_counters_is_an_outage(serve: Serve, count: Any, caplog: pytest.LogCaptureFixture) -> None:
-    away_for(serve(), Sample(SampleStatus.WAIT, None, None, 1.0, 3, count, 0), "env_steps", caplog)
+    away_for(serve(), Sample(SampleStatus.WAIT, None, None, 1.0, count, 0), "env_steps", caplog)
 
 
 def away_for(served: Served, sample: Sample, reason: str, caplog: pytest.LogCaptureFixture) -> None:
