@@ -100,10 +100,9 @@ class PolicyRunner:
         self._config, self._envs = config, envs
         self._obs_dim, self._action_dim = obs_dim, action_dim
         self._flags = missing * config.missing_flag
-        inputs = obs_dim + action_dim + self._flags
+        inputs = config.input_size(obs_dim, action_dim, missing)
         embedding = config.embedding or inputs
-        self._skip = {"hidden": 0, "hidden+embedding": embedding}.get(config.head_input, obs_dim)
-        features = self._skip + (config.hidden if config.head_input != "observation" else 0)
+        self._skip = config.skip_size(obs_dim, inputs)
         self._input = np.zeros((envs, inputs), np.float32)
         self._embed = _Linear(inputs, embedding, envs, relu=not config.layer_norm) if config.embedding else None
         self._from_embedding = _Linear(embedding, 3 * config.hidden, envs)
@@ -112,7 +111,7 @@ class PolicyRunner:
         normed = config.layer_norm and config.embedding > 0
         self._norm = (torch.ones(embedding), torch.zeros(embedding)) if normed else ()
         self._gru = _GRU(self._from_embedding, self._from_hidden, envs, config.hidden)
-        self._head = _head(features, config.heads, 2 * action_dim, envs)
+        self._head = _head(config.feature_size(self._skip), config.heads, 2 * action_dim, envs)
         input_dim = config.hidden + obs_dim + action_dim
         self._next_frame = _head(input_dim, config.heads, obs_dim, envs) if config.impute_missing else ()
 

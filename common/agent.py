@@ -64,7 +64,7 @@ class Memory(nn.Module):
 
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig, missing: int = 1) -> None:
         super().__init__()
-        width = obs_dim + action_dim + missing * config.missing_flag
+        width = config.input_size(obs_dim, action_dim, missing)
         self.missing_flag, self.head_input = config.missing_flag, config.head_input
         layers: list[nn.Module] = []
         if config.embedding:
@@ -72,9 +72,8 @@ class Memory(nn.Module):
             if config.layer_norm:
                 layers.insert(1, nn.LayerNorm(config.embedding))
         self.embed = nn.Sequential(*layers)
-        embedding = config.embedding or width
-        self.skip_dim = {"hidden": 0, "hidden+embedding": embedding}.get(config.head_input, obs_dim)
-        self.gru = nn.GRU(embedding, config.hidden, batch_first=True)
+        self.skip_dim = config.skip_size(obs_dim, width)
+        self.gru = nn.GRU(config.embedding or width, config.hidden, batch_first=True)
 
     def forward(self, observation: Tensor, missing: Tensor, prev_action: Tensor, hidden: Tensor) -> MemoryOutput:
         """(B, T, O) normalised, (B, T, M) bool, (B, T, A), (B, S) the state before the first, which begins with h."""
@@ -223,7 +222,7 @@ class Agent(nn.Module):
         self.config, self.obs_dim, self.action_dim = config, obs_dim, action_dim
         self.normalizer = Normalizer(obs_dim, config.normalize_observations)
         self.memory = Memory(obs_dim, action_dim, config, missing)
-        features = self.memory.skip_dim + (config.hidden if config.head_input != "observation" else 0)
+        features = config.feature_size(self.memory.skip_dim)
         self.world_model = WorldModel(features, obs_dim, action_dim, config)
         self.critic = TwinQ(features + privileged, action_dim, config)
         self.policy = GaussianPolicy(features, action_dim, config)

@@ -47,6 +47,18 @@ class AgentConfig:
     """Priority that a window enters a prioritized replay with: the largest seen, or the TD error that its actor
     computes. For the latter, actors are sent the critics, too."""
 
+    def input_size(self, obs_dim: int, action_dim: int, missing: int) -> int:
+        """Numbers that the memory reads at a step, before the embedding: o_t, a_{t-1}, and M flags where asked."""
+        return obs_dim + action_dim + missing * self.missing_flag
+
+    def skip_size(self, obs_dim: int, input_size: int) -> int:
+        """Numbers that the heads read beside h, or in its place."""
+        return {"hidden": 0, "hidden+embedding": self.embedding or input_size}.get(self.head_input, obs_dim)
+
+    def feature_size(self, skip_size: int) -> int:
+        """Numbers that the heads read in all."""
+        return skip_size + (self.hidden if self.head_input != "observation" else 0)
+
     def state_size(self, obs_dim: int) -> int:
         """S, numbers that an actor carries from step to step, and stores: h, and what was last seen where it fills."""
         return self.hidden + self.impute_missing * obs_dim
