@@ -35,12 +35,12 @@ from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError, first_line
 from rmc.common.process.role import StopSignal
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.config import flat, option
+from rmc.deploy.run.config import changes, option
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.migrations import FORMAT
-from rmc.deploy.run.opening import forget_start, has_more_than_a_start, make, new_folder
+from rmc.deploy.run.opening import default_name, forget_start, has_more_than_a_start, make, new_folder
 from rmc.deploy.run.starts import note_start, resume_command
 from rmc.deploy.run.state import STOPPED
 
@@ -96,16 +96,15 @@ def _sizes(config: BaselineConfig) -> dict[str, int]:
 
 def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, int]) -> RunFolder:
     """Make or take up a run's folder, locked, as ``open_run``. Raises ConfigError."""
-    env = config.env.id.replace(":", "_").replace("/", "_")
-    name = f"{env}__{config.algorithm}-{config.settings}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+    name = default_name(config.env.id, f"{config.algorithm}-{config.settings}", config.seed)
     folder = RunFolder(run_dir) if run_dir is not None else new_folder(Path("runs").resolve() / name)
     there = (folder.path / "config.json").exists() and folder.is_baseline()
     before = read(folder) if there else config
-    was, now = flat(before), flat(config)
-    changes = {path: [was[path], now[path]] for path in now if was[path] != now[path]}
-    if refused := next((path for path in changes if path not in MAY_CHANGE), None):
-        fix = f"the run in {folder.path} has {was[refused]!r}; use that, or another --run-dir"
-        raise ConfigError("ENV" if refused == "env.id" else option(refused), now[refused], fix)
+    changed = changes(before, config)
+    if refused := next((path for path in changed if path not in MAY_CHANGE), None):
+        was, now = changed[refused]
+        fix = f"the run in {folder.path} has {was!r}; use that, or another --run-dir"
+        raise ConfigError("ENV" if refused == "env.id" else option(refused), now, fix)
     if there:
         folder.check_sizes(config.env.id, sizes)
     elif has_more_than_a_start(folder):
@@ -115,7 +114,7 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
     if not there:
         forget_start(folder)
     folder.reopen(config.total_steps)
-    note_start(folder, changes, LaunchOptions(folder.path), None)
+    note_start(folder, changed, LaunchOptions(folder.path), None)
     written = json.dumps({"format": FORMAT} | asdict(config), indent=2)
     write_whole(folder.path / "config.json", f"{written}\n".encode())
     folder.write_sizes(sizes)

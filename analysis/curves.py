@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from rmc.analysis.history import History
-from rmc.analysis.out_file import check_writable
+from rmc.analysis.out_file import PICTURES, check_writable
 from rmc.analysis.statistics import (
     ENOUGH_SEEDS,
     Scores,
@@ -26,7 +26,6 @@ from rmc.analysis.statistics import (
 from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
 
-PICTURES = (".png", ".pdf", ".svg", ".jpg")
 Axis = Literal["env_steps", "updates", "wall_s"]
 LABELS = {"env_steps": "environment steps", "updates": "updates", "wall_s": "wall time (s)"}
 LEGEND_WIDTH, LEGEND_LINE = 55, 0.22  # characters under a panel, inches

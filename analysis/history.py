@@ -17,7 +17,7 @@ from rmc.analysis import baseline_settings
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.env.config import EnvConfig, write_kwargs
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig, flat, option
+from rmc.deploy.run.config import RunConfig, changes, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import SAME_AGENT
 from rmc.deploy.run.presets import preset_config
@@ -153,8 +153,8 @@ def _with(name: str, words: list[str]) -> str:
 
 def _changes(config: RunConfig) -> list[str]:
     """Options that differ from the preset's, as they are typed."""
-    was, now = flat(preset_config(config.preset, config.env)), flat(config)
-    return [_typed(path, now[path]) for path in now if path not in OMITTED and now[path] != was[path]]
+    changed = changes(preset_config(config.preset, config.env), config)
+    return [_typed(path, now) for path, (_, now) in changed.items() if path not in OMITTED]
 
 
 def _typed(path: str, value: Any) -> str:

@@ -4,6 +4,8 @@ from pathlib import Path
 
 from rmc.common.errors import ConfigError
 
+PICTURES = (".png", ".pdf", ".svg", ".jpg")
+
 
 def check_writable(name: str, path: Path, suffixes: tuple[str, ...]) -> None:
     """Raises ConfigError where a file of one of these kinds cannot be written there; tries, and changes nothing."""

@@ -12,7 +12,7 @@ from rmc.analysis.history import About, History
 from rmc.analysis.vitals import Record
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import flat
+from rmc.deploy.run.config import changes
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.state import run_state
@@ -65,13 +65,12 @@ class ReportRun:
             return []
         return [str(finding) for finding in examine(self.records, self.folder.config())]
 
-    def changed(self) -> dict[str, tuple[Any, Any]]:
+    def changed(self) -> dict[str, list[Any]]:
         """Options that are not the preset's, with both values; of a baseline there are none."""
         if self.folder.is_baseline():
             return {}
         config = self.folder.config()
-        was, now = flat(preset_config(config.preset, config.env)), flat(config)
-        return {path: (was[path], now[path]) for path in now if now[path] != was[path]}
+        return changes(preset_config(config.preset, config.env), config)
 
     def series(self, kind: str, name: str) -> Series:
         """A metric over wall time (s), the mean over the roles of a kind as each speaks; empty where nobody does."""

@@ -19,7 +19,7 @@ from torch import Tensor
 from rmc.analysis import memory_picture
 from rmc.analysis.episodes import Episode, Player, remembered
 from rmc.analysis.memory_picture import Remembered, remember
-from rmc.analysis.out_file import check_writable
+from rmc.analysis.out_file import PICTURES, check_writable
 from rmc.analysis.value_bias import ValueBias, value_bias
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.checkpoint import STATE
@@ -32,7 +32,6 @@ from rmc.deploy.run.validation import validate
 from rmc.learner.diagnostics import relative_l1_error
 from rmc.learner.losses import model_error
 
-PICTURES = (".png", ".pdf", ".svg", ".jpg")
 HORIZONS = (1, 5, 15)  # steps ahead
 SHOWN, SHOWN_STEPS = 4, 100  # dimensions in the picture, those that change the most, and from when on how long
 Floats = NDArray[np.float32]

@@ -11,10 +11,9 @@ from typing import Any, Literal
 
 import gymnasium
 
-from rmc.analysis.evaluation import FINAL_EPISODES, evaluate_policy
-from rmc.analysis.policy_file import read_policy
+from rmc.analysis.evaluation import FINAL_EPISODES
+from rmc.analysis.run_evaluation import evaluate_run
 from rmc.cli import training
-from rmc.cli.analysis_commands import evaluate_baseline
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import DM_CONTROL, PYBULLET
 from rmc.common.errors import ConfigError
@@ -166,11 +165,5 @@ def evaluate(
 
     Raises ConfigError; RmcError where the environment breaks in every episode.
     """
-    if not 1 <= episodes <= 10_000:
-        raise ConfigError("episodes", episodes, "take 1 to 10_000")
-    if flicker is not None and not 0.0 <= flicker <= 1.0:
-        raise ConfigError("flicker", flicker, "take a probability from 0 to 1")
     watchdog.warn()
-    if Path(run).is_dir() and RunFolder(Path(run)).is_baseline():
-        return evaluate_baseline(RunFolder(Path(run)), checkpoint, episodes, flicker)
-    return evaluate_policy(read_policy(run, checkpoint), episodes, flicker)
+    return evaluate_run(run, episodes, checkpoint, flicker)

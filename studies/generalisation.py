@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from rmc.analysis.baselines import evaluate
-from rmc.analysis.curves import PICTURES
 from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.history import objects
-from rmc.analysis.out_file import check_writable
+from rmc.analysis.out_file import PICTURES, check_writable
 from rmc.analysis.policy_file import read_policy
 from rmc.analysis.statistics import ENOUGH_SEEDS, interquartile_mean, interval
 from rmc.common.errors import ConfigError

@@ -246,6 +246,12 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
     return values
 
 
+def changes(was: Any, now: Any) -> dict[str, list[Any]]:
+    """Of two configs of a kind: by the option's path, what it was and is."""
+    before, after = flat(was), flat(now)
+    return {path: [before[path], after[path]] for path in after if before[path] != after[path]}
+
+
 def option(path: str) -> str:
     """The command line's name of a config path: ``replay.replay_ratio`` is ``--replay-ratio``."""
     return "--" + path.rpartition(".")[2].replace("_", "-")

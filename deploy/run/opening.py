@@ -7,11 +7,10 @@ import time
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import CheckpointError, ConfigError
-from rmc.deploy.run.config import RunConfig, flat, option
+from rmc.deploy.run.config import RunConfig, changes, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import IfExists, LaunchOptions
 from rmc.deploy.run.starts import note_start, starts
@@ -76,7 +75,7 @@ def open_run(
     ``options`` say how it is started, for its history, and what a new one begins with.
     """
     options = options or LaunchOptions(run_dir)
-    folder = RunFolder(run_dir or Path("runs") / _new_name(config))
+    folder = RunFolder(run_dir or Path("runs") / default_name(config.env.id, config.preset, config.seed))
     if os.fsencode(folder.path).decode(errors="replace") != str(folder.path):
         raise ConfigError("--run-dir", str(folder.path), "is no UTF-8; give another")
     there = run_dir is not None and if_exists != "new" and (folder.path / "config.json").exists()
@@ -101,7 +100,7 @@ def open_run(
         if initial is not None:  # before there is a config, without which it is no run
             CheckpointFolder(folder.checkpoints).save(0, initial.files)
         folder.reopen(config.total_steps)
-        note_start(folder, _changes(before, config), options, initial.origin if initial is not None else None)
+        note_start(folder, changes(before, config), options, initial.origin if initial is not None else None)
         folder.write_config(config)
         folder.write_sizes(config.sizes())
         folder.secret()
@@ -111,15 +110,14 @@ def open_run(
     return folder
 
 
-def _changes(before: RunConfig, config: RunConfig) -> dict[str, list[Any]]:
-    """By the option's path, what it was and is."""
-    was, now = flat(before), flat(config)
-    return {path: [was[path], now[path]] for path in now if was[path] != now[path]}
+def plain_name(env_id: str) -> str:
+    """An environment's id as part of a folder's name."""
+    return env_id.replace(":", "_").replace("/", "_")
 
 
-def _new_name(config: RunConfig) -> str:
-    env = config.env.id.replace(":", "_").replace("/", "_")
-    return f"{env}__{config.preset}__{config.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+def default_name(env_id: str, kind: str, seed: int) -> str:
+    """Of a run's folder, with the time."""
+    return f"{plain_name(env_id)}__{kind}__{seed}__{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def new_folder(path: Path) -> RunFolder:
@@ -186,12 +184,12 @@ def taken_up(folder: RunFolder, config: RunConfig, if_exists: IfExists, options:
 
 def _check_changes(folder: RunFolder, before: RunConfig, config: RunConfig) -> None:
     """Raises ConfigError for the first that may not be."""
-    changes = _changes(before, config)
-    for path in ["env.id", "preset", *changes]:
-        if path in changes and path not in MAY_CHANGE:
+    changed = changes(before, config)
+    for path in ["env.id", "preset", *changed]:
+        if path in changed and path not in MAY_CHANGE:
             name = "ENV" if path == "env.id" else option(path)
             why = WHY_NOT.get(path) or WHY_NOT.get(path.partition(".")[0], "that is for good")
-            was, now = changes[path]
+            was, now = changed[path]
             fix = f"the run in {folder.path} has {was!r}, and {why}; use that, or another --run-dir"
             raise ConfigError(name, now, fix)
 

@@ -11,16 +11,17 @@ import numpy as np
 from rich.console import Console
 
 from rmc.analysis import curves, env_check, export, history, memory_picture, video, world_model_picture
-from rmc.analysis.evaluation import EvaluationProgress, Watch, evaluate_policy
+from rmc.analysis.evaluation import EvaluationProgress
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
-from rmc.analysis.policy_file import read_policy
+from rmc.analysis.policy_file import PolicyFile, read_policy
+from rmc.analysis.run_evaluation import check_baselines, evaluate_run
 from rmc.analysis.run_paths import each_readable, expanded
 from rmc.cli import run_options
 from rmc.cli.ending import cut_note
 from rmc.cli.signals import signals_caught
+from rmc.common.env.config import check_range
 from rmc.common.errors import ConfigError
-from rmc.common.extra import check_installed
 from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.folder import RunFolder
@@ -30,68 +31,37 @@ log = logging.getLogger(__name__)
 
 def evaluate(command: run_options.Evaluate) -> int:
     """Play a checkpoint and print how it did."""
-    if not 1 <= command.episodes <= 10_000:
-        raise ConfigError("--episodes", command.episodes, "take 1 to 10_000")
     if not command.seconds >= 0.0:
         raise ConfigError("--seconds", command.seconds, "take 0 or more")
     for flicker in command.flicker:
-        if not 0.0 <= flicker <= 1.0:
-            raise ConfigError("--flicker", flicker, "take probabilities from 0 to 1")
-    if command.run.is_dir() and RunFolder(command.run).is_baseline():
-        return _evaluate_baseline(command)
-    policy = read_policy(command.run, command.checkpoint)
-    if command.env_timeout is not None:
-        policy = policy.with_timeout(command.env_timeout)
-    env = policy.header.env
+        check_range("--flicker", flicker, (0.0, 1.0))
     if command.video is not None:
-        video.prepare(env, command.video)
+        video.prepare(_filmed(command).header.env, command.video)
     watch = EvaluationProgress(Console(stderr=True), str(command.run))
     for probability in command.flicker or (None,):
-        _say_played(command, evaluate_policy(policy, command.episodes, probability, command.seconds, watch))
-    if command.video is not None:
-        env = dataclasses.replace(env, flicker=command.flicker[0]) if command.flicker else env
-        total = video.record(Policy(policy), env, policy.header.seed, command.video)
-        if not command.json:
-            terminal().print(f"{command.video}: an episode with return {total:,.1f}", soft_wrap=True)
-    return 0
-
-
-def _evaluate_baseline(command: run_options.Evaluate) -> int:
-    if command.video is not None:
-        raise ConfigError("--video", str(command.video), "only runs of rmc train are filmed; leave it")
-    folder, watch = RunFolder(command.run), EvaluationProgress(Console(stderr=True), str(command.run))
-    for flicker in command.flicker or (None,):
-        played = evaluate_baseline(
-            folder, command.checkpoint, command.episodes, flicker, command.seconds, watch, command.env_timeout
+        played = evaluate_run(
+            command.run, command.episodes, command.checkpoint, probability, command.seconds, watch, command.env_timeout
         )
-        _say_played(command, played)
+        terminal().print(json.dumps(played) if command.json else _result_line(played), soft_wrap=True)
+    if command.video is not None:
+        _film(command, command.video)
     return 0
 
 
-def evaluate_baseline(
-    folder: RunFolder,
-    checkpoint: str,
-    episodes: int,
-    flicker: float | None,
-    seconds: float = 0.0,
-    watch: Watch = lambda _: None,
-    env_timeout: float | None = None,
-) -> dict[str, Any]:
-    """Deterministic episodes of a baseline's last state, as ``evaluate_policy`` gives them. Raises ConfigError."""
-    if checkpoint != "latest":
-        raise ConfigError("--checkpoint", checkpoint, "a baseline keeps its last state only; use latest")
-    _check_baselines(str(folder.path))
-    from rmc.analysis import baselines
-
-    return baselines.evaluate(folder, episodes, flicker, seconds, watch, env_timeout)
+def _filmed(command: run_options.Evaluate) -> PolicyFile:
+    if command.run.is_dir() and RunFolder(command.run).is_baseline():
+        raise ConfigError("--video", str(command.video), "only runs of rmc train are filmed; leave it")
+    policy = read_policy(command.run, command.checkpoint)
+    return policy if command.env_timeout is None else policy.with_timeout(command.env_timeout)
 
 
-def _say_played(command: run_options.Evaluate, played: dict[str, Any]) -> None:
-    terminal().print(json.dumps(played) if command.json else _result_line(played), soft_wrap=True)
-
-
-def _check_baselines(what: str) -> None:
-    check_installed("baselines", ("stable_baselines3", "sb3_contrib"), "baseline", what)
+def _film(command: run_options.Evaluate, file: Path) -> None:
+    policy = _filmed(command)
+    env = policy.header.env
+    env = dataclasses.replace(env, flicker=command.flicker[0]) if command.flicker else env
+    total = video.record(Policy(policy), env, policy.header.seed, file)
+    if not command.json:
+        terminal().print(f"{file}: an episode with return {total:,.1f}", soft_wrap=True)
 
 
 def _result_line(played: dict[str, Any]) -> str:
@@ -148,7 +118,7 @@ def check_env(command: run_options.CheckEnv) -> int:
 
 def baseline(command: run_options.Baseline) -> int:
     """Train an agent of stable-baselines3."""
-    _check_baselines(command.algorithm)
+    check_baselines(command.algorithm)
     from rmc.analysis import baselines  # an extra, and slow to import
 
     with signals_caught() as stop:

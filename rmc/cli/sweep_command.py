@@ -15,6 +15,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig, option
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import plain_name
 from rmc.deploy.run.preflight import cores as cores_here
 from rmc.deploy.run.preflight import ring_bytes
 from rmc.deploy.run.state import STOPPED
@@ -76,7 +77,7 @@ def _check_usual(command: Sweep, names: Sequence[str], fix: str) -> None:
 
 def default_folder(what: str) -> Path:
     """The same for the same command, so that it goes on."""
-    name = Path(what).stem if what.endswith(".toml") else f"{what.replace(':', '_').replace('/', '_')}__sweep"
+    name = Path(what).stem if what.endswith(".toml") else f"{plain_name(what)}__sweep"
     return Path("runs") / name
 
 

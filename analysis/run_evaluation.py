@@ -1,0 +1,48 @@
+"""What ``rmc evaluate`` and ``rmc.evaluate`` do: a policy's file, a run or a baseline's run, played."""
+
+from pathlib import Path
+from typing import Any
+
+from rmc.analysis.evaluation import FINAL_EPISODES, Watch, evaluate_policy
+from rmc.analysis.policy_file import read_policy
+from rmc.common.env.config import check_range
+from rmc.common.errors import ConfigError
+from rmc.common.extra import check_installed
+from rmc.deploy.run.folder import RunFolder
+
+MOST_EPISODES = 10_000
+
+
+def evaluate_run(
+    source: str | Path,
+    episodes: int = FINAL_EPISODES,
+    checkpoint: str = "latest",
+    flicker: float | None = None,
+    seconds: float = 0.0,
+    watch: Watch = lambda _: None,
+    env_timeout: float | None = None,
+) -> dict[str, Any]:
+    """As ``evaluate_policy``: a policy's file, or a run's checkpoint; of a baseline's run its last state.
+
+    Raises ConfigError; RmcError where the environment breaks in every episode.
+    """
+    if not 1 <= episodes <= MOST_EPISODES:
+        raise ConfigError("--episodes", episodes, f"take 1 to {MOST_EPISODES:_}")
+    if flicker is not None:
+        check_range("--flicker", flicker, (0.0, 1.0))
+    folder = RunFolder(Path(source))
+    if not (folder.path.is_dir() and folder.is_baseline()):
+        policy = read_policy(source, checkpoint)
+        policy = policy if env_timeout is None else policy.with_timeout(env_timeout)
+        return evaluate_policy(policy, episodes, flicker, seconds, watch)
+    if checkpoint != "latest":
+        raise ConfigError("--checkpoint", checkpoint, "a baseline keeps its last state only; use latest")
+    check_baselines(str(source))
+    from rmc.analysis import baselines  # an extra
+
+    return baselines.evaluate(folder, episodes, flicker, seconds, watch, env_timeout)
+
+
+def check_baselines(what: str) -> None:
+    """Raises ConfigError where the extra is missing, which names ``what``."""
+    check_installed("baselines", ("stable_baselines3", "sb3_contrib"), "baseline", what)
