@@ -84,10 +84,8 @@ def draw_everything(client: ReplayClient, steps: int) -> np.ndarray:
         assert sample.rows is not None
         for row in sample.rows.copy():
             windows[int(row["serial"])] = row
-        drawn_steps, actors = (
-            sum(int(row["new_steps"]) for row in windows.values()),
-            {row["actor"] for row in sample.rows},
-        )
+        drawn_steps = sum(int(row["new_steps"]) for row in windows.values())
+        actors = {int(row["actor"]) for row in windows.values()}
         if sample.env_steps >= steps and drawn_steps >= sample.env_steps and len(actors) == CONFIG.actors:
             return np.array([windows[serial] for serial in sorted(windows)])
     raise AssertionError(f"{drawn_steps} steps after {SECONDS} s; the server has {sample.env_steps}")
