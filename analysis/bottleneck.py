@@ -117,7 +117,7 @@ def threads_of_learner(vitals: Vitals, config: RunConfig, cores: int) -> int:
 
 def host_cores(vitals: Vitals) -> int:
     """Cores that the run may use; 0 where it was recorded without."""
-    return int(vitals.last("launcher", "host_cores"))
+    return max(0, int(vitals.last("launcher", "host_cores")))
 
 
 def free_cores(vitals: Vitals) -> float | None:

@@ -42,7 +42,7 @@ def threads_fight(vitals: Vitals, config: RunConfig) -> Finding | None:
 def oversubscribed(vitals: Vitals, config: RunConfig) -> Finding | None:
     """Others compute on this machine, too."""
     load, cpus, cores = vitals.mean("launcher", "host_load"), vitals.last("launcher", "host_cpus"), host_cores(vitals)
-    if load is None or not cpus or load <= LOADED * cpus:
+    if load is None or not (cpus and cores) or load <= LOADED * cpus:
         return None
     busy = busy_threads(vitals, config, cores)
     if load <= busy + LOADED:  # it is this run's own, which threads_fight judges

@@ -234,6 +234,9 @@ def test_a_machine_that_others_use() -> None:
     assert finding is not None
     assert finding.measured == "load 9.0 on 4 CPUs, of which this run is 1.0"
     assert host_faults.oversubscribed(vitals(launcher=HOST), CONFIG) is None
+    for cores in (0, -3):  # as a damaged record may have it
+        odd = vitals(launcher=HOST | {"host_load": 9.0, "host_cores": cores}, learner=shares(0.5))
+        assert host_faults.oversubscribed(odd, CONFIG) is None
     stolen = host_faults.stolen(vitals(launcher=HOST | {"host_steal_share": 0.25}), CONFIG)
     assert stolen is not None
     assert "25% of the CPU time" in stolen.measured
