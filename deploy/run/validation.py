@@ -1,4 +1,4 @@
-"""Which configurations make no sense, judged in one place."""
+"""Which configurations make no sense; numbers of the environment are judged in ``common/env/config.py``."""
 
 from typing import Any, Literal, get_args
 
@@ -52,7 +52,7 @@ RANGES: dict[str, tuple[float, float]] = {  # both ends included
 
 
 def validate(config: RunConfig) -> None:
-    """Raises ConfigError for the first value that makes no sense; the one place that judges numbers."""
+    """Raises ConfigError for the first value that makes no sense."""
     check_env_config(config.env)
     for path, limits in RANGES.items():
         value: Any = config
