@@ -241,7 +241,7 @@ class Evaluator:
         """Hand out what is left, and close the environments."""
         with suppress(BusUnavailable, BusFull):
             while self._records:
-                self._bus.emit(self.name, {"time": time.time(), **self._records[0]})
+                self._bus.emit(self.name, self._records[0])
                 self._records.popleft()
         self._env.close()
 

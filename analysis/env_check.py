@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import check_env as gymnasiums_checks
 from numpy.typing import NDArray
 from rich.console import Console
 
+from rmc.common.agent_config import STD_FLOOR
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.describe import layout_of
 from rmc.common.env.faults import RAISED, describe_error
@@ -157,6 +158,9 @@ def _hints(env: Env, played: Played) -> Iterator[str]:
     still = np.flatnonzero(observations.std(0) == 0.0).tolist()
     if still:
         yield f"note: observations {_listed(still)} never changed"
+    faint = np.flatnonzero((observations.std(0) > 0.0) & (observations.std(0) < STD_FLOOR)).tolist()
+    if faint:
+        yield f"note: observations {_listed(faint)} vary by less than {STD_FLOOR}; scale them up in the environment"
     if np.abs(observations).max() > LARGE_OBSERVATION:
         yield f"note: observations reach {np.abs(observations).max():.3g}; scale them in the environment"
     yield from _reward_notes(np.abs(rewards))

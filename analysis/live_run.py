@@ -19,7 +19,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
 from rmc.deploy.run.starts import format_start, starts
 
-LOOK_BYTES = 8 << 20  # of metrics at a look: a long run's past is read in several
+LOOK_BYTES = 1 << 20  # of metrics at a look: a long run's past is read in several
 POINTS = 512  # most of a curve; even
 EVENTS, SAME_SECONDS = 200, 60.0  # most that are kept; within so long the same thing again is one event
 KINDS = ("actor", "replay", "learner", "evaluator")

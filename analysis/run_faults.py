@@ -4,9 +4,9 @@ from itertools import pairwise
 
 from rmc.analysis.finding import Finding, typed_number
 from rmc.analysis.vitals import Vitals
+from rmc.deploy.monitor.notices import STALLED_SECONDS
 from rmc.deploy.run.config import RunConfig
 
-STALLED_SECONDS = 60.0  # without a step and an update
 SILENT_SECONDS = 30.0  # without a word; roles speak every second
 PLAYED = 0.75  # of the checkpoints: fewer evaluations leave holes in the curve
 STALE_UPDATES = 1_000  # of lag; docs/metrics.md calls tens to hundreds healthy

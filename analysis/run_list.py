@@ -14,8 +14,8 @@ from rmc.deploy.monitor.figures import duration, number
 from rmc.deploy.monitor.recorded import recorded_status
 from rmc.deploy.monitor.table import STYLES
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import LISTED_BYTES
 
-RECENT_BYTES = 1 << 18  # of each run's metrics
 DAMAGED = "damaged"
 # Each column, and the console's width from which it is shown.
 COLUMNS = {"run": 0, "state": 0, "steps": 0, "return": 0, "best": 60, "done": 72, "time": 84, "env": 110, "agent": 130}
@@ -52,7 +52,7 @@ def summary(path: Path) -> RunSummary:
     """What is known of a run; that it is damaged, where it cannot be read."""
     folder = RunFolder(path)
     try:
-        status, result = recorded_status(folder, RECENT_BYTES), folder.result() or {}
+        status, result = recorded_status(folder, LISTED_BYTES), folder.result() or {}
     except (ConfigError, OSError) as error:
         return RunSummary(str(path), fault=str(error))
     returns = [one.return_mean for one in (status.best, status.last) if one is not None]

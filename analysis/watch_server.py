@@ -46,8 +46,12 @@ class Broadcast:
     async def follow(self, is_over: Callable[[], bool]) -> None:
         """Look at the runs until that says so; then every stream ends."""
         while not is_over():
-            news = [run.look() for run in self._runs]
-            if found := b"".join(_event(i, one) for i, one in enumerate(news) if one is not None):
+            news = []
+            for i, run in enumerate(self._runs):
+                if (new := run.look()) is not None:
+                    news.append(_event(i, new))
+                await asyncio.sleep(0)  # pages are answered between runs
+            if found := b"".join(news):
                 self._looks.append(found)
                 self._count += 1
                 self._wake()

@@ -12,10 +12,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rmc.common.agent_config import CRITIC_PARTS, LOG_STD_RANGE, NORMALIZED_CLIP, POLICY_PARTS, AgentConfig
+from rmc.common.agent_config import (
+    CRITIC_PARTS,
+    LOG_STD_RANGE,
+    NORMALIZED_CLIP,
+    POLICY_PARTS,
+    STD_FLOOR,
+    AgentConfig,
+)
 from rmc.common.critic import TwinQ
-
-STD_FLOOR = 1e-2  # a constant dimension is not blown up
 
 
 class Normalizer(nn.Module):

@@ -5,6 +5,7 @@ from typing import Literal
 
 LOG_STD_RANGE = (-20.0, 2.0)  # of the policy's Gaussian before the tanh
 NORMALIZED_CLIP = 10.0  # standard deviations
+STD_FLOOR = 1e-2  # of a number of an observation: one that is constant is not blown up
 HeadInput = Literal["hidden", "hidden+embedding", "hidden+observation", "observation"]
 POLICY_PARTS = ("normalizer.", "memory.", "policy.", "next_frame.")  # what it takes to act
 CRITIC_PARTS = ("critic.", "log_alpha", "privileged_normalizer.")  # what else it takes to rate a window

@@ -163,10 +163,13 @@ class CheckpointFolder:
                 self.damaged.add(number)
         return None
 
-    def mark_best(self, number: int, score: float) -> None:
-        """Record a checkpoint's evaluation if it is there and beats the best so far."""
-        if self.path(number).exists() and score > self._best_record()[1]:
+    def mark_best(self, number: int, score: float) -> bool:
+        """Record a checkpoint's evaluation if that beats the best so far; whether the checkpoint is there."""
+        if not self.path(number).exists():
+            return False
+        if score > self._best_record()[1]:
             write_whole(self.folder / BEST, json.dumps({"update": number, "eval_return_mean": score}).encode())
+        return True
 
     def best(self) -> int | None:
         """Number of the best checkpoint evaluated so far, if any."""

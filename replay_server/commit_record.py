@@ -49,7 +49,7 @@ class Progress:
     elsewhere_steps: int = 0  # trained steps drawn from the other shards, as the learner last said
     begun_env_steps: int = 0  # environment steps that were in before this ring began, empty
     begun_drawn_steps: int = 0  # and trained steps that were drawn, from all shards
-    max_priority: float = 1.0  # the largest seen
+    max_priority: float = 1.0  # a new window's
     observations: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (C,), of the statistics
     total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (D,)
     total_square: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (D,)

@@ -6,9 +6,13 @@ Shapes: n rows, T + 1 observations, O observation, M flags of what is missing, P
 import numpy as np
 from numpy.typing import NDArray
 
+from rmc.common.agent_config import STD_FLOOR
 from rmc.common.compiled import compiled
 from rmc.common.replay import ObservationStatistics
 from rmc.common.window import Rows, WindowSpec
+
+SETTLED = 1_000  # observations from which on the sums tell what a number may be
+FARTHEST = 100.0  # standard deviations from the mean that one counts as at most
 
 
 @compiled
@@ -18,11 +22,16 @@ def _add_up(
     missing: NDArray[np.uint8],
     new: NDArray[np.int32],
     last: NDArray[np.int32],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
     count: NDArray[np.int64],
     total: NDArray[np.float64],
     total_square: NDArray[np.float64],
 ) -> None:
-    """(n, F) with K numbers an observation from ``offset`` on, (n, T + 1, M), (n,), (n,), adds to (M,), (K,) twice."""
+    """(n, F) with K numbers an observation from ``offset`` on, (n, T + 1, M), (n,), (n,), adds to (M,), (K,) twice.
+
+    A number counts as within (K,) ``low`` and ``high``.
+    """
     size, flags = total.shape[0], missing.shape[2]
     for row in range(floats.shape[0]):
         for t in range(last[row] - new[row] + 1, last[row] + 1):
@@ -32,22 +41,37 @@ def _add_up(
                     continue
                 count[flag] += 1
                 for k in range(flag, flag + 1) if flags > 1 else range(size):
-                    value = np.float64(floats[row, start + k])
+                    value = min(max(np.float64(floats[row, start + k]), low[k]), high[k])
                     total[k] += value
                     total_square[k] += value * value
 
 
-def observation_sums(rows: Rows, spec: WindowSpec) -> ObservationStatistics:
-    """Over what no earlier window carried and what is not missing; padding is never read."""
+def _plausible(known: ObservationStatistics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(D,) lowest and highest that a number counts as: one of a simulator that explodes must not blind the rest."""
+    count = np.maximum(known.count, 1)
+    mean = known.total / count
+    std = np.sqrt(np.maximum(known.total_square / count - mean * mean, 0.0))
+    reach = np.where(known.count >= SETTLED, FARTHEST * np.maximum(std, STD_FLOOR), np.inf)
+    return mean - reach, mean + reach
+
+
+def observation_sums(rows: Rows, spec: WindowSpec, known: ObservationStatistics) -> ObservationStatistics:
+    """Over what no earlier window carried and what is not missing; padding is never read.
+
+    ``known`` are the sums so far.
+    """
     parts = [("observation", spec.obs_dim, rows["missing"])]
     if spec.privileged:
         parts.append(("privileged", spec.privileged, np.zeros((len(rows), spec.observations, 1), np.uint8)))
     new, last = np.minimum(rows["new_observations"], rows["last"] + 1), rows["last"]
     floats = rows.view(np.float32).reshape(len(rows), spec.dtype.itemsize // 4)
     assert spec.dtype.fields is not None
-    sums = []
+    low, high = _plausible(known)
+    sums, first = [], 0
     for name, size, missing in parts:
         count, total, total_square = np.zeros(missing.shape[2], np.int64), np.zeros(size), np.zeros(size)
-        _add_up(floats, spec.dtype.fields[name][1] // 4, missing, new, last, count, total, total_square)
+        part, first = slice(first, first + size), first + size
+        offset = spec.dtype.fields[name][1] // 4
+        _add_up(floats, offset, missing, new, last, low[part], high[part], count, total, total_square)
         sums.append((count if spec.counts == 1 else np.broadcast_to(count, size), total, total_square))
     return ObservationStatistics(*map(np.concatenate, zip(*sums, strict=True)))

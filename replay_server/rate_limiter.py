@@ -6,7 +6,7 @@
 drawn: trained steps drawn; inserted: environment steps. The tolerance is one batch and the slack's worth of
 steps. When the learner waits, the actors' limit is at least ``slack`` above what is inserted; so nobody
 waits for the other for ever where the slack covers the steps that actors may hold back unsent
-(actors * environments * stride).
+(actors * environments * trained steps of a window: an episode's first window is sent when it is full).
 """
 
 from dataclasses import dataclass

@@ -40,6 +40,13 @@ class ReplayStore:
         self.priorities[slots] = priorities
         self.tree.set(slots, self.leaf_values(priorities))
 
+    def largest_priority(self) -> float:
+        """Of the windows that are there, with which a new one enters; the last known where that cannot be told."""
+        there = self.tree.leaves() > 0.0
+        if not self.exponent or not there.any():
+            return self.ring.progress.max_priority
+        return float(self.priorities[there[: len(self.priorities)]].max())
+
     def forget(self, slots: NDArray[np.int64]) -> None:
         """Let (B,) slots hold no windows: none is drawn from them, now or after a restart."""
         self.ring.forget(slots)

@@ -158,8 +158,9 @@ class ReplayServer:
 
     def _insert(self, batch: IngestBatch) -> None:
         ring, progress, rows = self._store.ring, self._store.ring.progress, batch.rows
-        sums = observation_sums(rows, self.spec)
+        sums = observation_sums(rows, self.spec, self.statistics())
         slots = ring.write(rows)
+        progress.max_priority = self._store.largest_priority()
         initial = rows["initial_priority"][-ring.capacity :]
         priorities = np.where(initial > 0, np.maximum(initial, PRIORITY_FLOOR), progress.max_priority)
         self._store.set_priorities(slots, priorities.astype(np.float32))

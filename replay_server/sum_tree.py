@@ -60,6 +60,10 @@ class SumTree:
         """Values of (B,) slots."""
         return self._nodes[self.size + slots]
 
+    def leaves(self) -> Values:
+        """(size,) the values of all slots."""
+        return self._nodes[self.size :]
+
     def rebuild(self, values: Values) -> None:
         """Replace everything by (capacity,) values."""
         self._nodes[:] = 0.0

@@ -96,7 +96,7 @@ class Heartbeat:
 
     def _metrics(self) -> dict[str, Any]:
         refused = {"refused_values": self._bus.refused.total()}
-        return {"time": time.time(), **self._role.metrics(), **refused, **self._clock.shares()}
+        return {**self._role.metrics(), **refused, **self._clock.shares()}
 
 
 def run_role(

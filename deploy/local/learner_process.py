@@ -1,7 +1,6 @@
 """The learner's process."""
 
 import ssl
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -41,7 +40,7 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
     for client in clients:
         client.close()
     if learner.finished:
-        last = {"time": time.time(), **learner.metrics(), "finished": 1}
+        last = {**learner.metrics(), "finished": 1}
         with suppress(BusUnavailable, BusFull):  # its launcher waits for it, unless all is to stop
             until_taken(lambda: bus.emit(learner.name, last), learner.name, process.stop)
 

@@ -95,7 +95,7 @@ class Lockstep:
     def emit_metrics(self, clock: BusyClock) -> None:
         """Of every role; all have one thread, and so its shares."""
         for role in self.roles:
-            self.bus.emit(role.name, {"time": time.time(), **role.metrics(), **clock.shares()})
+            self.bus.emit(role.name, {**role.metrics(), **clock.shares()})
 
     def close(self) -> None:
         """Close every role; the learner saves first."""

@@ -129,6 +129,14 @@ class _Server(socketserver.ThreadingMixIn, WSGIServer):
         """Whether there is room for one more; else it is hung up on."""
         return self._free.acquire(blocking=False)
 
+    def process_request(self, *client: Any) -> None:
+        """Serve it in a thread, where one can be started."""
+        try:
+            super().process_request(*client)
+        except RuntimeError:
+            self._free.release()
+            raise
+
     def process_request_thread(self, *client: Any) -> None:
         """Serve it."""
         try:

@@ -24,6 +24,7 @@ from rmc.deploy.run.host import HostFigures
 from rmc.deploy.run.metrics_tail import MetricsTail, wall_seconds
 
 RECORD_SECONDS = 5.0  # between the launcher's own records, and looks at the run's folder
+TOO_LATE = "checkpoint %d was dropped before its evaluation ended; raise --keep-checkpoints, or lower --episodes"
 log = logging.getLogger(__name__)
 
 
@@ -93,7 +94,7 @@ class Monitor:
     def _take_in(self, bus: Bus) -> None:
         while records := self._read(bus):
             for record in records:
-                self.take(record)
+                self.take(record | {"time": time.time()})  # by one clock: machines' clocks differ
 
     def _read(self, bus: Bus) -> list[dict[str, Any]]:
         self._refused = bus.refused.total()
@@ -108,13 +109,20 @@ class Monitor:
         self.status.take(record)
         main = main_metrics(self.status) if record["role"] == "launcher" else evaluation_metrics(record)
         self._metrics_log.write(record, self.status.env_steps if at is None else at, main)
+        self._mark_best(record)
+
+    def _mark_best(self, record: dict[str, Any]) -> None:
+        """One that was cut says too little: of a task that punishes each step, it would always be the best."""
         update, score = record.get("eval_update"), record.get("eval_return_mean")
-        if record["role"] == "evaluator" and isinstance(update, int) and is_finite(score):
+        is_whole = record["role"] == "evaluator" and not record.get("eval_cut")
+        if is_whole and isinstance(update, int) and is_finite(score):
             self._unmarked[update] = float(score)
         with suppress(OSError):  # no room; the next record tries again
             for update in list(self._unmarked):
-                self._checkpoints.mark_best(update, self._unmarked[update])
+                is_there = self._checkpoints.mark_best(update, self._unmarked[update])
                 del self._unmarked[update]
+                if not is_there:
+                    log.warning(TOO_LATE, update)
 
     def _record_launcher(self) -> None:
         restarts = {f"restarts_{role}": count for role, count in self.restarts().items()}

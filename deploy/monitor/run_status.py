@@ -16,6 +16,7 @@ SILENT_SECONDS = 5.0  # after which a role's silence is shown; it speaks every s
 LAUNCHER_SECONDS = 15.0  # the same of the launcher, which speaks every 5
 WAITING_SHARE = 0.5  # from which a role is said to wait
 PAUSE_SECONDS = 30.0  # of the learner, after which what it waited before counts no more
+MOST_CHECKPOINTS = 64  # whose steps are known: evaluations follow within a few
 UNHEARD_SECONDS = 30.0  # of a role that has not spoken yet: it imports, and makes its environments
 
 
@@ -52,6 +53,7 @@ class RunStatus:
         self.final_steps: int | None = None  # once the run has its result
         self.heard = "*"  # which roles speak all the time; of a baseline the launcher alone
         self._pace = Pace()
+        self._checkpoints: dict[int, int] = {}  # environment steps by update
         self._counted, self._moved_at, self._spoke_at = (0, 0), 0.0, 0.0  # steps and updates, when they last grew
 
     @property
@@ -71,10 +73,20 @@ class RunStatus:
             self.roles[role] = current | new
         else:  # afresh: another thread may be going through the old one
             self.roles = {**self.roles, role: dict(new)}
+        self._note_checkpoint(record)
         self.take_evaluation(record)
         self._note_movement(_number(self.get("learner", "time")))
         if role.startswith("replay") and "env_steps" in record and _number(self.get("learner", "updates_per_s")) > 0:
             self._pace.note(_number(record.get("time")), self.env_steps)
+
+    def _note_checkpoint(self, record: dict[str, Any]) -> None:
+        update, steps = _steps(record.get("checkpoint_update")), _steps(record.get("checkpoint_env_steps"))
+        if record["role"] != "learner" or update is None or steps is None:
+            return
+        self._checkpoints.pop(update, None)
+        self._checkpoints[update] = steps  # last
+        if len(self._checkpoints) > MOST_CHECKPOINTS:
+            del self._checkpoints[next(iter(self._checkpoints))]
 
     def _note_movement(self, spoke_at: float) -> None:
         """When the counters last grew, by the learner's clock; a pause of it, as between starts, does not count."""
@@ -91,7 +103,7 @@ class RunStatus:
         deviation = deviation if is_finite(deviation) else None
         at = _steps(record.get("eval_env_steps"))
         self.last = EvaluationStatus(float(score), deviation, _steps(record["eval_update"]), at)
-        if self.best is None or self.last.return_mean > self.best.return_mean:
+        if not record.get("eval_cut") and (self.best is None or self.last.return_mean > self.best.return_mean):
             self.best = self.last
 
     def silent(self) -> dict[str, float]:
@@ -162,10 +174,8 @@ class RunStatus:
         return max(0, self.total_steps - self.env_steps) / rate
 
     def checkpoint_steps(self, update: int | None) -> int | None:
-        """Environment steps at the checkpoint of that update, or None where the learner has said them of another."""
-        steps = self.get("learner", "checkpoint_env_steps")
-        saved = update is not None and update == self.get("learner", "checkpoint_update")
-        return _steps(steps) if saved else None
+        """Environment steps at the checkpoint of that update, or None where the learner has not said them."""
+        return None if update is None else self._checkpoints.get(update)
 
     def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:
         """The sum or mean ``over`` all replay servers, or None."""

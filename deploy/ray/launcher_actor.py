@@ -18,9 +18,8 @@ from rmc.deploy.monitor import attach
 from rmc.deploy.monitor.recorded import recorded_status
 from rmc.deploy.ray.role_actor import NAMESPACE, RoleActor, Task, actor_name
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import LISTED_BYTES
 from rmc.deploy.run.starts import starts
-
-RECENT_BYTES = 1 << 18  # of a run's metrics
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ class LauncherActor(RoleActor):
     def summary(self) -> ClusterRunSummary:
         """How the run is. Raises ConfigError where its folder is damaged."""
         folder = RunFolder(self._folder)
-        status, past_starts = recorded_status(folder, RECENT_BYTES), starts(folder)
+        status, past_starts = recorded_status(folder, LISTED_BYTES), starts(folder)
         heard = set(status.roles) - set(status.silent())
         at = self._claim.read_text().split()[:1] if "learner" in heard else []
         address = next((node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] in at), None)

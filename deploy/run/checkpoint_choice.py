@@ -26,7 +26,7 @@ def _number(checkpoints: CheckpointFolder, which: str) -> int:
     if which == "best":
         best = checkpoints.best()
         if best is None or best not in numbers:
-            raise ConfigError("--checkpoint", which, "none was evaluated yet; use latest")
+            raise ConfigError("--checkpoint", which, "none was evaluated whole yet; use latest")
         return best
     if which.isdecimal() and int(which) in numbers:
         return int(which)

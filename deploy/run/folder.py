@@ -7,6 +7,7 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import secrets
 import socket
 import tempfile
@@ -34,6 +35,7 @@ RESULT = (
     "eval_episodes",
     "initial_return_mean",
 )
+RING = re.compile(r"replay(-\d+)?")  # a replay server's folder
 INITIAL = ("eval_return_mean", "eval_return_std", "eval_episodes")
 
 
@@ -42,7 +44,7 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path.resolve()
-        self.checkpoints, self.replay, self.logs = self.path / "checkpoints", self.path / "replay", self.path / "logs"
+        self.checkpoints, self.logs = self.path / "checkpoints", self.path / "logs"
         self.metrics = self.path / "metrics.jsonl"
         self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
         self.initial_file, self.sizes_file = self.path / "initial.json", self.path / "sizes.json"
@@ -54,6 +56,10 @@ class RunFolder:
     def name(self) -> str:
         """The run's name in Redis: the folder's, and what tells it from others of that name."""
         return f"{self.path.name}-{hashlib.sha256(self.secret()).hexdigest()[:8]}"
+
+    def rings(self) -> list[Path]:
+        """The folders of its replay servers' rings, as far as they are there."""
+        return [path for path in self.path.glob("replay*") if RING.fullmatch(path.name)]
 
     def settings(self) -> dict[str, Any]:
         """What ``config.json`` says, also that of a baseline or of an older version.

@@ -10,6 +10,7 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.deploy.run.folder import parse_record
 
 RECENT_BYTES = 16 << 20  # at the end of a file, within which every role has said all of its metrics
+LISTED_BYTES = 1 << 18  # the same where many runs are listed: each has said what a list shows
 EVALUATION = b'"eval_return_mean"'
 
 

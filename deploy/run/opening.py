@@ -14,6 +14,7 @@ from rmc.deploy.run.config import RunConfig, changes, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import IfExists, LaunchOptions
 from rmc.deploy.run.starts import note_start, starts
+from rmc.deploy.run.tracking import choose_tracking, keep_tracking
 from rmc.deploy.run.validation import validate_windows
 
 log = logging.getLogger(__name__)
@@ -79,7 +80,7 @@ def open_run(
     if os.fsencode(folder.path).decode(errors="replace") != str(folder.path):
         raise ConfigError("--run-dir", str(folder.path), "is no UTF-8; give another")
     there = run_dir is not None and if_exists != "new" and (folder.path / "config.json").exists()
-    before, initial = config, None
+    tracking, before, initial = choose_tracking(options), config, None
     if there:
         before = taken_up(folder, config, if_exists, options)
     else:
@@ -103,6 +104,7 @@ def open_run(
         note_start(folder, changes(before, config), options, initial.origin if initial is not None else None)
         folder.write_config(config)
         folder.write_sizes(config.sizes())
+        keep_tracking(folder, tracking)
         folder.secret()
     except BaseException:  # a notebook lives on, and would keep the lock
         folder.unlock()

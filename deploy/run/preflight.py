@@ -31,8 +31,6 @@ def check_machine(config: RunConfig, options: LaunchOptions) -> None:
 def check_port(options: LaunchOptions) -> None:
     """Raises ConfigError where metrics are to be served, and cannot be there now."""
     host, port = options.metrics_host, options.metrics_port
-    if port is None and host != LaunchOptions.metrics_host:
-        raise ConfigError("--metrics-host", host, "say which port: give --metrics-port, or leave it")
     if port is None:
         return
     if not 1 <= port <= 65_535:

@@ -23,6 +23,8 @@ def print_end(folder: RunFolder, console: Console) -> int:
         newest = CheckpointFolder(folder.checkpoints).latest()
         steps = json.loads(newest[1][PROGRESS])["env_steps"] if newest else 0
         return print_stopped(folder, steps, console)
+    if status is None:
+        raise RoleDied(f"the launcher of {folder.path} was killed; to go on: {resume_command(folder)}")
     log_file = folder.logs / "launcher.log"
     last_lines = log_file.read_text(errors="replace").strip().splitlines()[-30:] if log_file.exists() else []
     console.print("\n".join(last_lines), soft_wrap=True)

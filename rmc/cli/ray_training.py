@@ -21,7 +21,6 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.memory_reach import reach_note
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine, cores
-from rmc.deploy.run.tracking import choose_tracking, keep_tracking
 from rmc.deploy.run.validation import validate, validate_launch
 
 
@@ -47,10 +46,8 @@ def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> tup
     config = dataclasses.replace(config, learner=learner, actors=fit if options.all_cpus else config.actors)
     validate(config)  # again: the cluster may have changed the number of actors
     check_machine(config, options)
-    tracking = choose_tracking(options)
     place_for_sockets()
     folder = open_run(config, options.run_dir, options.if_exists, options)
-    keep_tracking(folder, tracking)
     folder.unlock()
     launcher.launch(config, folder, options)
     console.print(f"run folder {folder.path}", soft_wrap=True)

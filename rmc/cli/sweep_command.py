@@ -173,7 +173,7 @@ def _conduct(command: Sweep, work: Work, checked: list[Checked], index: Index) -
 
 def _warn_of_empty_rings(todo: list[Job]) -> None:
     begun = [job for job in todo if (job.folder / "checkpoints" / "epoch").exists()]
-    empty = [job.name for job in begun if not RunFolder(job.folder).replay.exists()]
+    empty = [job.name for job in begun if not RunFolder(job.folder).rings()]
     if empty:
         names = ", ".join(empty)
         log.warning("without their replay ring, these continue with --warmup-steps that are not trained on: %s", names)

@@ -1,5 +1,6 @@
 """``rmc train`` from its checks to ``result.json``."""
 
+import traceback
 from contextlib import AbstractContextManager, nullcontext
 from statistics import mean
 from typing import Any
@@ -26,7 +27,6 @@ from rmc.deploy.run.memory_reach import reach_note
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.state import STOPPED
-from rmc.deploy.run.tracking import choose_tracking, keep_tracking
 from rmc.deploy.run.validation import validate, validate_launch
 
 
@@ -48,14 +48,11 @@ def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
     validate(config)
     validate_launch(config, options)
     check_machine(config, options)
-    tracking = choose_tracking(options)
     if options.launcher == "local":
         place_for_sockets()
     if options.redis_url is not None:
         connect(options.redis_url, "check")
-    folder = open_run(config, options.run_dir, options.if_exists, options)
-    keep_tracking(folder, tracking)
-    return folder
+    return open_run(config, options.run_dir, options.if_exists, options)
 
 
 def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
@@ -64,9 +61,9 @@ def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, consol
     with signals_interrupt():
         try:
             return _conduct(config, folder, options, console)
-        except RmcError as error:  # whoever comes back to a closed terminal finds it there
+        except Exception as error:  # whoever comes back to a closed terminal finds it there
             if options.launcher != "ray":  # on Ray all that is printed goes there
-                Output.keep(f"{error}\n")
+                Output.keep(f"{error}\n" if isinstance(error, RmcError) else traceback.format_exc())
             raise
 
 

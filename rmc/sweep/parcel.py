@@ -2,15 +2,15 @@
 
 import io
 import os
-import re
 import tarfile
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rmc.deploy.run.folder import RING
+
 Stamps = dict[str, tuple[int, int]]  # a file's size and time of change in ms, by its path in the folder
-RING = re.compile(r"replay(-\d+)?")
 NS_PER_MS = 1_000_000  # finer times do not survive the tar
 
 

@@ -123,5 +123,6 @@ def conduct(
 
 
 def drop_replay(job: Job) -> None:
-    """Remove a finished run's ring. Its checkpoints, metrics and result stay; trained longer, it fills another."""
-    shutil.rmtree(RunFolder(job.folder).replay, ignore_errors=True)
+    """Remove a finished run's rings. Its checkpoints, metrics and result stay; trained longer, it fills another."""
+    for ring in RunFolder(job.folder).rings():
+        shutil.rmtree(ring, ignore_errors=True)

@@ -8,6 +8,7 @@ import psutil
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.preflight import DISK_RESERVE, cores, existing_parent, ring_bytes
 from rmc.sweep.job import Job
 
@@ -33,7 +34,7 @@ def runs_that_fit(run_cores: int, memory: int) -> int:
 
 def check_disk(folder: Path, jobs: Sequence[Job], ring: int, at_once: int, dropped: bool) -> None:
     """Raises ConfigError where the rings of runs that have none yet are larger than the free disk."""
-    new = sum(not (job.folder / "replay").exists() for job in jobs)
+    new = sum(not RunFolder(job.folder).rings() for job in jobs)
     count = min(new, at_once) if dropped else new
     free = shutil.disk_usage(existing_parent(folder.resolve())).free - DISK_RESERVE
     if count * ring > max(0, free):

@@ -96,8 +96,8 @@ def test_agrees_with_the_agent(
 
 
 @pytest.mark.parametrize("envs", [1, 32])
-def test_both_ways_to_multiply_agree_with_the_agent(envs: int) -> None:
-    """Default sizes: plain products for few environments, packed ones for many."""
+def test_default_sizes_agree_with_the_agent(envs: int) -> None:
+    """For few environments, and for many."""
     agent = make_agent(AgentConfig(head_input="hidden+embedding"))
     with torch.no_grad():
         for value in agent.parameters():

@@ -57,6 +57,13 @@ class Late(Odd):
         return *super().step(action)[:4], {"privileged": [1.0, 2.0]}
 
 
+class Faint(Odd):
+    """Its numbers are in metres, and move by tens of micrometres."""
+
+    def _observation(self) -> Any:
+        return (1e-5 * np.random.default_rng().normal(size=3)).astype(np.float32)
+
+
 class Rewarded(Odd):
     """Each reward has the same size, but for every hundredth."""
 
@@ -73,6 +80,7 @@ for _name, _sizes in {
 }.items():  # fmt: skip
     gym.register(f"{_name}-v0", Rewarded, kwargs=dict(zip(("size", "rare"), _sizes, strict=False)))
 gym.register("Odd-v0", entry_point=Odd)
+gym.register("Faint-v0", entry_point=Faint)
 gym.register("Untold-v0", entry_point=Untold)
 gym.register("Late-v0", entry_point=Late)
 gym.register("Unrewarded-v0", entry_point=Unrewarded)
@@ -99,6 +107,7 @@ def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
         assert words in text
     assert "the same seed and actions gave other observations" in text
     assert "--curiosity" in checked("Unrewarded-v0", capsys, "--steps", "100")[1]
+    assert "observations 0, 1, 2 vary by less than 0.01; scale them up" in checked("Faint-v0", capsys)[1]
 
 
 @pytest.mark.parametrize(

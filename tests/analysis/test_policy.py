@@ -186,7 +186,7 @@ def test_export_says_what_is_wrong_in_one_line(
     assert main.run(["export", str(run.path), "--out", str(tmp_path)]) == 2
     assert "is a folder" in capsys.readouterr().err
     assert main.run(["export", str(run.path), "--checkpoint", "best"]) == 2
-    assert "none was evaluated yet" in capsys.readouterr().err
+    assert "none was evaluated whole yet" in capsys.readouterr().err
     assert main.run(["export", str(run.path), "--checkpoint", "²"]) == 2
     assert "use latest, best or one of [7]" in capsys.readouterr().err
     assert main.run(["export", str(run.path), "--out", "/proc/policy.onnx"]) == 2

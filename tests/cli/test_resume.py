@@ -14,6 +14,7 @@ from rmc.deploy.run.config import Preset, RunConfig, flat
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.preflight import check_port
 from rmc.deploy.run.presets import debug, preset_config
 from tests.cli.test_main import complaint
 
@@ -78,6 +79,14 @@ def test_another_launcher_takes_the_device_alone_along(tmp_path: Path) -> None:
     assert parsed("resume", path, "--launcher", "local")[1] == LaunchOptions(path, "resume", "local", "cuda")
     assert parsed("resume", path, "--launcher", "ray", "--no-tls")[1] == dataclasses.replace(last, tls=False)
     assert parsed("resume", path, "--metrics-port", "None")[1] == dataclasses.replace(last, metrics_port=None)
+
+
+def test_a_run_that_was_served_goes_on_without(run: RunFolder) -> None:
+    last = LaunchOptions(run.path, metrics_port=9464, metrics_host="0.0.0.0")
+    open_run(run.config(), run.path, "resume", last).unlock()
+    launch = parsed("resume", run.path, "--metrics-port", "None")[1]
+    assert launch.metrics_port is None
+    check_port(launch)
 
 
 def test_a_new_folder_beside_it_begins_with_the_preset(run: RunFolder) -> None:

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from rmc.analysis import evaluation
 from rmc.cli import main, training
+from rmc.cli.ending import print_end
 from rmc.cli.training import conduct
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import RoleDied
@@ -168,3 +169,20 @@ def test_why_a_run_has_failed_stays_in_its_folder(tmp_path, monkeypatch):
     with pytest.raises(RoleDied):
         conduct(folder.config(), folder, placement, Console(quiet=True))
     assert (folder.logs / "launcher.log").read_text() == "the learner ended 3 times\n"
+
+
+def test_what_nobody_expected_stays_there_too(tmp_path, monkeypatch):
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+    monkeypatch.setattr(training, "_launch", lambda *_: 1 // 0)
+    folder.lock()
+    with pytest.raises(ZeroDivisionError):
+        conduct(folder.config(), folder, LaunchOptions(folder.path), Console(quiet=True))
+    text = (folder.logs / "launcher.log").read_text()
+    assert text.startswith("Traceback")
+    assert text.endswith("ZeroDivisionError: integer division or modulo by zero\n")
+
+
+def test_a_run_whose_launcher_was_killed_says_how_to_go_on(tmp_path):
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+    with pytest.raises(RoleDied, match=rf"the launcher of \S+ was killed; to go on: rmc resume {folder.path}"):
+        print_end(folder, Console(quiet=True))

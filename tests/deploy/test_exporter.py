@@ -6,6 +6,7 @@ import re
 import shutil
 import socket
 import subprocess
+import threading
 import time
 import urllib.request
 from pathlib import Path
@@ -28,9 +29,11 @@ ALERTS = ROOT / "deploy" / "monitor" / "alerts.yaml"
 DOCS = (ROOT / "docs" / "watching.md").read_text()
 HERE = "127.0.0.1"
 promtool = pytest.mark.skipif(shutil.which("promtool") is None, reason="no promtool here: apt-get install prometheus")
-STOPS, RISES = "0+50x5 250x40", "0+50x45"  # a value each minute
+STOPS, RISES = "0+50x5 250x75", "0+50x80"  # a value each minute
 ANOTHER_RUN = {'rmc_run_info{run="a"}': "1x10 stale", 'rmc_run_info{run="b"}': "_x10 1x30"}
 CASES = [  # an alert, what it looks at, and in which minutes it is silent and fires
+    ("RmcGone", {"up": "1x10 0x40", 'rmc_run_info{run="a"}': "1x10 stale"}, [10, 40], [14, 20]),
+    ("RmcGone", {"up": "0x40"}, [5, 20], []),  # that never served a run
     ("RmcNothingLearnt", {'rmc_updates{role="learner"}': STOPS}, [12], [16, 40]),
     ("RmcNothingLearnt", {'rmc_updates{role="learner"}': "0x40"}, [8], [12]),  # a warm-up
     ("RmcNothingLearnt", {'rmc_updates{role="learner"}': RISES}, [2, 12, 40], []),
@@ -45,9 +48,9 @@ CASES = [  # an alert, what it looks at, and in which minutes it is silent and f
         "RmcRingLost", {'rmc_ring_windows{role="replay"}': "1000x20 20+20x30", 'rmc_run_info{run="a"}': "1x50"},
         [20, 48], [22, 30, 43],
     ),
-    ("RmcWeightsStale", {'rmc_weights_update{role="actor-0"}': STOPS, "rmc_updates": RISES}, [12], [16]),
-    ("RmcWeightsStale", {'rmc_weights_update{role="actor-0"}': STOPS, "rmc_updates": STOPS}, [12, 16], []),
-    ("RmcWeightsStale", {'rmc_weights_update{role="actor-0"}': RISES, "rmc_updates": RISES}, [12, 40], []),
+    ("RmcWeightsStale", {'rmc_weights_update{role="actor-0"}': STOPS, "rmc_updates": RISES}, [16, 62], [66]),
+    ("RmcWeightsStale", {'rmc_weights_update{role="actor-0"}': STOPS, "rmc_updates": STOPS}, [16, 66], []),
+    ("RmcWeightsStale", {'rmc_weights_update{role="actor-0"}': RISES, "rmc_updates": RISES}, [12, 70], []),
     ("RmcDiskNearlyFull", {"rmc_host_disk_free_bytes": "10e9x5 1e9x9", "rmc_host_disk_bytes": "99e9x15"}, [5], [8]),
 ]  # fmt: skip
 
@@ -117,6 +120,21 @@ def test_strangers_take_few_handles_and_the_end_waits_for_none(status: RunStatus
     assert time.monotonic() - began < 2.0
     for stranger in strangers:
         stranger.close()
+
+
+def test_where_no_thread_can_be_started_later_looks_are_answered(
+    status: RunStatus, port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with exporter.served(status, "first", LaunchOptions(None, metrics_port=port)):
+        with monkeypatch.context() as patch:
+            patch.setattr(threading.Thread, "start", full)
+            for _ in range(2 * exporter.MOST_CLIENTS):
+                with socket.create_connection((HERE, port), timeout=10) as client:
+                    assert client.recv(1) == b""
+        assert "rmc_updates" in scraped(port)
 
 
 def test_a_port_that_is_taken_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

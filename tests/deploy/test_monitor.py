@@ -150,6 +150,7 @@ def test_an_evaluation_stands_where_its_checkpoint_was(monitor: Monitor, tmp_pat
     says("replay", env_steps=1_300)
     says("evaluator", eval_update=3, eval_return_mean=1.0)  # of a checkpoint that the learner has not spoken of
     says("learner", checkpoint_update=4, checkpoint_env_steps=1_000)
+    says("learner", checkpoint_update=8, checkpoint_env_steps=1_200)  # while 4 is still played
     says("evaluator", eval_update=4, eval_return_mean=2.0)
     monitor.close()
     lines = [json.loads(text) for text in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
@@ -203,6 +204,35 @@ def test_evaluations_of_earlier_starts_are_known(config: RunConfig, tmp_path: Pa
     monitor = Monitor(folder, config, Console(quiet=True))
     assert "eval 5 (best 9)" in line(monitor.status)
     assert "evaluator" not in monitor.status.roles  # it has not spoken in this start
+    monitor.close()
+
+
+def test_an_evaluation_that_was_cut_is_never_the_best(monitor: Monitor, caplog: pytest.LogCaptureFixture) -> None:
+    for update in (3, 6):
+        monitor._checkpoints.save(update, {})
+    monitor.take({"role": "evaluator", "eval_update": 3, "eval_return_mean": -900.0, "eval_cut": 0})
+    monitor.take({"role": "evaluator", "eval_update": 6, "eval_return_mean": -20.0, "eval_cut": 1})
+    assert monitor._checkpoints.best() == 3
+    assert monitor.status.best is not None
+    assert monitor.status.last is not None
+    assert (monitor.status.best.update, monitor.status.last.update) == (3, 6)
+    monitor.take({"role": "evaluator", "eval_update": 1, "eval_return_mean": 0.0})
+    assert "checkpoint 1 was dropped before its evaluation ended; raise --keep-checkpoints" in caplog.text
+    monitor.close()
+
+
+def test_the_clocks_of_other_machines_do_not_count(monitor: Monitor, monkeypatch: pytest.MonkeyPatch) -> None:
+    bus, now = MemoryBus(), time.time()
+    for second in range(12):
+        monkeypatch.setattr(time, "time", lambda second=second: now + second)
+        for role in ROLES:
+            bus.emit(role, {"time": now - 3_600.0, "updates_per_s": 9.0})
+        for shard in range(2):  # whose clocks differ, too
+            bus.emit(f"replay-{shard}", {"time": now + second - 0.5 * shard, "env_steps": 50 * second})
+        monitor.roles = lambda: (*ROLES, "replay-0", "replay-1")
+        monitor.watch(bus)
+    assert not monitor.status.silent()
+    assert monitor.status.eta_s == pytest.approx((CONFIG.total_steps - 1_100) / 100.0, rel=0.1)
     monitor.close()
 
 

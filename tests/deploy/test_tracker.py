@@ -20,6 +20,7 @@ from rmc.analysis.evaluation import initial_policy
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.monitor import tracker as tracker_module
+from rmc.deploy.monitor.films import Film, Films
 from rmc.deploy.monitor.tracker import Tracker, start_tracker
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import open_run
@@ -193,6 +194,20 @@ def test_every_second_evaluated_checkpoint_is_filmed(
     assert len(arrived) == 1
     assert arrived[0].stat().st_size > 1_000
     assert not caplog.messages
+
+
+def test_an_environment_that_says_much_holds_up_no_film(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    talks = "import sys; sys.stderr.write(('x' * 99 + chr(10)) * 2_000); sys.exit('the cause')"
+    popen = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", lambda _, **how: popen([sys.executable, "-c", talks], **how))
+    films, deadline = Films(folder, 1), time.monotonic() + 60.0
+    for update in (3, 4):  # the second has the words of its own alone
+        films.take({"eval_update": update}, 700)
+        while (film := films.finished()) is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        assert film == Film(folder.path / "videos" / f"00000000{update}.mp4", 700, "the cause")
+    films.close()
 
 
 def test_a_checkpoint_that_is_gone_is_one_warning(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:

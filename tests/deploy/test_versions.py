@@ -89,7 +89,7 @@ def test_what_reads_reads_it(old: RunFolder, capsys: pytest.CaptureFixture[str])
 
 def test_its_ring_is_opened_whole(old: RunFolder) -> None:
     config = old.config()
-    store = open_store(old.replay, config.window_spec(), config.replay.capacity, 0.6)
+    store = open_store(old.path / "replay", config.window_spec(), config.replay.capacity, 0.6)
     progress = store.ring.progress
     serials = np.arange(progress.valid_from, progress.next_serial)
     rows = np.zeros(80, store.ring.spec.dtype)
@@ -107,7 +107,7 @@ def test_its_ring_is_opened_whole(old: RunFolder) -> None:
 
 def test_it_goes_on_with_ring_checkpoint_and_counters(old: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
     config, threads = old.config(), torch.get_num_threads()
-    store = open_store(old.replay, config.window_spec(), config.replay.capacity, 0.6)
+    store = open_store(old.path / "replay", config.window_spec(), config.replay.capacity, 0.6)
     before = store.ring.progress
     store.close()
     words = ["resume", str(old.path), "--total-steps", "1800", "--launcher", "lockstep", "--replay-ratio", "4"]
@@ -120,7 +120,7 @@ def test_it_goes_on_with_ring_checkpoint_and_counters(old: RunFolder, capsys: py
     newest = CheckpointFolder(old.checkpoints).latest()
     assert newest is not None
     updates = json.loads(newest[1]["progress.json"])["updates"]
-    store = open_store(old.replay, old.config().window_spec(), 80, 0.6)
+    store = open_store(old.path / "replay", old.config().window_spec(), 80, 0.6)
     now = store.ring.progress
     store.close()
     assert (now.env_steps >= 1_800, now.windows, now.draws) == (True, 80, updates)

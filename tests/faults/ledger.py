@@ -15,7 +15,7 @@ class Ledger:
     """Of a run with one ring, which is there. Reads, and never writes, but for ``damage``."""
 
     def __init__(self, run: RunFolder) -> None:
-        config, path = run.config(), run.replay / "ring"
+        config, path = run.config(), run.path / "replay" / "ring"
         spec = config.window_spec()
         self._capacity, start = config.replay.capacity, _rows_start(spec)
         self._records = _records(np.memmap(path, np.uint8, "r", shape=(start,)), spec)

@@ -26,7 +26,7 @@ def run(tmp_path: Path) -> RunFolder:
 
 @pytest.fixture
 def store(run: RunFolder) -> Iterator[ReplayStore]:
-    store = open_store(run.replay, run.config().window_spec(), CAPACITY, 0.0)
+    store = open_store(run.path / "replay", run.config().window_spec(), CAPACITY, 0.0)
     yield store
     store.close()
 

@@ -3,6 +3,7 @@
 import copy
 import os
 import signal
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.errors import RmcError
 from rmc.common.window import WindowSpec
+from rmc.deploy.run.presets import robust
 from rmc.learner.config import UpdateConfig
 from rmc.learner.device_update import DeviceUpdate
 from rmc.learner.learner_checkpoint import STATE, LearnerProgress, pack, take_up
@@ -24,15 +26,10 @@ ROBUST = UpdateConfig(scheme=3, curiosity=0.1, curiosity_scale="std", policy_ema
 RAW = UpdateConfig(scheme=3)
 PROGRESS = LearnerProgress(1, 1, 1)
 AGENTS = {
-    "robust": AgentConfig(hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden"),
+    "robust": replace(robust("Ant-v5").agent, hidden=SPEC.state - SPEC.obs_dim, embedding=7, heads=(10, 9)),
+    "h alone": AgentConfig(hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden"),
     "embedding beside": AgentConfig(
         hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden+embedding", grounding=False
-    ),
-    "batch norm": AgentConfig(
-        hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden", critic_batch_norm=True
-    ),
-    "imputing": AgentConfig(
-        hidden=SPEC.state - SPEC.obs_dim, embedding=7, heads=(10, 9), head_input="hidden", impute_missing=True
     ),
 }
 

@@ -11,7 +11,7 @@ from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import Bus, EntryId, Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusUnavailable, FencedError
-from rmc.common.replay import SampleStatus
+from rmc.common.replay import ObservationStatistics, SampleStatus
 from rmc.common.window import WindowSpec
 from rmc.common.wire import encode_windows
 from rmc.replay_server.config import ReplayConfig
@@ -74,6 +74,21 @@ def test_new_windows_enter_with_their_own_or_the_largest_priority(make: Make, bu
     assert server._store.priorities[:5].tolist() == [0.5, 6.0, 6.0, 2.0, 6.0]
 
 
+def test_a_priority_that_was_corrected_is_no_new_windows(make: Make, bus: MemoryBus) -> None:
+    """As a learner gives that diverges, and begins again at its last checkpoint."""
+    server, sender = make(), Sender(bus)
+    sender.send(4)
+    drain(server)
+    server.update_priorities(np.arange(4), np.array([0.5, 1e20, 2.0, 0.1], np.float32))
+    server.update_priorities(np.array([1]), np.array([0.25], np.float32))
+    close(server)
+    server = make()
+    sender.send(2)
+    drain(server)
+    assert server._store.priorities[:6].tolist() == pytest.approx([0.5, 0.25, 2.0, 0.1, 2.0, 2.0])
+    assert server.stats()["max_priority"] == 2.0
+
+
 def test_values_are_what_windows_are_drawn_by(make: Make, bus: MemoryBus) -> None:
     server, sender = make(), Sender(bus)
     sender.send(20)
@@ -117,13 +132,14 @@ def test_statistics_against_a_loop_and_padding_changes_nothing() -> None:
         for t in range(row["last"] - row["new_observations"] + 1, row["last"] + 1)
         if not row["missing"][t].any()
     ]
-    sums = observation_sums(rows, SPEC)
+    none = ObservationStatistics.none(SPEC)
+    sums = observation_sums(rows, SPEC, none)
     assert sums.count == len(expected)
     np.testing.assert_allclose(sums.total, np.sum(expected, axis=0), rtol=1e-9)
     np.testing.assert_allclose(sums.total_square, np.sum(np.square(expected), axis=0), rtol=1e-9)
     rows["observation"][~observation_valid(rows, SPEC)] = np.nan
     rows["observation"][rows["missing"][..., 0] == 1] = 1e30
-    again = observation_sums(rows, SPEC)
+    again = observation_sums(rows, SPEC, none)
     assert again.count == sums.count
     assert np.array_equal(again.total, sums.total)
     assert np.array_equal(again.total_square, sums.total_square)
@@ -137,7 +153,7 @@ def test_statistics_by_number_leave_out_what_is_missing_alone() -> None:
     new = np.s_[:, -spec.train :]
     seen = rows["missing"][new] == 0
     observed, privileged = (rows[name][new].astype(float) for name in ("observation", "privileged"))
-    sums = observation_sums(rows, spec)
+    sums = observation_sums(rows, spec, ObservationStatistics.none(spec))
     assert sums.count.tolist() == [*seen.sum((0, 1)), *[50 * spec.train] * 2]
     expected = np.concatenate([(observed * seen).sum((0, 1)), privileged.sum((0, 1))])
     np.testing.assert_allclose(sums.total, expected, rtol=1e-9)
@@ -145,11 +161,29 @@ def test_statistics_by_number_leave_out_what_is_missing_alone() -> None:
     np.testing.assert_allclose(sums.total_square, expected, rtol=1e-9)
 
 
+def deviation(sums: ObservationStatistics) -> list[float]:
+    mean = sums.total / sums.count
+    return np.sqrt(sums.total_square / sums.count - mean**2).tolist()
+
+
+def test_one_huge_number_does_not_blind_the_statistics() -> None:
+    """Nor does a number that was constant for long stay one."""
+    rng, sums = np.random.default_rng(5), ObservationStatistics.none(SPEC)
+    for part in range(12):
+        rows = make_rows(100)
+        rows["observation"] = rng.normal(size=rows["observation"].shape)
+        rows["observation"][..., 1] *= 1e3 if part >= 6 else 0.0
+        rows["observation"][50, -1, 0] = 1e8 if part == 8 else 0.0
+        sums += observation_sums(rows, SPEC, sums)
+    assert deviation(sums)[0] < 2.5  # of 4 800, that one counts as 100 of its deviations
+    assert 500.0 < deviation(sums)[1] < 1e3 * 0.5**0.5  # its first part counts as too small
+
+
 def test_statistics_survive_a_restart_and_count_once(make: Make, bus: MemoryBus) -> None:
     server, sender = make(), Sender(bus)
     sender.send(8)
     drain(server)
-    expected = observation_sums(make_rows(8), SPEC)
+    expected = observation_sums(make_rows(8), SPEC, ObservationStatistics.none(SPEC))
     close(server)
     statistics = make().statistics()
     assert statistics.count == expected.count == 8 * SPEC.train

@@ -40,7 +40,7 @@ def test_runs_are_spread_and_their_folders_come_without_the_ring(tmp_path: Path)
         assert run.result() is not None
         assert run.ended() == 0
         assert {"config.json", "metrics.jsonl", "checkpoints"} <= {path.name for path in run.path.iterdir()}
-        assert not run.replay.exists()
+        assert not run.rings()
         assert "after training" in (folder / "logs" / f"{name}.log").read_text()
     assert not kept()
 

@@ -14,6 +14,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
 from rmc.sweep import local_runs, room
 from rmc.sweep.job import Job
+from rmc.sweep.pool import drop_replay
 from tests.integration.running import alive
 from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
 
@@ -153,9 +154,17 @@ def test_rings_that_the_disk_cannot_hold_are_refused(tmp_path: Path) -> None:
         room.check_disk(tmp_path, jobs, free, 1, dropped=False)
     with pytest.raises(ConfigError, match=r"1 rings take .* take fewer --jobs"):
         room.check_disk(tmp_path, jobs, free, 1, dropped=True)
-    for job in jobs:
-        (job.folder / "replay").mkdir(parents=True)
+    for job, ring in zip(jobs, ("replay", "replay-0", "replay-1"), strict=True):
+        (job.folder / ring).mkdir(parents=True)
     room.check_disk(tmp_path, jobs, free, 1, dropped=False)
+
+
+def test_the_rings_of_all_replay_servers_are_dropped(tmp_path: Path) -> None:
+    job = Job(tmp_path, (), 0)
+    for name in ("replay", "replay-0", "replay-11", "replay-counters", "checkpoints"):
+        (tmp_path / name).mkdir()
+    drop_replay(job)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoints", "replay-counters"]
 
 
 def test_a_sweep_in_a_runs_folder_or_with_a_damaged_index_is_refused(
