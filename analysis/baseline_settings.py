@@ -11,15 +11,17 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import from_dict
 from rmc.deploy.run.folder import RunFolder
 
-Algorithm = Literal["sac", "td3", "ddpg", "ppo", "recurrent-ppo"]
+Algorithm = Literal["sac", "crossq", "td3", "ddpg", "ppo", "recurrent-ppo"]
 Settings = Literal["paper", "zoo", "default"]
 PAPER_NET = [400, 300]
-OFF_POLICY = ("sac", "td3", "ddpg")
+OFF_POLICY = ("sac", "crossq", "td3", "ddpg")
+NAMES = {"crossq": "CrossQ", "recurrent-ppo": "RecurrentPPO"}
 NOISE = 0.1  # of TD3's and DDPG's actions, where the zoo explores by Gaussian noise
 
 _LEARNING_STARTS = {"learning_starts": 10_000}
 _WITH_NOISE = _LEARNING_STARTS | {"learning_rate": 1e-3, "batch_size": 256, "train_freq": 1, "gradient_steps": 1}
 _WIDE = {"log_std_init": -2.0, "ortho_init": False, "net_arch": {"pi": [256, 256], "vf": [256, 256]}}
+_CROSSQ_NET = {"pi": [256, 256], "qf": [2048, 2048]}
 _PPO_COLUMNS = (
     "batch_size", "n_steps", "gamma", "learning_rate", "ent_coef", "clip_range", "n_epochs", "gae_lambda",
     "max_grad_norm", "vf_coef",
@@ -60,7 +62,7 @@ class BaselineConfig:
     @property
     def name(self) -> str:
         """What plots call it."""
-        kind = "RecurrentPPO" if self.algorithm == "recurrent-ppo" else self.algorithm.upper()
+        kind = NAMES.get(self.algorithm, self.algorithm.upper())
         return {"paper": f"{kind} 400-300", "zoo": f"{kind} zoo", "default": kind}[self.settings]
 
 
@@ -106,6 +108,8 @@ def choose(algorithm: Algorithm, settings: Settings, env_id: str) -> Choice:
         return Choice(network={"net_arch": PAPER_NET}, noise=noise)
     if algorithm == "sac":
         return Choice(dict(_LEARNING_STARTS))
+    if algorithm == "crossq":
+        return Choice({"learning_starts": 5_000}, {"net_arch": dict(_CROSSQ_NET)})
     if algorithm in OFF_POLICY:
         return Choice(dict(_WITH_NOISE), {"net_arch": PAPER_NET}, noise=noise)
     body = env_id.rpartition("/")[2].partition("-")[0]

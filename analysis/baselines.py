@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from sb3_contrib import RecurrentPPO
+from sb3_contrib import CrossQ, RecurrentPPO
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -44,7 +44,9 @@ from rmc.deploy.run.opening import default_name, forget_start, has_more_than_a_s
 from rmc.deploy.run.starts import note_start, resume_command
 from rmc.deploy.run.state import STOPPED
 
-CLASSES: dict[str, Any] = {"sac": SAC, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO}
+CLASSES: dict[str, Any] = {
+    "sac": SAC, "crossq": CrossQ, "td3": TD3, "ddpg": DDPG, "ppo": PPO, "recurrent-ppo": RecurrentPPO,
+}  # fmt: skip
 MAY_CHANGE = {"total_steps", "threads", "checkpoint_steps", "episodes", "env.env_timeout"}
 SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
 RECORD_SECONDS = 5.0

@@ -10,6 +10,7 @@ OURS = {
     "CrossQ's form": "train ENV --head-input observation --hidden 8 --embedding 0 --no-impute-missing --no-grounding "
     "--scheme 2 --burn-in 0 --trained-steps 1 --capacity 110000 --batch-size 256 --replay-ratio 256 --policy-delay 3 "
     "--learning-rate 1e-3 --alpha-learning-rate 1e-3",
+    "RMC, heads of 1024": "train ENV --heads 1024 1024",
     "RMC, no contact forces": "train ENV --env-kwargs include_cfrc_ext_in_observation=false",
     "RMC, h alone": "train ENV --head-input hidden",
     "RMC, policy at every update": "train ENV --head-input hidden --policy-delay 1",
@@ -17,7 +18,7 @@ OURS = {
     "RMC, not averaged": before("--policy-ema-updates 0"),
     "RMC paper": "train ENV --preset paper",
 }
-THEIRS = {name: f"baseline {name.lower()} ENV" for name in ("SAC", "TD3", "DDPG", "PPO")}
+THEIRS = {name: f"baseline {name.lower()} ENV" for name in ("SAC", "CrossQ", "TD3", "DDPG", "PPO")}
 TUNED = {f"{name} zoo": f"{words} --settings zoo" for name, words in THEIRS.items()}
 STUDY = Study(
     "returns",
