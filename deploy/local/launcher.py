@@ -20,7 +20,7 @@ from rmc.deploy.local.role_command import (
 from rmc.deploy.local.role_environment import URL_VARIABLE
 from rmc.deploy.local.supervisor import STOP_SECONDS, Supervisor
 from rmc.deploy.monitor.monitor import Monitor
-from rmc.deploy.redis.connect import PATIENCE_VARIABLE, connect
+from rmc.deploy.redis.connect import PATIENCE_VARIABLE, connect, tried_again
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.run_redis import RunRedis
 from rmc.deploy.run.config import RunConfig
@@ -114,7 +114,7 @@ def train(
     run = LocalRun(config, folder, redis_url, device)
     monitor.restarts = run.supervisor.restarts
     try:
-        monitor.skip_old(run.bus)
+        tried_again(lambda: monitor.skip_old(run.bus))
         run.supervisor.start()
         while not stop.requested and not run.finished():
             run.tend()
@@ -130,8 +130,8 @@ def train(
 def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monitor, stop: StopSignal) -> bool:
     """Register a run whose roles are started by hand, watch it and end it; whether its total was reached."""
     bus = connect(redis_url, folder.name)
-    registration = Registration(config, folder, bus)
-    monitor.skip_old(bus)
+    registration = tried_again(lambda: Registration(config, folder, bus))
+    tried_again(lambda: monitor.skip_old(bus))
     while not stop.requested and not monitor.learner_finished():
         registration.tend()
         monitor.watch(bus)

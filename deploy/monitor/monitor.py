@@ -33,7 +33,7 @@ class Monitor:
 
     def __init__(self, folder: RunFolder, config: RunConfig, console: Console, tracker: Tracker | None = None) -> None:
         self.status = empty_status(folder, config.roles())
-        for record in MetricsTail(folder.metrics).take():  # of earlier starts
+        for record in MetricsTail(folder.metrics, recent_bytes=0).take():  # evaluations of earlier starts
             self.status.take_evaluation(record)
         self.restarts: Callable[[], dict[str, int]] = dict  # how often each role was started again
         self.unplaced: Callable[[], list[str]] = list  # roles that run nowhere now

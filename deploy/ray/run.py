@@ -31,6 +31,7 @@ from rmc.deploy.ray.placement import (
     whole_shares,
 )
 from rmc.deploy.ray.waiting_learners import WaitingLearners, learner_group
+from rmc.deploy.redis.connect import tried_again
 from rmc.deploy.redis.run_redis import RunRedis
 from rmc.deploy.redis.server import Port
 from rmc.deploy.run import tls
@@ -175,7 +176,7 @@ def train(
     monitor.roles = lambda: run.config.roles()
     over = False
     try:
-        monitor.skip_old(run.bus)
+        tried_again(lambda: monitor.skip_old(run.bus))
         run.start()
         while not stop.requested and not run.hosts.finished():
             run.tend()

@@ -2,8 +2,10 @@
 
 import logging
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.bus.redis_url import shown
@@ -11,7 +13,9 @@ from rmc.common.errors import BusFull, BusUnavailable, ConfigError
 from rmc.common.process.role import RECONNECT_SLEEP, StopSignal
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 PATIENCE_VARIABLE = "RMC_PATIENCE"  # seconds that a role which starts while Redis is coming back waits for it
+AWAY_SECONDS = 30.0  # of a Redis that has just answered, until what begins gives up
 PATIENCE_SECONDS = "30"  # of one that is started by hand, at the same time as its run perhaps
 
 
@@ -50,6 +54,17 @@ def connect(url: str, run: str, waits: Deadline | None = None) -> RedisBus:
         except BusUnavailable as error:
             if waits is None or not waits.wait(f"the Redis at {shown(url)}: {error}"):
                 raise ConfigError("--redis-url", shown(url), f"no Redis answers there ({error})") from None
+
+
+def tried_again(call: Callable[[], T]) -> T:
+    """Make a call of a Redis that has just answered, again where it is away for a moment. Raises BusUnavailable."""
+    waits = Deadline(AWAY_SECONDS, StopSignal())
+    while True:
+        try:
+            return call()
+        except BusUnavailable as error:
+            if not waits.wait(f"Redis: {error}"):
+                raise
 
 
 def _in_file(path: Path) -> str:

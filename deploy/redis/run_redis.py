@@ -3,7 +3,7 @@
 from contextlib import ExitStack
 
 from rmc.common.bus.redis_bus import RedisBus
-from rmc.deploy.redis.connect import connect
+from rmc.deploy.redis.connect import connect, tried_again
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.server import Port, RedisServer
 from rmc.deploy.redis.socket_folder import SocketFolder
@@ -29,7 +29,7 @@ class RunRedis:
             if self._server is not None:
                 self._leave.enter_context(self._server)
             self.bus: RedisBus = connect(self.url(LAUNCHER), folder.name)
-            self._registration = Registration(config, folder, self.bus)
+            self._registration = tried_again(lambda: Registration(config, folder, self.bus))
         except BaseException:
             self._leave.close()
             raise

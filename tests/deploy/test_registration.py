@@ -1,6 +1,7 @@
 """A run stays known in a Redis that forgets."""
 
 import json
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,9 @@ from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusUnavailable, ConfigError
 from rmc.deploy.local.role_process import Process
-from rmc.deploy.redis import registration
+from rmc.deploy.redis import connect, registration
 from rmc.deploy.redis.registration import Registration
+from rmc.deploy.redis.run_redis import RunRedis
 from rmc.deploy.run.config import from_registration, to_registration
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import debug
@@ -43,6 +45,28 @@ def test_a_redis_that_forgot_is_told_again_what_it_must_know(tmp_path: Path, red
     bus.request_stop("so it shall be")  # which is no reason to begin afresh
     registered.tend()
     assert bus.stop_requested() == "so it shall be"
+
+
+def test_a_redis_that_is_away_for_a_moment_ends_no_start(
+    tmp_path: Path, redis_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a network resets a connection right after it was tried."""
+    expire, moments = RedisBus.expire, [2, 10**9]
+
+    def away(bus: RedisBus, seconds: int | None) -> None:
+        moments[0] -= 1
+        if moments[0] >= 0:
+            raise BusUnavailable("reset by peer")
+        expire(bus, seconds)
+
+    monkeypatch.setattr(RedisBus, "expire", away)
+    folder = RunFolder(tmp_path)
+    with closing(RunRedis(CONFIG, folder, redis_url)) as own:
+        assert from_registration(own.bus.config() or b"") == CONFIG
+    monkeypatch.setattr(connect, "AWAY_SECONDS", 0.5)
+    moments.pop(0)
+    with pytest.raises(BusUnavailable, match="reset by peer"):
+        RunRedis(CONFIG, folder, redis_url)
 
 
 def test_a_redis_that_is_away_is_told_later(

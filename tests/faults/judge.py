@@ -31,7 +31,9 @@ def judge(folder: Path, acks: Acks) -> Judgement:
     """``acks``: the largest number of an entry that was acknowledged, by actor and epoch. Raises ConfigError."""
     run = RunFolder(folder)
     config = run.config()
-    store = open_store(run.replay, config.window_spec(), config.replay.capacity, config.replay.priority_exponent)
+    store = open_store(
+        run.path / "replay", config.window_spec(), config.replay.capacity, config.replay.priority_exponent
+    )
     try:
         progress, capacity = store.ring.progress, store.ring.capacity
         serials = np.arange(progress.valid_from, progress.next_serial)

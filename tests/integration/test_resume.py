@@ -34,7 +34,7 @@ def rmc(words: str, cwd) -> subprocess.CompletedProcess[str]:
 def drawn_steps(folder: RunFolder) -> int:
     """Trained steps that were drawn from the run's ring."""
     config = folder.config()
-    store = open_store(folder.replay, config.window_spec(), config.replay.capacity, 0.0)
+    store = open_store(folder.path / "replay", config.window_spec(), config.replay.capacity, 0.0)
     store.close()
     return store.ring.progress.drawn_steps
 
