@@ -47,8 +47,10 @@ def commands(config: RunConfig, folder: RunFolder, sockets: Path, device: str) -
 class LocalRun:
     """A run's processes between ``start`` and ``close``."""
 
-    def __init__(self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str) -> None:
-        self._redis = RunRedis(config, folder, redis_url)
+    def __init__(
+        self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str, stop: StopSignal
+    ) -> None:
+        self._redis = RunRedis(config, folder, stop, redis_url)
         self.bus, self._is_users = self._redis.bus, redis_url is not None
         self._shards = config.shards()
         self._listening: dict[str, tuple[int | None, float]] = {}  # who listened, and when it was seen last
@@ -111,10 +113,10 @@ def train(
     config: RunConfig, folder: RunFolder, redis_url: str | None, device: str, monitor: Monitor, stop: StopSignal
 ) -> bool:
     """Train until the total is reached or ``stop`` is set; whether it was reached. Raises RoleDied, ConfigError."""
-    run = LocalRun(config, folder, redis_url, device)
+    run = LocalRun(config, folder, redis_url, device, stop)
     monitor.restarts = run.supervisor.restarts
     try:
-        tried_again(lambda: monitor.skip_old(run.bus))
+        tried_again(lambda: monitor.skip_old(run.bus), stop)
         run.supervisor.start()
         while not stop.requested and not run.finished():
             run.tend()
@@ -130,8 +132,8 @@ def train(
 def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monitor, stop: StopSignal) -> bool:
     """Register a run whose roles are started by hand, watch it and end it; whether its total was reached."""
     bus = connect(redis_url, folder.name)
-    registration = tried_again(lambda: Registration(config, folder, bus))
-    tried_again(lambda: monitor.skip_old(bus))
+    registration = tried_again(lambda: Registration(config, folder, bus), stop)
+    tried_again(lambda: monitor.skip_old(bus), stop)
     while not stop.requested and not monitor.learner_finished():
         registration.tend()
         monitor.watch(bus)

@@ -83,7 +83,7 @@ def _folder(config: RunConfig, path: Path) -> Iterator[RunFolder]:
 
 
 def _train(config: RunConfig, folder: RunFolder, device: str, watcher: Monitor, stop: StopSignal) -> dict[str, RoleUse]:
-    run = LocalRun(config, folder, None, device)
+    run = LocalRun(config, folder, None, device, stop)
     uses: dict[str, RoleUse] = {}
     commands = {name: role.command.words for name, role in run.supervisor.roles.items()}
     try:

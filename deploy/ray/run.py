@@ -49,13 +49,15 @@ log = logging.getLogger(__name__)
 class ClusterRun:
     """A run's roles on Ray between ``start`` and ``close``. Ray must be connected."""
 
-    def __init__(self, config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool) -> None:
+    def __init__(
+        self, config: RunConfig, folder: RunFolder, device: str, all_cpus: bool, encrypted: bool, stop: StopSignal
+    ) -> None:
         self.config, self._folder, self._device, self._all_cpus = config, folder, device, all_cpus
         ip = ray.util.get_node_ip_address()
         if encrypted:
             tls.make_certificate(folder.path, ip)
         number, self._moved = _port(folder, ip)
-        self._redis = RunRedis(config, folder, port=Port(ip, number, folder.path if encrypted else None))
+        self._redis = RunRedis(config, folder, stop, port=Port(ip, number, folder.path if encrypted else None))
         self.bus = self._redis.bus
         self.hosts = Hosts(folder, device, encrypted, self._url)
         self._look_at = 0.0
@@ -171,12 +173,12 @@ def train(
     stop: StopSignal,
 ) -> bool:
     """Train until the total is reached or ``stop`` is set; whether it was reached. Raises RoleDied, ConfigError."""
-    run = ClusterRun(config, folder, device, all_cpus, encrypted)
+    run = ClusterRun(config, folder, device, all_cpus, encrypted, stop)
     monitor.restarts, monitor.unplaced = run.hosts.restarts, run.hosts.waiting
     monitor.roles = lambda: run.config.roles()
     over = False
     try:
-        tried_again(lambda: monitor.skip_old(run.bus))
+        tried_again(lambda: monitor.skip_old(run.bus), stop)
         run.start()
         while not stop.requested and not run.hosts.finished():
             run.tend()

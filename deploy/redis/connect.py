@@ -56,9 +56,9 @@ def connect(url: str, run: str, waits: Deadline | None = None) -> RedisBus:
                 raise ConfigError("--redis-url", shown(url), f"no Redis answers there ({error})") from None
 
 
-def tried_again(call: Callable[[], T]) -> T:
+def tried_again(call: Callable[[], T], stop: StopSignal) -> T:
     """Make a call of a Redis that has just answered, again where it is away for a moment. Raises BusUnavailable."""
-    waits = Deadline(AWAY_SECONDS, StopSignal())
+    waits = Deadline(AWAY_SECONDS, stop)
     while True:
         try:
             return call()

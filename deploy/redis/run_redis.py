@@ -3,6 +3,7 @@
 from contextlib import ExitStack
 
 from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.process.role import StopSignal
 from rmc.deploy.redis.connect import connect, tried_again
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.server import Port, RedisServer
@@ -16,10 +17,17 @@ class RunRedis:
     """Ready at once, gone at ``close``; the temporary folder of the run's sockets comes and goes with it.
 
     Without a ``url`` the run has a server of its own, which listens for other machines, too, where it has a ``port``.
-    Raises ConfigError, BusUnavailable, BusFull.
+    A ``stop`` ends its patience with a Redis that is away. Raises ConfigError, BusUnavailable, BusFull.
     """
 
-    def __init__(self, config: RunConfig, folder: RunFolder, url: str | None = None, port: Port | None = None) -> None:
+    def __init__(
+        self,
+        config: RunConfig,
+        folder: RunFolder,
+        stop: StopSignal,
+        url: str | None = None,
+        port: Port | None = None,
+    ) -> None:
         self._folder, self._url, self._leave = folder, url, ExitStack()
         self._socket_folder = SocketFolder()
         self._leave.callback(self._socket_folder.close)
@@ -29,7 +37,7 @@ class RunRedis:
             if self._server is not None:
                 self._leave.enter_context(self._server)
             self.bus: RedisBus = connect(self.url(LAUNCHER), folder.name)
-            self._registration = tried_again(lambda: Registration(config, folder, self.bus))
+            self._registration = tried_again(lambda: Registration(config, folder, self.bus), stop)
         except BaseException:
             self._leave.close()
             raise

@@ -13,6 +13,7 @@ from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusUnavailable, ConfigError
+from rmc.common.process.role import StopSignal
 from rmc.deploy.local.role_process import Process
 from rmc.deploy.redis import connect, registration
 from rmc.deploy.redis.registration import Registration
@@ -61,12 +62,17 @@ def test_a_redis_that_is_away_for_a_moment_ends_no_start(
 
     monkeypatch.setattr(RedisBus, "expire", away)
     folder = RunFolder(tmp_path)
-    with closing(RunRedis(CONFIG, folder, redis_url)) as own:
+    stop = StopSignal()
+    with closing(RunRedis(CONFIG, folder, stop, redis_url)) as own:
         assert from_registration(own.bus.config() or b"") == CONFIG
     monkeypatch.setattr(connect, "AWAY_SECONDS", 0.5)
     moments.pop(0)
     with pytest.raises(BusUnavailable, match="reset by peer"):
-        RunRedis(CONFIG, folder, redis_url)
+        RunRedis(CONFIG, folder, stop, redis_url)
+    monkeypatch.setattr(connect, "AWAY_SECONDS", 600.0)
+    stop.requested = True  # Ctrl-C
+    with pytest.raises(BusUnavailable, match="reset by peer"):
+        RunRedis(CONFIG, folder, stop, redis_url)
 
 
 def test_a_redis_that_is_away_is_told_later(
