@@ -198,15 +198,16 @@ def test_every_second_evaluated_checkpoint_is_filmed(
 
 def test_an_environment_that_says_much_holds_up_no_film(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     talks = "import sys; sys.stderr.write(('x' * 99 + chr(10)) * 2_000); sys.exit('the cause')"
+    scripts = iter([talks, "import sys; sys.exit(3)"])
     popen = subprocess.Popen
-    monkeypatch.setattr(subprocess, "Popen", lambda _, **how: popen([sys.executable, "-c", talks], **how))
+    monkeypatch.setattr(subprocess, "Popen", lambda _, **how: popen([sys.executable, "-c", next(scripts)], **how))
     films, deadline = Films(folder, 1), time.monotonic() + 60.0
-    for update in (3, 4):  # the second has the words of its own alone
+    for update, cause in ((3, "the cause"), (4, "exit status 3")):  # which has said nothing
         films.take({"eval_update": update}, 700)
         while (film := films.finished()) is None:
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        assert film == Film(folder.path / "videos" / f"00000000{update}.mp4", 700, "the cause")
+        assert film == Film(folder.path / "videos" / f"00000000{update}.mp4", 700, cause)
     films.close()
 
 
