@@ -6,7 +6,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class EvaluatorConfig:
-    """How a policy is judged."""
+    """Evaluation during training."""
 
     episodes: int = 5
     """Episodes per evaluation, played with the policy's mean, one after the other. 0 evaluates before and after
@@ -18,7 +18,7 @@ class EvaluatorConfig:
 
 @dataclass(frozen=True)
 class ActorConfig:
-    """How an actor collects."""
+    """Actors: environments, windows, how often weights come."""
 
     envs_per_actor: int = 4
     """N, environments of one actor; more of them share one forward pass."""

@@ -80,7 +80,7 @@ WHEN = {
     "layer_norm": "rarely: it cost return in a trial (`studies/notebook.md`)",
     "head_input": "`hidden` where the memory must do alone; `observation`, with "
     "`--scheme 2 --no-grounding --hidden 8 --embedding 0`, where all is seen and time counts: "
-    "[level by 60 000 steps, far behind by 300 000](results.md); the embedding in place of o cost return in a trial "
+    "[far behind by 300 000 steps](results.md); the embedding in place of o cost return in a trial "
     "(`studies/notebook.md`)",
     "critic_batch_norm": "off for target critics, and with batches below 16: [what it is worth](results.md)",
     "privileged_critic": "where the simulator knows what sensors do not see: "
@@ -102,7 +102,7 @@ WHEN = {
     "replay_ratio": "up for more learning from each step, down for more steps a second: the learner is what takes time",
     "warmup_steps": "up where random actions rarely meet a reward",
     "priority_exponent": "0.6 for R2D2's prioritized replay, 0 for uniform",
-    "importance_exponent": "0.4 with prioritized replay",
+    "importance_exponent": "rarely: uniform replay, as in `robust`, has no use for it",
     "replay_shards": "up where one replay server is the bottleneck: with dozens of actors",
     "learning_rate": "down when the losses jump or training diverges",
     "memory_learning_scale": "down to keep stored states fresh, at the price of a slower memory",

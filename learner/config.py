@@ -9,7 +9,7 @@ MODEL_PROCESS = "rmc learner: memory and world model"  # the title of the proces
 
 @dataclass(frozen=True)
 class UpdateConfig:
-    """The algorithm's constants; equations in ``learner/losses.py``."""
+    """The algorithm: step sizes, discount, losses."""
 
     learning_rate: float = 3e-4
     """Adam's step size for every network."""
@@ -54,7 +54,8 @@ class UpdateConfig:
     """Weight of the largest against the mean absolute TD error in a window's priority."""
 
     policy_ema_updates: int = 0
-    """Averaging window, in updates, of the saved and evaluated policy; at most 10 % of the updates so far. 0: off."""
+    """Time constant, in updates, of the moving average of the policy that is saved and evaluated; at most a tenth of
+    those made. 0: off."""
 
     def halves_are_apart(self) -> bool:
         """Whether memory and world model read nothing of critics, policy and temperature, nor of a common norm."""
@@ -68,7 +69,7 @@ class UpdateConfig:
 
 @dataclass(frozen=True)
 class LearnerConfig:
-    """How the learner runs; what it computes is in UpdateConfig."""
+    """The learner: batches, checkpoints, threads."""
 
     batch_size: int = 64
     """B, windows in a batch."""

@@ -1,4 +1,4 @@
-"""Theta-bar of algorithm 1: what acts, averaged over the last updates; checkpoints hold it and evaluations play it."""
+"""Theta-bar of algorithm 1: what acts, an exponential moving average; checkpoints hold it and evaluations play it."""
 
 from collections.abc import Iterator, Mapping
 
@@ -11,7 +11,7 @@ MOVE_UPDATES = 10  # updates between moves, which read and write all that acts
 
 
 class PolicyAverage:
-    """Over so many updates, early on over a tenth of those made; over 0 it is what acts."""
+    """Its time constant is so many updates, early on a tenth of those made; with 0 it is what acts."""
 
     def __init__(self, agent: Agent, updates: int) -> None:
         self._agent, self._updates = agent, updates

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """The replay server's options."""
+    """The replay buffer: its size, what is drawn from it and how often."""
 
     capacity: int = 70_000
     """Windows kept; the oldest are overwritten."""

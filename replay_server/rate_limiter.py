@@ -1,7 +1,7 @@
 """The rate limiter: ties updates to collection, in both directions. Pure arithmetic, no state.
 
     draw allowed:  drawn + B L_t <= (inserted - warm-up) * ratio + tolerance   and inserted >= warm-up
-    actors' limit: warm-up + drawn / ratio + slack, at most the run's total and what of the slack others hold unsent
+    actors' limit: warm-up + drawn / ratio + slack, at most the run's total; actors share what is left
 
 drawn: trained steps drawn; inserted: environment steps. The tolerance is one batch and the slack's worth of
 steps. When the learner waits, the actors' limit is at least ``slack`` above what is inserted; so nobody

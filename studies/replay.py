@@ -2,7 +2,7 @@
 
 from studies.study import Study
 
-PRIORITIZED = "--priority-exponent 0.6 --importance-exponent 0.4"
+PRIORITIZED = "--priority-exponent 0.6"
 WAYS = {
     "uniform, stored and burned in": "",
     "prioritized": PRIORITIZED,

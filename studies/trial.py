@@ -5,7 +5,7 @@ from studies.study import Study
 CHANGES = {
     "RMC": "",
     "layer norm": "--layer-norm",
-    "prioritized": "--priority-exponent 0.6 --importance-exponent 0.4",
+    "prioritized": "--priority-exponent 0.6",
     "EMA latent": "--latent-target ema",
     "EMA memory": "--target-memory ema",
     "curiosity": "--curiosity 0.1 --curiosity-scale std",

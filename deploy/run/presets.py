@@ -30,7 +30,7 @@ def robust(env: EnvConfig | str) -> RunConfig:
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=96.0, priority_exponent=0.0),
         update=UpdateConfig(scheme=3, policy_ema_updates=2_000, policy_delay=2),
-        learner=LearnerConfig(batch_size=16, importance_exponent=0.0, publish_updates=80),
+        learner=LearnerConfig(batch_size=16, publish_updates=80),
     )
 
 

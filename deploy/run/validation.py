@@ -59,6 +59,15 @@ def validate(config: RunConfig) -> None:
         for name in path.split("."):
             value = getattr(value, name)
         check_range(option(path), value, limits)
+    _validate_agent(config)
+    _validate_actors(config)
+    if config.total_steps <= config.replay.warmup_steps:
+        raise ConfigError(
+            "--total-steps", config.total_steps, f"take more than --warmup-steps={config.replay.warmup_steps}"
+        )
+
+
+def _validate_agent(config: RunConfig) -> None:
     if min(config.agent.heads) < 1:
         raise ConfigError("--heads", config.agent.heads, "take at least 1 unit a layer")
     if config.agent.layer_norm and not config.agent.embedding:
@@ -69,6 +78,16 @@ def validate(config: RunConfig) -> None:
         raise ConfigError(
             "--initial-priority", "actor", "uniform replay has no priorities; try --priority-exponent 0.6"
         )
+    if config.agent.missing_flag and config.env.frame_stack > 1:
+        raise ConfigError("--missing-flag", True, "a stack of frames has no flag; leave it, or use --frame-stack 1")
+    if config.agent.impute_missing and not config.agent.normalize_observations:
+        fix = "it takes --normalize-observations; or leave missing frames as they are: --no-impute-missing"
+        raise ConfigError("--impute-missing", True, fix)
+    if not config.update.policy_through_q and config.update.scheme < 4:
+        raise ConfigError("--policy-through-q", False, "schemes 1 to 3 have no such way; take --scheme 4, 5 or 6")
+
+
+def _validate_actors(config: RunConfig) -> None:
     if config.replay.replay_shards > config.actors:
         fix = f"every shard needs an actor: take at most --actors={config.actors}"
         raise ConfigError("--replay-shards", config.replay.replay_shards, fix)
@@ -79,17 +98,6 @@ def validate(config: RunConfig) -> None:
         raise ConfigError("--stride", config.actor.stride, f"take 0 to --trained-steps={config.window.trained_steps}")
     if config.actor.stride and config.actor.state_strategy == "episode":
         raise ConfigError("--stride", config.actor.stride, "an episode is one window; leave it, or use burn-in")
-    if config.agent.missing_flag and config.env.frame_stack > 1:
-        raise ConfigError("--missing-flag", True, "a stack of frames has no flag; leave it, or use --frame-stack 1")
-    if config.agent.impute_missing and not config.agent.normalize_observations:
-        fix = "it takes --normalize-observations; or leave missing frames as they are: --no-impute-missing"
-        raise ConfigError("--impute-missing", True, fix)
-    if not config.update.policy_through_q and config.update.scheme < 4:
-        raise ConfigError("--policy-through-q", False, "schemes 1 to 3 have no such way; take --scheme 4, 5 or 6")
-    if config.total_steps <= config.replay.warmup_steps:
-        raise ConfigError(
-            "--total-steps", config.total_steps, f"take more than --warmup-steps={config.replay.warmup_steps}"
-        )
 
 
 def validate_windows(config: RunConfig) -> None:
@@ -120,22 +128,28 @@ def validate_launch(config: RunConfig, options: LaunchOptions) -> None:
     ):
         if value not in (choices := _choices(kind)):
             raise ConfigError(name, value, f"take {', '.join(choices)}")
+    _validate_ray(options)
+    if launcher == "lockstep" and options.redis_url is not None:
+        raise ConfigError("--redis-url", shown(options.redis_url), "a lockstep run has no use for one; leave it")
+    if launcher == "lockstep" and config.replay.replay_shards > 1:
+        fix = "a lockstep run has one; use --launcher local"
+        raise ConfigError("--replay-shards", config.replay.replay_shards, fix)
+    if options.init_parts != "all" and options.init_from is None:
+        raise ConfigError("--init-parts", options.init_parts, "say whose: give --init-from RUN, or leave it")
+    if launcher == "manual" and options.redis_url is None:
+        raise ConfigError("--redis-url", None, "say which Redis the roles that you start by hand will use")
+
+
+def _validate_ray(options: LaunchOptions) -> None:
+    """What a run on Ray may not have, and what it alone may have."""
+    launcher = options.launcher
     if launcher == "ray" and options.redis_url is not None:
         raise ConfigError("--redis-url", shown(options.redis_url), "a run on Ray has a Redis of its own, on the head")
+    if launcher == "ray" and options.device not in ("cpu", "cuda"):
+        raise ConfigError("--device", options.device, "take cpu or cuda; Ray says which GPU")
     if launcher != "ray" and options.all_cpus:
         raise ConfigError("--all-cpus", True, "give --launcher ray; elsewhere say how many --actors")
     if launcher != "ray" and options.tls:
         raise ConfigError("--tls", True, "give --launcher ray; elsewhere take a --redis-url of rediss://")
     if launcher != "ray" and options.ray_address != "auto":
         raise ConfigError("--ray-address", options.ray_address, "give --launcher ray, or leave it")
-    if launcher == "lockstep" and options.redis_url is not None:
-        raise ConfigError("--redis-url", shown(options.redis_url), "a lockstep run has no use for one; leave it")
-    if launcher == "lockstep" and config.replay.replay_shards > 1:
-        fix = "a lockstep run has one; use --launcher local"
-        raise ConfigError("--replay-shards", config.replay.replay_shards, fix)
-    if launcher == "ray" and options.device not in ("cpu", "cuda"):
-        raise ConfigError("--device", options.device, "take cpu or cuda; Ray says which GPU")
-    if options.init_parts != "all" and options.init_from is None:
-        raise ConfigError("--init-parts", options.init_parts, "say whose: give --init-from RUN, or leave it")
-    if launcher == "manual" and options.redis_url is None:
-        raise ConfigError("--redis-url", None, "say which Redis the roles that you start by hand will use")

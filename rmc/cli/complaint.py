@@ -1,34 +1,41 @@
 """What the parser says of words that it cannot read."""
 
+import difflib
 import re
+from collections.abc import Sequence
 
-ENDS = ("For full helptext", "Argument helptext", "Arguments are applied", "Perhaps you meant")
-# The frame is of spaces where the output is no UTF-8.
-NEAR = re.compile(r"[│ ] {5}(--?[\w-]+)")
-WHERE = re.compile(r"[│ ] {9}in (rmc [\w -]+?) --help")
+from rmc.cli.parser import COMMANDS, option_names
+from rmc.deploy.run.config import option
+
+ENDS = ("For full helptext", "Argument helptext", "Arguments are applied", "Perhaps you meant", "Available subcommands")
 
 
-def as_line(boxed: str, command: str) -> str:
-    """tyro's boxed message as one line, without its frame, headings and help text.
-
-    Of the options that it finds near, the first of the ``command``, like rmc train, is named; or whose it is.
-    """
-    rows = [row.strip("│╭╮╰╯─ \t") for row in boxed.splitlines()]
+def as_line(boxed: str, words: Sequence[str]) -> str:
+    """tyro's boxed message as one line, without its frame, headings and help text; and what ``words`` may mean."""
+    rows = [row.strip("│╭╮╰╯─ \t") for row in boxed.splitlines()]  # the frame is of spaces where the output is no UTF-8
     body = [row for row in rows if row.strip("-")]
     ends = [i for i, row in enumerate(body) if row.startswith(ENDS)]
     heading = 1 if len(body) > 1 else 0
     message = " ".join(body[heading : ends[0] if ends else None])
-    return re.sub(r" \(applied to rmc[\w -]*\)", "", message) + _near(boxed, command)
+    return re.sub(r" \(applied to rmc[\w -]*\)", "", message) + _near(words)
 
 
-def _near(boxed: str, command: str) -> str:
-    near: dict[str, list[str]] = {}
-    for row in boxed.splitlines():
-        if option := NEAR.match(row):
-            near[option[1]] = []
-        elif near and (where := WHERE.match(row)):
-            near[list(near)[-1]].append(where[1])
-    for name, commands in near.items():
-        if command in commands:
-            return f"; did you mean {name}?"
-    return "".join(f"; {name} is an option of {commands[0]}" for name, commands in near.items() if commands)
+def _near(words: Sequence[str]) -> str:
+    """Of the first word that is wrong: a command or an option like it, or whose option it is; else nothing."""
+    options = {name: list(map(option, option_names(kind))) for name, (kind, _) in COMMANDS.items()}
+    options["sweep"] += options["train"]
+    command, *rest = words or [""]
+    if command not in options:
+        return _meant(command, list(options))
+    flags = [word.partition("=")[0].replace("_", "-") for word in rest if word.startswith("--")]
+    for flag in flags:
+        if flag.replace("--no-", "--", 1) in options[command]:
+            continue
+        others = [f"rmc {other}" for other, known in options.items() if flag in known]
+        return f"; {flag} is an option of {others[0]}" if others else _meant(flag, options[command])
+    return ""
+
+
+def _meant(word: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(word, known, 1)
+    return f"; did you mean {close[0]}?" if close else ""

@@ -50,23 +50,9 @@ def run(words: list[str]) -> int:
     if words == ["--version"]:
         return _say_version()
     parent = os.environ.pop(PARENT_VARIABLE, None)
-    if parent is not None:  # before the slow imports, so that there is no time in which a role could be left behind
-        exit_with_parent(int(parent))
-    if parent is not None or (words and words[0] in PLAYS):
-        descendants.adopt_orphans()  # of what environments start
-    if words[:1] == ["role"] and SINGLE_THREADED.intersection(words[1:2]):
-        # before numpy and torch are imported, which read these once
-        for name, value in SINGLE_THREAD.items():
-            os.environ.setdefault(name, value)
-    _choose_temporary_folder()
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
-    try:
-        # a user's own environments, last, so that they cannot shadow ours
-        own = [os.getcwd(), *filter(None, [os.environ.get(PATH_VARIABLE)])]
-        sys.path += [folder for folder in own if folder not in sys.path]
-    except FileNotFoundError:
-        if parent is None:  # a role is given whole paths
-            return _complain("the working folder is gone; cd to one that is there", CONFIG_STATUS)
+    _prepare_process(words, parent)
+    if not _extend_import_path() and parent is None:  # a role is given whole paths
+        return _complain("the working folder is gone; cd to one that is there", CONFIG_STATUS)
     from rmc.common.errors import ConfigError, RmcError
 
     try:
@@ -86,6 +72,29 @@ def run(words: list[str]) -> int:
         if begun or error.errno not in UNREADABLE or not isinstance(error.filename, str | bytes):
             raise
         return _complain(f"{os.fsdecode(error.filename)}: {error.strerror}; give another, or its rights", CONFIG_STATUS)
+
+
+def _prepare_process(words: list[str], parent: str | None) -> None:
+    """What numpy and torch read once, as they are imported, and the rest. ``parent``: what a role ends with."""
+    if parent is not None:  # before the slow imports, so that there is no time in which a role could be left behind
+        exit_with_parent(int(parent))
+    if parent is not None or (words and words[0] in PLAYS):
+        descendants.adopt_orphans()  # of what environments start
+    if words[:1] == ["role"] and SINGLE_THREADED.intersection(words[1:2]):
+        for name, value in SINGLE_THREAD.items():
+            os.environ.setdefault(name, value)
+    _choose_temporary_folder()
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads starve the other roles: 100 times slower
+
+
+def _extend_import_path() -> bool:
+    """By where a user's own environments are, last, so that they cannot shadow ours; False: that folder is gone."""
+    try:
+        own = [os.getcwd(), *filter(None, [os.environ.get(PATH_VARIABLE)])]
+    except FileNotFoundError:
+        return False
+    sys.path += [folder for folder in own if folder not in sys.path]
+    return True
 
 
 def _choose_temporary_folder() -> None:
@@ -129,8 +138,9 @@ def _complaint(words: list[str]) -> str:
 
     with contextlib.redirect_stderr(io.StringIO()) as stderr, contextlib.suppress(SystemExit):
         parser.parse(words)
-    command = " ".join(["rmc", *words[:1]])
-    return f"{complaint.as_line(stderr.getvalue(), command)} (see rmc --help)"
+    known = [word for word in words[:1] if word in parser.COMMANDS]
+    all_options = "-all" * (known in (["train"], ["resume"]))
+    return f"{complaint.as_line(stderr.getvalue(), words)} (see {' '.join(['rmc', *known])} --help{all_options})"
 
 
 def _complain(message: str, status: int) -> int:

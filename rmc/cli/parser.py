@@ -28,6 +28,10 @@ from rmc.deploy.run.starts import last_launch
 
 log = logging.getLogger(__name__)
 HELP = {"-h", "--help", ALL_OPTIONS}
+DESCRIPTION = (
+    "RMC trains recurrent agents with a world model for partially observed continuous control. "
+    "Begin with: rmc train InvertedPendulum-v5 --preset debug. rmc --version says which version this is."
+)
 FLAT = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 
 
@@ -139,7 +143,9 @@ def _parsed(words: list[str], defaults: dict[str, Any]) -> Any:
         for name, (kind, _) in COMMANDS.items()
     ]
     kinds: Any = functools.reduce(operator.or_, subcommands)
-    read = functools.partial(tyro.cli, kinds, prog="rmc", args=words, config=FLAT, registry=NUMERALS)
+    read = functools.partial(
+        tyro.cli, kinds, prog="rmc", description=DESCRIPTION, args=words, config=FLAT, registry=NUMERALS
+    )
     if words[:1] == ["sweep"]:  # what it does not know, rmc train may
         command, others = read(return_unknown_args=True)
         return dataclasses.replace(command, train_words=tuple(others))
@@ -162,8 +168,9 @@ def renamed(words: list[str]) -> list[str]:
 def option_names(kind: type) -> list[str]:
     """The names of a command's options, also of those in its parts; what has no flag is left out."""
     names: list[str] = []
-    for name, hint in get_type_hints(kind).items():
-        names += option_names(cast(type, hint)) if dataclasses.is_dataclass(hint) else [name]
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        if tyro.conf.Suppress not in getattr(hint, "__metadata__", ()):
+            names += option_names(cast(type, hint)) if dataclasses.is_dataclass(hint) else [name]
     return [name for name in names if name not in ("id", "config_file")]
 
 

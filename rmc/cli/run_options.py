@@ -104,8 +104,7 @@ class Plot:
     """Draw the returns of runs as curves, and print them as a table, by environment and agent."""
 
     runs: Positional[tuple[Path, ...]]
-    """Runs, folders that hold some at any depth, quoted patterns like 'runs/*', or files of JSON lines as a study
-    writes them."""
+    """Runs, folders with runs at any depth, quoted patterns like 'runs/*', or a study's files of JSON lines."""
     out: Path = Path("curves.png")
     """The picture to write."""
     by: Axis = "env_steps"

@@ -62,7 +62,7 @@ def _check(place: str, value: Any, spec: Spec, words: list[str]) -> None:
         try:
             parser.parse(["train", spec.env, *words])
         except SystemExit:
-            raise ConfigError(place, value, complaint.as_line(output.getvalue(), "rmc train")) from None
+            raise ConfigError(place, value, complaint.as_line(output.getvalue(), ["sweep", *words])) from None
 
 
 def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:

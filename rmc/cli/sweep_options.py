@@ -12,7 +12,7 @@ from tyro.conf import Positional
 class Sweep:
     """Train many runs: a grid's values with each seed, or a search; the same command continues it.
 
-    Options of rmc train that every run has come after ENV or SPEC, as they do there.
+    Options for every run follow ENV or SPEC, as in rmc train.
     """
 
     what: Annotated[Positional[str], tyro.conf.arg(metavar="ENV|SPEC.toml")]
@@ -22,8 +22,7 @@ class Sweep:
     grid: tuple[str, ...] = ()
     """Options of rmc train and their values, like learning_rate=3e-4,1e-3 heads=[64,64],[256,256]."""
     search: tuple[str, ...] = ()
-    """Options to search, in place of a grid, like learning_rate=1e-5..1e-2:log n_step=1..5 scheme=1,3; needs the extra
-    optuna."""
+    """In place of a grid: options to search, like learning_rate=1e-5..1e-2:log n_step=1..5 (extra: optuna)."""
     trials: int = 20
     """Runs of a search, over all its starts."""
     sampler_seed: int = 0

@@ -27,7 +27,7 @@ KEYWORDS = PrimitiveConstructorSpec(
 
 @dataclass(frozen=True)
 class EnvOptions(EnvConfig):
-    """The environment, its id without a flag."""
+    """The environment, and what the agent sees of it."""
 
     id: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
     """Gymnasium id, like HalfCheetah-v5 or dm_control/walker-walk-v0, or module:EnvId-v0 for your own."""
@@ -85,12 +85,11 @@ class Train:
     init_parts: InitParts = "all"
     """Networks to copy: all; memory, world model and imputer; or memory, policy and imputer."""
     launcher: Launcher = "local"
-    """local: processes on this machine. ray: a Ray cluster. lockstep: one thread, reproducible to the bit. manual: you
-    start the roles."""
+    """local: processes here. ray: a Ray cluster. lockstep: one thread, the same bits again. manual: by hand."""
     device: str = "cpu"
     """The learner's device: cpu, cuda or cuda:N."""
     redis_url: str | None = None
-    """A Redis of your own: unix:///path, redis://host:port, rediss://… or file:PATH, which holds such a line; by
+    """A Redis of your own: unix:///path, redis://host:port, rediss://… or file:PATH, a file with the URL; by
     default an embedded one."""
     ray_address: str = "auto"
     """With --launcher ray: auto finds the cluster that this machine is in, local starts one for this run alone."""

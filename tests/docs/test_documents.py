@@ -89,7 +89,7 @@ def test_what_the_table_of_equations_names_is_in_the_sources() -> None:
 
 
 def test_the_tests_that_security_names_exist() -> None:
-    named = re.findall(r"(?:tests/|\btest_)[\w/]*\.py", (ROOT / "SECURITY.md").read_text())
+    named = re.findall(r"(?:tests/|\btest_)[\w/]*\.py", (ROOT / "docs/security.md").read_text())
     assert len(named) > 5
     assert not [name for name in named if not (ROOT / name).exists()]
 
