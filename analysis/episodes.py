@@ -133,10 +133,13 @@ class Player:
         return hidden_parts(self._env, self._config.env)
 
     def several(self) -> list[Episode]:
-        """As many as it takes to learn about a memory."""
+        """As many as it takes to learn about a memory. Raises ConfigError, EnvFault."""
         episodes: list[Episode] = []
         while len(episodes) < LEAST_EPISODES or (len(episodes) < MOST_EPISODES and _steps(episodes) < ENOUGH_STEPS):
             episodes.append(self.play())
+            if episodes[-1].probe.keys() != (names := episodes[0].probe.keys()):
+                fix = f'its info["probe"] names {sorted(names)}, then others; return the same names in every episode'
+                raise ConfigError("ENV", self._config.env.id, fix)
         return episodes
 
     def play(self) -> Episode:

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from rmc.analysis.policy_file import PolicyFile
 from rmc.common.agent import Agent
 from rmc.common.extra import check_installed
+from rmc.common.whole_file import written_whole
 
 INPUTS, OUTPUTS = ("observation", "previous_action", "missing", "state"), ("action", "next_state")
 
@@ -65,7 +66,8 @@ def export(policy: PolicyFile, out: Path) -> None:
         )  # fmt: skip
         assert program is not None
         program.model.metadata_props.update(header.metadata())
-        program.save(str(out), external_data=False)
+        with written_whole(out) as temporary:
+            program.save(str(temporary), external_data=False)
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rmc.analysis import baseline_settings
-from rmc.common.bus.metrics_record import is_finite
+from rmc.common.bus.metrics_record import is_finite, is_whole
 from rmc.common.env.config import EnvConfig, write_kwargs
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, changes, option
@@ -99,12 +99,15 @@ def _of_line(raw: dict[str, Any], place: str) -> History:
     return history
 
 
-def of_run(folder: RunFolder) -> History:
-    """A run's, finished or not. Raises ConfigError where it is none, or was not evaluated yet."""
+def of_run(folder: RunFolder, only_whole: bool = False) -> History:
+    """A run's, finished or not. Raises ConfigError where it is none, or was not evaluated yet.
+
+    With ``only_whole`` evaluations are left out that were cut, or in which an episode broke.
+    """
     about = describe(folder.path)
-    evaluations = _evaluations(list(folder.records()))
+    evaluations = _evaluations([record for record in folder.records() if is_whole(record) or not only_whole])
     result = folder.result() or {}
-    if result:
+    if result and (is_whole(result) or not only_whole):
         ours = not folder.is_baseline()  # of its last checkpoint's own evaluation only the update is known
         below = result["env_steps"], result["updates"] if ours else math.inf
         evaluations = [one for one in evaluations if one.env_steps < below[0] and one.updates < below[1]]

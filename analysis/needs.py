@@ -60,14 +60,17 @@ def _slope(vitals: Vitals, role: str, name: str) -> float:
     return (after - before) / max(ended - began, 1e-9)
 
 
-def needs(config: RunConfig, trial: Trial, machine: Machine) -> list[Need]:
-    """All rows, in the order in which they are shown."""
+def needs(config: RunConfig, trial: Trial, machine: Machine, ring_there: int = 0, env_steps: int = 0) -> list[Need]:
+    """All rows, in the order in which they are shown.
+
+    A run that goes on has so many bytes of its ring on the disk, and so many steps behind it.
+    """
     fast = speed(config, trial.records)
-    seconds = config.total_steps / fast.steps_per_s
+    seconds = max(0, config.total_steps - env_steps) / fast.steps_per_s
     at = f"{fast.steps_per_s:,.0f} steps/s, {fast.updates_per_s:,.1f} updates/s"
     return [
         *memory(config, trial.roles, machine),
-        *disk(config, trial, seconds, machine),
+        *disk(config, trial, seconds, machine, ring_there),
         *bandwidth(config, fast, machine),
         *handles(trial.roles, machine),
         threads(config, trial.records, machine),
@@ -92,9 +95,9 @@ def _role_memory(kind: str, each: list[int]) -> Need:
     return Need(f"memory, {kind}{count}", megabytes(sum(each)))
 
 
-def disk(config: RunConfig, trial: Trial, seconds: float, machine: Machine) -> list[Need]:
-    """The ring, the checkpoints, what is recorded until the end, and all."""
-    rows, kept = ring_bytes(config), config.learner.keep_checkpoints + KEPT_BESIDE
+def disk(config: RunConfig, trial: Trial, seconds: float, machine: Machine, ring_there: int) -> list[Need]:
+    """What is to come of the ring, the checkpoints, what is recorded until the end, and all."""
+    rows, kept = max(0, ring_bytes(config) - ring_there), config.learner.keep_checkpoints + KEPT_BESIDE
     count = config.total_steps // config.learner.checkpoint_steps + 1
     saved, records = min(kept, count) * trial.checkpoint_bytes, trial.record_bytes_per_s * seconds
     free = max(0, machine.free_disk_bytes - DISK_RESERVE)

@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.analysis import hub
 from rmc.common.agent import Agent
-from rmc.common.bus.metrics_record import is_finite
+from rmc.common.bus.metrics_record import is_finite, is_whole
 from rmc.common.checkpoint import POLICY, PROGRESS
 from rmc.common.errors import ConfigError, MessageError, first_line
 from rmc.common.policy_header import METADATA_KEY, PolicyHeader
@@ -175,7 +175,8 @@ def _evaluated(header: PolicyHeader, folder: RunFolder) -> PolicyHeader:
     records = [result] if result is not None and result["updates"] == header.updates else []
     if not records:
         records = [record for record in folder.records() if record.get("eval_update") == header.updates]
-    if not records or not all(is_finite(records[-1].get(f"eval_{name}")) for name in EVALUATED):
+    played: dict[str, Any] = records[-1] if records else {}
+    if not is_whole(played) or not all(is_finite(played.get(f"eval_{name}")) for name in EVALUATED):
         return header
-    mean, deviation, episodes = (records[-1][f"eval_{name}"] for name in EVALUATED)
+    mean, deviation, episodes = (played[f"eval_{name}"] for name in EVALUATED)
     return replace(header, eval_return_mean=mean, eval_return_std=deviation, eval_episodes=episodes)

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rmc.analysis.run_paths import run_folders
+from rmc.common.bus.metrics_record import is_whole
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.figures import duration, number
 from rmc.deploy.monitor.recorded import recorded_status
@@ -55,8 +56,10 @@ def summary(path: Path) -> RunSummary:
         status, result = recorded_status(folder, LISTED_BYTES), folder.result() or {}
     except (ConfigError, OSError) as error:
         return RunSummary(str(path), fault=str(error))
-    returns = [one.return_mean for one in (status.best, status.last) if one is not None]
+    returns = [status.last.return_mean] if status.last is not None else []
     returns += [result["eval_return_mean"]] if result else []
+    best = [status.best.return_mean] if status.best is not None else []
+    best += [result["eval_return_mean"]] if result and is_whole(result) else []
     return RunSummary(
         str(path),
         str(status.state),
@@ -66,7 +69,7 @@ def summary(path: Path) -> RunSummary:
         result.get("env_steps", status.env_steps),
         status.total_steps,
         returns[-1] if returns else None,
-        max(returns, default=None),
+        max(best, default=None),
         result.get("wall_s", status.elapsed_s),
     )
 

@@ -7,6 +7,8 @@ import os
 import subprocess
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.faults import call_env
 from rmc.common.env.make import entry_point, find_spec, make_env
 from rmc.common.env.wrappers import Env
-from rmc.common.errors import ConfigError, EnvFault
+from rmc.common.errors import ConfigError, EnvFault, RmcError, first_line
 from rmc.common.extra import check_installed
 from rmc.common.whole_file import written_whole
 
@@ -62,16 +64,16 @@ def _mode_fault(env: EnvConfig) -> str | None:
 def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest: int = LONGEST_EPISODE) -> float:
     """Play one deterministic episode, ``longest`` steps of it at most, and write it to ``out``; its return.
 
-    ``prepare`` must have been called. Raises EnvFault.
+    ``prepare`` must have been called. Raises EnvFault; RmcError where the file cannot be written.
     """
-    from imageio_ffmpeg import write_frames  # an extra
+    from imageio_ffmpeg import count_frames_and_secs, write_frames  # an extra
 
     env = make_env(env_config, render=True)
     _follow(env)
     observation, info = env.reset(seed=seed)
     frame, rate = _frame(env), env.metadata.get("render_fps") or FRAMES_PER_SECOND
     total = 0.0
-    with written_whole(out) as path:
+    with written_whole(out) as path, _told(out):
         video = write_frames(str(path), (frame.shape[1], frame.shape[0]), fps=rate, macro_block_size=1)
         video.send(None)  # the generator's start
         for _ in range(longest):
@@ -82,8 +84,18 @@ def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest:
             if terminated or truncated:
                 break
         video.close()
+        count_frames_and_secs(str(path))  # ffmpeg does not say that it could not write the end
     env.close()
     return total
+
+
+@contextmanager
+def _told(out: Path) -> Iterator[None]:
+    """What ffmpeg raises, with its own words of many lines, as one RmcError."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        raise RmcError(f"{out}: ffmpeg cannot write the video ({first_line(error)}); is the disk full?") from None
 
 
 def _follow(env: Env) -> None:

@@ -105,7 +105,7 @@ class CheckpointFolder:
             return 0
 
     def note_save(self, seconds: float) -> None:
-        """How long a save took, from the first look at the state until it was on the disk."""
+        """How long it takes to end: an update, and a save from the first look at the state until it is on the disk."""
         self._note(SAVE_SECONDS, str(seconds))
 
     def last_save(self) -> float:

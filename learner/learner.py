@@ -78,6 +78,7 @@ class Learner:
         self._look_at = 0.0  # when to ask next whether Redis still has the weights
         self._published: Version | None = None  # last
         self._save_at, self._checkpoint_error = 0.0, ""
+        self._slowest = self._save_seconds = 0.0  # seconds of an update, and of the last save
         torch.set_flush_denormal(True)  # into which Adam's moments of idle units decay: 13 % slower on a CPU
         torch.manual_seed(seed)  # the networks' initial weights
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent, spec.missing, spec.privileged)
@@ -134,7 +135,7 @@ class Learner:
             self._freeze_statistics()
         began = time.perf_counter()
         self._learn(sample)
-        self._threads.note(time.perf_counter() - began)
+        self._note_pace(time.perf_counter() - began)
         if self.env_steps >= self._next_checkpoint:
             self._flush()
             self.checkpoint()
@@ -155,6 +156,13 @@ class Learner:
             self._finish(updated)
         if number % self.config.publish_updates == 0 or needs_weights(number):
             self._finish_pending()
+
+    def _note_pace(self, seconds: float) -> None:
+        """Of an update: whoever ends this learner waits for those that are pending, and for a save."""
+        self._threads.note(seconds)
+        if seconds > 2.0 * self._slowest:
+            self._slowest = seconds
+            self.checkpoints.note_save(self._save_seconds + seconds)
 
     def _finish_pending(self) -> None:
         for updated in self._updated.drain():
@@ -271,7 +279,8 @@ class Learner:
             self._policy_learnt,
         )
         self.checkpoints.save(self.updates, pack(state, policy, progress))
-        self.checkpoints.note_save(time.monotonic() - began)
+        self._save_seconds = time.monotonic() - began
+        self.checkpoints.note_save(self._save_seconds + self._slowest)
 
     def _after(self, env_steps: int) -> int:
         return (env_steps // self.config.checkpoint_steps + 1) * self.config.checkpoint_steps

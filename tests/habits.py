@@ -176,6 +176,8 @@ class Draws(Slide):
         self.picture, self.render_mode = picture, render_mode
 
     def render(self) -> Any:
+        if self.picture == "noise":  # which no codec makes small
+            return self.np_random.integers(0, 256, (128, 128, 3), np.uint8)
         return PICTURES[self.picture]
 
 

@@ -50,6 +50,14 @@ def is_finite(value: Any) -> TypeGuard[float]:
     return _is_number(value) and math.isfinite(value)
 
 
+def is_whole(evaluation: Mapping[str, Any]) -> bool:
+    """Whether all its episodes were played to their ends.
+
+    Else it is compared with no other: of a task that punishes each step, one that was cut short would always be best.
+    """
+    return not (evaluation.get("eval_cut") or evaluation.get("eval_broken_episodes"))
+
+
 def is_metric(name: str, value: Any) -> bool:
     """Whether a record may hold that: all who show one count with it."""
     if name.endswith(TEXT):

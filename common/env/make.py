@@ -53,13 +53,18 @@ def make_env(config: EnvConfig, render: bool = False, privileged: bool = False) 
         _check_delay(config, limit)
         env: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
     fault = call_env("spaces", lambda: space_fault(env.observation_space, env.action_space))
-    if fault is None and config.hide != "nothing" and not structure(env):
+    if fault is None and config.hide != "nothing" and not _says_parts(env):
         fault = f"it does not say which observations are {config.hide}; --hide is for MuJoCo's bodies, like Ant-v5"
     if fault is not None:
         with suppress(*RAISED):
             env.close()
         raise ConfigError("ENV", config.id, fault)
     return _as_seen(env, config, limit, privileged)
+
+
+def _says_parts(env: gym.Env[Any, Any]) -> bool:
+    """Whether it says which parts an observation has, all of it: a wrapper may have added to a body's own."""
+    return 0 < sum(structure(env).values()) == gym.spaces.flatdim(env.observation_space)
 
 
 def _make(registered: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
@@ -140,9 +145,14 @@ def recreate_env(env: Env, make_env: Callable[[], Env]) -> Env:
 
 
 def further_env(make_env: Callable[[], Env], what: str) -> Env:
-    """One where it is known that a first one can be made. Raises RmcError, which says what that may mean."""
+    """One where it is known that a first one can be made.
+
+    Raises ConfigError; RmcError for all else, which says what that may mean.
+    """
     try:
         return make_env()
+    except ConfigError:
+        raise
     except Exception as error:
         fix = "where only one can exist, take --actors 1 --envs-per-actor 1 --episodes 0"
         raise RmcError(f"{what} cannot be made beside the others ({describe_error(error)}); {fix}") from error

@@ -13,6 +13,7 @@ from rmc.common.process.outage import OutageLog
 
 METRICS_PERIOD = 1.0  # seconds between a role's metrics records, which are its heartbeat too
 STOP_PERIOD = 0.5  # seconds between looks at the bus's stop key
+TERMINATED_STATUS = 128 + signal.SIGTERM  # a shell's word for it
 IDLE_SECONDS = 0.002  # slept after a step that had nothing to do
 RECONNECT_SLEEP = 0.5  # seconds between tries while Redis is away or full
 
@@ -39,12 +40,20 @@ class StopSignal:
     """Set by SIGTERM and SIGINT; the loop looks at it between steps."""
 
     def __init__(self) -> None:
-        self.requested = False
+        self.requested = self.terminated = False
 
     def install(self) -> None:
         """Catch both signals in this process."""
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: self.request())
+        signal.signal(signal.SIGTERM, lambda *_: self._terminate())
+        signal.signal(signal.SIGINT, lambda *_: self.request())
+
+    def _terminate(self) -> None:
+        self.requested = self.terminated = True
+
+    @property
+    def exit_status(self) -> int:
+        """Of a role that has closed. After SIGTERM it is no end of the run: its launcher starts the role again."""
+        return TERMINATED_STATUS if self.terminated else 0
 
     def request(self) -> None:
         self.requested = True

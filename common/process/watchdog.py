@@ -20,6 +20,7 @@ LOOK_SECONDS = 0.1
 WARNER = "rmc-env-warnings"  # the thread
 STDERR = 2  # an environment may have put something else in sys.stderr's place
 HUNG_STATUS = 3  # of a process that ended so
+HUNG_WORDS = "Timeout ("  # with which faulthandler begins; its status is 1
 SLACK = 1.1  # of the time that a call has, until it counts as one that cannot even be told
 
 

@@ -22,7 +22,7 @@ EVALUATOR_IDLE_SECONDS = 0.05  # and an evaluator every 0.1 s
 EVALUATOR_NICENESS = 10  # it must not take the learner's core
 
 
-def run_actor(place: RunConnection, index: int) -> None:
+def run_actor(place: RunConnection, index: int) -> int:
     """The process of actor ``index``."""
     process = Process(place)
     config = process.config
@@ -33,6 +33,7 @@ def run_actor(place: RunConnection, index: int) -> None:
     with process.starting(f"actor-{index}"):
         actor = make_actor(config, index, make_env, process.bus)
     run_role(actor, process.bus, process.stop, idle_seconds=ACTOR_IDLE_SECONDS)
+    return process.stop.exit_status
 
 
 def make_actor(
@@ -52,7 +53,7 @@ def make_evaluator(
     return Evaluator(config.seed, make_env, config.agent, config.evaluator, bus, clock, config.layout.missing)
 
 
-def run_evaluator(place: RunConnection) -> None:
+def run_evaluator(place: RunConnection) -> int:
     """The evaluator's process."""
     process = Process(place)
     config = process.config
@@ -61,3 +62,4 @@ def run_evaluator(place: RunConnection) -> None:
     with process.starting("evaluator"):
         evaluator = make_evaluator(config, process.make_env, process.bus)
     run_role(evaluator, process.bus, process.stop, idle_seconds=EVALUATOR_IDLE_SECONDS)
+    return process.stop.exit_status

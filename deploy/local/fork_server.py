@@ -1,5 +1,6 @@
 """The supervisor's end of the fork server; the program itself is ``rmc/cli/fork_server.py``."""
 
+import errno
 import os
 import signal
 import socket
@@ -18,7 +19,6 @@ from rmc.deploy.local.role_environment import SINGLE_THREAD, inherited, working_
 POLL_SECONDS = 0.01
 END_SECONDS = 2.0
 IMPORT_SECONDS, REPLY_SECONDS = 120.0, 10.0  # until one that does not answer counts as gone
-FAILED_STATUS = 1
 LARGEST = 65_536  # bytes of a request
 
 
@@ -33,9 +33,9 @@ def open_log(path: Path) -> BinaryIO:
 class ForkedProcess:
     """A process that a fork server forked; what it has of ``subprocess.Popen`` does the same."""
 
-    def __init__(self, fork_server: "ForkServer", generation: int, pid: int, returncode: int | None = None) -> None:
+    def __init__(self, fork_server: "ForkServer", generation: int, pid: int) -> None:
         self._fork_server, self._generation, self.pid = fork_server, generation, pid
-        self.returncode = returncode
+        self.returncode: int | None = None
 
     def poll(self) -> int | None:
         """Its exit status, negative for a signal; None while it runs."""
@@ -63,16 +63,18 @@ class ForkServer:
         self._ours: socket.socket | None = None
 
     def fork(self, words: tuple[str, ...], environment: dict[str, str], log: int) -> ForkedProcess:
-        """A process of ``rmc`` and these words, its output to ``log``. Raises RoleDied where no fork server comes up.
+        """A process of ``rmc`` and these words, its output to ``log``.
 
-        Where the system has no room for a process, its log says so and it has ended already.
+        Raises RoleDied where no fork server comes up, OSError where the system has no room for a process.
         """
         request = {"words": words, "environment": environment}
         for _ in range(2):  # one that was killed since is found out by asking it
             self.start()
             pid = self._ask(request, log)
+            if pid == 0:
+                raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
             if pid is not None:
-                return ForkedProcess(self, self._generation, pid, None if pid else FAILED_STATUS)
+                return ForkedProcess(self, self._generation, pid)
         raise RoleDied(f"the fork server of roles does not start; its log is {self._log}")
 
     def status_of(self, pid: int, generation: int) -> int | None:

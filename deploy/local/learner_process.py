@@ -23,7 +23,7 @@ from rmc.learner.replay_client import ReplayClient
 from rmc.learner.sharded_replay import ShardedReplay
 
 
-def run_learner(place: RunConnection, folder: Path, device: str) -> None:
+def run_learner(place: RunConnection, folder: Path, device: str) -> int:
     """The learner's process; checkpoints go to ``folder``. Its last record says ``finished`` where the run is."""
     secret, process = place.secret(), Process(place)
     config, spec, bus = process.config, process.config.window_spec(), process.bus
@@ -43,6 +43,8 @@ def run_learner(place: RunConnection, folder: Path, device: str) -> None:
         last = {**learner.metrics(), "finished": 1}
         with suppress(BusUnavailable, BusFull):  # its launcher waits for it, unless all is to stop
             until_taken(lambda: bus.emit(learner.name, last), learner.name, process.stop)
+        return 0
+    return process.stop.exit_status
 
 
 def make_learner(

@@ -20,7 +20,7 @@ def make_server(config: RunConfig, folder: Path, bus: Bus, shard: Shard) -> Repl
     return ReplayServer(spec, config.replay, folder, config.seed, config.total_steps, config.actors, slack, bus, shard)
 
 
-def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> None:
+def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> int:
     """A replay server's process; its ring lies in ``folder``, its socket at ``listen``."""
     secret, process = place.secret(), Process(place)
     config, spec = process.config, process.config.window_spec()
@@ -33,3 +33,4 @@ def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> N
         sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size, context)
         process.bus.announce_replay(server.owner, sockets.address)
     run_role(ReplayProcess(server, sockets), process.bus, process.stop, idle_seconds=0.0)
+    return process.stop.exit_status

@@ -14,7 +14,8 @@ from typing import BinaryIO
 
 from rmc.common.errors import RoleDied
 from rmc.common.process.parent_death import PARENT_VARIABLE
-from rmc.common.process.watchdog import HUNG_STATUS
+from rmc.common.process.role import TERMINATED_STATUS
+from rmc.common.process.watchdog import HUNG_STATUS, HUNG_WORDS, SLACK
 from rmc.deploy.local.fork_server import ForkedProcess, ForkServer, open_log
 from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inherited, working_folder
@@ -31,7 +32,7 @@ log = logging.getLogger(__name__)
 
 def from_outside(status: int) -> bool:
     """Whether somebody else ended it, for whom it can do nothing: it is started again, however often."""
-    return status in (-signal.SIGKILL, -signal.SIGTERM)
+    return status in (-signal.SIGKILL, -signal.SIGTERM, TERMINATED_STATUS)
 
 
 class QuickDeaths:
@@ -42,7 +43,8 @@ class QuickDeaths:
 
     def note(self, status: int, lived: float, last_words: str, where: str = "") -> None:
         """One more, after so many seconds. Raises RoleDied where it is one too many, or starting again cannot help."""
-        lived -= self.env_timeout if status == HUNG_STATUS else 0.0
+        hung = status == HUNG_STATUS or (status == 1 and last_words.startswith(HUNG_WORDS))
+        lived -= SLACK * self.env_timeout if hung else 0.0
         self.count = self.count + 1 if lived < QUICK_SECONDS and not from_outside(status) else 0
         if self.count >= QUICK_DEATHS or status == EXIT_CONFIG:
             how = f"killed by signal {-status}" if status < 0 else f"exit status {status}"
@@ -109,18 +111,19 @@ class RoleProcess:
             else:
                 self._note_death(status)
         elif time.monotonic() >= self._start_at:
-            self._start_again()
+            self.restarts += self.start_or_wait()
 
-    def _start_again(self) -> None:
-        """Later, where this machine has no process or no memory to give now."""
+    def start_or_wait(self) -> bool:
+        """Start it, or later, where this machine has no process or no memory to give now; whether it is started."""
         try:
             self.start()
-            self.restarts += 1
         except OSError as error:
             if error.errno not in NO_PROCESS:
                 raise
             log.warning("%s cannot be started now (%s); trying again", self.command.name, error.strerror)
             self._start_at = time.monotonic() + LONGEST_BACKOFF
+            return False
+        return True
 
     def _note_death(self, status: int) -> None:
         now = time.monotonic()
@@ -133,7 +136,7 @@ class RoleProcess:
         with suppress(OSError), self.log.open("rb") as log:
             log.seek(max(self.log_start, self.log.stat().st_size - TRACEBACK_BYTES))
             text = log.read().decode(errors="replace").rstrip()
-        start = text.rfind("Traceback (most recent call last)")
+        start = max(text.rfind("Traceback (most recent call last)"), text.rfind(HUNG_WORDS))
         return text[start:] if start >= 0 else "\n".join(text.splitlines()[-20:]) or "(none)"
 
     def signal(self, number: int) -> None:
@@ -156,7 +159,7 @@ class RoleProcess:
 
     def _end_group(self) -> None:
         """What it has started goes with it; the fork server, which sees to those that left the group, may be gone."""
-        if self._process is not None and self._process.pid > 0:  # none where there was no room for one
+        if self._process is not None:
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(self._process.pid, signal.SIGKILL)
 
@@ -189,7 +192,7 @@ class Supervisor:
         if self._fork_server is not None:
             self._fork_server.start()
         for role in sorted(self.roles.values(), key=lambda role: role.command.single_thread):
-            role.start()
+            role.start_or_wait()
 
     def tend(self) -> None:
         """Start dead roles again. Raises RoleDied for one that dies too often."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from rmc.common.bus.metrics_record import is_finite
+from rmc.common.bus.metrics_record import is_finite, is_whole
 from rmc.common.bus.protocol import Bus
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable
@@ -112,10 +112,8 @@ class Monitor:
         self._mark_best(record)
 
     def _mark_best(self, record: dict[str, Any]) -> None:
-        """One that was cut says too little: of a task that punishes each step, it would always be the best."""
         update, score = record.get("eval_update"), record.get("eval_return_mean")
-        is_whole = record["role"] == "evaluator" and not record.get("eval_cut")
-        if is_whole and isinstance(update, int) and is_finite(score):
+        if record["role"] == "evaluator" and is_whole(record) and isinstance(update, int) and is_finite(score):
             self._unmarked[update] = float(score)
         with suppress(OSError):  # no room; the next record tries again
             for update in list(self._unmarked):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from statistics import mean
 from typing import Any
 
-from rmc.common.bus.metrics_record import is_finite
+from rmc.common.bus.metrics_record import is_finite, is_whole
 from rmc.deploy.monitor.pace import Pace
 from rmc.deploy.run.state import State
 
@@ -103,7 +103,7 @@ class RunStatus:
         deviation = deviation if is_finite(deviation) else None
         at = _steps(record.get("eval_env_steps"))
         self.last = EvaluationStatus(float(score), deviation, _steps(record["eval_update"]), at)
-        if not record.get("eval_cut") and (self.best is None or self.last.return_mean > self.best.return_mean):
+        if is_whole(record) and (self.best is None or self.last.return_mean > self.best.return_mean):
             self.best = self.last
 
     def silent(self) -> dict[str, float]:

@@ -78,8 +78,10 @@ def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None
     host = actor.remote(task, str(folder.path), config.learner.keep_checkpoints)
     try:
         ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)
-    except ray.exceptions.RayError as error:
+    except BaseException as error:  # Ctrl-C, too
         ray.kill(host, no_restart=True)  # it must not begin once nobody expects it
+        if not isinstance(error, ray.exceptions.RayError):
+            raise
         fix = f"the run's launcher could not begin on the head ({last_line(error)})"
         raise ConfigError("--launcher", "ray", fix) from None
 

@@ -69,6 +69,8 @@ def read(path: Path) -> dict[str, Any]:
     provider = config.get("provider") if isinstance(config, dict) else None
     if not isinstance(provider, dict) or "type" not in provider:
         raise ConfigError("CONFIG", str(path), "is no Ray cluster's file; start from one in deploy/cluster/")
+    if provider["type"] == "local" and not {"head_ip", "worker_ips"} <= provider.keys():
+        raise ConfigError("CONFIG", str(path), "its provider has no head_ip or worker_ips; write the machines into it")
     return dict(config)
 
 

@@ -57,14 +57,20 @@ def connect(url: str, run: str, waits: Deadline | None = None) -> RedisBus:
 
 
 def tried_again(call: Callable[[], T], stop: StopSignal) -> T:
-    """Make a call of a Redis that has just answered, again where it is away for a moment. Raises BusUnavailable."""
+    """Make a call of a Redis that has just answered, again where it is away for a moment.
+
+    Raises BusUnavailable; KeyboardInterrupt where that is waited for and the run is stopped.
+    """
     waits = Deadline(AWAY_SECONDS, stop)
     while True:
         try:
             return call()
         except BusUnavailable as error:
-            if not waits.wait(f"Redis: {error}"):
-                raise
+            if waits.wait(f"Redis: {error}"):
+                continue
+            if stop.requested:
+                raise KeyboardInterrupt from None
+            raise
 
 
 def _in_file(path: Path) -> str:

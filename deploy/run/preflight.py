@@ -24,7 +24,7 @@ def check_machine(config: RunConfig, options: LaunchOptions) -> None:
     if options.launcher != "ray":
         check_learner(config, options.device)
     if options.launcher in ("local", "lockstep"):
-        check_ring_fits(config, Path("runs") if options.run_dir is None else options.run_dir)
+        check_ring_fits(config, options)
     check_port(options)
 
 
@@ -58,7 +58,15 @@ def ring_bytes(config: RunConfig) -> int:
     return shards * ring.file_bytes(config.window_spec(), -(-config.replay.capacity // shards))
 
 
-def check_ring_fits(config: RunConfig, run_dir: Path) -> None:
+def ring_bytes_there(config: RunConfig, options: LaunchOptions) -> int:
+    """What of that a run that goes on has on the disk already."""
+    if options.run_dir is None or options.if_exists == "new":
+        return 0
+    rings = [options.run_dir / shard.role / "ring" for shard in config.shards()]
+    return sum(path.stat().st_size for path in rings if path.exists())
+
+
+def check_ring_fits(config: RunConfig, options: LaunchOptions) -> None:
     """Raises ConfigError where a run's rings are larger than the free disk or the machine's memory.
 
     A ring is a mapped file; one larger than the memory would turn every draw into disk reads.
@@ -68,10 +76,8 @@ def check_ring_fits(config: RunConfig, run_dir: Path) -> None:
     def most(room: int) -> int:
         return max(0, capacity - -(-(size - room) // row))
 
-    rings = [run_dir / shard.role / "ring" for shard in config.shards()]
-    existing = sum(path.stat().st_size for path in rings if path.exists())
-    free_disk = shutil.disk_usage(existing_parent(run_dir.resolve())).free
-    room = existing + max(0, free_disk - DISK_RESERVE)
+    free_disk = shutil.disk_usage(existing_parent((options.run_dir or Path("runs")).resolve())).free
+    room = ring_bytes_there(config, options) + max(0, free_disk - DISK_RESERVE)
     if size > room:
         rest = f"{_gb(free_disk)} are free, {_gb(DISK_RESERVE)} of which are left for checkpoints and logs"
         fix = f"take at most {most(room)}" if most(room) else "make room"

@@ -37,7 +37,7 @@ def evaluate(command: run_options.Evaluate) -> int:
         check_range("--flicker", flicker, (0.0, 1.0))
     if command.video is not None:
         video.prepare(_filmed(command).header.env, command.video)
-    watch = EvaluationProgress(Console(stderr=True), str(command.run))
+    watch = EvaluationProgress(Console(stderr=True, markup=False, emoji=False, highlight=False), str(command.run))
     for probability in command.flicker or (None,):
         played = evaluate_run(
             command.run, command.episodes, command.checkpoint, probability, command.seconds, watch, command.env_timeout

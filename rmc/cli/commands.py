@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import logging
+import shlex
 
 from rmc.analysis import run_list
 from rmc.analysis.doctor import examine_run
@@ -89,7 +90,7 @@ def attach(command: run_options.Attach) -> int:
     try:
         attachment.watch(folder, console, attachment.LauncherGone(folder))
     except KeyboardInterrupt:
-        console.print(f"it goes on; rmc stop {command.run} ends it", soft_wrap=True)
+        console.print(f"it goes on; rmc stop {shlex.quote(str(command.run))} ends it", soft_wrap=True)
         return 0
     return print_end(folder, console)
 

@@ -42,7 +42,9 @@ def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
     if any(word.partition("=")[0].replace("_", "-") == KWARGS for word in words):
         kwargs = {}
     last = [KWARGS, *write_kwargs(kwargs)] if kwargs else []
-    return [words[0], *file_words, *words[1:], *last], env
+    own = words[1:]
+    first = list(itertools.takewhile(lambda word: not word.startswith("-"), own))  # ENV: a list would take it in
+    return [words[0], *first, *file_words, *own[len(first) :], *last], env
 
 
 def _named(words: Sequence[str]) -> Path | None:

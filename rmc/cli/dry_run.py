@@ -10,6 +10,7 @@ from rmc.analysis.needs import Need, needs
 from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.trial import TRAINED_SECONDS, run_trial, trial_config
+from rmc.deploy.monitor.recorded import recorded_status
 from rmc.deploy.redis.connect import connect
 from rmc.deploy.redis.socket_folder import place_for_sockets
 from rmc.deploy.run.config import RunConfig
@@ -17,7 +18,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.host import this_machine
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import taken_up
-from rmc.deploy.run.preflight import check_learner, check_port
+from rmc.deploy.run.preflight import check_learner, check_port, ring_bytes_there
 from rmc.deploy.run.tracking import choose_tracking
 from rmc.deploy.run.validation import validate, validate_launch, validate_windows
 
@@ -43,7 +44,7 @@ def dry_run(config: RunConfig, options: LaunchOptions, console: Console) -> int:
     machine = this_machine((options.run_dir or Path("runs")).resolve())
     with signals_caught() as stop:
         measured = run_trial(trial, options.device, stop)
-    rows = needs(config, measured, machine)
+    rows = needs(config, measured, machine, ring_bytes_there(config, options), _steps_made(options))
     console.print(_table(rows))
     for finding in examine(measured.records, config):
         console.print(str(finding), soft_wrap=True)
@@ -58,12 +59,24 @@ def _check_start(config: RunConfig, options: LaunchOptions) -> None:
     choose_tracking(options)
     if options.redis_url is not None:
         connect(options.redis_url, "check")
-    if options.run_dir is not None and options.if_exists != "new" and (options.run_dir / "config.json").exists():
-        taken_up(RunFolder(options.run_dir), config, options.if_exists, options)
+    if (folder := _there(options)) is not None:
+        taken_up(folder, config, options.if_exists, options)
     elif options.init_from is not None:
         from rmc.deploy.run import warm_start  # imports torch
 
         warm_start.prepare(config, options.init_from, options.init_parts)
+
+
+def _there(options: LaunchOptions) -> RunFolder | None:
+    """The run that goes on."""
+    path = options.run_dir
+    is_there = path is not None and options.if_exists != "new" and (path / "config.json").exists()
+    return RunFolder(path) if path is not None and is_there else None
+
+
+def _steps_made(options: LaunchOptions) -> int:
+    folder = _there(options)
+    return recorded_status(folder).env_steps if folder is not None else 0
 
 
 def _table(rows: list[Need]) -> Table:

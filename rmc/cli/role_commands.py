@@ -25,7 +25,7 @@ class RoleSecrets:
 
 
 def run_role(command: Role) -> int:
-    """Be one role of a run until it ends."""
+    """Be one role of a run until it ends; its exit status."""
     role, secrets = command.role, RoleSecrets()
     if isinstance(role, LauncherRole):
         return launch(role)
@@ -34,27 +34,23 @@ def run_role(command: Role) -> int:
     if not url:
         raise ConfigError("--redis-url", url, f"say where the run's Redis is, or set {URL_VARIABLE}")
     if isinstance(role, ActorRole | EvaluatorRole):
-        _play(role, RunConnection(role.run, url))
-        return 0
+        return _play(role, RunConnection(role.run, url))
     place = RunConnection(role.run, url, secrets.secret, role.secret_file, role.tls_folder)
     if isinstance(role, ReplayRole):
         from rmc.deploy.local import replay_process
 
-        replay_process.run_replay(place, role.folder, role.listen, role.shard)
-    else:
-        from rmc.deploy.local import learner_process
+        return replay_process.run_replay(place, role.folder, role.listen, role.shard)
+    from rmc.deploy.local import learner_process
 
-        learner_process.run_learner(place, role.folder, role.device)
-    return 0
+    return learner_process.run_learner(place, role.folder, role.device)
 
 
-def _play(role: ActorRole | EvaluatorRole, place: RunConnection) -> None:
+def _play(role: ActorRole | EvaluatorRole, place: RunConnection) -> int:
     from rmc.deploy.local import actor_process
 
     if isinstance(role, ActorRole):
-        actor_process.run_actor(place, role.index)
-    else:
-        actor_process.run_evaluator(place)
+        return actor_process.run_actor(place, role.index)
+    return actor_process.run_evaluator(place)
 
 
 def launch(command: LauncherRole) -> int:

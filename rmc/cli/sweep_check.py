@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from rmc.cli import complaint, parser
+from rmc.cli.train_options import Train
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, flat, option, option_words
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.validation import validate, validate_launch, validate_windows
 from rmc.sweep.job import Job
-from rmc.sweep.spec import Range, Spec
+from rmc.sweep.spec import Range, Spec, check_name
 
 RESERVED = (
     "run_dir", "if_exists", "redis_url", "ray_address", "all_cpus", "tls", "metrics_port", "metrics_host", "dry_run",
@@ -34,19 +35,17 @@ class Checked:
 
 def check_values(spec: Spec, on_this_machine: bool) -> None:
     """Raises ConfigError, which names the key, for the first value that rmc train would not read."""
-    words = [*spec.words, *(option(name) for name in spec.options)]
-    if not on_this_machine and (named := [word for word in words if word.partition("=")[0] in FILES]):
-        raise ConfigError(
-            named[0], " ".join(spec.words), "the nodes do not have that file; write options into [options]"
-        )
     given = {word.partition("=")[0].replace("_", "-") for word in spec.words}
+    ranges = spec.search.ranges if spec.search is not None else {}
+    named = given | {option(name) for name in (*spec.options, *spec.grid, *ranges)}
+    if not on_this_machine and (files := named.intersection(FILES)):
+        raise ConfigError(min(files), " ".join(spec.words), "the nodes do not have that file; leave it")
     if "--seed" in given:
         raise ConfigError("--seed", " ".join(spec.words), "a sweep has several: give --seeds")
     for name in RESERVED:
         if option(name) in given:
             raise ConfigError(option(name), " ".join(spec.words), "a sweep's runs are given none; leave it")
     _check("options of rmc train", " ".join(spec.words), spec, list(spec.words))
-    ranges = spec.search.ranges if spec.search is not None else {}
     ends = {name: [value.low, value.high] if isinstance(value, Range) else value for name, value in ranges.items()}
     for part, values in (("options", {name: [value] for name, value in spec.options.items()}), ("grid", spec.grid)):
         for name, tried in values.items():
@@ -94,6 +93,7 @@ def with_length(job: Job, config: RunConfig) -> Job:
 
 def _checked(job: Job, on_this_machine: bool) -> Checked:
     command = parser.parse(list(job.words))
+    _check_file(command)
     config, options = command.config(), dataclasses.replace(command.launch_options(), run_dir=job.folder)
     validate(config)
     validate_windows(config)
@@ -103,6 +103,15 @@ def _checked(job: Job, on_this_machine: bool) -> Checked:
     else:
         config.sizes()  # the environment's, which the nodes make, too
     return Checked(job, config, options)
+
+
+def _check_file(command: Train) -> None:
+    """Raises ConfigError for what the file of ``--config`` says, and a sweep's runs are not given."""
+    defaults = {item.name: item.default for item in dataclasses.fields(Train)}
+    for name in RESERVED:
+        if (value := getattr(command, name)) != defaults[name]:
+            raise ConfigError(option(name), value, "a sweep's runs are given none; leave it out of that file")
+    check_name(option("launcher"), "launcher", command.launcher)
 
 
 def is_whole(name: str, config: RunConfig) -> bool:

@@ -1,5 +1,6 @@
 """``rmc train`` from its checks to ``result.json``."""
 
+import shlex
 import traceback
 from contextlib import AbstractContextManager, nullcontext
 from statistics import mean
@@ -11,7 +12,7 @@ from rmc.cli.ending import format_evaluation, print_result, print_stopped
 from rmc.cli.signals import signals_caught, signals_interrupt
 from rmc.common.bus.protocol import Bus
 from rmc.common.checkpoint import POLICY, CheckpointFolder
-from rmc.common.errors import ConfigError, EnvFault, RmcError
+from rmc.common.errors import ConfigError, RmcError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local import launcher
 from rmc.deploy.local.supervisor import EXIT_CONFIG
@@ -81,7 +82,7 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
         if options.metrics_port is not None:
             console.print(f"metrics on {options.metrics_host}, port {options.metrics_port}", soft_wrap=True)
         if options.launcher == "manual":
-            console.print(f"start the roles with --run {folder.name}", soft_wrap=True)
+            console.print(f"start the roles with --run {shlex.quote(folder.name)}", soft_wrap=True)
         try:
             # before and after, nothing runs that Ctrl-C could not end at once
             with signals_caught() as stop, _metrics_served(folder, monitor, options):
@@ -132,7 +133,7 @@ def _video(config: RunConfig, folder: RunFolder, console: Console) -> str | None
         video.record(load_policy(folder.path), config.env, config.seed, out)
     except KeyboardInterrupt:
         return None
-    except (ConfigError, EnvFault, OSError) as error:
+    except (RmcError, OSError) as error:
         console.print(f"no video: {error}", soft_wrap=True)
         return None
     return str(out)

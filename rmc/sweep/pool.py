@@ -118,7 +118,18 @@ def conduct(
                     ended(one.job, ending)
             time.sleep(LOOK_SECONDS)
     finally:
-        for one in at_work:  # only where an error ends the sweep itself
+        _end(at_work)  # only where an error ends the sweep itself
+
+
+def _end(at_work: list[_AtWork]) -> None:
+    """Cleanly, where that comes in time."""
+    try:
+        while at_work := [one for one in at_work if one.run.status() is None]:
+            for one in at_work:
+                one.stop()
+            time.sleep(LOOK_SECONDS)
+    finally:  # of a second Ctrl-C, or a cluster that is gone
+        for one in at_work:
             one.run.kill()
 
 

@@ -85,12 +85,14 @@ class SearchPlan:
         """Raises KeyError, ValueError where its values are not of these ranges."""
         if values_of(line).keys() != self._distributions.keys():
             raise KeyError
+        judged = self._evaluations(job)
+        is_complete = state == TrialState.COMPLETE and bool(judged)
         return optuna.trial.create_trial(
-            state=state,
-            value=_final_return(job) if state == TrialState.COMPLETE else None,
+            state=state if is_complete or state != TrialState.COMPLETE else TrialState.FAIL,
+            value=judged[-1][1].return_mean if is_complete else None,
             params=self._params(values_of(line)),
             distributions=self._distributions,
-            intermediate_values={step: one.return_mean for step, one in self._evaluations(job)},
+            intermediate_values={step: one.return_mean for step, one in judged},
         )
 
     def _params(self, values: dict[str, Any]) -> dict[str, Any]:
@@ -145,7 +147,7 @@ class SearchPlan:
     def _evaluations(self, job: Job) -> list[tuple[int, Evaluation]]:
         """By which evaluation of a run it is: the steps themselves differ a little from run to run."""
         try:
-            evaluations = of_run(RunFolder(job.folder)).evaluations
+            evaluations = of_run(RunFolder(job.folder), only_whole=True).evaluations
         except ConfigError:  # none yet
             return []
         by_step = {round(one.env_steps / self._checkpoint_steps): one for one in evaluations}
@@ -155,14 +157,12 @@ class SearchPlan:
         """Tell Optuna."""
         at_work = self._at_work.pop(job.name)
         self._report(at_work, job)
-        if ending.state == "finished":
-            self._study.tell(at_work.trial, _final_return(job))
+        judged = self._evaluations(job) if ending.state == "finished" else []
+        if judged:
+            self._study.tell(at_work.trial, judged[-1][1].return_mean)
         else:
-            self._study.tell(at_work.trial, state=TRIAL_STATES.get(ending.state, TrialState.FAIL))
-
-
-def _final_return(job: Job) -> float:
-    return of_run(RunFolder(job.folder)).evaluations[-1].return_mean
+            state = TrialState.PRUNED if ending.state == "pruned" else TrialState.FAIL
+            self._study.tell(at_work.trial, state=state)
 
 
 class _Trial:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite
-from rmc.common.env.config import EnvConfig
+from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import flat
 from rmc.deploy.run.presets import robust
@@ -106,6 +106,9 @@ def check_name(place: str, name: str, value: Any) -> None:
         near = difflib.get_close_matches(name, NAMES, 1)
         hint = f"did you mean {near[0]}?" if near else "rmc train --help lists them"
         raise ConfigError(place, value, f"no option that a sweep's runs take; {hint}")
+    for one in value if isinstance(value, list) else [value]:
+        if name == "env_kwargs" and isinstance(one, dict):
+            check_kwargs(one)
     if name == "launcher" and (value if isinstance(value, str) else "") not in RUN_LAUNCHERS:
         raise ConfigError(place, value, f"a run's is {' or '.join(RUN_LAUNCHERS)}; --launcher ray spreads whole runs")
 

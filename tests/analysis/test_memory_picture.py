@@ -255,6 +255,33 @@ def test_a_probe_that_is_no_dict_of_the_same_numbers_is_named(probe: Any, tmp_pa
         player.play()
 
 
+class Changing(MemoryEnv):
+    """Its ``info["probe"]`` has other names in every episode."""
+
+    count = 0
+
+    def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        observation, _ = super().reset(**options)
+        self.count += 1
+        return observation, {"probe": {f"object {self.count}": 0.0}}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        return *super().step(action)[:4], {"probe": {f"object {self.count}": 0.0}}
+
+
+gym.register("Changing-v0", Changing, kwargs={"delay": 3})
+
+
+def test_a_probe_with_other_names_in_each_episode_is_named(tmp_path: Path) -> None:
+    config = dataclasses.replace(MEMORY, env=EnvConfig("tests.analysis.test_memory_picture:Changing-v0"))
+    folder = make_run(tmp_path / "run", config)
+    with (
+        closing(Player(folder, built(ASLEEP), config, "latest")) as player,
+        pytest.raises(ConfigError, match=r"names \['object \d'\], then others; return the same names in every episode"),
+    ):
+        player.several()
+
+
 def test_both_are_shown_in_panels_and_tables(of_memory_env: list[Episode]) -> None:
     from matplotlib.figure import Figure
 

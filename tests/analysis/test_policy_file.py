@@ -116,12 +116,22 @@ def test_the_return_is_that_of_the_checkpoint(tmp_path: Path, result: bool) -> N
         record = {"role": "evaluator", "eval_update": update, "eval_return_mean": mean, "eval_return_std": 0.5}
         with run.metrics.open("a") as lines:
             lines.write(json.dumps(record | {"eval_episodes": 5}) + "\n")
+    if not result:
+        with run.metrics.open("a") as lines:  # of another checkpoint
+            lines.write(json.dumps(record | {"eval_episodes": 1, "eval_cut": 1}) + "\n")
     if result:
         played = {"eval_return_mean": -4.0, "eval_return_std": 0.25, "eval_episodes": 10, "initial_return_mean": 0.0}
         run.write_result(played | {"env_steps": 70, "updates": 7, "wall_s": 1.0})
     header = read_policy(run.path).header
     evaluation = header.eval_return_mean, header.eval_return_std, header.eval_episodes
     assert evaluation == ((-4.0, 0.25, 10) if result else (-2.0, 0.5, 5))
+
+
+def test_an_evaluation_that_was_cut_is_no_return(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
+    record = {"role": "evaluator", "eval_update": 7, "eval_return_mean": -3.0, "eval_return_std": 0.0}
+    run.metrics.write_text(json.dumps(record | {"eval_episodes": 1, "eval_cut": 1}) + "\n")
+    assert read_policy(run.path).header.eval_return_mean is None
 
 
 def test_an_older_runs_policy_is_given_its_header(tmp_path: Path) -> None:

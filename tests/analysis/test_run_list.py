@@ -27,6 +27,8 @@ def run_in(path: Path, status: int | None, scores: tuple[float, ...] = ()) -> Ru
         {"role": "replay", "time": time.time(), "env_steps": 700},
         {"role": "launcher", "time": time.time(), "wall_s": 9.0},
         *({"role": "evaluator", "eval_return_mean": score, "eval_update": 5} for score in scores),
+        *({"role": "evaluator", "eval_return_mean": 99.0, "eval_update": 5, "eval_cut": 1} for _ in scores[:1]),
+        *({"role": "evaluator", "eval_return_mean": score, "eval_update": 5} for score in scores[-1:]),
     ]
     folder.metrics.write_text("".join(json.dumps(record) + "\n" for record in records))
     folder.unlock(status)

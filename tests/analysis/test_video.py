@@ -9,10 +9,13 @@ import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
 
 from rmc.analysis import video
+from rmc.analysis.policy import load_policy
 from rmc.analysis.video import _follow
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
+from rmc.common.errors import RmcError
+from rmc.common.whole_file import temporary_path
 from tests.analysis.test_policy import AGENTS, make_run
 
 
@@ -36,6 +39,19 @@ def test_a_video_or_a_line_that_says_why_not(tmp_path: Path) -> None:
     assert "#dimensions 0: 480x480" in lines
     images = [line.split(",")[-1] for line in lines if not line.startswith("#")]
     assert 1 < len(set(images)) <= 1000
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a pipe that imageio leaves open
+@pytest.mark.parametrize("steps", [3, 400])
+def test_a_video_that_cannot_be_written_is_one_line_and_none_is_left(steps: int, tmp_path: Path) -> None:
+    """A short one fills no pipe: ffmpeg fails when all is sent."""
+    config = EnvConfig("tests.habits:Draws-v0", env_kwargs={"picture": "noise"})
+    policy = load_policy(make_run(tmp_path / "run", AGENTS["robust"], config.id, env_kwargs=config.env_kwargs).path)
+    out = tmp_path / "episode.mp4"
+    temporary_path(out).symlink_to("/dev/full")
+    with pytest.raises(RmcError, match=r"episode\.mp4: ffmpeg cannot write the video \(.*\); is the disk full\?$"):
+        video.record(policy, config, 0, out, steps)
+    assert not out.exists()
 
 
 def test_the_camera_follows() -> None:

@@ -20,6 +20,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.trial import RoleUse, Trial, trial_config
 from rmc.deploy.run.host import Machine, this_machine
+from rmc.deploy.run.preflight import ring_bytes
 from rmc.deploy.run.presets import debug, robust
 from rmc.replay_server.ring import file_bytes
 from tests.integration.running import Training
@@ -87,6 +88,17 @@ def test_what_does_not_fit_is_marked(less: dict[str, Any], what: list[str], is_n
     assert [(row.what, row.is_needed) for row in table.values() if row.fits is False] == [
         (one, is_needed) for one in what
     ]
+
+
+def test_a_run_that_goes_on_needs_what_is_to_come() -> None:
+    trial, ring = Trial({"learner": RoleUse(1, 1, 1)}, records(), 0, 0.0), ring_bytes(CONFIG)
+    before, after = (
+        {row.what: row.needs for row in needs(CONFIG, trial, MACHINE, *there)} for there in ((), (ring, 1_000))
+    )
+    assert (before["disk, ring"], after["disk, ring"]) == (megabytes(ring), megabytes(0))
+    assert [rows["time to the end"].split(" at")[0] for rows in (before, after)] == [
+        duration(CONFIG.total_steps / 60), duration((CONFIG.total_steps - 1_000) / 60)
+    ]  # fmt: skip
 
 
 def test_numbers_are_told_in_units_that_suit_them() -> None:

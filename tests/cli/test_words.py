@@ -69,6 +69,12 @@ def test_a_wrong_file_is_refused(
     assert fix in message
 
 
+def test_a_list_at_the_files_end_takes_no_environment_in(file: Path) -> None:
+    file.write_text('env = "Pendulum-v1"\ntrack_tags = ["a", "b"]\n')
+    command = parser.parse(["train", "HalfCheetah-v5", "--seed", "2", "--config", str(file)])
+    assert (command.env.id, command.track_tags, command.seed) == ("HalfCheetah-v5", ("a", "b"), 2)
+
+
 def test_a_file_that_is_not_there_or_is_two(tmp_path: Path, file: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.toml.*cannot be read"):
         parser.parse(["train", PENDULUM, "--config", str(tmp_path / "none.toml")])

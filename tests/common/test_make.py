@@ -9,10 +9,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
+from gymnasium.spaces import Box
+from gymnasium.wrappers import TransformObservation
 
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.make import env_layout, make_env
-from rmc.common.errors import ConfigError
+from rmc.common.env.make import env_layout, further_env, make_env
+from rmc.common.errors import ConfigError, RmcError
 from tests.memory_env import ANSWER_STEPS
 
 REPOSITORY = Path(__file__).parents[2]
@@ -34,9 +37,17 @@ class OddSpaces(gym.Env[Any, Any]):
         return self.observation_space.sample(), 0.0, False, False, {}
 
 
-Box = gym.spaces.Box
 VECTOR = Box(-1.0, 1.0, (3,), np.float64)
 gym.register("OddSpaces-v0", entry_point=OddSpaces)
+
+
+def longer() -> gym.Env[Any, Any]:
+    """A body of MuJoCo's whose observation says one number more than the body knows of."""
+    space = Box(-np.inf, np.inf, (5,), np.float64)
+    return TransformObservation(InvertedPendulumEnv(), lambda observation: np.append(observation, 1.0), space)
+
+
+gym.register("Longer-v0", entry_point=longer)
 
 
 def odd(name: str, observation: gym.Space[Any], action: gym.Space[Any]) -> EnvConfig:
@@ -129,6 +140,7 @@ def test_the_outermost_actions_are_within_the_bounds(bound: float, dtype: type) 
             "of its actions {'b': 'Discrete'}",
         ),
         (EnvConfig("Pendulum-v1", hide="velocities"), "--hide is for MuJoCo's bodies"),
+        (EnvConfig("tests.common.test_make:Longer-v0", hide="velocities"), "--hide is for MuJoCo's bodies"),
         (EnvConfig("HalfCheetah-v5", noise=-0.1), "--noise=-0.1"),
         (EnvConfig("HalfCheetah-v5", env_timeout=math.inf), "--env-timeout=inf: take a number from 0.1 to"),
         (EnvConfig("HalfCheetah-v5", frame_stack=0), "--frame-stack=0"),
@@ -277,3 +289,11 @@ def test_memory_task_needs_a_memory(delay: int) -> None:
             returns.append(total)
     assert min(remembered) == ANSWER_STEPS
     assert abs(np.mean(blind)) < 4 * ANSWER_STEPS / math.sqrt(200)
+
+
+def test_what_a_further_environment_is_refused_for_stays_a_refusal() -> None:
+    """On a node that lacks its module, for one."""
+    with pytest.raises(ConfigError, match="no_such_module"):
+        further_env(lambda: make_env(EnvConfig("no_such_module:Thing-v0")), "an environment of actor-0's 8")
+    with pytest.raises(RmcError, match="an environment of actor-0's 8 cannot be made beside the others"):
+        further_env(lambda: [][0], "an environment of actor-0's 8")

@@ -1,5 +1,7 @@
 """The loop that every role shares: it goes on without Redis, and is closed whatever happens."""
 
+import signal
+
 import pytest
 
 from rmc.common.bus.memory_bus import MemoryBus
@@ -72,6 +74,19 @@ def test_says_its_metrics_and_hears_the_stop():
         "waiting_share",
         "waiting_for",
     }
+
+
+def test_sigterm_is_no_end_in_order_and_ctrl_c_is():
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        for number, status in ((signal.SIGINT, 0), (signal.SIGTERM, 143)):
+            stop = StopSignal()
+            stop.install()
+            signal.raise_signal(number)
+            assert (stop.requested, stop.exit_status) == (True, status)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def test_the_last_state_is_said_after_closing():

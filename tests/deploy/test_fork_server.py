@@ -15,7 +15,7 @@ import pytest
 
 from rmc.cli import fork_server
 from rmc.common.errors import RoleDied
-from rmc.deploy.local.fork_server import FAILED_STATUS, IMPORT_SECONDS, ForkedProcess, ForkServer
+from rmc.deploy.local.fork_server import IMPORT_SECONDS, ForkedProcess, ForkServer
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")
 
@@ -113,8 +113,11 @@ def test_a_system_without_room_for_a_process_is_said(tmp_path: Path, monkeypatch
     with ours, theirs, (tmp_path / "log").open("ab") as log:
         assert fork_server._forked(theirs, {"words": [], "environment": {}}, log.fileno()) == 0
     assert (tmp_path / "log").read_text() == "no process can be forked: Resource temporarily unavailable\n"
-    ended = ForkedProcess(ForkServer(tmp_path / "fork_server.log"), 0, 0, FAILED_STATUS)
-    assert ended.poll() == FAILED_STATUS
+    refusing = ForkServer(tmp_path / "fork_server.log")
+    monkeypatch.setattr(refusing, "start", lambda: None)
+    monkeypatch.setattr(refusing, "_ask", lambda *_: 0)
+    with pytest.raises(BlockingIOError, match="temporarily unavailable"):  # as of any other process
+        fork(refusing, tmp_path / "log")
 
 
 FORKS_THAT_DRAW = """

@@ -66,6 +66,7 @@ def test_a_file_that_is_none_is_named(tmp_path: Path) -> None:
         ("[1, 2]", "is no Ray cluster's file"),
         ("a: [", "cannot be read"),
         ("provider: 3", "is no Ray"),
+        ("provider: {type: local, coordinator_address: a:1}", "has no head_ip or worker_ips"),
     ]:
         odd.write_text(text)
         with pytest.raises(ConfigError, match=message):

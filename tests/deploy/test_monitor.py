@@ -212,6 +212,7 @@ def test_an_evaluation_that_was_cut_is_never_the_best(monitor: Monitor, caplog: 
         monitor._checkpoints.save(update, {})
     monitor.take({"role": "evaluator", "eval_update": 3, "eval_return_mean": -900.0, "eval_cut": 0})
     monitor.take({"role": "evaluator", "eval_update": 6, "eval_return_mean": -20.0, "eval_cut": 1})
+    monitor.take({"role": "evaluator", "eval_update": 6, "eval_return_mean": -10.0, "eval_broken_episodes": 4})
     assert monitor._checkpoints.best() == 3
     assert monitor.status.best is not None
     assert monitor.status.last is not None

@@ -70,7 +70,7 @@ def test_a_containers_memory_is_what_counts(tmp_path: Path, monkeypatch: pytest.
     config = run(15, 8)
     large = dataclasses.replace(config, replay=dataclasses.replace(config.replay, capacity=100_000))
     with pytest.raises(ConfigError, match=r"^--capacity=100000: takes .* of 0.001 GB memory; take at most \d+$"):
-        check_ring_fits(large, tmp_path)
+        check_ring_fits(large, LaunchOptions(tmp_path))
 
 
 def test_a_gpu_that_is_not_there_is_refused_with_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,7 +100,7 @@ def test_a_run_is_refused_so_before_it_starts_but_on_a_gpu(memory: int, tmp_path
 def test_a_ring_that_the_disk_does_not_hold_is_refused_with_the_largest_that_it_does(
     shards: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    free = DISK_RESERVE + 1_000_000
+    free, options = DISK_RESERVE + 1_000_000, LaunchOptions(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
 
     def of(capacity: int) -> RunConfig:
@@ -110,15 +110,17 @@ def test_a_ring_that_the_disk_does_not_hold_is_refused_with_the_largest_that_it_
         )
 
     with pytest.raises(ConfigError, match=r"^--capacity=100000: takes 0.37\d GB of disk") as error:
-        check_ring_fits(of(100_000), tmp_path)
+        check_ring_fits(of(100_000), options)
     most = int(re.findall(r"\d+", str(error.value))[-1])
-    check_ring_fits(of(most - most % shards), tmp_path)
+    check_ring_fits(of(most - most % shards), options)
     assert ring_bytes(of(most + shards)) > 1_000_000
     for shard in of(100_000).shards():  # a run that goes on has its rings already
         (tmp_path / shard.role).mkdir()
         with (tmp_path / shard.role / "ring").open("wb") as ring:
             ring.truncate(ring_bytes(of(100_000)) // shards)
-    check_ring_fits(of(100_000), tmp_path)
+    check_ring_fits(of(100_000), options)
+    with pytest.raises(ConfigError, match="--capacity=100000"):  # one beside it has none
+        check_ring_fits(of(100_000), dataclasses.replace(options, if_exists="new"))
 
 
 def test_a_ring_on_another_machine_is_not_judged_by_this_ones_disk(

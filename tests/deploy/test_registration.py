@@ -71,7 +71,7 @@ def test_a_redis_that_is_away_for_a_moment_ends_no_start(
         RunRedis(CONFIG, folder, stop, redis_url)
     monkeypatch.setattr(connect, "AWAY_SECONDS", 600.0)
     stop.requested = True  # Ctrl-C
-    with pytest.raises(BusUnavailable, match="reset by peer"):
+    with pytest.raises(KeyboardInterrupt):
         RunRedis(CONFIG, folder, stop, redis_url)
 
 

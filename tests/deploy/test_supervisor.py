@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 
 from rmc.common.errors import RoleDied
+from rmc.common.process.role import TERMINATED_STATUS
 from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.local import supervisor
 from rmc.deploy.local.role_command import RoleCommand
-from rmc.deploy.local.supervisor import RoleProcess, Supervisor
+from rmc.deploy.local.supervisor import QuickDeaths, RoleProcess, Supervisor
 
 
 @pytest.fixture
@@ -83,16 +84,36 @@ def test_one_that_hangs_soon_after_each_start_ends_the_run(quick: Path, monkeypa
         tend_until(role)
 
 
-@pytest.mark.parametrize("number", [9, 15])
-def test_a_role_that_others_kill_is_started_again_however_often(quick: Path, number: int) -> None:
-    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\nkill -{number} $$\n")
+def test_one_that_hangs_in_c_soon_after_each_start_ends_the_run() -> None:
+    """The interpreter ends it then, with a traceback and the status of any other error."""
+    deaths, told = QuickDeaths("actor-0", 60.0), "Timeout (0:01:06)!\nThread 0x1 (most recent call first):"
+    deaths.note(1, 66.5, told)
+    deaths.note(1, 66.5, told)
+    with pytest.raises(RoleDied, match="3 times in a row"):
+        deaths.note(1, 66.5, told)
+    deaths.note(1, 66.5, "Traceback (most recent call last)")  # that lived for long
+    assert deaths.count == 0
+
+
+def test_the_interpreters_words_of_a_hang_are_its_last(quick: Path) -> None:
     role = RoleProcess(RoleCommand("actor-0", ("actor",)), {}, quick)
+    role.log.write_text("before\nTimeout (0:01:06)!\n" + "Thread\n" * 30)
+    assert role.last_words().startswith("Timeout (0:01:06)!\nThread")
+
+
+@pytest.mark.parametrize("end", ["kill -9 $$", "kill -15 $$", f"exit {TERMINATED_STATUS}"])
+@pytest.mark.parametrize("ends", [False, True])
+def test_a_role_that_others_kill_is_started_again_however_often(quick: Path, end: str, ends: bool) -> None:
+    """The learner, too, whose end in order is that of the run."""
+    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\n{end}\n")
+    role = RoleProcess(RoleCommand("role", ("role",), ends=ends), {}, quick)
     role.start()
     deadline = time.monotonic() + 20.0
     while role.restarts < 10:
         assert time.monotonic() < deadline
         role.tend()
         time.sleep(0.001)
+    assert not role.finished
     role.signal(9)
     role.reap(5.0)
 
@@ -149,6 +170,7 @@ def test_where_no_process_can_be_started_now_it_is_tried_again(quick: Path, monk
         return begin(*words, **options)
 
     monkeypatch.setattr(supervisor.subprocess, "Popen", scarce)
+    assert not role.start_or_wait()
     tend_until(role)
     assert (role.finished, role.restarts) == (True, 1)
 

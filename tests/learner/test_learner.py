@@ -448,6 +448,20 @@ def test_priorities_of_what_a_gpu_still_works_on_come_later_but_come(setting, mo
     assert len(returned) == setting.learner.updates
 
 
+def test_how_long_an_update_takes_is_noted_before_there_is_a_checkpoint(setting, monkeypatch):
+    """Ctrl-C waits for it."""
+    setting.feed(60)
+    updated = setting.learner._updated
+    whole = type(updated).__call__
+    monkeypatch.setattr(type(updated), "__call__", lambda *given: (time.sleep(0.5), whole(*given))[1])
+    setting.learner.step()
+    assert setting.learner.checkpoints.patience(0.0) >= 3 * 0.5
+    monkeypatch.undo()
+    setting.learner.step()
+    assert setting.learner.checkpoint()
+    assert setting.learner.checkpoints.patience(0.0) >= 3 * 0.5  # it may be as slow again
+
+
 def test_how_long_a_save_takes_is_noted(setting, monkeypatch):
     whole = setting.learner.checkpoints.save
     monkeypatch.setattr(setting.learner.checkpoints, "save", lambda *given: (time.sleep(0.5), whole(*given))[1])

@@ -129,6 +129,26 @@ def test_a_run_below_the_median_is_pruned_once_enough_are_finished(tmp_path: Pat
     assert not work_of(tmp_path, index, spec_of(prune=False)).plan.is_hopeless(good)
 
 
+def test_an_evaluation_that_was_cut_is_not_what_a_search_looks_for(tmp_path: Path, index: Index) -> None:
+    """Of a task that punishes each step it would be the best."""
+    work = work_of(tmp_path, index, spec_of())
+    job = work.plan.next()
+    index.begin(job)
+    pretend(job, [-900.0, -800.0], finished=True)
+    folder = RunFolder(job.folder)
+    folder.write_result((folder.result() or {}) | {"eval_return_mean": -20.0, "eval_cut": 1})
+    work.plan.end(job, Ending("finished", 1.0))
+    index.end(job, Ending("finished", 1.0))
+    assert [trial.value for trial in work.plan._study.trials] == [-800.0]
+    assert [trial.value for trial in work_of(tmp_path, index, spec_of()).plan._study.trials] == [-800.0]
+    lost = work.plan.next()
+    pretend(lost, [-20.0], finished=False)
+    text = folder.metrics.read_text().splitlines()[-1]
+    RunFolder(lost.folder).metrics.write_text(json.dumps(json.loads(text) | {"eval_cut": 1}) + "\n")
+    work.plan.end(lost, Ending("finished", 1.0))
+    assert [trial.value for trial in work.plan._study.trials] == [-800.0, None]
+
+
 def test_other_ranges_than_those_of_its_trials_are_refused(tmp_path: Path, index: Index) -> None:
     work = work_of(tmp_path, index, spec_of())
     play(work, index, [1.0] * 4)

@@ -119,6 +119,7 @@ FILES = {
     "[search.ranges]\ngrounding = {low = 0, high = 1}": "search.grounding=",
     "[grid]\nscheme = [1]\n[search.ranges]\nn_step = [1]": "grid=['scheme']: a sweep has a grid or a search",
     'seeds = "1-2"\n[search.ranges]\nn_step = [1]': "seeds=[1, 2]: a search has one",
+    "[options]\nenv_kwargs = {reset_noise_scale = 1979-05-27}": "--env-kwargs reset_noise_scale=",
     "seeds = [": "not TOML",
 }
 
@@ -156,6 +157,14 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(
         ([PENDULUM, "--jobs", "-1"], "--jobs=-1: take 1 or more"),
         ([PENDULUM, "--config", "f.toml", "--launcher", "ray"], "--config='--config f.toml': the nodes do not"),
         (
+            [PENDULUM, "--init_from", "runs/a", "--launcher", "ray"],
+            "--init-from='--init_from runs/a': the nodes do not have that file",
+        ),
+        (
+            [PENDULUM, "--grid", "init_from=runs/a,runs/b", "--launcher", "ray"],
+            "--init-from='': the nodes do not have that file",
+        ),
+        (
             [PENDULUM, "--preset", "debug", "--ray-address", "head:6379"],
             "--ray-address='head:6379': give --launcher ray",
         ),
@@ -173,6 +182,23 @@ def test_bad_words_are_one_line(
     assert main.run(["sweep", *words]) == 2
     _one_line(capsys, message)
     assert os.listdir() == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "metrics_port = 9000", "dry_run = true", 'if_exists = "new"', 'run_dir = "x"', 'redis_url = "unix:///a"',
+        'launcher = "manual"',
+    ],
+)  # fmt: skip
+def test_what_a_sweeps_runs_are_not_given_is_refused_in_the_file_of_config_too(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("base.toml").write_text(f'preset = "debug"\n{line}\n')
+    assert main.run(["sweep", PENDULUM, "--config", "base.toml"]) == 2
+    _one_line(capsys, f"--{line.split()[0].replace('_', '-')}=")
+    assert os.listdir() == ["base.toml"]
 
 
 def _one_line(capsys: pytest.CaptureFixture[str], message: str) -> None:

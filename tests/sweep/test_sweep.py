@@ -1,18 +1,22 @@
 """Sweeps as a user starts, interrupts and repeats them."""
 
+import errno
 import os
 import re
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import psutil
 import pytest
 
 from rmc.cli.main import run
 from rmc.common.errors import ConfigError
+from rmc.common.process.role import StopSignal
 from rmc.deploy.run.folder import RunFolder
-from rmc.sweep import local_runs, room
+from rmc.sweep import local_runs, pool, room
 from rmc.sweep.job import Job
 from rmc.sweep.pool import drop_replay
 from tests.integration.running import alive
@@ -133,6 +137,45 @@ def test_ctrl_c_ends_all_in_order_and_a_kill_leaves_nothing(tmp_path: Path) -> N
         while alive(processes):
             assert time.monotonic() < deadline, alive(processes)
             time.sleep(0.1)
+
+
+class Saving:
+    """A run that needs a moment to save once it is asked to end."""
+
+    def __init__(self) -> None:
+        self.done: list[str] = []
+
+    def stop(self) -> None:
+        self.done.append("stop")
+
+    def status(self) -> int | None:
+        looks = self.done.count("look")
+        self.done += ["look"] if "stop" in self.done else []
+        return 130 if looks >= 2 else None
+
+    def kill(self) -> None:
+        self.done.append("kill")
+
+    def last_words(self) -> str:
+        return ""
+
+
+def test_a_full_disk_ends_a_sweep_but_its_runs_save_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pool, "LOOK_SECONDS", 0.01)
+    jobs = [Job(tmp_path / str(number), ("train", "Pendulum-v1"), number) for number in range(2)]
+    at_work = [Saving() for _ in jobs]
+    plan = SimpleNamespace(next=lambda: jobs.pop(0) if jobs else None, is_hopeless=lambda _: False)
+    place = SimpleNamespace(has_room=lambda: True, start=lambda job: at_work[job.seed])
+
+    def begun(job: Job) -> None:
+        if job.seed == 1:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(OSError, match="No space left"):
+        pool.conduct(cast(Any, plan), cast(Any, place), StopSignal(), begun, lambda *_: None)
+    assert at_work[0].done[0] == "stop"
+    assert "kill" not in at_work[0].done
+    assert at_work[1].done == []
 
 
 def test_cores_are_shared_out() -> None:
