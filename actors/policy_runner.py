@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
-from torch.nn import functional as F
 
 from rmc.common.agent_config import CRITIC_PARTS, LOG_STD_RANGE, NORMALIZED_CLIP, AgentConfig
 from rmc.common.errors import MessageError
@@ -102,14 +101,12 @@ class PolicyRunner:
         self._flags = missing * config.missing_flag
         inputs = config.input_size(obs_dim, action_dim, missing)
         embedding = config.embedding or inputs
-        self._skip = config.skip_size(obs_dim, inputs)
+        self._skip = config.skip_size(obs_dim)
         self._input = np.zeros((envs, inputs), np.float32)
-        self._embed = _Linear(inputs, embedding, envs, relu=not config.layer_norm) if config.embedding else None
+        self._embed = _Linear(inputs, embedding, envs, relu=True) if config.embedding else None
         self._from_embedding = _Linear(embedding, 3 * config.hidden, envs)
         self._from_hidden = _Linear(config.hidden, 3 * config.hidden, envs)
         self._mean, self._std = torch.zeros(obs_dim), torch.ones(obs_dim)
-        normed = config.layer_norm and config.embedding > 0
-        self._norm = (torch.ones(embedding), torch.zeros(embedding)) if normed else ()
         self._gru = _GRU(self._from_embedding, self._from_hidden, envs, config.hidden)
         self._head = _head(config.feature_size(self._skip), config.heads, 2 * action_dim, envs)
         input_dim = config.hidden + obs_dim + action_dim
@@ -144,7 +141,6 @@ class PolicyRunner:
             layers["memory.embed.0.{}"] = self._embed
         copies = [layer.take(weights, name) for name, layer in layers.items()]
         plain = {"normalizer.mean": self._mean, "normalizer.std": self._std}
-        plain |= dict(zip(("memory.embed.1.weight", "memory.embed.1.bias"), self._norm, strict=False))
         return copies + [partial(mine.copy_, _of_shape(weights, name, mine)) for name, mine in plain.items()]
 
     def act(
@@ -161,11 +157,10 @@ class PolicyRunner:
         if self._config.head_input == "observation":
             x, new_hidden = filled[:, : self._obs_dim], self._gru.out.zero_()
         else:
-            embedding = self._embedded(filled)
+            embedding = filled if self._embed is None else self._embed(filled)
             x = new_hidden = self._gru(embedding, torch.from_numpy(hidden))
             if self._skip:
-                skip = embedding if self._config.head_input == "hidden+embedding" else filled
-                x = torch.cat([x, skip[:, : self._skip]], 1)
+                x = torch.cat([x, filled[:, : self._skip]], 1)
         for layer in self._head:
             x = layer(x)
         new_state: Floats = new_hidden.numpy()
@@ -197,14 +192,6 @@ class PolicyRunner:
         last_frame = state[:, self._config.hidden :]
         expected: Floats = (last_frame + x.numpy()).clip(-NORMALIZED_CLIP, NORMALIZED_CLIP)
         return expected * last_frame.any(1, keepdims=True)
-
-    def _embedded(self, x: Tensor) -> Tensor:
-        if self._embed is None:
-            return x
-        embedding = self._embed(x)
-        if not self._norm:
-            return embedding
-        return F.layer_norm(embedding, embedding.shape[1:], *self._norm).relu_()
 
     def _action(self, head: Floats, noise: Floats | None) -> Floats:
         mean, log_std = head[:, : self._action_dim], head[:, self._action_dim :]

@@ -76,7 +76,7 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
     latent_change = memory.hidden[0].diff(dim=0)
     real = episode.observation[0, 1:]
-    ahead = _open_loop(agent, memory, seen[0, :-1], episode.action[0], episode.missing.shape[-1])
+    ahead = _open_loop(agent, memory, seen[0, :-1], episode.action[0])
     return Insight(
         real=real.numpy(),
         predicted=ahead[1].numpy(),
@@ -89,21 +89,18 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     )
 
 
-def _open_loop(
-    agent: Agent, memory: MemoryOutput, observation: Tensor, action: Tensor, flags: int
-) -> dict[int, Tensor]:
+def _open_loop(agent: Agent, memory: MemoryOutput, observation: Tensor, action: Tensor) -> dict[int, Tensor]:
     """Horizon K -> (T - K + 1, O): from every step on, the model's own states and observations in place of the real.
 
-    Observations (T, O) to start from, actions (T, A); ``flags`` is M.
+    Observations (T, O) to start from, actions (T, A).
     """
-    hidden, skip = memory.hidden[0, :-1], memory.skip[0, :-1]
+    hidden = memory.hidden[0, :-1]
     steps, predicted = len(action), {}
     for ahead in range(1, min(max(HORIZONS), steps) + 1):
         count = steps - ahead + 1  # starts from which so many steps were played
-        hidden, skip, observation, a = hidden[:count], skip[:count], observation[:count], action[ahead - 1 :]
-        step = agent.world_model(agent.features(MemoryOutput(hidden, skip)), a)
+        hidden, observation, a = hidden[:count], observation[:count], action[ahead - 1 :]
+        step = agent.world_model(agent.features(MemoryOutput(hidden, agent.memory.skip(observation))), a)
         hidden, observation = hidden + step.hidden_change, observation + step.observation_change
-        skip = agent.memory.skip(observation, torch.zeros(count, flags, dtype=torch.bool), a)
         if ahead in HORIZONS:
             predicted[ahead] = observation
     return predicted

@@ -30,7 +30,7 @@ from studies.study import commit
 
 LINES, RUNS = HERE / "results" / "guard.jsonl", Path("runs") / "guard"
 CUE = (
-    "--hidden 64 --embedding 64 --heads 128 128 --head-input hidden+embedding --normalize-observations "
+    "--hidden 64 --embedding 64 --heads 128 128 --head-input hidden+observation --normalize-observations "
     "--learning-rate 5e-4 --polyak 0.99 --target-memory ema --batch-size 16 --capacity 5000 --warmup-steps 1000 "
     "--priority-exponent 0 --episodes 10 --replay-ratio 32 --alpha-learning-rate 5e-3"
 )

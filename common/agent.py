@@ -58,7 +58,7 @@ class MemoryOutput(NamedTuple):
     """What the memory makes of a sequence."""
 
     hidden: Tensor  # (B, T, H), h_t after (o_t, a_{t-1}); zeros without a memory
-    skip: Tensor  # (B, T, ·), what the heads read beside it: e_t, o_t, or nothing
+    skip: Tensor  # (B, T, ·), what the heads read beside it: o_t, or nothing
 
 
 class Memory(nn.Module):
@@ -74,10 +74,8 @@ class Memory(nn.Module):
         layers: list[nn.Module] = []
         if config.embedding:
             layers = [nn.Linear(width, config.embedding), nn.ReLU()]
-            if config.layer_norm:
-                layers.insert(1, nn.LayerNorm(config.embedding))
         self.embed = nn.Sequential(*layers)
-        self.skip_dim = config.skip_size(obs_dim, width)
+        self.skip_dim = config.skip_size(obs_dim)
         self.gru = nn.GRU(config.embedding or width, config.hidden, batch_first=True)
 
     def forward(self, observation: Tensor, missing: Tensor, prev_action: Tensor, hidden: Tensor) -> MemoryOutput:
@@ -86,7 +84,7 @@ class Memory(nn.Module):
             return MemoryOutput(observation.new_zeros(*observation.shape[:2], self.gru.hidden_size), observation)
         embedding = self._embedded(observation, missing, prev_action)
         hidden = self._unroll(embedding, hidden[:, : self.gru.hidden_size].unsqueeze(0).contiguous())
-        return MemoryOutput(hidden, self._skip(observation, embedding))
+        return MemoryOutput(hidden, self.skip(observation))
 
     @torch.no_grad()
     def start_gates(self, steps: int) -> None:
@@ -108,17 +106,14 @@ class Memory(nn.Module):
         embedding = self._embedded(observation, missing, prev_action)
         return torch.gru_cell(embedding, hidden, *self.gru.all_weights[0])
 
-    def skip(self, observation: Tensor, missing: Tensor, prev_action: Tensor) -> Tensor:
-        """What the heads read beside h: (..., O) normalised, (..., M) bool, (..., A) -> (..., ·)."""
-        return self._skip(observation, self._embedded(observation, missing, prev_action))
+    def skip(self, observation: Tensor) -> Tensor:
+        """What the heads read beside h: (..., O) normalised -> (..., O), or (..., 0)."""
+        return observation[..., : self.skip_dim]
 
     def inputs(self, observation: Tensor, missing: Tensor, prev_action: Tensor) -> Tensor:
         """What is embedded: (..., O) normalised, (..., M) bool, (..., A) -> (..., O + A), or M more with the flags."""
         flag = [missing.to(observation.dtype)] if self.missing_flag else []
         return torch.cat([observation, prev_action, *flag], dim=-1)
-
-    def _skip(self, observation: Tensor, embedding: Tensor) -> Tensor:
-        return (embedding if self.head_input == "hidden+embedding" else observation)[..., : self.skip_dim]
 
     def _embedded(self, observation: Tensor, missing: Tensor, prev_action: Tensor) -> Tensor:
         """(..., O) normalised, (..., M) bool, (..., A) -> (..., E)."""

@@ -6,7 +6,7 @@ from typing import Literal
 LOG_STD_RANGE = (-20.0, 2.0)  # of the policy's Gaussian before the tanh
 NORMALIZED_CLIP = 10.0  # standard deviations
 STD_FLOOR = 1e-2  # of a number of an observation: one that is constant is not blown up
-HeadInput = Literal["hidden", "hidden+embedding", "hidden+observation", "observation"]
+HeadInput = Literal["hidden", "hidden+observation", "observation"]
 POLICY_PARTS = ("normalizer.", "memory.", "policy.", "next_frame.")  # what it takes to act
 CRITIC_PARTS = ("critic.", "log_alpha", "privileged_normalizer.")  # what else it takes to rate a window
 
@@ -23,11 +23,9 @@ class AgentConfig:
     """Hidden layers of every head."""
     gate_init: Literal["uniform", "chrono"] = "uniform"
     """Initial bias of the GRU's update gates. uniform: PyTorch's. chrono: time constants up to a window's length."""
-    layer_norm: bool = False
-    """LayerNorm between the embedding's Linear and its ReLU."""
     head_input: HeadInput = "hidden"
-    """What the heads read: the hidden state; beside it the current embedding, or observation; or the observation alone,
-    an agent without a memory."""
+    """What the heads read: the hidden state; the observation beside it; or the observation alone, an agent without a
+    memory."""
     critic_batch_norm: bool = False
     """Batch norm in the critics, as CrossQ has it: Q of this and the next state share one pass; no target critics."""
     privileged_critic: bool = False
@@ -52,9 +50,9 @@ class AgentConfig:
         """Numbers that the memory reads at a step, before the embedding: o_t, a_{t-1}, and M flags where asked."""
         return obs_dim + action_dim + missing * self.missing_flag
 
-    def skip_size(self, obs_dim: int, input_size: int) -> int:
-        """Numbers that the heads read beside h, or in its place."""
-        return {"hidden": 0, "hidden+embedding": self.embedding or input_size}.get(self.head_input, obs_dim)
+    def skip_size(self, obs_dim: int) -> int:
+        """Numbers that the heads read beside h, or in its place: o_t."""
+        return 0 if self.head_input == "hidden" else obs_dim
 
     def feature_size(self, skip_size: int) -> int:
         """Numbers that the heads read in all."""

@@ -77,11 +77,9 @@ WHEN = {
     "embedding": "0 for the paper's raw input",
     "heads": "rarely",
     "gate_init": "`chrono` where something seen once is needed many steps later; the preset `memory` has it",
-    "layer_norm": "rarely: it cost return in a trial (`studies/notebook.md`)",
     "head_input": "`hidden` where the memory must do alone; `observation`, with "
     "`--scheme 2 --no-grounding --hidden 8 --embedding 0`, where all is seen and time counts: "
-    "[far behind by 300 000 steps](results.md); the embedding in place of o cost return in a trial "
-    "(`studies/notebook.md`)",
+    "[far behind by 300 000 steps](results.md)",
     "critic_batch_norm": "off for target critics, and with batches below 16: [what it is worth](results.md)",
     "privileged_critic": "where the simulator knows what sensors do not see: "
     "[an environment of your own](custom-environments.md#seen-in-part)",

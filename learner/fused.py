@@ -44,9 +44,9 @@ class FusedAgent(Agent):
 
     @torch.no_grad()
     def impute(self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """As ``Agent.impute``, which it is without a memory, or where the embedding has no plain layer."""
+        """As ``Agent.impute``, which it is without a memory or an embedding."""
         c = self.config
-        if not (c.embedding and applies(observation)) or c.layer_norm or c.head_input == "observation":
+        if not (c.embedding and applies(observation)) or c.head_input == "observation":
             return super().impute(observation, missing, prev_action, state)
         with torch.autocast("cpu", enabled=False):
             return _impute(self, observation, missing, prev_action, state)

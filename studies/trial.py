@@ -4,12 +4,10 @@ from studies.study import Study
 
 CHANGES = {
     "RMC": "",
-    "layer norm": "--layer-norm",
     "prioritized": "--priority-exponent 0.6",
     "EMA latent": "--latent-target ema",
     "EMA memory": "--target-memory ema",
     "curiosity": "--curiosity 0.1 --curiosity-scale std",
-    "embedding beside": "--head-input hidden+embedding",
     "raw observations": "--no-normalize-observations --no-impute-missing",
 }
 STUDY = Study("trial", {name: f"train ENV {words}" for name, words in CHANGES.items()})

@@ -70,8 +70,6 @@ def validate(config: RunConfig) -> None:
 def _validate_agent(config: RunConfig) -> None:
     if min(config.agent.heads) < 1:
         raise ConfigError("--heads", config.agent.heads, "take at least 1 unit a layer")
-    if config.agent.layer_norm and not config.agent.embedding:
-        raise ConfigError("--layer-norm", True, "it normalises the embedding, so it needs --embedding above 0")
     if config.agent.head_input == "observation" and config.update.curiosity:
         raise ConfigError("--curiosity", config.update.curiosity, "it is the error in a memory's change; take 0")
     if config.agent.initial_priority == "actor" and config.replay.priority_exponent == 0.0:

@@ -22,8 +22,7 @@ AGENTS = {
             hidden=HIDDEN,
             embedding=embedding,
             heads=(8, 8),
-            layer_norm=bool(embedding),
-            head_input="hidden+embedding",
+            head_input="hidden+observation",
             normalize_observations=True,
             missing_flag=bool(embedding),
         )

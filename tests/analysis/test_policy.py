@@ -28,9 +28,9 @@ from rmc.deploy.run.presets import debug
 
 AGENTS = {
     "robust": AgentConfig(
-        hidden=16, embedding=12, heads=(10, 9), head_input="hidden+embedding", normalize_observations=True
+        hidden=16, embedding=12, heads=(10, 9), head_input="hidden+observation", normalize_observations=True
     ),
-    "layer norm": AgentConfig(hidden=16, embedding=12, heads=(10, 9), layer_norm=True),
+    "layer norm": AgentConfig(hidden=16, embedding=12, heads=(10, 9)),
     "observation beside": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="hidden+observation"),
     "without a memory": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="observation"),
     "filling blanks": AgentConfig(

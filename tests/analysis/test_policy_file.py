@@ -239,7 +239,7 @@ def _set(*path: Any, value: Any) -> Callable[[dict[str, Any]], None]:
         (_set("agent", "embedding", value=10**9), "other sizes than its header's: memory.embed.0.bias has shape (12,)"),
         (_set("agent", "embedding", value=-3), "damaged header: no networks have its sizes"),
         (_set("agent", "embedding", value=10**40), "damaged header: no networks have its sizes"),
-        (_set("agent", "layer_norm", value=True), "memory.embed.1.bias has shape None, its header says (12,)"),
+        (_set("agent", "layer_norm", value=True), "agent.layer_norm=True: no such option in this version"),
         (_set("agent", "heads", value=[10, "9"]), "header of another version: RMC 0.1.0 wrote it; agent.heads='9'"),
         (_set("agent", "rotary", value=True), "agent.rotary=True: no such option in this version"),
         (_set("env", value=3), "env=3: must be an object"),

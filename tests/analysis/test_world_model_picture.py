@@ -63,8 +63,7 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
         action = episode.action[:, t : t + 1]
         step = agent.world_model(agent.features(seen), action)
         frame = frame + step.observation_change
-        embedding = agent.memory.embed(torch.cat([frame, action], -1))
-        skip = {"hidden": frame[..., :0], "hidden+embedding": embedding}.get(agent.config.head_input, frame)
+        skip = frame[..., :0] if agent.config.head_input == "hidden" else frame
         seen = seen._replace(hidden=seen.hidden + step.hidden_change, skip=skip)
     return frame[0, 0]
 

@@ -38,7 +38,7 @@ TRAIN_FLAGS = """
     --config --run-dir --if-exists --launcher --device --redis-url --ray-address --all-cpus --tls
     --track --track-project --track-tags --video-every --metrics-port --metrics-host --dry-run
     --burn-in --trained-steps
-    --hidden --embedding --heads --gate-init --layer-norm --head-input --critic-batch-norm --privileged-critic
+    --hidden --embedding --heads --gate-init --head-input --critic-batch-norm --privileged-critic
     --normalize-observations --grounding
     --missing-flag --impute-missing --initial-priority
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
@@ -427,11 +427,15 @@ def test_a_runs_folder_is_its_owners_alone_until_they_open_it(tmp_path: Path) ->
 
 def test_options_become_the_config() -> None:
     words = ["train", PENDULUM, "--preset", "paper", "--seed", "4", "--envs-per-actor", "3", "--heads", "64", "32"]
-    command = parser.parse([*words, "--replay-ratio", "64", "--flicker", "0.5", "--head-input", "hidden+embedding"])
+    command = parser.parse([*words, "--replay-ratio", "64", "--flicker", "0.5", "--head-input", "hidden+observation"])
     assert isinstance(command, train_options.Train)
     config = command.config()
     expected = paper(EnvConfig(PENDULUM, 0.5))
     assert (config.seed, config.actor.envs_per_actor, config.agent.heads) == (4, 3, (64, 32))
-    assert (config.replay.replay_ratio, config.agent.head_input, config.env.flicker) == (64.0, "hidden+embedding", 0.5)
+    assert (config.replay.replay_ratio, config.agent.head_input, config.env.flicker) == (
+        64.0,
+        "hidden+observation",
+        0.5,
+    )
     assert config.update == expected.update
     assert to_json(config) != to_json(expected)

@@ -26,7 +26,7 @@ def run(tmp_path: Path) -> RunFolder:
     """One that has no option as its preset, nor as another."""
     config = debug(EnvConfig(PENDULUM, flicker=0.25, env_kwargs={"reset_noise_scale": 0.02}))
     config = dataclasses.replace(
-        config, seed=3, total_steps=12_345, agent=dataclasses.replace(config.agent, heads=(7, 5), layer_norm=True),
+        config, seed=3, total_steps=12_345, agent=dataclasses.replace(config.agent, heads=(7, 5), missing_flag=True),
         update=dataclasses.replace(config.update, learning_rate=0.1 + 0.2),
     )  # fmt: skip
     folder = open_run(config, tmp_path / "run", "fail", LaunchOptions(tmp_path / "run", "fail", "lockstep", "cuda"))
@@ -57,7 +57,7 @@ def test_every_preset_gives_its_defaults(name: Preset) -> None:
 
 
 def test_what_is_said_is_all_that_changes(run: RunFolder) -> None:
-    words = ("--total-steps", 20_000, "--replay-ratio", "7.5", "--launcher", "local", "--no-layer-norm")
+    words = ("--total-steps", 20_000, "--replay-ratio", "7.5", "--launcher", "local", "--no-missing-flag")
     for command in (
         ("resume", run.path, *words),
         ("resume", *words, run.path),
@@ -66,7 +66,7 @@ def test_what_is_said_is_all_that_changes(run: RunFolder) -> None:
         config, launch = parsed(*command)
         was, now = flat(run.config()), flat(config)
         assert {path: now[path] for path in now if now[path] != was[path]} == {
-            "total_steps": 20_000, "replay.replay_ratio": 7.5, "agent.layer_norm": False
+            "total_steps": 20_000, "replay.replay_ratio": 7.5, "agent.missing_flag": False
         }  # fmt: skip
         assert (launch.launcher, launch.device) == ("local", "cuda")
 

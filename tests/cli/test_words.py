@@ -15,7 +15,7 @@ preset = "debug"
 total-steps = 1_200
 learning_rate = 1e-3
 heads = [24, 16]
-layer_norm = true
+missing_flag = true
 normalize_observations = false
 env_kwargs = { reset_noise_scale = 0.02 }
 """
@@ -30,7 +30,11 @@ def file(tmp_path: Path) -> Path:
 def test_options_come_from_a_file(file: Path) -> None:
     config = parser.parse(["train", "--config", str(file)]).config()
     assert (config.env.id, config.preset, config.total_steps) == (PENDULUM, "debug", 1_200)
-    assert (config.agent.heads, config.agent.layer_norm, config.agent.normalize_observations) == ((24, 16), True, False)
+    assert (config.agent.heads, config.agent.missing_flag, config.agent.normalize_observations) == (
+        (24, 16),
+        True,
+        False,
+    )
     assert config.update.learning_rate == 1e-3
     assert config.agent.hidden == 32  # the preset's own
     assert config.env.env_kwargs == {"reset_noise_scale": 0.02}

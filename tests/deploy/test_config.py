@@ -72,7 +72,7 @@ def test_json_keeps_every_value(rate: float, steps: int, head_input: Any, target
         ("seed", True, "must be int"),
         ("agent.heads", [1], r"must be tuple\[int, int\]"),
         ("agent.heads", [1, "2"], "must be int"),
-        ("agent.layer_norm", 1, "must be bool"),
+        ("agent.missing_flag", 1, "must be bool"),
         ("update.policy_q", "third", "must be one of 'first', 'min'"),
         ("update.gamma", "0.99", "must be float"),
         ("env", 5, "must be an object"),

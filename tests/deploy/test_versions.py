@@ -2,7 +2,8 @@
 
 ``runs/format-1-a`` was made before keywords of environments, sizes.json and initial.json; ``format-1-b`` by the last
 version that wrote config.json without a format; ``format-2`` before rows had checksums and sensors dropped out;
-``format-4``, with batch norm in its critics, before the policy could wait for its turn. All ended at step 1500.
+``format-4``, with batch norm in its critics, before the policy could wait for its turn; ``format-5`` by the
+last version with a LayerNorm behind the embedding. All ended at step 1500.
 """
 
 import json
@@ -28,11 +29,11 @@ from rmc.replay_server.recovery import open_store
 
 RUNS = Path(__file__).parent / "runs"
 # Whoever changes this list raises FORMAT by a migration, and keeps a run of the version before in runs/.
-FORMAT_5 = """
+FORMAT_6 = """
     env.id env.flicker env.drop_sensors env.flicker_burst env.delay env.hide env.noise env.frame_stack
     env.action_repeat env.time_limit env.env_timeout env.env_kwargs preset seed total_steps actors
     window.burn_in window.trained_steps
-    agent.hidden agent.embedding agent.heads agent.gate_init agent.layer_norm agent.head_input agent.critic_batch_norm
+    agent.hidden agent.embedding agent.heads agent.gate_init agent.head_input agent.critic_batch_norm
     agent.privileged_critic agent.normalize_observations agent.grounding agent.missing_flag agent.impute_missing
     agent.initial_priority
     actor.envs_per_actor actor.stride actor.state_strategy actor.reward_scale actor.refresh_steps actor.chunk_windows
@@ -47,7 +48,7 @@ FORMAT_5 = """
 """.split()  # noqa: SIM905
 
 
-@pytest.fixture(params=["format-1-a", "format-1-b", "format-2", "format-3", "format-4"])
+@pytest.fixture(params=["format-1-a", "format-1-b", "format-2", "format-3", "format-4", "format-5"])
 def old(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
     with tarfile.open(RUNS / f"{request.param}.tar.xz") as archive:
         archive.extractall(tmp_path, filter="data")
@@ -55,8 +56,8 @@ def old(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
 
 
 def test_an_option_comes_with_a_format() -> None:
-    assert sorted(flat(robust(EnvConfig("")))) == sorted(FORMAT_5)
-    assert FORMAT == 5
+    assert sorted(flat(robust(EnvConfig("")))) == sorted(FORMAT_6)
+    assert FORMAT == 6
 
 
 def test_its_options_are_read_in_the_words_of_this_version(old: RunFolder) -> None:
@@ -153,6 +154,8 @@ def test_a_format_that_is_none_of_ours_is_one_line(
 
 def test_an_option_that_this_format_does_not_know_is_refused() -> None:
     raw = json.loads(to_json(debug(EnvConfig("InvertedPendulum-v5"))))
+    with pytest.raises(ConfigError, match=r"agent\.layer_norm=True: this version has no such option; use the version"):
+        from_json(json.dumps(raw | {"format": 5, "agent": raw["agent"] | {"layer_norm": True}}))
     raw["agent"]["fill_blanks"] = True  # the old name, in a file that says it has the new ones
     with pytest.raises(ConfigError, match=r"agent\.fill_blanks=True: no such option"):
         from_json(json.dumps(raw))

@@ -18,7 +18,7 @@ import psutil
 
 START_SECONDS = 120.0  # five processes import torch on two cores that other tests may use
 SMALL = (
-    "--hidden", "64", "--embedding", "64", "--heads", "128", "128", "--head-input", "hidden+embedding",
+    "--hidden", "64", "--embedding", "64", "--heads", "128", "128", "--head-input", "hidden+observation",
     "--normalize-observations",
 )  # fmt: skip
 FAST = ("--learning-rate", "5e-4", "--polyak", "0.99", "--target-memory", "ema", "--batch-size", "16")

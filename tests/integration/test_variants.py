@@ -58,7 +58,7 @@ VARIANTS: list[dict[str, Any]] = [
     {"state_strategy": "stored"},
     {"state_strategy": "episode", "env": "Reacher-v5"},
     {"embedding": 0, "grounding": False},
-    {"layer_norm": True, "head_input": "hidden+embedding", "normalize_observations": True},
+    {"head_input": "hidden+observation", "normalize_observations": True},
     {"flicker": 0.5},
     {"flicker": 0.5, "missing_flag": True, "normalize_observations": True},
     {"flicker": 0.5, "impute_missing": True, "normalize_observations": True},

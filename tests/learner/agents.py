@@ -8,7 +8,6 @@ ROBUST = AgentConfig(
     hidden=SPEC.state,
     embedding=7,
     heads=(10, 9),
-    layer_norm=True,
-    head_input="hidden+embedding",
+    head_input="hidden+observation",
     normalize_observations=True,
 )

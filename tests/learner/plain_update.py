@@ -23,7 +23,6 @@ class Known(NamedTuple):
     """The memory after an observation."""
 
     h: Tensor
-    e: Tensor
     o: Tensor
 
 
@@ -88,7 +87,7 @@ class PlainUpdate:
             previous = row["prev_action"] if t == row["first"] else row["action"][t - 1]
             e = self.embedded(memory, row, t, impute[t], torch.tensor(previous))
             h = torch.zeros_like(h) if self.agent.config.head_input == "observation" else gru(memory, e, h)
-            known[t] = Known(h, e, impute[t])
+            known[t] = Known(h, impute[t])
         return {t: known[t] for t in range(self.burn_in, int(row["last"]) + 1)}
 
     def embedded(self, memory: Memory, row: np.void, t: int, o: Tensor, previous: Tensor) -> Tensor:
@@ -128,7 +127,7 @@ class PlainUpdate:
         return [part.mean() for part, is_seen in zip(parts, seen, strict=True) if is_seen]
 
     def z(self, known: Known) -> Tensor:
-        parts = {"hidden": known.h, "embedding": known.e, "observation": known.o}
+        parts = {"hidden": known.h, "observation": known.o}
         return torch.cat([parts[name] for name in self.agent.config.head_input.split("+")])
 
     def sample(self, z: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ from rmc.learner.diagnostics import measurable, staleness
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=5)
 UNBURNED = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=0, train=5)
-AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), head_input="hidden+embedding", normalize_observations=True)
+AGENT = AgentConfig(hidden=8, embedding=6, heads=(7, 6), head_input="hidden+observation", normalize_observations=True)
 FILLING = dataclasses.replace(AGENT, impute_missing=True)
 STEPS = 32  # of the episode
 

@@ -29,7 +29,7 @@ AGENTS = {
     "robust": replace(robust("Ant-v5").agent, hidden=SPEC.state - SPEC.obs_dim, embedding=7, heads=(10, 9)),
     "h alone": AgentConfig(hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden"),
     "embedding beside": AgentConfig(
-        hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden+embedding", grounding=False
+        hidden=SPEC.state, embedding=7, heads=(10, 9), head_input="hidden+observation", grounding=False
     ),
 }
 

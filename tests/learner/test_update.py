@@ -274,7 +274,7 @@ def test_beta_decays_to_zero():
 
 def test_values_and_policy_are_not_rounded_to_bf16():
     agent, action = make(ROBUST).agent, torch.rand(4, 5, SPEC.action_dim)
-    features = torch.randn(4, 5, ROBUST.hidden + ROBUST.embedding)
+    features = torch.randn(4, 5, ROBUST.hidden + SPEC.obs_dim)
     with torch.autocast("cpu", torch.bfloat16):
         outputs = [agent.critic(features, action), *agent.policy(features)]
     for output in outputs:
@@ -290,7 +290,7 @@ def test_bf16_stays_near_fp32():
     for (name, p), q in zip(plain.agent.named_parameters(), half.agent.parameters(), strict=True):
         assert p.grad is not None
         assert q.grad is not None
-        assert (p.grad - q.grad).norm() <= 0.1 * p.grad.norm() + 1e-4, name
+        assert (p.grad - q.grad).norm() <= 0.15 * p.grad.norm() + 1e-4, name
 
 
 @pytest.mark.parametrize("order", ["joint", "alternate"])

@@ -20,7 +20,7 @@ ROBUST = AgentConfig(
     hidden=SPEC.state,
     embedding=7,
     heads=(10, 9),
-    head_input="hidden+embedding",
+    head_input="hidden+observation",
     normalize_observations=True,
     missing_flag=True,
 )
@@ -55,7 +55,7 @@ AGENTS = [
     PAPER,
     ROBUST,
     NORMED,
-    dataclasses.replace(ROBUST, layer_norm=True, head_input="hidden"),
+    dataclasses.replace(ROBUST, head_input="hidden"),
     dataclasses.replace(ROBUST, head_input="observation"),
     dataclasses.replace(ROBUST, head_input="hidden", impute_missing=True),
     dataclasses.replace(ROBUST, head_input="hidden+observation"),

@@ -101,7 +101,7 @@ FILES = {
     '[grid]\nlearning_rate = ["high"]': "grid.learning_rate='high': Error parsing --learning-rate",
     "[grid]\nlearning_rate = [3e-4, 7.0]": "--learning-rate=7.0: take a number from",
     "[grid]\nlearning_rate = [1979-05-27]": "grid.learning_rate=datetime.date(1979, 5, 27)",
-    "[grid]\nlayer_norm = [true]\nembedding = [16, 0]": "--layer-norm=True: it normalises the embedding",
+    "[grid]\nstride = [9, 20]\ntrained_steps = [10, 20]": "--stride=20: take 0 to --trained-steps=10",
     "[options]\nactors = 1\n[grid]\nactors = [1, 2]": "actors=[1, 2]: is an option of every run and varied, too",
     "[search]": "search.ranges={}: name options",
     "[search]\ntrials = 0\n[search.ranges]\nscheme = [1]": "search.trials=0: take 1 to",
