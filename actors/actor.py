@@ -212,7 +212,7 @@ class Actor:
     def _poll_ack(self) -> None:
         now = self._clock()
         ack = self._believed(self._bus.ack(self._index), now)
-        if ack is not None and self._is_forgotten_life(ack):
+        if ack is not None and self._is_forgotten(ack):
             log.warning("%s: the replay server does not know epoch %d any more", self.name, self._unacked.epoch)
             self.restart()
             return
@@ -233,11 +233,11 @@ class Actor:
         self._older_since = min(self._older_since, now) if older else float("inf")
         return None if older and now < self._older_since + DOUBT_SECONDS else ack
 
-    def _is_forgotten_life(self, ack: Ack) -> bool:
-        """Whether Redis has forgotten a life of this actor that the ring knows, or the ring has forgotten ours.
+    def _is_forgotten(self, ack: Ack) -> bool:
+        """Whether Redis has forgotten an incarnation of this actor that the ring knows, or the ring has forgotten ours.
 
-        The former: our epoch is too small (before its first credit a life has sent its hello alone). The latter: we
-        are granted less than what was acknowledged. Raises FencedError where a newer life is real.
+        The former: our epoch is too small (before its first credit one has sent its hello alone). The latter: we
+        are granted less than what was acknowledged. Raises FencedError where a newer one is real.
         """
         ours = self._unacked.epoch
         if ack.id.epoch != ours:

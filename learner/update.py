@@ -151,13 +151,13 @@ class JointUpdate:
             with torch.set_grad_enabled(batch.plan.trains_policy):
                 mean, log_std = agent.policy(z_policy)
                 pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean, batch.cut))
-            now = critic_input(z_value[:, :-1], privileged[:, :-1]), a
-            after = critic_input(model.next_z, privileged[:, 1:]), pi[:, 1:].detach()
-            q, next_q = self._values(now, after, m)
+            taken = critic_input(z_value[:, :-1], privileged[:, :-1]), a
+            following = critic_input(model.next_z, privileged[:, 1:]), pi[:, 1:].detach()
+            q, next_q = self._values(taken, following, m)
             next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:].detach())
             y = losses.td_target(r + beta * model.curiosity, c.gamma, d, next_value, m, c.n_step)
             z_actor = z_policy if c.policy_through_q else z.detach()
-            judged = critic_input(z_actor[:, :-1], privileged[:, :-1]), pi[:, :-1]
+            proposed = critic_input(z_actor[:, :-1], privileged[:, :-1]), pi[:, :-1]
 
         log_pi, td_error = log_pi[:, :-1], (q.detach() - y).abs().mean(0)
         loss_values = {
@@ -165,21 +165,24 @@ class JointUpdate:
             "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
         }
         if batch.plan.trains_policy:
-            loss_values["policy_loss"] = losses.policy_loss(log_pi, self._frozen_q(*judged), alpha, m)
+            loss_values["policy_loss"] = losses.policy_loss(log_pi, self._frozen_q(*proposed), alpha, m)
         reported = {"policy_loss": self.policy_loss.clone()} | detached(loss_values)
         trace = Trace(reported, alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m)
         return loss_values, ValuePass(losses.priority(td_error, c.eta, m), value_metrics(trace, beta))
 
-    def _values(self, now: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], m: Tensor) -> tuple[Tensor, Tensor]:
-        """Q of (h_t, a_t), and of (h_{t+1}, a') without gradient, (2, B, T) each: the latter by the target critics.
+    def _values(
+        self, taken: tuple[Tensor, Tensor], following: tuple[Tensor, Tensor], m: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Q of what was taken, (h_t, a_t), and of what follows, (h_{t+1}, a'), without gradient: (2, B, T) each.
 
-        With batch norm one pass gives both, and there are no targets (CrossQ, arXiv 1902.05605).
+        The latter is the target critics'. With batch norm one pass gives both, and there are no targets (CrossQ, arXiv
+        1902.05605).
         """
         if self.target_critic is not None:
             with torch.no_grad():
-                next_q = self.target_critic(*after)
-            return self.agent.critic(*now), next_q
-        both = (torch.cat(pair, dim=1) for pair in zip(now, after, strict=True))
+                next_q = self.target_critic(*following)
+            return self.agent.critic(*taken), next_q
+        both = (torch.cat(pair, dim=1) for pair in zip(taken, following, strict=True))
         q, next_q = self.agent.critic(*both, torch.cat([m, m], dim=1)).chunk(2, dim=2)
         return q, next_q.detach()
 
@@ -311,10 +314,8 @@ class JointUpdate:
             for group, ours in zip(optimizer.param_groups, own, strict=True):
                 group.update(ours)  # of this config and this device, whatever wrote the checkpoint
         self.curiosity_variance.copy_(state["curiosity_variance"])
-        _, was_missing, fill_loss = state.get("imputer_turns", torch.zeros(3))  # of older checkpoints
-        self.was_missing.copy_(state.get("was_missing", was_missing > 0))
-        self.fill_loss.copy_(state.get("fill_loss", fill_loss))
-        self.policy_loss.copy_(state.get("policy_loss", self.policy_loss))
+        for name in ("was_missing", "fill_loss", "policy_loss"):  # which checkpoints of older versions have not
+            getattr(self, name).copy_(state.get(name, getattr(self, name)))
         self._resume_noise(state["generator"].cpu())
 
     def _resume_noise(self, state: Tensor) -> None:

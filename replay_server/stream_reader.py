@@ -20,8 +20,8 @@ ROUND_BYTES = 4 << 20  # read at most about this much in a round, so that the le
 MAX_ENTRIES = 256  # of one actor in a round
 DISCOVERY_ROUNDS = 100  # rounds between looks for actors beyond those the run was started with
 BEFORE_ALL = EntryId(0, -1)
-LARGEST = EntryId(2**31 - 1, 2**40)  # of each number; a row can say no larger epoch, and no life sends more entries
-SKIPPED = 1 << 20  # entries of a life that Redis can have lost at once
+LARGEST = EntryId(2**31 - 1, 2**40)  # of each number; a row can say no larger epoch, and no incarnation sends more
+SKIPPED = 1 << 20  # entries of an incarnation that Redis can have lost at once
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class StreamReader:
             rows = self._stamped(entries, bodies)
         for entry, body, steps in zip(entries, bodies, self._steps(bodies, rows["new_steps"]), strict=True):
             before = positions.get(entry.actor, StreamPosition(BEFORE_ALL, 0))
-            settled = before.settled_steps if entry.id.epoch == before.id.epoch else 0  # an actor's new life
+            settled = before.settled_steps if entry.id.epoch == before.id.epoch else 0  # an actor's new incarnation
             settled += self._lost_steps(entry) if body is None else steps
             positions[entry.actor] = StreamPosition(entry.id, settled)
         return IngestBatch(rows, positions, broken)
@@ -102,7 +102,7 @@ class StreamReader:
                 continue
             if not _is_possible(entry.id, before, taken_epochs.get(entry.actor, 0)):
                 self._refuse(
-                    entry, MessageError("id", f"{entry.id.epoch}-{entry.id.seq}, which no life can have reached")
+                    entry, MessageError("id", f"{entry.id.epoch}-{entry.id.seq}, which no incarnation can have reached")
                 )
                 broken[entry.actor] = before
                 continue
@@ -116,7 +116,7 @@ class StreamReader:
     def _lacks_entries(self, before: EntryId, entry: Entry) -> bool:
         """Whether Redis has lost what comes between, and its actor may still have it.
 
-        It has not where it was asked before, nor where the ring does not know this life at all: what is missing
+        It has not where it was asked before, nor where the ring does not know this incarnation at all: what is missing
         then was trimmed after another ring's commit.
         """
         same_epoch = entry.id.epoch == before.epoch
@@ -178,7 +178,7 @@ class StreamReader:
 
 
 def _is_possible(new: EntryId, before: EntryId, newest_epoch: int) -> bool:
-    """Whether a life can have reached an id, where ``before`` was taken last and its actor has taken so many epochs."""
+    """Whether an id can have been reached, where ``before`` was taken last and its actor has taken so many epochs."""
     if new.epoch == before.epoch:
         return new.seq <= min(before.seq + SKIPPED, LARGEST.seq)
     return new.epoch <= min(newest_epoch, before.epoch + MAX_EPOCH_GAP, LARGEST.epoch) and new.seq <= LARGEST.seq

@@ -64,7 +64,7 @@ class RedisBus(RedisConnection):
     def take_epoch(self, role: str, floor: int = 0) -> int:
         key = self.key("epoch", role)
         while not floor < (epoch := self._next_epoch(key, floor)) <= floor + MAX_EPOCH_GAP:
-            # Redis lost its data, or somebody changed them; two lives that catch up at once still get one each.
+            # Redis lost its data, or somebody changed them; two incarnations that catch up at once still get one each.
             self.call(self.redis.incrby, key, floor - epoch)
         return epoch
 

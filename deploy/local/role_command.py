@@ -17,7 +17,7 @@ class RoleCommand:
     single_thread: bool = True
     forked: bool = True  # if of a single thread: by the fork server, which has torch in memory
     ends: bool = False  # cleanly, once the run is done; any other that ends unasked is started again
-    env_timeout: float = 0.0  # seconds, of one that plays: what it hung for is no part of its life
+    env_timeout: float = 0.0  # seconds, of one that plays: what it hung for does not count as lived
 
 
 def actor_commands(config: RunConfig, run: str) -> list[RoleCommand]:

@@ -46,7 +46,7 @@ class LauncherActor(RoleActor):
     def __init__(self, task: Task, folder: str, keep: int) -> None:
         self._folder = Path(folder)
         self._checkpoints = CheckpointFolder(self._folder / "checkpoints", keep)
-        self._claim = self._folder / "learner-at"  # the node and the life of the host that holds the learner
+        self._claim = self._folder / "learner-at"  # the node and the incarnation of the host that holds the learner
         super().__init__(task)
 
     def log_folder(self) -> Path:

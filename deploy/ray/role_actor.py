@@ -161,7 +161,7 @@ class RoleActor:
             os._exit(1)
 
     def report(self, incarnation: str, log_start: int) -> RoleReport:
-        """How the role is, and its log from there on; of another life's, from this one's start on."""
+        """How the role is, and its log from there on; of another incarnation's, from this one's start on."""
         start = log_start if incarnation == self._incarnation else self._role.log_start
         log = b""
         with suppress(FileNotFoundError), self._role.log.open("rb") as file:
