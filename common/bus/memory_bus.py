@@ -1,7 +1,7 @@
 """``MemoryBus``: the bus in this process's memory, for lockstep runs and tests."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rmc.common.bus.protocol import (
@@ -143,6 +143,9 @@ class MemoryBus:
             records += kept[max(0, int(cursor) - forgotten) :]
             cursors[role] = str(forgotten + len(kept))
         return records, cursors
+
+    def records_end(self, roles: Iterable[str]) -> dict[str, str]:
+        return {role: str(self._forgotten[role] + len(self._records.get(role, []))) for role in roles}
 
     def memory_bytes(self) -> int:
         return 0

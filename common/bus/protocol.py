@@ -21,7 +21,7 @@ Every Redis key, R = ``rmc:{run}``:
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -175,6 +175,9 @@ class Bus(Protocol):
 
         What is no record is left out.
         """
+
+    def records_end(self, roles: Iterable[str]) -> dict[str, str]:
+        """The cursors behind all that is kept now."""
 
     def memory_bytes(self) -> int:
         """What its server has allocated; 0 where there is none, or it does not say."""

@@ -1,7 +1,7 @@
 """The bus over Redis: unix socket, TCP or TLS; the keys stand in ``common/bus/protocol.py``."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -241,6 +241,13 @@ class RedisBus(RedisConnection):
             if len(entries) == RECORDS_READ:  # more than roles say: whoever does that shall not fill Redis
                 self.call(self.redis.xtrim, name, METRICS_KEPT)
         return records, cursors
+
+    def records_end(self, roles: Iterable[str]) -> dict[str, str]:
+        return {role: self._record_end(self.key("metrics", role)) for role in roles}
+
+    def _record_end(self, key: str) -> str:
+        entries = self.call(lambda: self.redis.xrevrange(key, count=1))
+        return entries[0][0].decode() if entries else "0"
 
     def _record(self, entry: tuple[bytes, dict[bytes, bytes]]) -> dict[str, Any] | None:
         try:

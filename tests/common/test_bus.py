@@ -243,6 +243,7 @@ def test_metrics_by_role(bus):
     records, cursors = bus.records({"learner": "0", "evaluator": "0"})
     assert records == [{"role": "learner", "updates": 1}, {"role": "learner", "updates": 2}]
     assert bus.records(cursors)[0] == []
+    assert bus.records_end(cursors) == cursors
     bus.emit("evaluator", {"eval_update": 4})
     assert bus.records(cursors)[0] == [{"role": "evaluator", "eval_update": 4}]
     assert bus.records({})[0] == []
