@@ -31,7 +31,6 @@ from rmc.deploy.ray.placement import (
     whole_shares,
 )
 from rmc.deploy.ray.waiting_learners import WaitingLearners, learner_group
-from rmc.deploy.redis.connect import tried_again
 from rmc.deploy.redis.run_redis import RunRedis
 from rmc.deploy.redis.server import Port
 from rmc.deploy.run import tls
@@ -178,7 +177,6 @@ def train(
     monitor.roles = lambda: run.config.roles()
     over = False
     try:
-        tried_again(lambda: monitor.skip_old(run.bus), stop)
         run.start()
         while not stop.requested and not run.hosts.finished():
             run.tend()
