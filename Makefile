@@ -52,7 +52,7 @@ $(VENV)-$(NEWEST)/.installed: $(VENV)-$(NEWEST)/.packages
 	$(@D)/bin/python -m pip install --quiet --no-deps -e .
 	@touch $@
 
-# The scripts of tests/faults at length, some two hours in all; each puts its rows into tests/faults/results.json.
+# The scripts of tests/faults at length, some three hours in all; each puts its rows into tests/faults/results.json.
 # Linux; disk_full wants root, clock a C compiler.
 FAULTS := fuzz fuzz_files broken_checkpoints kill_actor kill_replay kill_learner kill_redis kill_all nan_loss frozen disk_full clock \
 	slow_learner soak
