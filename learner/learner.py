@@ -78,7 +78,7 @@ class Learner:
         self._look_at = 0.0  # when to ask next whether Redis still has the weights
         self._published: Version | None = None  # last
         self._save_at, self._checkpoint_error = 0.0, ""
-        self._slowest = self._save_seconds = 0.0  # seconds of an update, and of the last save
+        self._slowest, self._save_seconds = 0.0, checkpoints.last_save()  # of an update, of the last save
         torch.set_flush_denormal(True)  # into which Adam's moments of idle units decay: 13 % slower on a CPU
         torch.manual_seed(seed)  # the networks' initial weights
         self.agent = Agent(spec.obs_dim, spec.action_dim, agent, spec.missing, spec.privileged)

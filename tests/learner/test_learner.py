@@ -462,6 +462,15 @@ def test_how_long_an_update_takes_is_noted_before_there_is_a_checkpoint(setting,
     assert setting.learner.checkpoints.patience(0.0) >= 3 * 0.5  # it may be as slow again
 
 
+def test_how_long_an_earlier_start_took_to_save_stays_noted(setting):
+    setting.feed(60)
+    setting.learner.close()
+    setting.learner.checkpoints.note_save(3.0)
+    setting.learner = setting.start()
+    assert setting.learner.step()
+    assert setting.learner.checkpoints.patience(0.0) > 3 * 3.0
+
+
 def test_how_long_a_save_takes_is_noted(setting, monkeypatch):
     whole = setting.learner.checkpoints.save
     monkeypatch.setattr(setting.learner.checkpoints, "save", lambda *given: (time.sleep(0.5), whole(*given))[1])
