@@ -37,7 +37,7 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     """Steps and wall time of an evaluation lie between what learner and launcher said around it, resumed or not."""
     config = dataclasses.replace(robust(EnvConfig("Hopper-v5", flicker=0.5)), seed=3)
     config = dataclasses.replace(
-        config, agent=dataclasses.replace(config.agent, head_input="hidden+observation", heads=(5, 6))
+        config, agent=dataclasses.replace(config.agent, head_input="hidden", heads=(5, 6))
     )
     (tmp_path / "config.json").write_text(to_json(config))
     records = [
@@ -53,7 +53,7 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     ]
     (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, records)) + '\n{"role": "evalu')
     (past,) = history.read(tmp_path)
-    assert past.agent == "RMC --heads 5 6 --head-input hidden+observation"
+    assert past.agent == "RMC --heads 5 6 --head-input hidden"
     assert past.env == "Hopper-v5, flicker 0.5"
     assert (past.seed, past.finished, past.initial_return) == (3, False, None)
     assert past.evaluations == [Evaluation(500, 50, 5.0, 7.0, 1.0), Evaluation(900, 90, 15.0, 9.0, 1.0)]
