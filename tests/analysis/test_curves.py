@@ -36,9 +36,7 @@ def test_a_line_holds_a_history():
 def test_a_run_is_read_from_its_folder(tmp_path):
     """Steps and wall time of an evaluation lie between what learner and launcher said around it, resumed or not."""
     config = dataclasses.replace(robust(EnvConfig("Hopper-v5", flicker=0.5)), seed=3)
-    config = dataclasses.replace(
-        config, agent=dataclasses.replace(config.agent, head_input="hidden", heads=(5, 6))
-    )
+    config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, head_input="hidden", heads=(5, 6)))
     (tmp_path / "config.json").write_text(to_json(config))
     records = [
         {"role": "launcher", "time": 100.0, "wall_s": 0.0},

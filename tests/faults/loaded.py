@@ -101,10 +101,10 @@ class Loaded(Training):
         pattern = others.get(role, rf"rmc\.cli\.main role {word} .*{f'--index {index}' if index else ''}")
         return next((one for one in self.launcher.children(recursive=True) if _matches(one, pattern)), None)
 
-    def kill(self, role: str) -> float:
-        """kill -9; how long it takes until it is back in a new epoch."""
+    def kill(self, role: str, number: signal.Signals = signal.SIGKILL) -> float:
+        """kill -9, or another signal; how long it takes until it is back in a new epoch."""
         victim, epoch = self.process_of(role), self.bus.current_epoch(role)
-        victim.kill()
+        victim.send_signal(number)
         return self.until(lambda: self.bus.current_epoch(role) > epoch)
 
     def arm(self, fault: str) -> None:

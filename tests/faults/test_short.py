@@ -5,6 +5,7 @@ A second run has a ring that is full and wraps.
 
 import os
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -96,6 +97,13 @@ def test_the_learner_is_killed_also_amid_saving(run: Loaded) -> None:
     run.strike("half-a-checkpoint", "learner")
     run.until_all_go_on()
     assert [one["same"] for one in run.events("resumed")] == [True, True]
+
+
+def test_roles_that_somebody_asks_to_end_start_again(run: Loaded) -> None:
+    """As kill and earlyoom do. An actor's three ends in a row are not its own."""
+    for role in ("learner", "replay", "actor-0", "actor-0", "actor-0", "actor-0"):
+        run.kill(role, signal.SIGTERM)
+    run.until_all_go_on()
 
 
 def test_a_loss_is_no_number(run: Loaded) -> None:
