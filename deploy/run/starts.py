@@ -17,7 +17,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import from_dict, option
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import Launcher, LaunchOptions
-from rmc.deploy.run.metrics_tail import MetricsTail
+from rmc.deploy.run.metrics_tail import LISTED_BYTES, MetricsTail
 
 KEPT = (  # of how a run was started last
     "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls", "metrics_port", "metrics_host",
@@ -58,7 +58,7 @@ def note_start(
 def _env_steps(folder: RunFolder) -> int:
     """That the run has, by its newest checkpoint and what its roles said last."""
     newest: dict[str, int] = {}
-    for record in MetricsTail(folder.metrics).take():
+    for record in MetricsTail(folder.metrics, LISTED_BYTES).take():
         if record["role"].startswith(("learner", "replay")) and is_finite(record.get("env_steps")):
             newest[record["role"]] = int(record["env_steps"])
     learner, saved = newest.pop("learner", 0), 0

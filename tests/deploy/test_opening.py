@@ -8,6 +8,7 @@ import pytest
 
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.run import metrics_tail
 from rmc.deploy.run.config import RunConfig, flat
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import MAY_CHANGE, open_run
@@ -69,6 +70,19 @@ def test_the_history_is_a_line_a_start(tmp_path: Path) -> None:
     assert [start.env_steps for start in starts(folder)] == [0, 1_230, 1_230]
     assert starts(folder)[-1].changes == {}
     assert format_starts(folder) == "3 starts; from step 1,230 --total-steps 4000 to 9000, --replay-ratio 32 to 8"
+
+
+def test_of_a_run_of_weeks_a_start_parses_what_was_said_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else every start of its launcher holds more than the one before."""
+    folder = open_run(CONFIG, tmp_path / "run", "fail")
+    folder.unlock()
+    line = '{"role": "replay", "env_steps": 7, "more": "%s"}\n' % ("x" * 400)
+    folder.metrics.write_text(line * 20_000 + '{"role": "replay", "env_steps": 9000}\n')
+    parsed, parse = [], metrics_tail.parse_record
+    monkeypatch.setattr(metrics_tail, "parse_record", lambda line: parsed.append(len(line)) or parse(line))
+    open_run(CONFIG, folder.path, "resume").unlock()
+    assert starts(folder)[-1].env_steps == 9_000
+    assert 0 < sum(parsed) < 1.1 * metrics_tail.LISTED_BYTES
 
 
 def test_an_older_run_has_no_history(tmp_path: Path) -> None:

@@ -47,11 +47,12 @@ class Witness:
             time.sleep(LOOK_SECONDS)
 
     def _look(self, bus: RedisBus) -> None:
-        for actor, before in enumerate(self._before):
+        before = self._before
+        for actor in range(len(before)):
             ack = bus.ack(actor)
             if ack is not None:
-                self.acks_went_back += ack.id < before
-                self._before[actor] = ack.id
+                self.acks_went_back += before is self._before and ack.id < before[actor]  # else it is another Redis's
+                before[actor] = ack.id
                 newest(self.acks, actor, ack.id)
         version = bus.latest_version()
         if version is not None and [version] != self.versions[-1:]:
