@@ -38,8 +38,7 @@ def train(config: RunConfig, options: LaunchOptions, console: Console) -> tuple[
 
 def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> tuple[RunFolder, int]:
     launcher.check_on_head()
-    goes_on = options.run_dir is not None and options.if_exists != "new"
-    if goes_on and options.run_dir is not None and (options.run_dir / "secret").exists():
+    if options.run_dir is not None and options.if_exists != "new" and (options.run_dir / "secret").exists():
         launcher.check_not_there(RunFolder(options.run_dir))
     placement.check_room(config, options.device)
     fit = placement.actors_that_fit(config)

@@ -28,8 +28,7 @@ def result_table(jobs: Sequence[Job], index: Index) -> Table:
 
 def _row(runs: list[Job], index: Index) -> tuple[float, list[str]]:
     """Its mean return, by which it is sorted, and its cells."""
-    lines = [line for job in runs if (line := index.lines.get(job.name)) is not None]
-    returns = [line["return"] for line in lines if line["state"] == "finished"]
+    returns = [line["return"] for job in runs if (line := index.lines.get(job.name)) and line["state"] == "finished"]
     mean = float(np.mean(returns)) if returns else -np.inf
     deviation = f" ± {np.std(returns):,.1f}" if len(returns) > 1 else ""
     others = [index.state(job) for job in runs if index.state(job) != "finished"]
