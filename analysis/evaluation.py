@@ -89,11 +89,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def evaluate_policy(
-    policy: PolicyFile,
-    episodes: int,
-    flicker: float | None = None,
-    seconds: float = 0.0,
-    watch: Watch = lambda _: None,
+    policy: PolicyFile, episodes: int, flicker: float | None = None, seconds: float = 0.0, watch: Watch = lambda _: None
 ) -> dict[str, Any]:
     """Deterministic episodes of a policy, as ``evaluate_blob``, and where it comes from. Raises ConfigError."""
     header = policy.header

@@ -90,11 +90,7 @@ class Policy:
         self, observation: ArrayLike, missing: bool | BoolArray = ..., explore: bool = ..., *, units: Units
     ) -> NDArray[Any]: ...
     def act(
-        self,
-        observation: ArrayLike,
-        missing: bool | BoolArray = False,
-        explore: bool = False,
-        units: Units = "agent",
+        self, observation: ArrayLike, missing: bool | BoolArray = False, explore: bool = False, units: Units = "agent"
     ) -> NDArray[Any]:
         """(O,) -> (A,) or (N, O) -> (N, A): the policy's mean, or a sample of it.
 

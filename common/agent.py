@@ -12,14 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rmc.common.agent_config import (
-    CRITIC_PARTS,
-    LOG_STD_RANGE,
-    NORMALIZED_CLIP,
-    POLICY_PARTS,
-    STD_FLOOR,
-    AgentConfig,
-)
+from rmc.common.agent_config import CRITIC_PARTS, LOG_STD_RANGE, NORMALIZED_CLIP, POLICY_PARTS, STD_FLOOR, AgentConfig
 from rmc.common.critic import TwinQ
 
 

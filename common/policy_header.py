@@ -52,11 +52,7 @@ class PolicyHeader:
 
     def sizes(self) -> dict[str, int]:
         """O, A and S by name."""
-        return {
-            "observation": self.obs_dim,
-            "action": self.action_dim,
-            "state": self.agent.state_size(self.obs_dim),
-        }
+        return {"observation": self.obs_dim, "action": self.action_dim, "state": self.agent.state_size(self.obs_dim)}
 
     def summary(self) -> str:
         """Where it comes from and how good it is, in a line."""

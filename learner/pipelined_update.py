@@ -28,13 +28,7 @@ from rmc.common.window import WindowSpec
 from rmc.learner.batch import Batch, Plan, view_batch
 from rmc.learner.config import MODEL_PROCESS
 from rmc.learner.optimizers import begin_moments
-from rmc.learner.update import (
-    MODEL_PARTS,
-    VALUE_PARTS,
-    JointUpdate,
-    ModelPass,
-    UpdateResult,
-)
+from rmc.learner.update import MODEL_PARTS, VALUE_PARTS, JointUpdate, ModelPass, UpdateResult
 
 AHEAD = 2  # batches that the model's half may be ahead
 REQUEST = struct.Struct("qqq???")  # an update's number, the threads that it takes, its plan

@@ -34,13 +34,7 @@ class RunStatus:
     """The newest value of everything, by role."""
 
     def __init__(
-        self,
-        env: str,
-        preset: str,
-        seed: int,
-        total_steps: int,
-        replay_ratio: float,
-        expected: tuple[str, ...] = (),
+        self, env: str, preset: str, seed: int, total_steps: int, replay_ratio: float, expected: tuple[str, ...] = ()
     ) -> None:
         """``expected`` are the roles that are about to speak."""
         self._since = dict.fromkeys(expected, time.time())  # of those that have not spoken

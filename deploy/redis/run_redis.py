@@ -21,12 +21,7 @@ class RunRedis:
     """
 
     def __init__(
-        self,
-        config: RunConfig,
-        folder: RunFolder,
-        stop: StopSignal,
-        url: str | None = None,
-        port: Port | None = None,
+        self, config: RunConfig, folder: RunFolder, stop: StopSignal, url: str | None = None, port: Port | None = None
     ) -> None:
         self._folder, self._url, self._leave = folder, url, ExitStack()
         self._socket_folder = SocketFolder()

@@ -19,11 +19,7 @@ from rmc.common.shard import Shard
 
 LAUNCHER = "launcher"
 CONNECTS = "+ping +hello"
-EVERYONE = (
-    "(+get %R~R:config %R~R:stop)",
-    "(+get +set +incr +incrby ~R:epoch:ROLE)",
-    "(+xadd %W~R:metrics:ROLE)",
-)
+EVERYONE = ("(+get %R~R:config %R~R:stop)", "(+get +set +incr +incrby ~R:epoch:ROLE)", "(+xadd %W~R:metrics:ROLE)")
 ACTOR = (
     "(+get %R~R:weights %R~R:weights:*)",
     "(+sadd %W~R:actors)",

@@ -94,10 +94,7 @@ def inspect(command: run_options.Inspect) -> int:
     ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in insight.open_loop.items())
     hardest = np.argsort(-insight.unexplained)[: world_model_picture.SHOWN]
     worst = ", ".join(f"{i} ({insight.unexplained[i]:.0%})" for i in hardest)
-    console.print(
-        f"unexplained of the observation's change: {ahead} (100% is a guess of no change)",
-        soft_wrap=True,
-    )
+    console.print(f"unexplained of the observation's change: {ahead} (100% is a guess of no change)", soft_wrap=True)
     console.print(f"worst dimensions one step ahead: {worst}")
     if value is not None:
         counted = f"with the entropy's bonus, over {value.steps:,} steps"

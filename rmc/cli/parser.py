@@ -110,10 +110,7 @@ def _defaults_of_run(words: list[str], env: str, command: Any) -> dict[str, Any]
 
 
 def _defaults(config: RunConfig, launch: LaunchOptions) -> dict[str, Any]:
-    return {
-        "train": train_options.from_config(config, launch),
-        "resume": train_options.resuming(config, launch),
-    }
+    return {"train": train_options.from_config(config, launch), "resume": train_options.resuming(config, launch)}
 
 
 def _known_run(command: Any) -> RunFolder | None:

@@ -16,12 +16,7 @@ except ImportError as missing:
 
     raise ConfigError("search", "", f"Optuna is not installed; {how_to_install('optuna')}") from missing
 
-from optuna.distributions import (
-    BaseDistribution,
-    CategoricalDistribution,
-    FloatDistribution,
-    IntDistribution,
-)
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import TrialState
 
 from rmc.analysis.history import Evaluation, of_run

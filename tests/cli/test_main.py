@@ -199,11 +199,7 @@ def test_a_wrong_option_is_one_short_line(words: str, said: str, capsys: pytest.
     ],
 )
 def test_errors_are_one_line(
-    words: list[str],
-    named: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
+    words: list[str], named: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(PATIENCE_VARIABLE, "1")

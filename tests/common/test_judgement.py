@@ -182,10 +182,7 @@ def test_a_file_in_place_of_a_module_comes_with_the_right_name(env: str) -> None
 @pytest.mark.parametrize(
     ("env", "says"),
     [
-        (
-            "LateSpaces",
-            "spaces raises AttributeError: 'LateSpaces' object has no attribute 'observation",
-        ),
+        ("LateSpaces", "spaces raises AttributeError: 'LateSpaces' object has no attribute 'observation"),
         ("NoRobot", "the environment's spaces raises RuntimeError: no robot answers (habits.py, line "),
         ("NoModule", "the environment cannot be made: ModuleNotFoundError: No module named 'tests.nowhere'"),
         ("Mistyped", "the environment cannot be made: TypeError: can only concatenate str"),

@@ -183,10 +183,7 @@ def test_refused_in_one_line(config: EnvConfig, says: str) -> None:
 )
 def test_a_users_broken_module_is_one_line_with_its_place(source: str, says: str, tmp_path: Path) -> None:
     (tmp_path / "broken.py").write_text(source)
-    run = _python(
-        tmp_path,
-        "from rmc.common.env.make import *; env_layout(EnvConfig('broken:Broken-v0'))",
-    )
+    run = _python(tmp_path, "from rmc.common.env.make import *; env_layout(EnvConfig('broken:Broken-v0'))")
     assert says in run.stderr.splitlines()[-1]
     assert run.stderr.splitlines()[-1].startswith("rmc.common.errors.ConfigError: ENV='broken:Broken-v0': ")
 
@@ -209,8 +206,7 @@ def test_a_users_module_in_the_working_folder_does_not_shadow_ours(tmp_path: Pat
 @pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Humanoid-v5"])
 def test_mujoco_prints_nothing_and_leaves_no_file(tmp_path: Path, env_id: str) -> None:
     run = _python(
-        tmp_path,
-        f"from rmc.common.env.make import *; make_env(EnvConfig({env_id!r})).reset(seed=0); print('made')",
+        tmp_path, f"from rmc.common.env.make import *; make_env(EnvConfig({env_id!r})).reset(seed=0); print('made')"
     )
     assert (run.stdout, run.stderr) == ("made\n", "")
     assert list(tmp_path.iterdir()) == []

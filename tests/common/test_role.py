@@ -68,12 +68,7 @@ def test_says_its_metrics_and_hears_the_stop():
     assert (role.taken, role.closed) == (0, True)
     bus.clear_stop()
     run_role(role, bus, stop, lambda: role.taken >= 5)
-    assert bus.records({"counting": "0"})[0][-1].keys() >= {
-        "taken",
-        "busy_share",
-        "waiting_share",
-        "waiting_for",
-    }
+    assert bus.records({"counting": "0"})[0][-1].keys() >= {"taken", "busy_share", "waiting_share", "waiting_for"}
 
 
 def test_sigterm_is_no_end_in_order_and_ctrl_c_is():

@@ -25,14 +25,7 @@ from rmc.common.bus.protocol import join_pieces
 from rmc.common.checksum import crc32
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError, MessageError
-from rmc.common.wire import (
-    HEADER,
-    Kind,
-    decode_header,
-    decode_meta,
-    encode_frame,
-    encode_windows,
-)
+from rmc.common.wire import HEADER, Kind, decode_header, decode_meta, encode_frame, encode_windows
 from rmc.deploy.run.config import from_json, from_registration, to_json, to_registration
 from rmc.deploy.run.presets import robust
 from rmc.replay_server.commit_record import Progress, decode_published

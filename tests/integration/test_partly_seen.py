@@ -71,8 +71,7 @@ def test_it_trains_and_its_windows_say_what_was_seen(options: dict[str, Any], tm
 
 def test_a_run_that_goes_on_has_the_same_bits(tmp_path: Path) -> None:
     longer = dataclasses.replace(
-        partial(scheme=3),
-        learner=dataclasses.replace(partial().learner, checkpoint_steps=200),
+        partial(scheme=3), learner=dataclasses.replace(partial().learner, checkpoint_steps=200)
     )
     straight = run(longer, tmp_path / "straight")
     run(longer, tmp_path / "stopped", stop_after_checkpoints=1)

@@ -48,8 +48,7 @@ def test_options_of_train_come_after_the_environment_or_the_file(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("raw", "seeds"),
-    [("1-3,7", (1, 2, 3, 7)), ("4", (4,)), ([5, 2], (5, 2)), (6, (6,)), (" 1 , 2", (1, 2))],
+    ("raw", "seeds"), [("1-3,7", (1, 2, 3, 7)), ("4", (4,)), ([5, 2], (5, 2)), (6, (6,)), (" 1 , 2", (1, 2))]
 )
 def test_seeds(raw: object, seeds: tuple[int, ...]) -> None:
     assert read_seeds(raw) == seeds
