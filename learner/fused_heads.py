@@ -223,7 +223,7 @@ def relu_layer(x: Tensor, w: Tensor, b: Tensor) -> Tensor:
 
 def _last_layer(x: Tensor, w: Tensor, b: Tensor, out: Tensor) -> None:
     """out <- x w + b: (N, in), (in, out), (out,) -> (N, out); products in w's type."""
-    if w.shape[1] == 1:
+    if w.shape[1] == 1 and w.dtype == torch.float32:
         kernels.dot(bits(x), w.detach().numpy()[:, 0], b.detach().numpy(), out.numpy()[:, 0])
     else:
         torch.add(torch.mm(x.to(w.dtype), w), b, out=out)
@@ -232,7 +232,7 @@ def _last_layer(x: Tensor, w: Tensor, b: Tensor, out: Tensor) -> None:
 def _last_layer_back(grad: Tensor, x: Tensor, w: Tensor, dw: Tensor, db: Tensor, db_before: Tensor) -> Tensor:
     """The gradient before the ReLU that gave x, (N, in) in bfloat16; fills those of w, b and of the bias before."""
     torch.sum(grad, 0, out=db)
-    if w.shape[1] == 1:
+    if w.shape[1] == 1 and w.dtype == torch.float32:
         back = torch.empty_like(x)
         of_w, of_x = w.detach().numpy()[:, 0], bits(x)
         kernels.dot_back(grad.numpy()[:, 0], of_x, of_w, bits(back), dw.numpy()[:, 0], db_before.numpy())

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.agent import Agent
+from rmc.common.bus.metrics_record import MAX_LIST
 from rmc.common.metrics import Means, Rate
 from rmc.common.replay import Replay
 from rmc.common.window import BoolArray, Rows, WindowSpec
@@ -71,6 +72,6 @@ class LearnerMetrics:
         unexplained, self._unexplained = self._unexplained, []
         return {
             "updates_per_s": self._rate.take(updates),
-            **({"observation_unexplained": unexplained} if unexplained else {}),
+            **({"observation_unexplained": unexplained} if 0 < len(unexplained) <= MAX_LIST else {}),
             **self._means.take(),
         }

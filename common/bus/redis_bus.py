@@ -243,11 +243,9 @@ class RedisBus(RedisConnection):
         return records, cursors
 
     def records_end(self, roles: Iterable[str]) -> dict[str, str]:
-        return {role: self._record_end(self.key("metrics", role)) for role in roles}
-
-    def _record_end(self, key: str) -> str:
-        entries = self.call(lambda: self.redis.xrevrange(key, count=1))
-        return entries[0][0].decode() if entries else "0"
+        asked = list(roles)
+        replies = self.each("XREVRANGE", [self.key("metrics", role) for role in asked], "+", "-", "COUNT", 1)
+        return {role: last[0][0].decode() if last else "0" for role, last in zip(asked, replies, strict=True)}
 
     def _record(self, entry: tuple[bytes, dict[bytes, bytes]]) -> dict[str, Any] | None:
         try:

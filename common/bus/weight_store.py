@@ -30,21 +30,25 @@ class WeightStore:
         keys = self._piece_keys(version, len(pieces), evaluate)
         for key, piece in zip(keys, pieces, strict=True):  # one call each: a pipeline would make them one blob again
             self._connection.call(self._connection.redis.set, key, piece, UNPUBLISHED_SECONDS)
-        self._make_newest(version, f"{version.epoch} {version.update} {len(pieces)} {crc32(blob)}", keys, evaluate)
+        head = f"{version.epoch} {version.update} {len(pieces)} {crc32(blob)}"
+        if not self._make_newest(version, head, keys, evaluate):  # only the whole can be repeated, not this call
+            raise BusUnavailable(f"weights {version.update} are gone before they were published")
 
-    def _make_newest(self, version: Version, head: str, pieces: list[str], evaluate: bool) -> None:
+    def _make_newest(self, version: Version, head: str, pieces: list[str], evaluate: bool) -> bool:
         """Name the version as the newest, and keep its pieces: those of a learner that did not come so far expire.
+
+        Whether all are there still. Raises FencedError.
 
         Those of the version before expire rather than vanish: a reader amid them can finish.
         """
         epoch_key, head_key = self._connection.key("epoch", "learner"), self._connection.key(KINDS[evaluate])
 
-        def transaction(pipe: Any) -> None:
+        def transaction(pipe: Any) -> bool:
             held = self._connection.number(pipe.get(epoch_key))
             if held > version.epoch:
                 raise FencedError(f"learner epoch {version.epoch} was replaced by {held}")
             if pipe.exists(*pieces) < len(pieces):
-                raise BusUnavailable(f"weights {version.update} are gone before they were published")
+                return False
             before = self._parsed(pipe.get(head_key))
             pipe.multi()
             if held < version.epoch:  # Redis lost its data: the next learner must not begin below
@@ -55,8 +59,12 @@ class WeightStore:
             if before is not None and before[0] != version:
                 for key in self._piece_keys(before[0], before[1], evaluate):
                     pipe.expire(key, REPLACED_SECONDS)
+            return True
 
-        self._connection.call(lambda: self._connection.redis.transaction(transaction, epoch_key))
+        made: bool = self._connection.call(
+            lambda: self._connection.redis.transaction(transaction, epoch_key, value_from_callable=True)
+        )
+        return made
 
     def _head(self, evaluate: bool) -> tuple[Version, int, int] | None:
         return self._parsed(self._connection.call(self._connection.redis.get, self._connection.key(KINDS[evaluate])))

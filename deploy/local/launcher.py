@@ -129,6 +129,15 @@ def train(
         run.close()
 
 
+def _asked_to_stop(bus: RedisBus, reason: str) -> bool:
+    """Whether Redis took it."""
+    try:
+        bus.request_stop(reason)
+    except (BusUnavailable, BusFull):
+        return False
+    return True
+
+
 def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monitor, stop: StopSignal) -> bool:
     """Register a run whose roles are started by hand, watch it and end it; whether its total was reached."""
     bus = connect(redis_url, folder.name)
@@ -138,12 +147,14 @@ def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monito
         registration.tend()
         monitor.watch(bus)
         time.sleep(TICK_SECONDS)
-    with suppress(BusUnavailable, BusFull):
-        bus.request_stop("stopped by its launcher" if stop.requested else "finished")
+    reason, asked = "stopped by its launcher" if stop.requested else "finished", False
     deadline = time.monotonic() + CheckpointFolder(folder.checkpoints).patience(STOP_SECONDS)
-    while stop.requested and time.monotonic() < deadline:  # the learner saves; what it says then is still recorded
-        monitor.watch(bus)
+    while (stop.requested or not asked) and time.monotonic() < deadline:
+        asked = asked or _asked_to_stop(bus, reason)
+        monitor.watch(bus)  # the learner saves; what it says then is still recorded
         time.sleep(TICK_SECONDS)
+    if not asked:
+        log.warning("Redis took no request to stop; end the run's roles by hand")
     registration.keep()
     _expire(bus)
     return monitor.learner_finished()

@@ -71,6 +71,7 @@ class Monitor:
         try:
             self._take_in(bus)
             if due:
+                self._find_ends(bus)
                 self._redis_bytes = bus.memory_bytes()
             self.outage.end()
         except (BusUnavailable, BusFull) as error:
@@ -82,6 +83,12 @@ class Monitor:
             self._record_launcher()
             if self._tracker is not None:
                 self._tracker.look()
+
+    def _find_ends(self, bus: Bus) -> None:
+        """A Redis that came back empty after the clock was set back gives its records lower ids."""
+        for role, end in bus.records_end(self.roles()).items():
+            if _in_order(end) < _in_order(self._cursors.get(role, "0")):
+                self._cursors[role] = "0"
 
     def _look_at_folder(self) -> None:
         self._folder.check_there()
@@ -117,6 +124,8 @@ class Monitor:
         with suppress(OSError):  # no room; the next record tries again
             for update in list(self._unmarked):
                 is_there = self._checkpoints.mark_best(update, self._unmarked[update])
+                if not is_there and update > max(self._checkpoints.numbers(), default=-1):
+                    continue  # it is on its way from the learner's node
                 del self._unmarked[update]
                 if not is_there:
                     log.warning(TOO_LATE, update)
@@ -145,3 +154,8 @@ class Monitor:
         self._record_launcher()
         self.view.close()
         self._metrics_log.close()
+
+
+def _in_order(entry: str) -> tuple[int, ...]:
+    """The id of an entry, milliseconds and a number, as it is sorted."""
+    return tuple(map(int, entry.split("-")))

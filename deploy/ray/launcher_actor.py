@@ -104,7 +104,7 @@ class LauncherActor(RoleActor):
     def claim(self, incarnation: str, node: str) -> bool:
         """Be the host of the learner: no other's checkpoints are taken from now on. Whether the last was there, too."""
         before = self._claim.read_text().split() if self._claim.exists() else []
-        self._claim.write_text(f"{node} {incarnation}")
+        write_whole(self._claim, f"{node} {incarnation}".encode())
         return before[:1] == [node]
 
     def archive(self, incarnation: str, number: int, files: dict[str, bytes], took: float) -> None:

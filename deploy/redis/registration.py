@@ -31,11 +31,17 @@ class Registration:
         self._config = changed
 
     def tend(self) -> None:
-        """Look now and then whether Redis still knows, and copy what is counted; while it is away, nothing."""
+        """Look now and then whether Redis still knows, and copy what is counted; while it is away, nothing.
+
+        One that came back with an older config also has the stop that ended the start which wrote that.
+        """
         if time.monotonic() >= self._look_at:
             self._look_at = time.monotonic() + LOOK_SECONDS
             with suppress(BusUnavailable, BusFull):
-                if self._bus.config() is None:
+                known = self._bus.config()
+                if known is not None and known != self._config:
+                    self._bus.clear_stop()
+                if known != self._config:
                     self._publish()
         self._progress_backup.keep(self._bus)
 

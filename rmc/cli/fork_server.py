@@ -17,6 +17,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import setproctitle
+import torch
 
 from rmc.common.process import descendants, parent_death
 from rmc.deploy.local.fork_server import LARGEST
@@ -91,7 +92,8 @@ def _be(words: list[str], environment: dict[str, str], log: int) -> None:
         os.close(log)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        np.random.seed()  # noqa: NPY002 - an environment may draw from it, and forks would all draw the same
+        np.random.seed()  # noqa: NPY002 - an environment may draw from these, and forks would all draw the same
+        torch.seed()
         os.environ.update(environment)
         sys.argv = ["rmc", *words]
         setproctitle.setproctitle(" ".join(command_line(words)))

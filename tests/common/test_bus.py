@@ -5,6 +5,7 @@ import os
 import shutil
 import tempfile
 import uuid
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,8 @@ from rmc.common.bus.protocol import (
 from rmc.common.bus.redis_bus import RECORDS_READ, RedisBus
 from rmc.common.bus.weight_store import UNPUBLISHED_SECONDS
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
+from rmc.common.process.role import StopSignal
+from rmc.deploy.local.role_process import until_taken
 from rmc.deploy.redis.server import RedisServer
 
 
@@ -226,13 +229,17 @@ def test_weights_that_went_before_they_were_the_newest_are_not_named(redis_url, 
     bus.publish_weights(Version(1, 1), b"one")
     transaction = bus.redis.transaction
 
-    def empty_and_go_on(*args):
+    def empty_and_go_on(*args, **options):
         bus.redis.delete(bus.key("weights", 1, 2, 0))
-        return transaction(*args)
+        return transaction(*args, **options)
 
     monkeypatch.setattr(bus.redis, "transaction", empty_and_go_on)
-    with pytest.raises(BusUnavailable, match="gone before"):
-        bus.publish_weights(Version(1, 2), b"two")
+    stop = StopSignal()
+    for repeats in (False, True):  # a learner that starts repeats each call, for ever
+        with pytest.raises(BusUnavailable, match="gone before"), ExitStack() as stack:
+            if repeats:
+                stack.enter_context(bus.repeated(lambda call: until_taken(call, "learner", stop)))
+            bus.publish_weights(Version(1, 2), b"two")
     assert bus.weights() == (Version(1, 1), b"one")
 
 

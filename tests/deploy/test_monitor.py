@@ -217,6 +217,11 @@ def test_an_evaluation_that_was_cut_is_never_the_best(monitor: Monitor, caplog: 
     assert monitor.status.best is not None
     assert monitor.status.last is not None
     assert (monitor.status.best.update, monitor.status.last.update) == (3, 6)
+    monitor.take({"role": "evaluator", "eval_update": 9, "eval_return_mean": 50.0})  # still on the learner's node
+    assert (monitor._checkpoints.best(), "dropped" in caplog.text) == (3, False)
+    monitor._checkpoints.save(9, {})
+    monitor.take({"role": "learner", "updates": 9})
+    assert monitor._checkpoints.best() == 9
     monitor.take({"role": "evaluator", "eval_update": 1, "eval_return_mean": 0.0})
     assert "checkpoint 1 was dropped before its evaluation ended; raise --keep-checkpoints" in caplog.text
     monitor.close()
@@ -234,6 +239,23 @@ def test_the_clocks_of_other_machines_do_not_count(monitor: Monitor, monkeypatch
         monitor.watch(bus)
     assert not monitor.status.silent()
     assert monitor.status.eta_s == pytest.approx((CONFIG.total_steps - 1_100) / 100.0, rel=0.1)
+    monitor.close()
+
+
+def test_a_redis_that_lost_its_records_is_heard_though_the_clock_went_back(
+    monitor: Monitor, redis_url: str, run_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus = RedisBus(redis_url, run_name)
+    key = bus.key("metrics", "learner")
+    bus.redis.xadd(key, {"r": encode_record({"updates": 3})}, id=f"{int(time.time() * 1_000) + 3_600_000}-0")
+    monitor.watch(bus)
+    assert monitor.status.get("learner", "updates") == 3
+    bus.redis.delete(key)
+    bus.emit("learner", {"updates": 5})
+    for _ in range(2):  # the first look finds that out
+        monitor._next_record = 0.0
+        monitor.watch(bus)
+    assert monitor.status.get("learner", "updates") == 5
     monitor.close()
 
 
@@ -256,7 +278,7 @@ def test_evaluations_that_found_no_room_are_marked_when_there_is_some(
     for update, score in ((10, 1.0), (20, 3.0), (30, 2.0)):
         monkeypatch.setattr(monitor._checkpoints, "mark_best", full)
         monitor.take({"role": "evaluator", "eval_update": update, "eval_return_mean": score})
-    monkeypatch.setattr(monitor._checkpoints, "mark_best", lambda *arguments: marked.append(arguments))
+    monkeypatch.setattr(monitor._checkpoints, "mark_best", lambda *arguments: marked.append(arguments) or True)
     for _ in range(2):
         monitor.take({"role": "learner", "updates": 30})
     assert marked == [(10, 1.0), (20, 3.0), (30, 2.0)]

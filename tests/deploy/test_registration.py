@@ -1,5 +1,6 @@
 """A run stays known in a Redis that forgets."""
 
+import dataclasses
 import json
 from contextlib import closing
 from pathlib import Path
@@ -8,13 +9,16 @@ import numpy as np
 import pytest
 import redis
 from gymnasium.spaces import Box
+from rich.console import Console
 
 from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusUnavailable, ConfigError
 from rmc.common.process.role import StopSignal
+from rmc.deploy.local import launcher
 from rmc.deploy.local.role_process import Process
+from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.redis import connect, registration
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.run_redis import RunRedis
@@ -46,6 +50,41 @@ def test_a_redis_that_forgot_is_told_again_what_it_must_know(tmp_path: Path, red
     bus.request_stop("so it shall be")  # which is no reason to begin afresh
     registered.tend()
     assert bus.stop_requested() == "so it shall be"
+
+
+def test_a_redis_that_came_back_with_what_it_knew_before_is_told_again(
+    tmp_path: Path, redis_url: str, run_name: str
+) -> None:
+    """As one that is restored from a snapshot of before the run went on."""
+    bus = RedisBus(redis_url, run_name)
+    registered = Registration(CONFIG, RunFolder(tmp_path), bus)
+    bus.set_config(to_registration(dataclasses.replace(CONFIG, actors=7)))
+    bus.request_stop("stopped by its launcher")
+    registered.tend()
+    assert from_registration(bus.config() or b"") == CONFIG
+    assert bus.stop_requested() is None
+
+
+def test_a_run_started_by_hand_is_told_to_stop_once_redis_takes_it(
+    tmp_path: Path, redis_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, stop, request_stop, tries = CONFIG, StopSignal(), RedisBus.request_stop, [3]
+
+    def away(bus: RedisBus, reason: str) -> None:
+        tries[0] -= 1
+        if tries[0] >= 0:
+            raise BusUnavailable("gone again")
+        request_stop(bus, reason)
+
+    monkeypatch.setattr(RedisBus, "request_stop", away)
+    folder = RunFolder(tmp_path)
+    folder.write_config(config)
+    bus, monitor = RedisBus(redis_url, folder.name), Monitor(folder, config, Console(quiet=True))
+    bus.emit("learner", {"finished": 1})
+    monkeypatch.setattr(monitor, "skip_old", lambda _: None)
+    assert launcher.attend(config, folder, redis_url, monitor, stop)
+    assert bus.stop_requested() == "finished"
+    monitor.close()
 
 
 def test_a_redis_that_is_away_for_a_moment_ends_no_start(

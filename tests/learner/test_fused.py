@@ -112,6 +112,21 @@ def test_values_and_gradients_are_about_as_near_to_float32_as_plain_bfloat16(par
     assert max(map(max, actual.values())) > 1e-5  # it is bfloat16
 
 
+def test_one_observation_number_is_imputed_as_several_are():
+    torch.manual_seed(0)
+    plain = Agent(1, 2, CONFIG)
+    fused = copy.deepcopy(plain)
+    fuse(fused)
+    hidden, o, action = torch.randn(B, T, 24), torch.randn(B, T, 1), torch.randn(B, T, 2)
+    outputs = []
+    for agent in (plain, fused):
+        outputs.append(run_next_frame(agent, True, hidden, o, action))
+        outputs[-1].sum().backward()
+    torch.testing.assert_close(*outputs, atol=0.02, rtol=0.02)
+    expected, actual = (agent.next_frame.net[0].weight.grad for agent in (plain, fused))
+    assert float((actual - expected).norm() / expected.norm()) < 0.05
+
+
 @pytest.mark.parametrize("part", CASES)
 def test_without_autocast_they_are_the_plain_ones_to_the_bit(pair, part):
     plain, fused = pair
