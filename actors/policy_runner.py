@@ -7,6 +7,7 @@ Float32 throughout; agrees with ``rmc.common.agent`` (its modules are the refere
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,6 +40,9 @@ def _check_finite(weights: dict[str, Tensor]) -> None:
             raise ValueError(f"{name} holds NaN or infinity, expected finite weights")
 
 
+PLAIN: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}  # whatever the caller's program has as default
+
+
 class _Linear:
     """y = x W + b, then ReLU if asked, into ``out``.
 
@@ -47,8 +51,8 @@ class _Linear:
     """
 
     def __init__(self, inputs: int, outputs: int, rows: int, relu: bool = False) -> None:
-        self._weight, self._bias, self._relu = torch.zeros(inputs, outputs), torch.zeros(outputs), relu
-        self.out = torch.zeros(rows, outputs)
+        self._weight, self._bias = torch.zeros(inputs, outputs, **PLAIN), torch.zeros(outputs, **PLAIN)
+        self.out, self._relu = torch.zeros(rows, outputs, **PLAIN), relu
 
     def take(self, weights: dict[str, Tensor], name: str) -> Callable[[], object]:
         """What is called ``name``, out of ``weights``; calling the result copies it. Raises KeyError, ValueError."""
@@ -75,7 +79,7 @@ class _GRU:
         self._gates, self._new = from_input.out[:, gates], from_input.out[:, new]
         self._hidden_gates, self._hidden_new = from_hidden.out[:, gates], from_hidden.out[:, new]
         self._r, self._z = self._gates[:, :size], self._gates[:, size:]
-        self.out = torch.empty(rows, size)
+        self.out = torch.empty(rows, size, **PLAIN)
 
     def __call__(self, x: Tensor, hidden: Tensor) -> Tensor:
         self._from_input(x)
@@ -106,7 +110,7 @@ class PolicyRunner:
         self._embed = _Linear(inputs, embedding, envs, relu=True) if config.embedding else None
         self._from_embedding = _Linear(embedding, 3 * config.hidden, envs)
         self._from_hidden = _Linear(config.hidden, 3 * config.hidden, envs)
-        self._mean, self._std = torch.zeros(obs_dim), torch.ones(obs_dim)
+        self._mean, self._std = torch.zeros(obs_dim, **PLAIN), torch.ones(obs_dim, **PLAIN)
         self._gru = _GRU(self._from_embedding, self._from_hidden, envs, config.hidden)
         self._head = _head(config.feature_size(self._skip), config.heads, 2 * action_dim, envs)
         input_dim = config.hidden + obs_dim + action_dim

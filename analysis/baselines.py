@@ -30,6 +30,7 @@ from rmc.actors.config import EvaluatorConfig
 from rmc.actors.evaluator import Rollout, evaluation_metrics, first_start, play_episodes
 from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose, read, validate
 from rmc.analysis.evaluation import FINAL_EPISODES, EvaluationProgress, Watch, missing_shares
+from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import env_layout, make_env
 from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError, first_line
@@ -361,16 +362,24 @@ def evaluate(
     progress = read_object(states[-1] / PROGRESS, "env_steps", "updates")
     env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
     env = env if env_timeout is None else dataclasses.replace(env, env_timeout=env_timeout)
-    bare: VecEnv = DummyVecEnv([lambda: make_env(env)])
-    scales = states[-1] / SCALES
     with _reading(states[-1]):
         model = CLASSES[config.algorithm].load(states[-1] / MODEL, device="cpu")
-        scaled = _scaled_by(VecNormalize.load(str(scales), bare) if scales.exists() else bare)
+        scaled = _kept_scaling(states[-1] / SCALES, env)
     seed = first_start(config.seed, final=True)
     match = play_episodes(SB3Adapter(model, scaled), lambda: make_env(env), episodes, seed, seconds, watch)
-    bare.close()
     about = {"env": env.id, "preset": config.name, "seed": config.seed, **progress}
     return about | evaluation_metrics(match) | missing_shares(env)
+
+
+def _kept_scaling(scales: Path, env: EnvConfig) -> Callable[[Floats], Floats]:
+    """Observations as a model sees them that was saved with these, if with any."""
+    if not scales.exists():
+        return lambda observation: observation
+    bare = DummyVecEnv([lambda: make_env(env)])
+    try:
+        return _scaled_by(VecNormalize.load(str(scales), bare))
+    finally:
+        bare.close()
 
 
 def _scaled_by(vec: VecEnv) -> Callable[[Floats], Floats]:

@@ -22,6 +22,7 @@ from rmc.common.env.process_state import changes
 from rmc.common.env.watched_env import WatchedEnv
 from rmc.common.env.wrappers import Env, Floats
 from rmc.common.errors import EnvFault
+from rmc.common.window import BoolArray
 from rmc.deploy.run.config import WindowConfig
 from rmc.deploy.run.memory_reach import format_reach
 
@@ -70,7 +71,7 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
     """Print facts, notes and faults; 0 where there is no fault, else 1. Raises ConfigError as ``rmc train`` would."""
     env, played = first_env(config), Played()
     stages: list[Callable[[], Iterable[str]]] = [
-        lambda: _gymnasiums_notes(WatchedEnv(env.unwrapped, config.id, config.env_timeout)),
+        lambda: _gymnasiums_notes(WatchedEnv(_users(env), config.id, config.env_timeout)),
         lambda: _guarded(lambda: played.play(env, steps, seed=0)),
         lambda: _nonsense(played),
         lambda: _hints(env, played),
@@ -88,6 +89,13 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
     sound = not _faults(lines)
     console.print("it can be trained on" if sound else "fix the fault first")
     return 0 if sound else 1
+
+
+def _users(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    """As it was made, with the user's own wrappers and none of ours."""
+    while isinstance(env, gym.Wrapper) and not isinstance(env, WatchedEnv):
+        env = env.env
+    return env.env if isinstance(env, WatchedEnv) else env
 
 
 def _faults(lines: list[str]) -> list[str]:
@@ -155,11 +163,11 @@ def _nonsense(played: Played) -> Iterator[str]:
 
 def _hints(env: Env, played: Played) -> Iterator[str]:
     observations, rewards = np.stack(played.observations), np.array(played.rewards)
-    still = np.flatnonzero(observations.std(0) == 0.0).tolist()
-    if still:
+    still = np.ptp(observations, axis=0) == 0.0
+    faint = ~still & (observations.std(0, dtype=np.float64) < STD_FLOOR)
+    if still.any():
         yield f"note: observations {_listed(still)} never changed"
-    faint = np.flatnonzero((observations.std(0) > 0.0) & (observations.std(0) < STD_FLOOR)).tolist()
-    if faint:
+    if faint.any():
         yield f"note: observations {_listed(faint)} vary by less than {STD_FLOOR}; scale them up in the environment"
     if np.abs(observations).max() > LARGE_OBSERVATION:
         yield f"note: observations reach {np.abs(observations).max():.3g}; scale them in the environment"
@@ -206,7 +214,9 @@ def _reward_notes(sizes: NDArray[np.float64]) -> Iterator[str]:
         yield f"note: rewards are small, {sizes.max():.3g} a step at most; try --reward-scale {scale:.1g}"
 
 
-def _listed(numbers: list[int]) -> str:
+def _listed(chosen: BoolArray) -> str:
+    """The numbers of those that are."""
+    numbers = np.flatnonzero(chosen).tolist()
     shown = ", ".join(map(str, numbers[:LISTED]))
     return f"{shown} and {len(numbers) - LISTED} more" if len(numbers) > LISTED else shown
 

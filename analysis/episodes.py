@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rmc.actors.evaluator import LONGEST_EPISODE
+from rmc.actors.evaluator import LONGEST_EPISODE, first_start
 from rmc.analysis.policy import load_policy
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.env.config import EnvConfig
@@ -146,7 +146,7 @@ class Player:
         """The next one. Raises ConfigError, EnvFault."""
         is_first, policy, env = not self._played, self._policy, self._env
         self._played += 1
-        observation, info = env.reset(seed=self._config.seed if is_first else None)
+        observation, info = env.reset(seed=first_start(self._config.seed, final=True) if is_first else None)
         policy.reset()
         observations, own, infos, actions, rewards = [observation], [self._record.newest], [info], [], []
         for _ in range(LONGEST_EPISODE if is_first else LONGEST_FURTHER):

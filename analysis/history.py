@@ -123,7 +123,7 @@ def of_run(folder: RunFolder, only_whole: bool = False) -> History:
         last.env_steps,
         last.updates,
         last.wall_s,
-        result.get("initial_return_mean"),
+        result.get("initial_return_mean", (folder.initial() or {}).get("eval_return_mean")),
         evaluations,
         bool(result),
     )

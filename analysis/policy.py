@@ -164,7 +164,7 @@ class Policy:
             fix = f"give {self.header.obs_dim} numbers, as policy.make_env() or gymnasium.spaces.flatten does"
             raise ConfigError("observation", reprlib.repr(observation), fix) from None
         as_environment = raw.shape == self.header.layout.observations[0].shape and raw.size == self.header.obs_dim
-        return raw.ravel() if as_environment and raw.shape[:1] != (1,) else raw  # (1, O) is that of N = 1
+        return raw.ravel() if as_environment else raw
 
     def _rows(self, raw: Floats) -> Floats:
         """(O,) or (N, O) -> (N, O). Raises ConfigError."""

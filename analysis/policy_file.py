@@ -20,6 +20,7 @@ from rmc.deploy.monitor.recorded import empty_status
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import from_dict
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import MetricsTail
 from rmc.deploy.run.migrations import FORMAT, migrated
 from rmc.deploy.run.validation import validate
 
@@ -174,7 +175,8 @@ def _evaluated(header: PolicyHeader, folder: RunFolder) -> PolicyHeader:
     result = folder.result()
     records = [result] if result is not None and result["updates"] == header.updates else []
     if not records:
-        records = [record for record in folder.records() if record.get("eval_update") == header.updates]
+        records = MetricsTail(folder.metrics).take()
+        records = [record for record in records if record.get("eval_update") == header.updates]
     played: dict[str, Any] = records[-1] if records else {}
     if not is_whole(played) or not all(is_finite(played.get(f"eval_{name}")) for name in EVALUATED):
         return header

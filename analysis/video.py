@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rmc.actors.evaluator import LONGEST_EPISODE
+from rmc.actors.evaluator import LONGEST_EPISODE, first_start
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.faults import call_env
 from rmc.common.env.make import entry_point, find_spec, make_env
+from rmc.common.env.process_state import ApartCall
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError, EnvFault, RmcError, first_line
 from rmc.common.extra import check_installed
@@ -47,7 +48,8 @@ def prepare(env: EnvConfig, out: Path) -> None:
 
 def _mode_fault(env: EnvConfig) -> str | None:
     """Why an environment has no pictures, as far as it can be told without making it."""
-    factory = call_env("entry point", lambda: entry_point(find_spec(env.id)))
+    with ApartCall(env.id, "make", env.env_timeout):
+        factory = call_env("entry point", lambda: entry_point(find_spec(env.id)))
     metadata = getattr(factory, "metadata", None)
     modes = metadata.get("render_modes") or [] if isinstance(metadata, dict) else []
     if isinstance(factory, type) and MODE not in modes:
@@ -70,8 +72,9 @@ def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest:
 
     env = make_env(env_config, render=True)
     _follow(env)
-    observation, info = env.reset(seed=seed)
-    frame, rate = _frame(env), env.metadata.get("render_fps") or FRAMES_PER_SECOND
+    observation, info = env.reset(seed=first_start(seed, final=True))
+    frame = _frame(env)
+    rate = (env.metadata.get("render_fps") or FRAMES_PER_SECOND) / env_config.action_repeat  # a frame for each action
     total = 0.0
     with written_whole(out) as path, _told(out):
         video = write_frames(str(path), (frame.shape[1], frame.shape[0]), fps=rate, macro_block_size=1)

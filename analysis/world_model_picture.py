@@ -85,7 +85,7 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
         predicted_reward=prediction.reward[0].numpy(),
         ahead={horizon: predicted.numpy() for horizon, predicted in ahead.items()},
         unexplained=relative_l1_error(*_error(ahead[1], episode, 1)).numpy(),
-        open_loop={horizon: _overall(*_error(predicted, episode, horizon)) for horizon, predicted in ahead.items()},
+        open_loop=_open_loop_errors(ahead, episode),
     )
 
 
@@ -106,8 +106,11 @@ def _open_loop(agent: Agent, memory: MemoryOutput, observation: Tensor, action: 
     return predicted
 
 
-def _overall(error: Tensor, size: Tensor) -> float:
-    return float(error.sum() / size.sum().clamp(min=1e-9))
+def _open_loop_errors(ahead: dict[int, Tensor], episode: Episode) -> dict[int, float]:
+    """By horizon, over all dimensions; a horizon of which nothing was seen at both ends is left out."""
+    errors = {horizon: _error(predicted, episode, horizon) for horizon, predicted in ahead.items()}
+    sums = {horizon: (float(error.sum()), float(size.sum())) for horizon, (error, size) in errors.items()}
+    return {horizon: error / size for horizon, (error, size) in sums.items() if size > 0.0}
 
 
 def _error(predicted: Tensor, episode: Episode, horizon: int) -> tuple[Tensor, Tensor]:

@@ -16,6 +16,7 @@ from rmc.analysis.run_evaluation import evaluate_run
 from rmc.cli import training
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import DM_CONTROL, PYBULLET
+from rmc.common.env.process_state import torch_as_imported
 from rmc.common.errors import ConfigError
 from rmc.common.process import watchdog
 from rmc.deploy.monitor.view import terminal
@@ -115,7 +116,8 @@ def _train(config: RunConfig, options: LaunchOptions) -> dict[str, Any]:
     watchdog.warn()
     if options.launcher != "lockstep":
         _check_importable(config.env)
-    folder, status = training.train(config, options, terminal())
+    with torch_as_imported():
+        folder, status = training.train(config, options, terminal())
     if status == STOPPED:
         raise KeyboardInterrupt
     result = folder.result()
@@ -166,4 +168,5 @@ def evaluate(
     Raises ConfigError; RmcError where the environment breaks in every episode.
     """
     watchdog.warn()
-    return evaluate_run(run, episodes, checkpoint, flicker)
+    with torch_as_imported():
+        return evaluate_run(run, episodes, checkpoint, flicker)

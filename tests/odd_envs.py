@@ -14,13 +14,15 @@ class Odd(gym.Env[Any, Any]):
 
 
 class Column(gym.Env[Any, Any]):
-    """It can be learnt in: a vector that stands upright."""
+    """It can be learnt in: a vector that stands upright, or lies."""
 
-    observation_space = gym.spaces.Box(-1.0, 1.0, (2, 1), np.float32)
     action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
 
+    def __init__(self, shape: tuple[int, int] = (2, 1)) -> None:
+        self.observation_space = gym.spaces.Box(-1.0, 1.0, shape, np.float32)
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        return np.zeros((2, 1), np.float32), {}
+        return np.zeros(self.observation_space.shape or (), np.float32), {}
 
 
 _VECTOR = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
@@ -29,3 +31,4 @@ _UNBOUNDED = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
 gym.register("OddImage-v0", lambda: Odd(_IMAGE, _VECTOR))
 gym.register("OddUnbounded-v0", lambda: Odd(_VECTOR, _UNBOUNDED))
 gym.register("Column-v0", lambda: Column())
+gym.register("Row-v0", lambda: Column((1, 2)))

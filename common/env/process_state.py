@@ -5,8 +5,8 @@ import random
 import signal
 import sys
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,6 +59,18 @@ class ProcessState(NamedTuple):
     def differences(self, other: "ProcessState") -> set[str]:
         """The names of what is not the same."""
         return {name for name, mine, theirs in zip(self._fields, self, other, strict=True) if mine != theirs}
+
+
+@contextmanager
+def torch_as_imported() -> Iterator[None]:
+    """Torch's defaults as a fresh process has them; afterwards all is as the caller's program had it."""
+    theirs, torch = ProcessState.read(), sys.modules.get("torch")
+    if torch is not None:
+        theirs._replace(dtype=torch.float32, gradients=True, device=torch.device("cpu")).install(theirs)
+    try:
+        yield
+    finally:
+        theirs.install(ProcessState.read())
 
 
 def _go(folder: str | None) -> None:

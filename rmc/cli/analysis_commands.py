@@ -3,7 +3,10 @@
 import dataclasses
 import json
 import logging
-from collections.abc import Sequence
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -35,17 +38,36 @@ def evaluate(command: run_options.Evaluate) -> int:
         raise ConfigError("--seconds", command.seconds, "take 0 or more")
     for flicker in command.flicker:
         check_range("--flicker", flicker, (0.0, 1.0))
+    aside = _said_aside if command.json else nullcontext
     if command.video is not None:
-        video.prepare(_filmed(command).header.env, command.video)
+        with aside():
+            video.prepare(_filmed(command).header.env, command.video)
     watch = EvaluationProgress(Console(stderr=True, markup=False, emoji=False, highlight=False), str(command.run))
     for probability in command.flicker or (None,):
-        played = evaluate_run(
-            command.run, command.episodes, command.checkpoint, probability, command.seconds, watch, command.env_timeout
-        )
+        with aside():
+            played = evaluate_run(
+                command.run, command.episodes, command.checkpoint, probability, command.seconds, watch,
+                command.env_timeout,
+            )  # fmt: skip
         terminal().print(json.dumps(played) if command.json else _result_line(played), soft_wrap=True)
     if command.video is not None:
-        _film(command, command.video)
+        with aside():
+            _film(command, command.video)
     return 0
+
+
+@contextmanager
+def _said_aside() -> Iterator[None]:
+    """What a user's module prints goes to standard error."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 def _filmed(command: run_options.Evaluate) -> PolicyFile:

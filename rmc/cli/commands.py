@@ -11,7 +11,6 @@ from rmc.cli import run_options, train_options, training
 from rmc.cli.dry_run import dry_run
 from rmc.cli.ending import print_end
 from rmc.cli.redis_password import warn_of_password
-from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
 from rmc.deploy.monitor import attach as attachment
 from rmc.deploy.monitor.recorded import recorded_status, status_json
@@ -36,8 +35,6 @@ def stats(command: run_options.Stats) -> int:
     """Print the newest metrics of a run, and its result if it has one."""
     folder, console = RunFolder(command.run), terminal()
     status = recorded_status(folder)
-    if not status.roles:
-        raise ConfigError("RUN", str(folder.path), "it has no metrics yet; train it first")
     if command.json:
         console.print(json.dumps(status_json(folder, status)), soft_wrap=True)
         return 0

@@ -80,6 +80,10 @@ def _prepare_process(words: list[str], parent: str | None) -> None:
         exit_with_parent(int(parent))
     if parent is not None or (words and words[0] in PLAYS):
         descendants.adopt_orphans()  # of what environments start
+        if words[0] != "role":  # which ends them itself
+            from rmc.cli import signals
+
+            signals.interrupt()
     if words[:1] == ["role"] and SINGLE_THREADED.intersection(words[1:2]):
         for name, value in SINGLE_THREAD.items():
             os.environ.setdefault(name, value)

@@ -3,6 +3,7 @@
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from rmc.common.process.role import StopSignal
 
@@ -10,15 +11,20 @@ from rmc.common.process.role import StopSignal
 @contextmanager
 def signals_interrupt() -> Iterator[None]:
     """SIGTERM and a closed terminal are KeyboardInterrupt, as SIGINT is, for as long as this lasts."""
-    numbers = [signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup ignores it
-        numbers.append(signal.SIGHUP)
-    before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
+    before = interrupt()
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def interrupt() -> dict[signal.Signals, Any]:
+    """The same from now on; the handlers before."""
+    numbers = [signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup ignores it
+        numbers.append(signal.SIGHUP)
+    return {number: signal.signal(number, signal.default_int_handler) for number in numbers}
 
 
 @contextmanager

@@ -69,7 +69,7 @@ def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, consol
 
 
 def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
-    status, tracker = 1, None
+    status, tracker, env_steps = 1, None, 0
     end: dict[str, Any] = {"state": "failed"}
     try:
         console.print(f"run folder {folder.path}", soft_wrap=True)
@@ -89,9 +89,9 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
                 finished = _launch(config, folder, options, monitor, stop)
         finally:
             monitor.close()
+            env_steps = monitor.status.env_steps
         if not finished:
-            status, end = STOPPED, {"state": "stopped"}
-            return print_stopped(folder, monitor.status.env_steps, console)
+            raise KeyboardInterrupt
         result = _result(config, folder, monitor, before, console)
         folder.write_result(result)
         status, end = 0, {"state": "finished", **result}
@@ -100,9 +100,9 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
     except ConfigError:
         status = EXIT_CONFIG
         raise
-    except KeyboardInterrupt:
-        status = STOPPED
-        raise
+    except KeyboardInterrupt:  # also amid the first evaluation, or the last
+        status, end = STOPPED, {"state": "stopped"}
+        return print_stopped(folder, env_steps, console)
     finally:
         try:
             if tracker is not None:

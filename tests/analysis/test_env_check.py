@@ -64,6 +64,19 @@ class Faint(Odd):
         return (1e-5 * np.random.default_rng().normal(size=3)).astype(np.float32)
 
 
+class Still(Odd):
+    """Its numbers never change, and are none that a binary fraction holds."""
+
+    def _observation(self) -> Any:
+        return np.array([0.1, 0.3, 9.81], np.float32)
+
+
+def mended(**kwargs: Any) -> gym.Env[Any, Any]:
+    """What gymnasium would complain of, but for a wrapper of the user's."""
+    space = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
+    return gym.wrappers.TransformObservation(Odd(**kwargs), lambda o: (o * 0.0 + 0.5).astype(np.float32), space)
+
+
 class Rewarded(Odd):
     """Each reward has the same size, but for every hundredth."""
 
@@ -81,6 +94,8 @@ for _name, _sizes in {
     gym.register(f"{_name}-v0", Rewarded, kwargs=dict(zip(("size", "rare"), _sizes, strict=False)))
 gym.register("Odd-v0", entry_point=Odd)
 gym.register("Faint-v0", entry_point=Faint)
+gym.register("Still-v0", entry_point=Still)
+gym.register("Mended-v0", entry_point=mended)
 gym.register("Untold-v0", entry_point=Untold)
 gym.register("Late-v0", entry_point=Late)
 gym.register("Unrewarded-v0", entry_point=Unrewarded)
@@ -108,6 +123,14 @@ def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
     assert "the same seed and actions gave other observations" in text
     assert "--curiosity" in checked("Unrewarded-v0", capsys, "--steps", "100")[1]
     assert "observations 0, 1, 2 vary by less than 0.01; scale them up" in checked("Faint-v0", capsys)[1]
+    still = checked("Still-v0", capsys)[1]
+    assert "observations 0, 1, 2 never changed" in still
+    assert "scale them up" not in still
+
+
+def test_it_is_judged_with_the_users_own_wrappers(capsys):
+    assert "gymnasium says" in checked("Odd-v0", capsys, "--steps", "50")[1]
+    assert "gymnasium says" not in checked("Mended-v0", capsys, "--steps", "50")[1]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 import dataclasses
 import importlib.util
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
+from rmc import api
 from rmc.actors.evaluator import first_start
 from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.policy import load_policy
@@ -84,6 +87,41 @@ def test_a_loop_of_ones_own_gives_what_an_evaluation_gives(run: RunFolder) -> No
         returns.append(total)
     result = evaluate_policy(read_policy(run.path), episodes=3)
     assert np.mean(returns) == result["eval_return_mean"]
+
+
+@contextmanager
+def torch_of_anothers() -> Iterator[None]:
+    """As a program has it that computes in float64, elsewhere."""
+    torch.set_default_dtype(torch.float64)
+    torch.set_default_device("meta")
+    torch.set_num_threads(2)
+    try:
+        yield
+        assert (torch.get_default_dtype(), torch.get_default_device().type) == (torch.float64, "meta")
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_default_dtype(torch.float32)
+        torch.set_default_device(None)
+
+
+def test_a_program_with_other_defaults_of_torch_keeps_them(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run", AGENTS["filling blanks"], "Pendulum-v1", flicker=0.2)
+    with torch_of_anothers():
+        policy = load_policy(folder.path)
+        for _ in range(2):
+            assert policy.act(np.zeros(3)).shape == (1,)
+            policy.reset()
+        assert api.evaluate(folder.path, episodes=1)["eval_episodes"] == 1
+        config = dataclasses.replace(debug(EnvConfig("Pendulum-v1")), total_steps=600)
+        assert api.train(config, tmp_path / "new", launcher="lockstep")["eval_episodes"] == 10
+
+
+def test_an_observation_in_the_environments_own_shape_is_one(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run", AGENTS["paper"], "tests.odd_envs:Row-v0")
+    policy, own = load_policy(folder.path), np.zeros((1, 2), np.float32)
+    assert policy.act(own).shape == (1,)
+    policy.reset()
+    assert policy.act(np.zeros(2)).shape == (1,)
 
 
 @pytest.mark.long

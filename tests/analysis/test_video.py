@@ -1,12 +1,14 @@
 """rmc evaluate --video and its grid of flicker probabilities, as a user runs them."""
 
+import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from imageio_ffmpeg import get_ffmpeg_exe
+from imageio_ffmpeg import count_frames_and_secs, get_ffmpeg_exe
 
 from rmc.analysis import video
 from rmc.analysis.policy import load_policy
@@ -17,6 +19,16 @@ from rmc.common.env.make import make_env
 from rmc.common.errors import RmcError
 from rmc.common.whole_file import temporary_path
 from tests.analysis.test_policy import AGENTS, make_run
+
+MOVES = """
+import os
+import gymnasium, torch
+from tests.habits import Draws
+print("a banner", flush=True)
+os.chdir("/")
+torch.set_default_dtype(torch.float64)
+gymnasium.register("Moves-v0", Draws)
+"""
 
 
 def evaluate(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
@@ -52,6 +64,34 @@ def test_a_video_that_cannot_be_written_is_one_line_and_none_is_left(steps: int,
     with pytest.raises(RmcError, match=r"episode\.mp4: ffmpeg cannot write the video \(.*\); is the disk full\?$"):
         video.record(policy, config, 0, out, steps)
     assert not out.exists()
+
+
+def frames(video_file: Path) -> tuple[int, float]:
+    """How many, and how long they last."""
+    return count_frames_and_secs(str(video_file))
+
+
+def test_it_lasts_as_long_as_the_episode_whatever_is_repeated(tmp_path: Path) -> None:
+    for repeat, length in ((1, 12), (4, 3)):
+        config = EnvConfig("tests.habits:Draws-v0", env_kwargs={"picture": "sound"}, action_repeat=repeat)
+        folder = make_run(tmp_path / f"{repeat}", AGENTS["robust"], config.id, env_kwargs=config.env_kwargs)
+        policy, out = load_policy(folder.path), tmp_path / f"{repeat}.mp4"
+        video.record(policy, config, 0, out, length)
+        assert frames(out) == (length, pytest.approx(1.2, abs=0.1))
+
+
+def test_what_a_module_does_as_it_is_imported_is_the_environments_alone(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "moves.py").write_text(MOVES)
+    monkeypatch.syspath_prepend(tmp_path)
+    make_run(tmp_path / "run", AGENTS["robust"], "moves:Moves-v0", env_kwargs={"picture": "sound"})
+    done = subprocess.run(
+        [sys.executable, "-m", "rmc.cli.main", "evaluate", "run", "--episodes", "1", "--json", "--video", "film.mp4"],
+        capture_output=True, text=True, timeout=170, check=False, cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.getcwd()},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr.splitlines()) == (0, ["a banner"])
+    assert json.loads(done.stdout)["eval_episodes"] == 1
+    assert (tmp_path / "film.mp4").exists()
 
 
 def test_the_camera_follows() -> None:

@@ -13,7 +13,7 @@ from safetensors.torch import save
 
 from rmc.analysis import episodes
 from rmc.analysis.episodes import Episode, Player
-from rmc.analysis.world_model_picture import HORIZONS, load_agent, look
+from rmc.analysis.world_model_picture import HORIZONS, inspect, load_agent, look
 from rmc.cli import main
 from rmc.common.agent import Agent
 from rmc.common.checkpoint import CheckpointFolder
@@ -115,6 +115,13 @@ def test_an_episode_that_never_ends_is_looked_at_for_a_while(
     short, plain = (Player(folder, agent, run, "latest").play() for run in (scaled, config))
     assert short.action.shape[1] == 25
     torch.testing.assert_close(short.reward, 0.5 * plain.reward)  # as the world model has learnt it
+
+
+def test_a_horizon_at_which_nothing_was_seen_has_no_share(config: RunConfig, tmp_path: Path) -> None:
+    """Zero would read as a perfect prediction."""
+    blind = dataclasses.replace(config, env=dataclasses.replace(config.env, flicker=1.0))
+    folder = make_run(tmp_path / "run", blind)
+    assert inspect(folder.path, "latest", tmp_path / "out.png")[0].open_loop == {}
 
 
 def test_a_model_without_grounding_has_nothing_to_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -190,7 +190,9 @@ def test_odd_lines_of_metrics_are_passed_over(tmp_path: Path) -> None:
     odd = [b"5", b'{"a": 1}', b'{"role": 1}', b'{"role": "launcher", "wall_s": "abc"}', b"\xff", b'{"role": "launch']
     folder.metrics.write_bytes(b"\n".join([odd[-2], *(json.dumps(one).encode() for one in records), *odd]))
     assert wall_seconds(folder.metrics) == 3.0
-    assert [one.return_mean for one in of_run(folder).evaluations] == [7.0]
+    folder.write_initial({"eval_return_mean": 2.0, "eval_return_std": 0.0, "eval_episodes": 10})
+    history = of_run(folder)
+    assert ([one.return_mean for one in history.evaluations], history.initial_return) == ([7.0], 2.0)
     assert run(["stats", str(folder.path)]) == 0
 
 

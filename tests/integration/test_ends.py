@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from rmc.deploy.run.folder import RunFolder
 from tests import wandb_file
 from tests.integration.running import Training, alive
 
@@ -51,6 +52,24 @@ def test_a_role_that_dies_at_once_ends_the_run_with_its_traceback(tmp_path: Path
             assert training.finish(150) == 1
     assert "RuntimeError: the wheel came off" in training.text().splitlines()[-1]
     assert "3 times in a row" in training.text()
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_who_stops_it_amid_its_first_or_last_evaluation_is_told_how_to_go_on(when: str, tmp_path: Path) -> None:
+    """Ten episodes of 50 steps take 5 s."""
+    steps = ("--total-steps", "400", "--warmup-steps", "100", "--episodes", "0")
+    with Training(tmp_path / "run", *steps, env="tests.slow_env:Slow-v0") as training:
+        if when == "before":
+            training.wait_for(lambda: "run folder" in training.text())
+        else:
+            training.wait_for(lambda: training.newest("learner", "finished") and not training.sockets())
+            time.sleep(1.0)
+        training.interrupt()
+        assert training.process.returncode == 130
+    steps_made = 400 * (when == "after")
+    how = f"stopped at environment step {steps_made}; to go on:\n  rmc resume {tmp_path / 'run'}\n"
+    assert how in training.text()
+    assert RunFolder(tmp_path / "run").ended() == 130
 
 
 BROKEN = """

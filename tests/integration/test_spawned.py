@@ -14,6 +14,7 @@ import pytest
 
 from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.redis.socket_folder import sweep
+from rmc.deploy.run.state import STOPPED
 from tests.integration.running import Training, alive
 from tests.integration.spawning_env import SPAWNED
 
@@ -110,15 +111,29 @@ def test_those_of_a_group_end_where_the_fork_server_is_killed(training: Spawner)
         left.kill()
 
 
-def test_they_end_with_a_command_in_which_a_call_hangs(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "rmc.cli.main", "check-env", SPAWNING, "--steps", "1000000", "--env-timeout", "1"]
-    process = subprocess.Popen(words, env={**os.environ, SPAWNED: str(tmp_path)}, stderr=subprocess.DEVNULL)
+def checked(tmp_path: Path, *words: str) -> tuple[subprocess.Popen[bytes], list[psutil.Process]]:
+    """A command that plays without end, and what its environment has started."""
+    command = [sys.executable, "-m", "rmc.cli.main", "check-env", SPAWNING, "--steps", "1000000", *words]
+    process = subprocess.Popen(command, env={**os.environ, SPAWNED: str(tmp_path)}, stderr=subprocess.DEVNULL)
     note = tmp_path / str(process.pid)
     while not note.exists():
         assert process.poll() is None
         time.sleep(0.05)
     theirs = alive([psutil.Process(int(pid)) for pid in note.read_text().split()])
     assert len(theirs) == 3
+    return process, theirs
+
+
+def test_they_end_with_a_command_in_which_a_call_hangs(tmp_path: Path) -> None:
+    process, theirs = checked(tmp_path, "--env-timeout", "1")
     (tmp_path / f"hang-{process.pid}").touch()
     assert process.wait(60.0) == HUNG_STATUS
+    assert alive(theirs) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_they_end_with_a_command_that_is_told_to(number: signal.Signals, tmp_path: Path) -> None:
+    process, theirs = checked(tmp_path)
+    process.send_signal(number)
+    assert process.wait(60.0) == STOPPED
     assert alive(theirs) == []
