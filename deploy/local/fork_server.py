@@ -60,12 +60,14 @@ class ForkServer:
         self._log = log
         self._program: subprocess.Popen[bytes] | None = None
         self._generation = 0  # of the program
+        self._status: int | None = None  # with which the last one ended; None where it hung
         self._ours: socket.socket | None = None
 
     def fork(self, words: tuple[str, ...], environment: dict[str, str], log: int) -> ForkedProcess:
         """A process of ``rmc`` and these words, its output to ``log``.
 
-        Raises RoleDied where no fork server comes up, OSError where the system has no room for a process.
+        Raises RoleDied where no fork server comes up; OSError where the system has no room for a process, or somebody
+        killed that server as it came up.
         """
         request = {"words": words, "environment": environment}
         for _ in range(2):  # one that was killed since is found out by asking it
@@ -75,6 +77,8 @@ class ForkServer:
                 raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
             if pid is not None:
                 return ForkedProcess(self, self._generation, pid)
+        if self._status in (-signal.SIGKILL, -signal.SIGTERM):
+            raise OSError(errno.EAGAIN, "the fork server of roles was killed")
         raise RoleDied(f"the fork server of roles does not start; its log is {self._log}")
 
     def status_of(self, pid: int, generation: int) -> int | None:
@@ -122,8 +126,9 @@ class ForkServer:
             self._ours.close()
             self._ours = None
         if self._program is not None:
+            self._status = None
             try:
-                self._program.wait(END_SECONDS)
+                self._status = self._program.wait(END_SECONDS)
             except subprocess.TimeoutExpired:
                 self._program.kill()
                 self._program.wait()

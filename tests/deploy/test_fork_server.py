@@ -86,6 +86,18 @@ def test_one_that_does_not_start_says_where_to_look(tmp_path: Path, monkeypatch:
     assert (tmp_path / "fork_server.log").read_text() == "no torch here\n" * 2
 
 
+def test_one_that_is_killed_as_it_starts_is_tried_again_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a machine short of memory does it; a role that cannot be started now is started later."""
+    killed = tmp_path / "python"
+    killed.write_text("#!/bin/sh\nkill -KILL $$\n")
+    killed.chmod(0o700)
+    monkeypatch.setattr(fork_server.sys, "executable", str(killed))
+    one = ForkServer(tmp_path / "fork_server.log")
+    with pytest.raises(BlockingIOError, match="the fork server of roles was killed"):
+        fork(one, tmp_path / "log", "actor")
+    one.close()
+
+
 def test_one_that_hangs_is_given_up_for_another(
     shared: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
