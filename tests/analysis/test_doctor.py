@@ -4,8 +4,6 @@ import dataclasses
 import json
 import math
 import random
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ from rmc.cli.main import run
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import RunConfig, to_json
 from rmc.deploy.run.presets import debug, robust
+from tests.command import rmc
 
 CONFIG = robust(EnvConfig("HalfCheetah-v5"))
 Record = dict[str, Any]
@@ -287,11 +286,9 @@ def test_a_run_that_has_just_begun_is_one_line(tmp_path: Path, capsys: pytest.Ca
 
 def trained(folder: Path, *words: str) -> str:
     """What a real run prints, whose doctor afterwards says the same."""
-    command = [sys.executable, "-m", "rmc.cli.main"]
-    done = subprocess.run([*command, "train", *words, "--preset", "debug", "--run-dir", str(folder)],
-                          capture_output=True, text=True, timeout=170)  # fmt: skip
+    done = rmc("train", *words, "--preset", "debug", "--run-dir", str(folder), timeout=170)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
-    asked = subprocess.run([*command, "doctor", str(folder)], capture_output=True, text=True, timeout=60)
+    asked = rmc("doctor", str(folder), timeout=60)
     assert (asked.returncode, asked.stderr) == (0, "")
     *findings, last = asked.stdout.splitlines()
     assert last.startswith("judged by the newest ")
@@ -320,11 +317,8 @@ def test_a_real_run_whose_evaluator_starves(tmp_path: Path) -> None:
 
 def test_a_real_run_records_its_host(tmp_path: Path) -> None:
     config = dataclasses.replace(debug(EnvConfig("InvertedPendulum-v5")), total_steps=600)
-    done = subprocess.run(
-        [sys.executable, "-m", "rmc.cli.main", "train", config.env.id, "--preset", "debug", "--total-steps", "600",
-         "--launcher", "lockstep", "--run-dir", str(tmp_path / "run")],
-        capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
+    words = ["train", config.env.id, "--preset", "debug", "--total-steps", "600", "--launcher", "lockstep"]
+    done = rmc(*words, "--run-dir", str(tmp_path / "run"))
     assert done.returncode == 0, done.stdout + done.stderr
     lines = map(json.loads, (tmp_path / "run" / "metrics.jsonl").read_text().splitlines())
     last = [one for one in lines if one["role"] == "launcher"][-1]

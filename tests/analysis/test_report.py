@@ -5,7 +5,6 @@ import json
 import re
 import shutil
 import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from rmc.analysis.report_run import ReportRun
 from rmc.cli.main import run
 from rmc.deploy.run.folder import RunFolder
 from tests.analysis import browser
+from tests.command import rmc
 from tests.docs.running import ran
 
 BROWSER_SECONDS = 60
@@ -188,10 +188,7 @@ def test_where_nothing_renders_the_video_is_a_note(
 def test_a_baseline_stands_beside_a_run(trained: Path, tmp_path: Path) -> None:
     path = tmp_path / "sac"
     words = ["baseline", "sac", "InvertedPendulum-v5", "--total-steps", "200", "--checkpoint-steps", "100"]
-    done = subprocess.run(
-        [sys.executable, "-m", "rmc.cli.main", *words, "--episodes", "1", "--run-dir", str(path)],
-        capture_output=True, text=True, timeout=170, check=False,
-    )  # fmt: skip
+    done = rmc(*words, "--episodes", "1", "--run-dir", str(path), timeout=170)
     assert done.returncode == 0, done.stdout + done.stderr
     text = written(tmp_path / "report.html", str(trained), str(path))
     assert "SAC 400-300</span>" in text

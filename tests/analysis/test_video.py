@@ -3,7 +3,6 @@
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from rmc.common.env.make import make_env
 from rmc.common.errors import RmcError
 from rmc.common.whole_file import temporary_path
 from tests.analysis.test_policy import AGENTS, make_run
+from tests.command import rmc
 
 MOVES = """
 import os
@@ -33,8 +33,7 @@ gymnasium.register("Moves-v0", Draws)
 
 def evaluate(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """In a process of its own: rendering leaves traces in one."""
-    command = [sys.executable, "-m", "rmc.cli.main", "evaluate", str(folder), "--episodes", "1", *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=170, check=False)
+    return rmc("evaluate", str(folder), "--episodes", "1", *words, timeout=170)
 
 
 def test_a_video_or_a_line_that_says_why_not(tmp_path: Path) -> None:

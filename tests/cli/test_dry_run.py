@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -23,11 +22,12 @@ from rmc.deploy.run.host import Machine, this_machine
 from rmc.deploy.run.preflight import ring_bytes
 from rmc.deploy.run.presets import debug, robust
 from rmc.replay_server.ring import file_bytes
+from tests.command import COMMAND, rmc
 from tests.integration.running import Training
 
 CONFIG = debug(EnvConfig("InvertedPendulum-v5"))
 MACHINE = Machine(4, 8 << 30, 100 << 30, 1024, 10e9)
-COMMAND = [sys.executable, "-m", "rmc.cli.main", "train", "InvertedPendulum-v5", "--preset", "debug"]
+TRAIN = ["train", "InvertedPendulum-v5", "--preset", "debug"]
 MEMORY_TOLERANCE = 0.3  # of a role's: when a process is looked at decides on some of it
 DISK_TOLERANCE = 0.05
 
@@ -119,8 +119,7 @@ def test_this_machine_has_something(tmp_path: Path) -> None:
 
 
 def dry_run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*COMMAND, "--dry-run", "--run-dir", str(folder), *words],
-                          capture_output=True, text=True, timeout=170)  # fmt: skip
+    return rmc(*TRAIN, "--dry-run", "--run-dir", str(folder), *words, timeout=170)
 
 
 def bytes_of(output: str, what: str) -> float:
@@ -168,7 +167,7 @@ def test_a_ring_that_is_too_large_is_marked_and_the_status_is_1(
     """As trials, those of docs/memory.md and docs/doctor.md are real."""
     measured = Trial({"learner": RoleUse(300 << 20, 20, 4)}, records(), 2_000_000, 1_000.0)
     monkeypatch.setattr(cli_dry_run, "run_trial", lambda config, device, stop: measured)
-    words = [*COMMAND[3:], "--dry-run", "--run-dir", str(tmp_path / "run"), "--capacity", "1000000000000"]
+    words = [*TRAIN, "--dry-run", "--run-dir", str(tmp_path / "run"), "--capacity", "1000000000000"]
     assert main.run(words) == 1
     output, errors = capsys.readouterr()
     assert errors == ""
@@ -184,7 +183,7 @@ def test_a_trial_needs_processes(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
-    words = [*COMMAND, "--dry-run", "--run-dir", str(tmp_path / "run")]
+    words = [*COMMAND, *TRAIN, "--dry-run", "--run-dir", str(tmp_path / "run")]
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:

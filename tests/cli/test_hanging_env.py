@@ -2,8 +2,6 @@
 
 import os
 import re
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -13,6 +11,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.run.presets import debug
 from tests.analysis.test_world_model_picture import make_run
+from tests.command import rmc
 
 ENV = "tests.hanging_env:HangsAsTold-v0"
 LINE = r"rmc: ENV='{}': {} has not returned for {} s \(hanging_env\.py, line \d+\); fix it, or raise --env-timeout\n"
@@ -21,10 +20,7 @@ LINE = r"rmc: ENV='{}': {} has not returned for {} s \(hanging_env\.py, line \d+
 def check_ends(words: list[str], place: str, call: str, seconds: float) -> None:
     """Within a time that leaves room for slow imports."""
     began = time.monotonic()
-    done = subprocess.run(
-        [sys.executable, "-m", "rmc.cli.main", *words], env={**os.environ, "RMC_TEST_HANGS": place},
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+    done = rmc(*words, env={**os.environ, "RMC_TEST_HANGS": place})
     assert re.fullmatch(LINE.format(re.escape(ENV), call, f"{seconds:g}"), done.stderr), done.stderr
     assert done.returncode == HUNG_STATUS
     assert time.monotonic() - began >= seconds
@@ -54,9 +50,6 @@ def test_a_baseline(tmp_path: Path) -> None:
 
 def test_a_time_that_is_none_is_refused() -> None:
     for value in ("0", "-1", "nan"):
-        done = subprocess.run(
-            [sys.executable, "-m", "rmc.cli.main", "check-env", ENV, "--env-timeout", value],
-            capture_output=True, text=True, timeout=120, check=False,
-        )  # fmt: skip
+        done = rmc("check-env", ENV, "--env-timeout", value)
         assert done.returncode == 2
         assert f"--env-timeout={float(value)}: take a number from 0.1 to 1_000_000.0" in done.stderr

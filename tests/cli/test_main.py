@@ -26,6 +26,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug, paper
+from tests.command import rmc
 
 PENDULUM = "InvertedPendulum-v5"
 DEBUG = ["train", PENDULUM, "--preset", "debug"]
@@ -213,10 +214,7 @@ def test_errors_are_one_line(
 @pytest.mark.parametrize("words", [DEBUG, ["role", "actor", "--run", "x"]])
 @pytest.mark.parametrize("login", ["", ":hush@"])
 def test_a_password_on_the_command_line_is_warned_of_once(words: list[str], login: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "rmc.cli.main", *words, "--redis-url", f"redis://{login}localhost:1"],
-        capture_output=True, text=True, env=os.environ | {"RMC_PATIENCE": "0"},
-    )  # fmt: skip
+    done = rmc(*words, "--redis-url", f"redis://{login}localhost:1", env=os.environ | {"RMC_PATIENCE": "0"})
     *warnings, error = done.stderr.splitlines()
     assert error.startswith("rmc: --redis-url='redis://localhost:1': no Redis answers there")
     assert ["file:PATH" in line for line in warnings] == [True] * bool(login)

@@ -3,8 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 import urllib.request
@@ -18,6 +16,7 @@ from ray.cluster_utils import Cluster
 
 from rmc.deploy.run.folder import RunFolder
 from tests.cluster import machines
+from tests.command import rmc
 from tests.deploy.test_tls import lacks_tls
 from tests.integration.running import ENVIRONMENT, Training, free_port
 
@@ -116,10 +115,8 @@ def test_checkpoints_that_do_not_reach_the_head_are_said_and_brought_later(tmp_p
 
 
 def test_more_than_the_cluster_holds_is_refused(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "rmc.cli.main", "train", "InvertedPendulum-v5", "--launcher", "ray"]
-    done = subprocess.run(
-        [*words, "--run-dir", str(tmp_path / "run")], env=ENVIRONMENT, capture_output=True, text=True, timeout=120
-    )
+    words = ["train", "InvertedPendulum-v5", "--launcher", "ray", "--run-dir", str(tmp_path / "run")]
+    done = rmc(*words, env=ENVIRONMENT)
     assert done.returncode == 2
     assert done.stderr.startswith("rmc: --ray-address='auto': no Ray cluster answers")
     assert not (tmp_path / "run").exists()
@@ -167,9 +164,7 @@ def test_a_node_is_lost_and_another_comes(nodes: Cluster, tmp_path: Path) -> Non
 
         trainer = RunFolder(folder).trainer()
         assert trainer is not None
-        done = subprocess.run(
-            [sys.executable, "-m", "rmc.cli.main", "stop", str(folder)], env=ENVIRONMENT, capture_output=True, text=True
-        )
+        done = rmc("stop", str(folder), env=ENVIRONMENT)
         assert done.returncode == 0, done.stderr
         assert "to go on:\n  rmc resume " in done.stdout
         assert training.finish(60) == 130
@@ -196,12 +191,6 @@ def test_a_killed_launcher_and_a_role_that_somebody_ended_come_back(nodes: Clust
         training.interrupt()
     assert training.process.returncode == 130
     assert ring(folder.path).exists()  # it may go on from there
-
-
-def rmc(*words: str) -> subprocess.CompletedProcess[str]:
-    """A command beside the runs."""
-    command = [sys.executable, "-m", "rmc.cli.main", *words]
-    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
 
 
 @pytest.mark.long
@@ -246,7 +235,7 @@ def _learner_node(run: Training) -> list[str]:
 
 def _check_list_and_stop(address: str, one: Training, other: Training) -> None:
     names = [RunFolder(run.folder).name for run in (one, other)]
-    listed = json.loads(rmc("list", "--ray-address", address, "--json").stdout)
+    listed = json.loads(rmc("list", "--ray-address", address, "--json", env=ENVIRONMENT).stdout)
     assert {line["run"]: line["folder"] for line in listed} == {
         name: str(run.folder) for name, run in zip(names, (one, other), strict=True)
     }
@@ -254,16 +243,16 @@ def _check_list_and_stop(address: str, one: Training, other: Training) -> None:
     assert (first["env"], first["total_steps"]) == ("InvertedPendulum-v5", 10_000_000)
     assert first["learner"] in ("127.0.0.2", "127.0.0.3")
     assert one.newest("replay", "env_steps") >= first["env_steps"] > 0
-    assert "run" in rmc("list", "--ray-address", address).stdout
+    assert "run" in rmc("list", "--ray-address", address, env=ENVIRONMENT).stdout
     for name, problem in (
         ("none", "is not trained on this cluster; its runs: "),
         ("run", "is the name of several; give one of: "),
     ):
-        refused = rmc("stop", name, "--ray-address", address)
+        refused = rmc("stop", name, "--ray-address", address, env=ENVIRONMENT)
         assert refused.returncode == 2
         assert refused.stderr == f"rmc: RUN='{name}': {problem}{', '.join(sorted(names))}\n"
     for run, name in ((one, names[0]), (other, "run")):  # of the second there is only one then
-        done = rmc("stop", name, "--ray-address", address)
+        done = rmc("stop", name, "--ray-address", address, env=ENVIRONMENT)
         assert done.returncode == 0, done.stderr
         assert f"{name} has ended; its folder is {run.folder} on " in done.stdout
         assert max(RunFolder(run.folder).checkpoints.glob("[0-9]*")).is_dir()

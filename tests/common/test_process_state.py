@@ -1,8 +1,6 @@
 """What an environment changes of its process is its own: our code finds the process as it was."""
 
 import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
 from rmc.common.env.process_state import ApartCall, ProcessState
 from tests import meddling_env
+from tests.command import rmc
 from tests.counting_env import CountingEnv
 
 
@@ -89,16 +88,11 @@ def test_training_does_not_notice(tmp_path: Path, launcher: str) -> None:
     """The module lies where the command is started, and meddles when it is imported, too; the run's folder is there."""
     (tmp_path / "mine.py").write_text(MODULE)
     words = ["train", "mine:Mine-v0", "--preset", "debug", "--run-dir", "run", "--launcher", launcher]
-    done = subprocess.run(
-        [sys.executable, "-m", "rmc.cli.main", *words, "--total-steps", "1200", "--checkpoint-steps", "600"],
-        cwd=tmp_path, env={**os.environ, "PYTHONPATH": os.getcwd(), "RMC_SECRET": ""}, capture_output=True, text=True,
-        timeout=170, check=False,
-    )  # fmt: skip
+    words += ["--total-steps", "1200", "--checkpoint-steps", "600"]
+    environment = {**os.environ, "PYTHONPATH": os.getcwd(), "RMC_SECRET": ""}
+    done = rmc(*words, cwd=tmp_path, env=environment, timeout=170)
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "run" / "result.json").exists()
-    words = ["inspect", "run", "--out", "picture.png"]
-    assert subprocess.run(
-        [sys.executable, "-m", "rmc.cli.main", *words], cwd=tmp_path, timeout=100, check=False,
-        env={**os.environ, "PYTHONPATH": os.getcwd()},
-    ).returncode == 0  # fmt: skip
+    done = rmc("inspect", "run", "--out", "picture.png", cwd=tmp_path, env=environment, timeout=100)
+    assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "picture.png").exists()

@@ -2,8 +2,6 @@
 
 import importlib.util
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from rmc.cli import main
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import env_layout, make_env
 from rmc.common.errors import ConfigError
+from tests.command import rmc
 
 INSTALLED = all(map(importlib.util.find_spec, ("pybullet", "pybullet_envs_gymnasium")))
 needs_pybullet = pytest.mark.skipif(not INSTALLED, reason="pybullet is not installed: make test-pybullet")
@@ -121,7 +120,6 @@ def test_check_train_and_evaluate(tmp_path: Path, capfd: pytest.CaptureFixture[s
     run = ["--preset", "debug", "--total-steps", "1200", "--launcher", "lockstep", "--checkpoint-steps", "1100"]
     assert main.run(["train", ANT, *run, "--run-dir", str(tmp_path / "run")]) == 0
     assert "it can be trained on" in capfd.readouterr().out
-    words = ["evaluate", str(tmp_path / "run"), "--episodes", "1", "--json"]
-    done = subprocess.run([sys.executable, "-m", "rmc.cli.main", *words], capture_output=True, text=True, timeout=100)
+    done = rmc("evaluate", str(tmp_path / "run"), "--episodes", "1", "--json", timeout=100)
     assert json.loads(done.stdout)["env"] == ANT, done.stderr  # and nothing else
     assert "pybullet" not in done.stderr

@@ -15,6 +15,7 @@ from rmc.cli.parser import COMMANDS
 from rmc.common import agent, critic
 from rmc.common.env import missing
 from rmc.learner import diagnostics, losses, update, update_order
+from tests.command import rmc
 from tests.docs.running import LOCKSTEP
 
 ROOT = Path(__file__).parents[2]
@@ -106,8 +107,7 @@ def test_its_commands_run(tmp_path: Path) -> None:
     commands = re.findall(r"```sh\n(rmc .*)\n```", README)
     assert [command.split()[1] for command in commands] == ["train", "evaluate", "stats"]
     for command in commands:
-        words = [sys.executable, "-m", "rmc.cli.main", *command.split()[1:]]
-        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=280)
+        done = rmc(*command.split()[1:], cwd=tmp_path, timeout=280)
         assert done.returncode == 0, done.stdout + done.stderr
         assert done.stderr == ""
         assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
@@ -147,8 +147,7 @@ def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Pat
     for command in commands:
         shorter = ["--preset", "debug", "--total-steps", "1500"] * command.startswith("rmc train")
         shorter += LOCKSTEP * ("instruments" in command)
-        words = [sys.executable, "-m", "rmc.cli.main", *command.split()[1:], *shorter]
-        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=280)
+        done = rmc(*command.split()[1:], *shorter, cwd=tmp_path, timeout=280)
         assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
         names.append(done.stdout)
     assert "time limit 100" in names[0]

@@ -1,11 +1,11 @@
 """The commands of docs/sweeps.md run as they are printed, with one seed and one trial; Ray's has tests of its own."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.command import rmc
 
 PAGE = (Path(__file__).parents[2] / "docs" / "sweeps.md").read_text()
 
@@ -20,8 +20,7 @@ def test_its_commands_run(tmp_path: Path) -> None:
     assert len(on_ray) == 1
     for command in (one for one in commands if one not in on_ray):
         fewer = command.replace("--seeds 1-2", "--seeds 1").replace("--trials 2", "--trials 1")
-        words = [sys.executable, "-m", "rmc.cli.main", *fewer.split()[1:]]
-        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+        done = rmc(*fewer.split()[1:], cwd=tmp_path, timeout=300)
         assert (done.returncode, done.stderr) == (0, ""), f"{command}\n{done.stdout}{done.stderr}"
     runs = {path.parent.name: len(path.read_text().splitlines()) for path in tmp_path.glob("runs/*/sweep.jsonl")}
     assert runs == {"InvertedPendulum-v5__sweep": 2, "rates": 2, "search": 1}

@@ -2,7 +2,6 @@
 
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 
 from rmc.deploy.run.folder import RunFolder
 from tests import wandb_file
+from tests.command import COMMAND, rmc
 from tests.integration.running import Training, alive
 
 ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
@@ -90,17 +90,17 @@ gymnasium.register("Broken-v0", Broken, max_episode_steps=100)
 def test_a_run_is_watched_and_stopped_from_another_terminal(tmp_path: Path) -> None:
     with Training(tmp_path / "run", "--total-steps", "10000000") as training:
         training.wait_for_updates()
-        words = [sys.executable, "-m", "rmc.cli.main"]
-        with subprocess.Popen([*words, "attach", str(tmp_path / "run")], stdout=subprocess.PIPE, text=True) as watcher:
+        attach = [*COMMAND, "attach", str(tmp_path / "run")]
+        with subprocess.Popen(attach, stdout=subprocess.PIPE, text=True) as watcher:
             assert watcher.stdout is not None
             assert watcher.stdout.readline().startswith("0% | ")
-            done = subprocess.run([*words, "stop", str(tmp_path / "run")], capture_output=True, text=True, timeout=60)
+            done = rmc("stop", str(tmp_path / "run"), timeout=60)
             assert (done.returncode, done.stderr) == (0, "")
             assert "to go on:\n  rmc resume " in done.stdout
             assert training.finish(30) == 130
             assert "to go on:\n  rmc resume " in watcher.stdout.read()
             assert watcher.wait(30) == 130
-    done = subprocess.run([*words, "attach", str(tmp_path / "run")], capture_output=True, text=True, timeout=60)
+    done = rmc("attach", str(tmp_path / "run"), timeout=60)
     assert done.returncode == 2
     assert "nobody trains it now" in done.stderr
 

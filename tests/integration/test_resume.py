@@ -5,8 +5,6 @@ import json
 import os
 import re
 import shlex
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -16,19 +14,11 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.starts import starts
 from rmc.replay_server.recovery import open_store
+from tests.command import rmc
 from tests.docs.running import ran
 from tests.integration.running import ENVIRONMENT, Training
 
 SIZES = "--hidden 16 --embedding 16 --heads 16 16 --total-steps 8000 --actors 2 --replay-ratio 8".split()  # noqa: SIM905
-
-
-def rmc(words: str, cwd) -> subprocess.CompletedProcess[str]:
-    assert words.startswith("rmc ")
-    command = [sys.executable, "-m", "rmc.cli.main", *shlex.split(words)[1:]]
-    path = os.pathsep.join([os.getcwd(), os.environ.get("PYTHONPATH", "")])
-    return subprocess.run(
-        command, cwd=cwd, env={**ENVIRONMENT, "PYTHONPATH": path}, capture_output=True, text=True, timeout=240
-    )
 
 
 def drawn_steps(folder: RunFolder) -> int:
@@ -49,7 +39,8 @@ def test_the_printed_command_goes_on(launcher, tmp_path):
         (printed,) = re.findall(r"to go on:\n\s+(rmc .*)\n", training.text())
     config = RunFolder(folder).config()
     assert printed == f"rmc resume '{folder}'"
-    done = rmc(printed, tmp_path)
+    path = os.pathsep.join([os.getcwd(), os.environ.get("PYTHONPATH", "")])
+    done = rmc(*shlex.split(printed)[1:], cwd=tmp_path, env={**ENVIRONMENT, "PYTHONPATH": path}, timeout=240)
     assert done.returncode == 0, done.stdout + done.stderr
     result = RunFolder(folder).result()
     assert 8_000 <= result["env_steps"] < 8_000 + 2 * config.slack_steps()
