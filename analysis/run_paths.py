@@ -3,7 +3,7 @@
 import glob
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -42,14 +42,23 @@ def run_folders(folder: Path) -> Iterator[Path]:
             yield Path(path)
 
 
-def each_readable(paths: Iterable[Path], read: Callable[[Path], T]) -> list[T]:
-    """What can be read, each path once; the others are told. Raises ConfigError where there is one alone."""
-    found, once = [], list(dict.fromkeys(paths))
-    for path in once:
+def each_readable(
+    given: Sequence[Path], read: Callable[[Path], T], otherwise: str = "none of them is a run's folder"
+) -> list[T]:
+    """What can be read of all that is meant, each once; the others are told.
+
+    Raises ConfigError where nothing is given or can be read: that one's own where there is one alone, or ``otherwise``.
+    """
+    if not given:
+        raise ConfigError("RUNS", "", "give folders of runs")
+    found, once = [], {os.path.realpath(path): path for one in given for path in expanded(one)}
+    for path in once.values():
         try:
             found.append(read(path))
         except ConfigError as error:
             if len(once) == 1:
                 raise
             log.warning("%s (left out)", error)
+    if not found:
+        raise ConfigError("RUNS", " ".join(map(str, given)), otherwise)
     return found

@@ -19,7 +19,7 @@ from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.analysis.policy_file import PolicyFile, read_policy
 from rmc.analysis.run_evaluation import check_baselines, evaluate_run
-from rmc.analysis.run_paths import each_readable, expanded
+from rmc.analysis.run_paths import each_readable
 from rmc.cli import run_options
 from rmc.cli.ending import cut_note
 from rmc.cli.signals import signals_caught
@@ -146,8 +146,6 @@ def baseline(command: run_options.Baseline) -> int:
 
 def plot(command: run_options.Plot) -> int:
     """Draw curves and print their table."""
-    if not command.runs:
-        raise ConfigError("RUNS", "", "give folders of runs, or files of JSON lines")
     groups, console = curves.grouped(_histories(command.runs)), terminal(max(terminal().width, curves.WIDTH))
     console.print(*curves.tables(groups, command.reference), sep="\n")
     curves.draw(groups, command.by, command.out)
@@ -157,8 +155,8 @@ def plot(command: run_options.Plot) -> int:
 
 def _histories(paths: Sequence[Path]) -> list[history.History]:
     """Of all that can be read; the others are told. Raises ConfigError where that is none."""
-    runs = [run for path in paths for run in expanded(path)]
-    histories = [one for read in each_readable(runs, history.read) for one in read]
+    fix = "no history in there; give runs that were evaluated"
+    histories = [one for read in each_readable(paths, history.read, fix) for one in read]
     if not histories:
-        raise ConfigError("RUNS", " ".join(map(str, paths)), "no history in there; give runs that were evaluated")
+        raise ConfigError("RUNS", " ".join(map(str, paths)), fix)
     return histories

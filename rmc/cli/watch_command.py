@@ -6,7 +6,7 @@ import secrets
 import socket
 from contextlib import suppress
 
-from rmc.analysis.run_paths import each_readable, expanded
+from rmc.analysis.run_paths import each_readable
 from rmc.cli import run_options
 from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
@@ -17,16 +17,11 @@ ANY = ("0.0.0.0", "::")
 
 def watch(command: run_options.Watch) -> int:
     """Serve the page until Ctrl-C."""
-    if not command.runs:
-        raise ConfigError("RUNS", "", "give folders of runs")
-    check_installed("watch", ("starlette", "uvicorn"), "RUNS", str(command.runs[0]))
+    check_installed("watch", ("starlette", "uvicorn"), "RUNS", " ".join(map(str, command.runs)))
     from rmc.analysis.live_run import LiveRun
     from rmc.analysis.watch_server import serve  # an extra
 
-    paths = [path for given in command.runs for path in expanded(given)]
-    runs = each_readable(paths, lambda path: LiveRun(str(path), path))
-    if not runs:
-        raise ConfigError("RUNS", " ".join(map(str, command.runs)), "none of them is a run's folder")
+    runs = each_readable(command.runs, lambda path: LiveRun(str(path), path))
     with _listening(command.host, command.port) as listener:
         address, port = listener.getsockname()[:2]
         token = "" if ipaddress.ip_address(address).is_loopback else secrets.token_urlsafe()
