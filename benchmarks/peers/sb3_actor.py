@@ -5,7 +5,6 @@
 Answers each line, the seconds to measure for. It has the thread count that was fastest at the start.
 """
 
-import json
 import os
 import sys
 import time
@@ -14,6 +13,7 @@ import gymnasium as gym
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
+from turns import take_turns
 
 TRIAL_SECONDS = 2.0
 
@@ -47,9 +47,7 @@ class Collector:
 def main() -> None:
     collector = Collector(sys.argv[1], int(sys.argv[2]))
     torch.set_num_threads(max(range(1, (os.cpu_count() or 1) + 1), key=collector.with_threads))
-    print(json.dumps({"ready": True}), flush=True)
-    for line in sys.stdin:
-        print(json.dumps({"value": collector.speed(float(line))}), flush=True)
+    take_turns(collector.speed)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 python sbx_end_to_end.py ENV SEED EVERY EPISODES STEPS THREADS
 """
 
-import json
 import os
 import sys
 
@@ -12,31 +11,16 @@ if THREADS == 1:  # before JAX is imported
     os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 import gymnasium as gym  # noqa: E402
+from evaluation import Evaluation  # noqa: E402
 from sbx import SAC  # noqa: E402
-from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
-from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
 
 ENDLESS = 10_000_000
 LEARNING_STARTS = 10_000  # rl-zoo's for MuJoCo
 
 
-class Evaluation(BaseCallback):
-    """Plays deterministic episodes now and then."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._env = gym.make(ENV_ID)
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps % EVERY == 0:
-            mean, _ = evaluate_policy(self.model, self._env, EPISODES, deterministic=True, warn=False)
-            print(json.dumps({"steps": self.num_timesteps, "return": float(mean)}), flush=True)
-        return True
-
-
 def main() -> None:
     pace = {"train_freq": STEPS, "gradient_steps": STEPS, "learning_starts": LEARNING_STARTS}
-    SAC("MlpPolicy", gym.make(ENV_ID), seed=SEED, **pace).learn(ENDLESS, Evaluation())
+    SAC("MlpPolicy", gym.make(ENV_ID), seed=SEED, **pace).learn(ENDLESS, Evaluation(ENV_ID, EVERY, EPISODES))
 
 
 if __name__ == "__main__":
