@@ -7,9 +7,9 @@ CRC, and so have any n of them side by side: one pass over a batch tells whether
 from functools import cache
 
 import numpy as np
+from isal.isal_zlib import crc32  # 7 times as fast as zlib's, more within the caches
 from numpy.typing import NDArray
 
-from rmc.common.checksum import crc32
 from rmc.common.window import CHECKSUM_BYTES, BoolArray, Rows
 
 

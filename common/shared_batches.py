@@ -12,9 +12,9 @@ import os
 from typing import Any
 
 import numpy as np
+from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
-from rmc.common.checksum import crc32
 from rmc.common.errors import MessageError
 from rmc.common.row_checksum import crc_of_whole
 from rmc.common.window import Rows, WindowSpec

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
+from isal.isal_zlib import crc32
 
-from rmc.common.checksum import crc32
 from rmc.common.errors import MessageError
 from rmc.common.window import Rows, WindowSpec
 

@@ -25,7 +25,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
-from rmc.common.checksum import crc32
+from isal.isal_zlib import crc32
+
 from rmc.common.errors import MessageError
 
 MAX_EPOCH_GAP = 1 << 16  # epochs that a role can take at most beyond the last one that is known of it

@@ -2,9 +2,10 @@
 
 from typing import Any
 
+from isal.isal_zlib import crc32
+
 from rmc.common.bus.protocol import Version, join_pieces, split_pieces
 from rmc.common.bus.redis_connection import RedisConnection
-from rmc.common.checksum import crc32
 from rmc.common.errors import BusUnavailable, FencedError, MessageError
 
 KINDS = ("weights", "evaluate")  # of policies: what acts, and what is evaluated

@@ -6,9 +6,9 @@ from contextlib import suppress
 from pathlib import Path
 
 import msgpack
+from isal.isal_zlib import crc32
 
 from rmc.common.bus.memory_bus import MemoryBus
-from rmc.common.checksum import crc32
 from rmc.common.errors import MessageError
 from rmc.common.wire import HEADER, MAGIC, VERSION, Kind
 from rmc.common.wire import proof as proof_of

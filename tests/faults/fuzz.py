@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 import msgpack
 import numpy as np
 import torch
+from isal.isal_zlib import crc32
 from safetensors.torch import save
 
 from rmc.actors.policy_runner import PolicyRunner
@@ -22,7 +23,6 @@ from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.metrics_record import decode_record, encode_record
 from rmc.common.bus.protocol import join_pieces
-from rmc.common.checksum import crc32
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError, MessageError
 from rmc.common.wire import HEADER, Kind, decode_header, decode_meta, encode_frame, encode_windows
