@@ -7,12 +7,12 @@ import re
 import secrets
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal
 
 from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.config import option
+from rmc.deploy.run.config import from_dict, option
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions, Tracker
 
@@ -84,23 +84,17 @@ def keep_tracking(folder: RunFolder, tracking: Tracking | None) -> None:
 
 def kept_tracking(path: Path) -> Tracking | None:
     """That of a run's folder, None where it has none. Raises ConfigError where the file is damaged."""
+    names, kept = {item.name for item in dataclasses.fields(Tracking)}, None
     try:
-        settings = read_object(_file(path))
+        settings = {"video_every": 0} | read_object(_file(path))  # a version before had none
+        kept = from_dict(Tracking, {name: value for name, value in settings.items() if name in names}, "")
     except (FileNotFoundError, NotADirectoryError):
         return None
     except ConfigError:
-        settings = {}
-    if not _is_whole(settings):
+        pass
+    if kept is None or kept.video_every < 0:
         raise ConfigError("tracking.json", str(_file(path)), "is damaged; remove it, and give --track again")
-    every = settings.get("video_every", 0)  # a version before had none
-    return Tracking(settings["tracker"], settings["project"], tuple(settings["tags"]), settings["id"], every)
-
-
-def _is_whole(settings: dict[str, Any]) -> bool:
-    tags, every = settings["tags"] if isinstance(settings.get("tags"), list) else [None], settings.get("video_every", 0)
-    texts = settings.get("project"), settings.get("id"), *tags
-    whole = isinstance(every, int) and every >= 0 and all(isinstance(text, str) for text in texts)
-    return whole and settings.get("tracker") in (*get_args(Tracker), VIDEOS)
+    return kept
 
 
 def _file(path: Path) -> Path:
