@@ -12,7 +12,7 @@ from rmc.analysis.history import About, History
 from rmc.analysis.vitals import Record
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import changes
+from rmc.deploy.run.config import changes, flat
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.state import run_state
@@ -41,7 +41,7 @@ class ReportRun:
         except ConfigError:
             folder.result()  # damaged, it is an error; a missing evaluation is none
             past = None
-        return ReportRun(folder, about, past, records, _flat(folder.settings()))
+        return ReportRun(folder, about, past, records, flat(folder.settings()))
 
     @property
     def name(self) -> str:
@@ -98,12 +98,3 @@ class ReportRun:
         return [
             max(0.0, wall - (began - at)) if at < began else float(one) for at, one in zip(times, seconds, strict=True)
         ]
-
-
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """``config.json`` by dotted path."""
-    options: dict[str, Any] = {}
-    for name, value in settings.items():
-        nested = isinstance(value, dict) and name != "env_kwargs"
-        options |= _flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
-    return options

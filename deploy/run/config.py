@@ -235,14 +235,11 @@ def _matches(kind: Any, value: Any) -> bool:
 
 
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:
-    """A config's values by dotted path."""
+    """The values of a config, or of what JSON holds of one, by dotted path."""
     values: dict[str, Any] = {}
-    for item in dataclasses.fields(config):
-        value = getattr(config, item.name)
-        if dataclasses.is_dataclass(value):
-            values |= flat(value, f"{prefix}{item.name}.")
-        else:
-            values[prefix + item.name] = value
+    for name, value in (config if isinstance(config, dict) else dataclasses.asdict(config)).items():
+        nested = isinstance(value, dict) and name != "env_kwargs"
+        values |= flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}
     return values
 
 
