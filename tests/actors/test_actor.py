@@ -41,10 +41,16 @@ def bus(request: pytest.FixtureRequest, redis_url: str, run_name: str) -> Bus:
     return MemoryBus() if request.param == "memory" else RedisBus(redis_url, run_name)
 
 
-def make_actor(bus: Bus, index: int = 0, seed: int = 1, config: ActorConfig = CONFIG) -> Actor:
+def make_actor(
+    bus: Bus,
+    index: int = 0,
+    seed: int = 1,
+    config: ActorConfig = CONFIG,
+    make: Callable[[], Any] = lambda: make_env(COUNTING),
+) -> Actor:
     """Its clock counts calls, so that no test waits for a timer."""
     clock: Callable[[], float] = itertools.count().__next__
-    return Actor(index, seed, lambda: make_env(COUNTING), SPEC, AGENT, config, bus, clock)
+    return Actor(index, seed, make, SPEC, AGENT, config, bus, clock)
 
 
 def publish(bus: Bus, update: int) -> bytes:
@@ -445,8 +451,7 @@ def test_a_redis_that_is_back_as_it_was_ends_no_life(bus: Bus) -> None:
 
 
 def make_broken(bus: Bus, env: str) -> Actor:
-    clock: Callable[[], float] = itertools.count().__next__
-    return Actor(0, 1, lambda: make_env(EnvConfig(f"tests.broken_env:{env}")), SPEC, AGENT, CONFIG, bus, clock)
+    return make_actor(bus, make=lambda: make_env(EnvConfig(f"tests.broken_env:{env}")))
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -474,8 +479,7 @@ def test_an_environment_that_always_breaks_early_is_learnt_from_up_to_there() ->
         bus = MemoryBus()
         publish(bus, 0)
         config = dataclasses.replace(CONFIG, state_strategy=strategy)  # type: ignore[arg-type]
-        clock: Callable[[], float] = itertools.count().__next__
-        actor = Actor(0, 1, lambda: make_env(EnvConfig("tests.broken_env:Early-v0")), SPEC, AGENT, config, bus, clock)
+        actor = make_actor(bus, config=config, make=lambda: make_env(EnvConfig("tests.broken_env:Early-v0")))
         reader = Reader(bus)
         play(bus, actor, reader, 300)
         rows = reader.rows()
@@ -493,7 +497,7 @@ def test_what_critics_are_not_asked_to_read_is_the_environments_own_affair() -> 
 
     bus = MemoryBus()
     publish(bus, 0)
-    actor = Actor(0, 1, lambda: Gives(make_env(COUNTING)), SPEC, AGENT, CONFIG, bus, itertools.count().__next__)
+    actor = make_actor(bus, make=lambda: Gives(make_env(COUNTING)))
     play(bus, actor, Reader(bus), 60)
     assert actor.metrics()["broken_episodes"] == 0
     actor.close()
@@ -525,9 +529,9 @@ gym.register("Scaling-v0", entry_point=Scaling)
 
 
 def test_a_window_holds_the_agents_own_actions() -> None:
-    bus, clock = MemoryBus(), itertools.count().__next__
+    bus = MemoryBus()
     publish(bus, 0)
-    actor = Actor(0, 1, lambda: make_env(EnvConfig("Scaling-v0")), SPEC, AGENT, CONFIG, bus, clock)
+    actor = make_actor(bus, make=lambda: make_env(EnvConfig("Scaling-v0")))
     reader = Reader(bus)
     play(bus, actor, reader, 500)
     rows = reader.rows()
@@ -543,8 +547,7 @@ def test_an_environment_that_always_breaks_at_once_ends_the_actor() -> None:
 
     bus = MemoryBus()
     publish(bus, 0)
-    clock: Callable[[], float] = itertools.count().__next__
-    actor = Actor(0, 1, lambda: Dead(make_env(COUNTING)), SPEC, AGENT, CONFIG, bus, clock)
+    actor = make_actor(bus, make=lambda: Dead(make_env(COUNTING)))
     with pytest.raises(RuntimeError, match="it is dead"):
         play(bus, actor, Reader(bus), 2000)
 
@@ -582,8 +585,7 @@ def test_an_environment_that_breaks_now_and_then_at_once_goes_on() -> None:
 
     bus = MemoryBus()
     publish(bus, 0)
-    clock: Callable[[], float] = itertools.count().__next__
-    actor = Actor(0, 1, lambda: BreaksAtTimes(make_env(COUNTING)), SPEC, AGENT, CONFIG, bus, clock)
+    actor = make_actor(bus, make=lambda: BreaksAtTimes(make_env(COUNTING)))
     play(bus, actor, Reader(bus), 2000)
     assert actor.metrics()["broken_episodes"] > 20
     actor.close()

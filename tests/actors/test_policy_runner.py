@@ -4,7 +4,7 @@ import pickle
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -37,6 +37,12 @@ def make_runner(agent: Agent, envs: int = ENVS, missing: int = 1) -> PolicyRunne
     runner = PolicyRunner(agent.obs_dim, agent.action_dim, agent.config, envs, missing)
     runner.load(save(agent.policy_weights()))
     return runner
+
+
+def first_step(runner: PolicyRunner) -> tuple[Any, ...]:
+    """What it is given when all environments begin."""
+    action, state = runner.start()
+    return np.ones((ENVS, OBS_DIM), np.float32), action, np.zeros((ENVS, 1), np.bool_), state, None
 
 
 @torch.no_grad()
@@ -161,13 +167,7 @@ def test_refused_weights_change_nothing(spoilt: str) -> None:
     config = AgentConfig(hidden=8, embedding=8, heads=(8, 8), normalize_observations=True)
     agent, others = make_agent(config), make_agent(config, seed=1).policy_weights()
     runner = make_runner(agent)
-    given = (
-        np.ones((ENVS, OBS_DIM), np.float32),
-        runner.start()[0],
-        np.zeros((ENVS, 1), np.bool_),
-        runner.start()[1],
-        None,
-    )
+    given = first_step(runner)
     before = runner.act(*given)[0]
     with pytest.raises(MessageError):
         runner.load(save(others | {spoilt: torch.zeros(3, 7)}))
@@ -182,13 +182,7 @@ def test_weights_that_are_not_finite_are_refused_by_name(name: str, value: float
     )  # fmt: skip
     agent = make_agent(config)
     runner = make_runner(agent)
-    given = (
-        np.ones((ENVS, OBS_DIM), np.float32),
-        runner.start()[0],
-        np.zeros((ENVS, 1), np.bool_),
-        runner.start()[1],
-        None,
-    )
+    given = first_step(runner)
     before = runner.act(*given)[0]
     weights = {key: tensor.clone() for key, tensor in agent.broadcast_weights().items()}
     name = next(key for key in weights if key.startswith(name))

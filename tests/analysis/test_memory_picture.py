@@ -23,8 +23,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
-from tests.analysis.test_policy import AGENTS
-from tests.analysis.test_world_model_picture import make_run
+from tests.analysis.test_policy import AGENTS, run_of
 from tests.memory_env import MemoryEnv
 
 PLAIN = AgentConfig(hidden=4, embedding=0, heads=(10, 9))
@@ -46,7 +45,7 @@ def built(gate: float) -> Agent:
 
 
 def played(config: RunConfig, agent: Agent, path: Path) -> tuple[list[Episode], list[HiddenPart]]:
-    with closing(Player(make_run(path, config), agent, config, "latest")) as player:
+    with closing(Player(run_of(path, config), agent, config, "latest")) as player:
         return player.several(), player.hidden_parts()
 
 
@@ -82,7 +81,7 @@ def test_differences_are_those_of_two_whole_passes(agent: str, tmp_path: Path) -
     """From the state before the change on, or over the whole episode: the same."""
     env = EnvConfig("Pendulum-v1", flicker=0.3, time_limit=30)
     config = RunConfig(env, preset="debug", seed=4, agent=AGENTS[agent])
-    folder = make_run(tmp_path / "run", config)
+    folder = run_of(tmp_path / "run", config)
     torch.manual_seed(0)
     network = Agent(3, 1, config.agent).eval()
     with closing(Player(folder, network, config, "latest")) as player:
@@ -248,7 +247,7 @@ gym.register("Told-v0", Told)
 def test_a_probe_that_is_no_dict_of_the_same_numbers_is_named(probe: Any, tmp_path: Path) -> None:
     env = EnvConfig("tests.analysis.test_memory_picture:Told-v0", env_kwargs={"probe": 1.0})
     config = dataclasses.replace(MEMORY, env=env)
-    folder = make_run(tmp_path / "run", config)
+    folder = run_of(tmp_path / "run", config)
     player = Player(folder, built(ASLEEP), config, "latest")
     player._env.unwrapped._probe = probe  # type: ignore[attr-defined]
     with closing(player), pytest.raises(ConfigError, match=r'its info\["probe"\] is .*; return a dict of the same'):
@@ -274,7 +273,7 @@ gym.register("Changing-v0", Changing, kwargs={"delay": 3})
 
 def test_a_probe_with_other_names_in_each_episode_is_named(tmp_path: Path) -> None:
     config = dataclasses.replace(MEMORY, env=EnvConfig("tests.analysis.test_memory_picture:Changing-v0"))
-    folder = make_run(tmp_path / "run", config)
+    folder = run_of(tmp_path / "run", config)
     with (
         closing(Player(folder, built(ASLEEP), config, "latest")) as player,
         pytest.raises(ConfigError, match=r"names \['object \d'\], then others; return the same names in every episode"),

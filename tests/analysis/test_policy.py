@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import io
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,9 +23,10 @@ from rmc.analysis.policy_file import read_policy
 from rmc.cli import main
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
-from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.checkpoint import STATE, CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
@@ -33,7 +35,7 @@ AGENTS = {
     "robust": AgentConfig(
         hidden=16, embedding=12, heads=(10, 9), head_input="hidden+observation", normalize_observations=True
     ),
-    "layer norm": AgentConfig(hidden=16, embedding=12, heads=(10, 9)),
+    "plain": AgentConfig(hidden=16, embedding=12, heads=(10, 9)),
     "observation beside": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="hidden+observation"),
     "without a memory": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="observation"),
     "filling blanks": AgentConfig(
@@ -56,9 +58,13 @@ def make_run(
     env_kwargs: dict[str, Any] | None = None,
     header: bool = True,
 ) -> RunFolder:
-    """A run's folder with one checkpoint of an agent that was never trained; without ``header`` as of RMC 0.1.0."""
+    """``run_of`` these and the preset debug."""
     env_config = EnvConfig(env, flicker=flicker, env_kwargs=env_kwargs or {})
-    config = dataclasses.replace(debug(env_config), agent=agent_config)
+    return run_of(path, dataclasses.replace(debug(env_config), agent=agent_config), header)
+
+
+def run_of(path: Path, config: RunConfig, header: bool = True) -> RunFolder:
+    """A run's folder with one checkpoint of an agent that was never trained; without ``header`` as of RMC 0.1.0."""
     folder, spec = open_run(config, path, "fail"), config.window_spec()
     folder.unlock()
     torch.manual_seed(0)
@@ -66,8 +72,9 @@ def make_run(
     agent.normalizer.freeze(torch.tensor(10), torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
     progress = {"updates": 7, "env_steps": 70}
     metadata = dataclasses.replace(config.policy_header(), **progress).metadata() if header else None
-    policy = save(agent.policy_weights(), metadata)
-    files = {"policy.safetensors": policy, "progress.json": json.dumps(progress).encode(), "learner.pt": b""}
+    policy, state = save(agent.policy_weights(), metadata), io.BytesIO()
+    torch.save({"agent": agent.state_dict()}, state)
+    files = {"policy.safetensors": policy, "progress.json": json.dumps(progress).encode(), STATE: state.getvalue()}
     CheckpointFolder(folder.checkpoints).save(7, files)
     return folder
 

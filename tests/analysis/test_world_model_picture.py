@@ -2,14 +2,12 @@
 
 import dataclasses
 import io
-import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save
 
 from rmc.analysis import episodes
 from rmc.analysis.episodes import Episode, Player
@@ -20,29 +18,12 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
-from tests.analysis.test_policy import AGENTS
+from tests.analysis.test_policy import AGENTS, run_of
 from tests.hostile import hostile_state
 
 
-def make_run(path: Path, config: RunConfig) -> RunFolder:
-    folder, spec = open_run(config, path, "fail"), config.window_spec()
-    folder.unlock()
-    torch.manual_seed(0)
-    agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
-    agent.normalizer.freeze(torch.tensor(10), torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
-    state = io.BytesIO()
-    torch.save({"agent": agent.state_dict()}, state)
-    files = {"policy.safetensors": save(agent.policy_weights()), "learner.pt": state.getvalue()}
-    CheckpointFolder(folder.checkpoints).save(
-        3, files | {"progress.json": json.dumps({"updates": 3, "env_steps": 30}).encode()}
-    )
-    return folder
-
-
-@pytest.fixture(params=["robust", "layer norm", "filling blanks"])
+@pytest.fixture(params=["robust", "plain", "filling blanks"])
 def config(request: pytest.FixtureRequest) -> RunConfig:
     run = debug(EnvConfig("Pendulum-v1", flicker=0.1, time_limit=40))
     return RunConfig(env=run.env, preset="debug", agent=AGENTS[request.param])
@@ -69,7 +50,7 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
 
 
 def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -> None:
-    folder = make_run(tmp_path / "run", config)
+    folder = run_of(tmp_path / "run", config)
     agent = load_agent(folder, config, "latest")
     episode = Player(folder, agent, config, "latest").play()
     insight = look(agent, episode)
@@ -89,7 +70,7 @@ def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -
 def test_the_command_writes_a_picture_and_says_it_in_numbers(
     config: RunConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = make_run(tmp_path / "run", config)
+    folder = run_of(tmp_path / "run", config)
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 0
     assert (tmp_path / "seen.png").read_bytes().startswith(b"\x89PNG")
     output = capsys.readouterr().out
@@ -110,7 +91,7 @@ def test_an_episode_that_never_ends_is_looked_at_for_a_while(
 ) -> None:
     monkeypatch.setattr(episodes, "LONGEST_EPISODE", 25)
     scaled = dataclasses.replace(config, actor=dataclasses.replace(config.actor, reward_scale=0.5))
-    folder = make_run(tmp_path / "run", scaled)
+    folder = run_of(tmp_path / "run", scaled)
     agent = load_agent(folder, scaled, "latest")
     short, plain = (Player(folder, agent, run, "latest").play() for run in (scaled, config))
     assert short.action.shape[1] == 25
@@ -126,7 +107,7 @@ def test_a_horizon_at_which_nothing_was_seen_has_no_share(config: RunConfig, tmp
 
 def test_a_model_without_grounding_has_nothing_to_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = RunConfig(env=EnvConfig("Pendulum-v1"), preset="debug", agent=AGENTS["paper"])
-    folder = make_run(tmp_path / "run", run)
+    folder = run_of(tmp_path / "run", run)
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 2
     assert "--grounding" in capsys.readouterr().err
 
@@ -134,16 +115,16 @@ def test_a_model_without_grounding_has_nothing_to_show(tmp_path: Path, capsys: p
 def test_a_checkpoint_never_executes_code(
     config: RunConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder, mark = make_run(tmp_path / "run", config), tmp_path / "owned"
+    folder, mark = run_of(tmp_path / "run", config), tmp_path / "owned"
     checkpoints = CheckpointFolder(folder.checkpoints)
-    checkpoints.save(4, {**checkpoints.load(3), "learner.pt": hostile_state(mark)})
+    checkpoints.save(8, {**checkpoints.load(7), "learner.pt": hostile_state(mark)})
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 2
     assert "--checkpoint='latest': its learner.pt is not this run's" in capsys.readouterr().err
     assert not mark.exists()
 
 
 def test_networks_of_an_impossible_size_are_not_made(config: RunConfig, tmp_path: Path) -> None:
-    folder = make_run(tmp_path / "run", config)
+    folder = run_of(tmp_path / "run", config)
     huge = dataclasses.replace(config, agent=dataclasses.replace(config.agent, hidden=10**9))
     with pytest.raises(ConfigError, match=r"--hidden=1000000000: take a number from 1"):
         load_agent(folder, huge, "latest")
@@ -151,9 +132,9 @@ def test_networks_of_an_impossible_size_are_not_made(config: RunConfig, tmp_path
 
 @pytest.mark.parametrize("state", [[], {}, {"agent": None}, {"agent": {}}], ids=str)
 def test_another_runs_state_is_said_to_be_so(config: RunConfig, tmp_path: Path, state: object) -> None:
-    folder, file = make_run(tmp_path / "run", config), io.BytesIO()
+    folder, file = run_of(tmp_path / "run", config), io.BytesIO()
     checkpoints = CheckpointFolder(folder.checkpoints)
     torch.save(state, file)
-    checkpoints.save(4, {**checkpoints.load(3), "learner.pt": file.getvalue()})
+    checkpoints.save(8, {**checkpoints.load(7), "learner.pt": file.getvalue()})
     with pytest.raises(ConfigError, match=r"its learner\.pt is not this run's"):
         load_agent(folder, config, "latest")

@@ -10,7 +10,7 @@ import pytest
 from rmc.common.env.config import EnvConfig
 from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.run.presets import debug
-from tests.analysis.test_world_model_picture import make_run
+from tests.analysis.test_policy import run_of
 from tests.command import rmc
 
 ENV = "tests.hanging_env:HangsAsTold-v0"
@@ -35,7 +35,7 @@ def test_check_env(place: str, call: str) -> None:
 
 @pytest.mark.parametrize("words", [("evaluate",), ("evaluate", "--json"), ("inspect",)])
 def test_what_plays_a_run_takes_the_runs(tmp_path: Path, words: tuple[str, ...]) -> None:
-    folder = make_run(tmp_path / "run", debug(EnvConfig(ENV, env_timeout=2.0)))
+    folder = run_of(tmp_path / "run", debug(EnvConfig(ENV, env_timeout=2.0)))
     check_ends([words[0], str(folder.path), *words[1:]], "step", "step", 2)
 
 

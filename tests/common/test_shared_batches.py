@@ -36,10 +36,16 @@ def test_batches_take_turns_and_are_seen_by_the_other_side(descriptor):
         assert (values == number).all()
 
 
-def test_a_torn_batch_and_a_wrong_turn_are_refused(descriptor):
+@pytest.fixture
+def sent(descriptor):
+    """A server that has put one batch, its learner, and what it is told."""
     server, learner = SharedBatches(descriptor, SPEC, BATCH), SharedBatches(descriptor, SPEC, BATCH)
     add_checksums(server.rows[0])
-    reply = server.put(np.ones(BATCH))
+    return server, learner, server.put(np.ones(BATCH))
+
+
+def test_a_torn_batch_and_a_wrong_turn_are_refused(sent):
+    server, learner, reply = sent
     server.rows[0]["reward"][3, 1] = 5.0
     with pytest.raises(MessageError, match="crc"):
         learner.take(reply)
@@ -48,11 +54,9 @@ def test_a_torn_batch_and_a_wrong_turn_are_refused(descriptor):
             learner.take({**reply, "turn": turn})
 
 
-def test_another_whole_batch_in_that_turn_is_refused(descriptor):
+def test_another_whole_batch_in_that_turn_is_refused(sent):
     """With equal weights: whole rows have all one CRC."""
-    server, learner = SharedBatches(descriptor, SPEC, BATCH), SharedBatches(descriptor, SPEC, BATCH)
-    add_checksums(server.rows[0])
-    reply = server.put(np.ones(BATCH))
+    server, learner, reply = sent
     server.rows[0]["serial"] = 7
     add_checksums(server.rows[0])
     with pytest.raises(MessageError, match="crc"):

@@ -2,8 +2,14 @@
 
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.presets import debug
 
 
 @pytest.fixture
@@ -13,3 +19,11 @@ def handlers() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    """A run's that nobody trains."""
+    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    run.unlock()
+    return run

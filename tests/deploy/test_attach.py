@@ -8,18 +8,17 @@ import re
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor import view
 from rmc.deploy.monitor.attach import launcher_pid, stop, watch
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.opening import open_run
-from rmc.deploy.run.presets import debug
 
 HOLDER = """
 import sys, time
@@ -33,19 +32,19 @@ folder.unlock(int(sys.argv[2]))
 """
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> RunFolder:
-    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
-    run.unlock()
-    return run
+@contextmanager
+def holder(folder: RunFolder, status: int) -> Iterator[subprocess.Popen[str]]:
+    """A process that has the run's lock, and ends with that status once it is sent a line."""
+    words = [sys.executable, "-c", HOLDER, str(folder.path), str(status)]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as owner:
+        assert owner.stdout is not None
+        owner.stdout.readline()
+        yield owner
 
 
 def test_a_trainer_is_known_until_it_ends(folder: RunFolder) -> None:
     assert (folder.trainer(), folder.ended()) == (None, None)
-    words = [sys.executable, "-c", HOLDER, str(folder.path), "130"]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as owner:
-        assert owner.stdout is not None
-        owner.stdout.readline()
+    with holder(folder, 130) as owner:
         assert folder.trainer() == owner.pid == launcher_pid(folder)
         with pytest.raises(ConfigError, match="this run is being trained; stop it first"):
             folder.lock()
@@ -56,10 +55,7 @@ def test_a_trainer_is_known_until_it_ends(folder: RunFolder) -> None:
 
 
 def test_a_trainer_that_was_killed_has_not_ended(folder: RunFolder) -> None:
-    words = [sys.executable, "-c", HOLDER, str(folder.path), "0"]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as owner:
-        assert owner.stdout is not None
-        owner.stdout.readline()
+    with holder(folder, 0) as owner:
         owner.kill()
     assert (folder.trainer(), folder.ended()) == (None, None)
     folder.lock()

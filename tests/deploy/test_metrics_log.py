@@ -4,27 +4,16 @@ import io
 import json
 import logging
 import os
-from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from rmc.common.env.config import EnvConfig
 from rmc.deploy.monitor import metrics_log
 from rmc.deploy.monitor.metrics_log import MetricsLog
 from rmc.deploy.monitor.output import unfailing
 from rmc.deploy.monitor.run_status import RunStatus
 from rmc.deploy.monitor.view import View
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.opening import open_run
-from rmc.deploy.run.presets import debug
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> RunFolder:
-    run = open_run(debug(EnvConfig("Pendulum-v1")), tmp_path / "run", "fail")
-    run.unlock()
-    return run
 
 
 def lines(folder: RunFolder) -> list[int]:

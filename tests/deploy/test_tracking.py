@@ -2,27 +2,16 @@
 
 import dataclasses
 import importlib.util
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import open_run
-from rmc.deploy.run.presets import debug
 from rmc.deploy.run.tracking import PROJECT, Tracking, choose_tracking, keep_tracking, kept_tracking
 
 NEGATIVE = '{"tracker": "wandb", "project": "x", "tags": [], "id": "y", "video_every": -1}'
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> RunFolder:
-    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
-    run.unlock()
-    return run
 
 
 def chosen(folder: RunFolder, **options: Any) -> Tracking | None:
