@@ -147,15 +147,15 @@ def play_episodes(
 
     Those in which the environment broke are left out. Raises EnvFault where none is left.
     """
-    match = Rollout(runner, make_env(), make_env, episodes, seed, seconds)
+    rollout = Rollout(runner, make_env(), make_env, episodes, seed, seconds)
     try:
-        while match.step():
-            watch(match)
+        while rollout.step():
+            watch(rollout)
     finally:
-        match.env.close()
-    if not match.returns:
-        raise EnvFault(f"the environment broke in each of {match.broken} episodes: {match.fault}")
-    return match
+        rollout.env.close()
+    if not rollout.returns:
+        raise EnvFault(f"the environment broke in each of {rollout.broken} episodes: {rollout.fault}")
+    return rollout
 
 
 class Evaluator:
@@ -188,21 +188,21 @@ class Evaluator:
         self._runner = PolicyRunner(observation[0], action[0], agent, 1, missing)
         self._version = Version(0, -1)  # the newest that was looked at: none yet
         self._refused_weights = 0
-        self._match: Rollout | None = None
+        self._rollout: Rollout | None = None
         self._next_look = float("-inf")
         self._records: deque[dict[str, Any]] = deque()
 
     def step(self) -> bool:
         """One step of the running evaluation, or a look for a new policy; False where there is none."""
-        if self._match is None:
-            self._match = self._begin()
-        if self._match is None:
+        if self._rollout is None:
+            self._rollout = self._begin()
+        if self._rollout is None:
             return False
-        going_on = self._match.step()
-        self._env = self._match.env
+        going_on = self._rollout.step()
+        self._env = self._rollout.env
         if not going_on:
-            self._records.append(_record(self._match, self._version))
-            self._match = None
+            self._records.append(_record(self._rollout, self._version))
+            self._rollout = None
         return True
 
     def _begin(self) -> Rollout | None:
@@ -246,18 +246,18 @@ class Evaluator:
         self._env.close()
 
 
-def evaluation_metrics(match: Rollout) -> dict[str, Any]:
+def evaluation_metrics(rollout: Rollout) -> dict[str, Any]:
     """What an evaluation is told by, in records and results."""
     return {
-        "eval_return_mean": float(np.mean(match.returns)),
-        "eval_return_std": float(np.std(match.returns)),
-        "eval_episodes": len(match.returns),
-        "eval_cut": int(match.cut),
+        "eval_return_mean": float(np.mean(rollout.returns)),
+        "eval_return_std": float(np.std(rollout.returns)),
+        "eval_episodes": len(rollout.returns),
+        "eval_cut": int(rollout.cut),
     }
 
 
-def _record(match: Rollout, version: Version) -> dict[str, Any]:
-    broken = {"eval_broken_episodes": match.broken}
-    if not match.returns:
+def _record(rollout: Rollout, version: Version) -> dict[str, Any]:
+    broken = {"eval_broken_episodes": rollout.broken}
+    if not rollout.returns:
         return broken
-    return broken | evaluation_metrics(match) | {"eval_steps": match.steps, "eval_update": version.update}
+    return broken | evaluation_metrics(rollout) | {"eval_steps": rollout.steps, "eval_update": version.update}

@@ -292,7 +292,7 @@ class _Run(BaseCallback):
     # -- evaluation and records -------------------------------------------------------------------------
 
     def _play(self, episodes: int, final: bool) -> dict[str, Any]:
-        opponent, seed = SB3Adapter(self._model, _scaled_by(self._vec)), first_start(self.config.seed, final)
+        adapter, seed = SB3Adapter(self._model, _scaled_by(self._vec)), first_start(self.config.seed, final)
         progress = EvaluationProgress(self._console, f"evaluation at step {self.steps:,}")
 
         def watch(rollout: Rollout) -> None:
@@ -302,7 +302,7 @@ class _Run(BaseCallback):
 
         seconds = EvaluatorConfig.evaluation_seconds
         return evaluation_metrics(
-            play_episodes(opponent, lambda: make_env(self.config.env), episodes, seed, seconds, watch)
+            play_episodes(adapter, lambda: make_env(self.config.env), episodes, seed, seconds, watch)
         )
 
     def _first_evaluation(self) -> float:
@@ -366,9 +366,9 @@ def evaluate(
         model = CLASSES[config.algorithm].load(states[-1] / MODEL, device="cpu")
         scaled = _kept_scaling(states[-1] / SCALES, env)
     seed = first_start(config.seed, final=True)
-    match = play_episodes(SB3Adapter(model, scaled), lambda: make_env(env), episodes, seed, seconds, watch)
+    rollout = play_episodes(SB3Adapter(model, scaled), lambda: make_env(env), episodes, seed, seconds, watch)
     about = {"env": env.id, "preset": config.name, "seed": config.seed, **progress}
-    return about | evaluation_metrics(match) | missing_shares(env)
+    return about | evaluation_metrics(rollout) | missing_shares(env)
 
 
 def _kept_scaling(scales: Path, env: EnvConfig) -> Callable[[Floats], Floats]:

@@ -32,11 +32,11 @@ class EvaluationProgress:
     def __init__(self, console: Console, what: str) -> None:
         self._console, self._what, self._due = console, what, time.monotonic() + SAY_SECONDS
 
-    def __call__(self, match: Rollout) -> None:
+    def __call__(self, rollout: Rollout) -> None:
         """After each step."""
         if time.monotonic() >= self._due:
             self._due = time.monotonic() + SAY_SECONDS
-            at = f"episode {match.episode + 1} of {match.episodes}, {match.steps:,} steps"
+            at = f"episode {rollout.episode + 1} of {rollout.episodes}, {rollout.steps:,} steps"
             self._console.print(f"{self._what}: {at}", soft_wrap=True)
 
 
@@ -57,8 +57,8 @@ def evaluate_blob(
     runner.load(blob)
     with _one_thread():
         seed = first_start(header.seed, final=True)
-        match = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
-    return evaluation_metrics(match) | missing_shares(env)
+        rollout = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
+    return evaluation_metrics(rollout) | missing_shares(env)
 
 
 def missing_shares(env: EnvConfig) -> dict[str, float]:

@@ -121,9 +121,9 @@ def run_role(
     full is waited out here; every other error ends the role.
     """
     clock = BusyClock()
-    pulse = Heartbeat(role, bus, clock)
+    heartbeat = Heartbeat(role, bus, clock)
     try:
-        while not (stop.requested or finished() or pulse.stop_requested()):
+        while not (stop.requested or finished() or heartbeat.stop_requested()):
             try:
                 if role.step():
                     clock.busy()
@@ -132,9 +132,9 @@ def run_role(
                     clock.wait(role.waiting_for())
             except (BusUnavailable, BusFull) as error:
                 time.sleep(RECONNECT_SLEEP)
-                pulse.outage.begin(error)
+                heartbeat.outage.begin(error)
                 clock.wait("redis")
     except BaseException:
         role.close()
         raise
-    pulse.close()
+    heartbeat.close()

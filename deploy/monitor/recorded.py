@@ -64,7 +64,7 @@ def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus
     preset = settings.get("preset") or f"{settings.get('algorithm')}-{settings.get('settings')}"
     seed, total = settings.get("seed"), settings.get("total_steps")
     ratio = _part(settings, "replay").get("replay_ratio", 0.0)
-    if not (isinstance(env, str) and _is_whole(seed) and _is_whole(total) and is_finite(ratio)):
+    if not (isinstance(env, str) and _is_int(seed) and _is_int(total) and is_finite(ratio)):
         fix = "config.json has no env, seed or total_steps; restore it, or take another run"
         raise ConfigError("RUN", str(folder.path), fix)
     status = RunStatus(env, str(preset), seed, total, ratio, expected)
@@ -73,7 +73,7 @@ def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus
     return status
 
 
-def _is_whole(value: Any) -> TypeGuard[int]:
+def _is_int(value: Any) -> TypeGuard[int]:
     return isinstance(value, int) and is_finite(value)
 
 

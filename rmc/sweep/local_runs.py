@@ -53,7 +53,7 @@ class RunProcess:
 
     def last_words(self) -> str:
         """The last line of its log."""
-        return last_line(self._log)
+        return last_log_line(self._log)
 
 
 def core_parts(count: int) -> list[set[int]]:
@@ -73,7 +73,7 @@ def spawn(words: list[str], log: Path) -> "subprocess.Popen[bytes]":
         )  # fmt: skip
 
 
-def last_line(log: Path) -> str:
+def last_log_line(log: Path) -> str:
     """Of what a run said."""
     lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
     return lines[-1] if lines else "no word"

@@ -9,7 +9,7 @@ import ray
 
 from rmc.common.errors import ConfigError, last_line
 from rmc.sweep.job import Job
-from rmc.sweep.local_runs import last_line as last_log_line
+from rmc.sweep.local_runs import last_log_line
 from rmc.sweep.node_run import NodeRun
 from rmc.sweep.parcel import Parcel, Stamps, pack, unpack
 
