@@ -11,13 +11,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
+import psutil
 
 from benchmarks import PEER_ENVIRONMENT
 from rmc.common.bus.redis_bus import RedisBus
@@ -171,7 +171,7 @@ class Peer:
     def __enter__(self) -> "Peer":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         os.killpg(self._process.pid, signal.SIGKILL)  # with the servers that it has started
         self._process.wait()
 
@@ -193,6 +193,16 @@ def on_cores(cores: set[int]) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
+@contextmanager
+def running(processes: Iterable[psutil.Process]) -> Iterator[None]:
+    """Processes that are stopped outside of their turns."""
+    for process in processes:
+        process.resume()
+    yield
+    for process in processes:
+        process.suspend()
+
+
 def random_rows(spec: WindowSpec, count: int) -> Rows:
     """Full windows of plausible numbers."""
     rng = np.random.default_rng(0)
@@ -204,10 +214,10 @@ def random_rows(spec: WindowSpec, count: int) -> Rows:
     return rows
 
 
-def _serve(url: str, folder: str, spec: WindowSpec, config: ReplayConfig, actors: int, core: int) -> None:
+def _serve(url: str, folder: str, spec: WindowSpec, config: ReplayConfig, core: int) -> None:
     os.sched_setaffinity(0, {core})
     bus = RedisBus(url, RUN)
-    server = ReplayServer(spec, config, Path(folder), 0, ENDLESS, actors, ENDLESS, bus)
+    server = ReplayServer(spec, config, Path(folder), 0, ENDLESS, 1, ENDLESS, bus)
     process = ReplayProcess(server, SocketServer(server, spec, f"unix:{folder}/replay.sock", SECRET, 1024))
     while bus.stop_requested() is None:
         end = time.monotonic() + 0.5
@@ -217,7 +227,7 @@ def _serve(url: str, folder: str, spec: WindowSpec, config: ReplayConfig, actors
 
 
 @contextmanager
-def replay_process(spec: WindowSpec, config: ReplayConfig, actors: int = 1) -> Iterator[RedisBus]:
+def replay_process(spec: WindowSpec, config: ReplayConfig) -> Iterator[RedisBus]:
     """A real Redis and a real replay server on the last core; this process on the first."""
     cores = sorted(os.sched_getaffinity(0))
     with tempfile.TemporaryDirectory() as folder, RedisServer(Path(folder)) as redis:
@@ -226,7 +236,7 @@ def replay_process(spec: WindowSpec, config: ReplayConfig, actors: int = 1) -> I
         with on_cores({cores[0]}):
             bus = RedisBus(redis.url(), RUN)
             server = multiprocessing.get_context("spawn").Process(
-                target=_serve, args=(redis.url(), folder, spec, config, actors, cores[-1])
+                target=_serve, args=(redis.url(), folder, spec, config, cores[-1])
             )
             server.start()
             while bus.replay_address("replay") is None:

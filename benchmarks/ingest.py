@@ -24,6 +24,7 @@ from benchmarks.harness import (
     peer_python,
     random_rows,
     replay_process,
+    running,
     save,
     speed,
 )
@@ -51,20 +52,16 @@ def ours(spec: WindowSpec, windows: int, seconds: float) -> Iterator[Measure]:
             return CHUNK
 
         def measure() -> float:
-            for process in processes:
-                process.resume()
-            speed(one, 0.5)
-            sender.wait()
-            first, start = sender.seq, time.perf_counter()
-            speed(one, seconds)
-            sender.wait()
-            rate = (sender.seq - first) * CHUNK / (time.perf_counter() - start)
-            for process in processes:
-                process.suspend()
-            return rate
+            with running(processes):
+                speed(one, 0.5)
+                sender.wait()
+                first, start = sender.seq, time.perf_counter()
+                speed(one, seconds)
+                sender.wait()
+                return (sender.seq - first) * CHUNK / (time.perf_counter() - start)
 
         yield measure
-        for process in processes:
+        for process in processes:  # a stopped one cannot end
             process.resume()
 
 

@@ -28,6 +28,7 @@ from benchmarks.harness import (
     peer_python,
     random_rows,
     replay_process,
+    running,
     save,
     speed,
 )
@@ -110,20 +111,17 @@ def ours(spec: WindowSpec, windows: int, seconds: float) -> Iterator[Measure]:
         learner, processes = Learner(bus, spec), psutil.Process().children(recursive=True)
 
         def measure() -> float:
-            for process in processes:
-                process.resume()
-            orders.send(seconds + 2 * SETTLE)
-            speed(learner.step, SETTLE)
-            before, start = learner.env_steps, time.perf_counter()
-            rate = speed(learner.step, seconds)
-            committed = (learner.env_steps - before) / spec.train / (time.perf_counter() - start)
-            assert min(orders.recv(), committed) > KEPT_UP * RATE, committed
-            for process in processes:
-                process.suspend()
-            return rate
+            with running(processes):
+                orders.send(seconds + 2 * SETTLE)
+                speed(learner.step, SETTLE)
+                before, start = learner.env_steps, time.perf_counter()
+                rate = speed(learner.step, seconds)
+                committed = (learner.env_steps - before) / spec.train / (time.perf_counter() - start)
+                assert min(orders.recv(), committed) > KEPT_UP * RATE, committed
+                return rate
 
         yield measure
-        for process in processes:
+        for process in processes:  # a stopped one cannot end
             process.resume()
         learner.client.close()
         sender.kill()

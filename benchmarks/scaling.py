@@ -25,7 +25,6 @@ from benchmarks.harness import ENDLESS, RUN, random_rows
 from rmc.common.bus.protocol import EntryId
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.make import env_layout
 from rmc.common.shard import Shard
 from rmc.common.window import WindowSpec
 from rmc.common.wire import encode_hello, encode_windows
@@ -175,9 +174,7 @@ def main() -> None:
     parser.add_argument("--first-rate", type=float, default=2000.0)
     parser.add_argument("--alone", choices=["redis", "replay"], default="", help="what has the first core for itself")
     options = parser.parse_args()
-    layout = env_layout(EnvConfig(options.env))
-    obs_dim, action_dim = layout.obs_dim, layout.action_dim
-    spec = WindowSpec(obs_dim, action_dim, robust(EnvConfig(options.env)).agent.state_size(obs_dim))
+    spec = robust(EnvConfig(options.env)).window_spec()
     path = Path(__file__).parent / "results" / "scaling.jsonl"
     for shards in options.shards:
         rate, kept_up = options.first_rate, True

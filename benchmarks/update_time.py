@@ -69,16 +69,8 @@ def updates_per_s(run: Path, began: float) -> float:
 
 def _spy(pid: int, out: Path, seconds: float) -> subprocess.Popen[bytes]:
     words = [str(Path(sys.executable).with_name("py-spy")), "record", "--pid", str(pid), "--rate", str(RATE)]
-    words += [
-        "--nonblocking",
-        "--duration",
-        str(round(seconds)),
-        "--format",
-        "raw",
-        "--full-filenames",
-        "--output",
-        str(out),
-    ]
+    words += ["--nonblocking", "--duration", str(round(seconds))]
+    words += ["--format", "raw", "--full-filenames", "--output", str(out)]
     return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
