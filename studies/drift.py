@@ -17,8 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rmc.analysis.world_model_picture import load_agent
 from rmc.common.agent import Agent
-from rmc.common.checkpoint import STATE, CheckpointFolder
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.critic import critic_input
 from rmc.common.window import Rows
 from rmc.deploy.run.config import RunConfig
@@ -69,30 +70,29 @@ def windows_of(folder: Path, config: RunConfig, count: int) -> Rows:
 
 
 @torch.no_grad()
-def seen_by(checkpoint: Path, config: RunConfig, batch: Batch) -> Seen:
+def seen_by(folder: RunFolder, number: int, config: RunConfig, batch: Batch) -> Seen:
     """A checkpoint's."""
-    spec = config.window_spec()
-    agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
-    agent.load_state_dict(torch.load(checkpoint / STATE, weights_only=True)["agent"])
+    agent = load_agent(folder, config, str(number))
     o, remembered = impute_and_unroll(agent, agent.normalizer(batch.observation, batch.missing), batch)
-    parts = remembered.hidden, agent.features(remembered), o[:, spec.burn_in :]
+    parts = remembered.hidden, agent.features(remembered), o[:, config.window_spec().burn_in :]
     return Seen(agent, *(part[:, :-1].flatten(0, 1) for part in parts))
 
 
 @torch.no_grad()
 def report(run: Path, count: int) -> None:
     """Print a run's lines."""
-    config, checkpoints = RunFolder(run).config(), CheckpointFolder(run / "checkpoints")
+    folder = RunFolder(run)
+    config = folder.config()
     rows = windows_of(run, config, count)
     raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
     batch = view_batch(raw, torch.ones(len(rows)), config.window_spec())
-    *before, number = checkpoints.numbers()
-    now = seen_by(checkpoints.path(number), config, batch)
+    *before, number = CheckpointFolder(folder.checkpoints).numbers()
+    now = seen_by(folder, number, config, batch)
     probe = sorted(held_out_r2(now.hidden, now.observation).tolist())
     print(f"{run.name}, {len(rows)} windows, update {number:,}")
     print(f"  o: median {probe[len(probe) // 2]:.2f}, worst dimensions " + ", ".join(f"{x:.2f}" for x in probe[:5]))
     for earlier in before:
-        then = seen_by(checkpoints.path(earlier), config, batch)
+        then = seen_by(folder, earlier, config, batch)
         print(f"  {number - earlier:,} updates before: {_compared(now, then, batch)}")
 
 

@@ -10,14 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rmc.analysis.baselines import evaluate
-from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.history import objects
 from rmc.analysis.out_file import PICTURES, check_writable
-from rmc.analysis.policy_file import read_policy
+from rmc.analysis.run_evaluation import evaluate_run
 from rmc.analysis.statistics import ENOUGH_SEEDS, interquartile_mean, interval
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.folder import RunFolder
 from rmc.sweep.job import Job
 from studies.study import Play, Scale, Study, before
 
@@ -43,15 +40,9 @@ STUDY = Study(
 
 def play(job: Job, episodes: int = EPISODES) -> dict[str, object]:
     """A line: returns of a run's last checkpoint under each probability."""
-    folder, returns = RunFolder(job.folder), []
-    for probability in PROBABILITIES:
-        if folder.is_baseline():
-            played = evaluate(folder, episodes, probability)
-        else:
-            played = evaluate_policy(read_policy(folder.path), episodes, probability)
-        returns.append(played["eval_return_mean"])
-    about = {**job.values, "seed": job.seed, "env_steps": played["env_steps"]}
-    return about | {"flicker": PROBABILITIES, "returns": returns}
+    played = [evaluate_run(job.folder, episodes, flicker=probability) for probability in PROBABILITIES]
+    about = {**job.values, "seed": job.seed, "env_steps": played[-1]["env_steps"]}
+    return about | {"flicker": PROBABILITIES, "returns": [one["eval_return_mean"] for one in played]}
 
 
 def area(returns: list[float]) -> float:
