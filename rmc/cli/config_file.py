@@ -15,7 +15,6 @@ RENAMED = {
     "fill-blanks": "impute-missing",
     "blank-flag": "missing-flag",
     "policy-average": "policy-ema-updates",
-    "track-video-every": "video-every",
 }  # for one more version
 OPTION, KWARGS = "--config", "--env-kwargs"
 

@@ -17,25 +17,20 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 
 
-class RoleSecrets:
-    """What the environment told this process alone: taken out of it, before anything is started that would inherit."""
-
-    def __init__(self) -> None:
-        self.redis_url, self.secret = (os.environ.pop(name, "") for name in (URL_VARIABLE, SECRET_VARIABLE))
-
-
 def run_role(command: Role) -> int:
     """Be one role of a run until it ends; its exit status."""
-    role, secrets = command.role, RoleSecrets()
+    # told to this process alone: taken out of the environment, before anything is started that would inherit it
+    given_url, secret = (os.environ.pop(name, "") for name in (URL_VARIABLE, SECRET_VARIABLE))
+    role = command.role
     if isinstance(role, LauncherRole):
         return launch(role)
     warn_of_password(role.redis_url)
-    url = role.redis_url or secrets.redis_url
+    url = role.redis_url or given_url
     if not url:
         raise ConfigError("--redis-url", url, f"say where the run's Redis is, or set {URL_VARIABLE}")
     if isinstance(role, ActorRole | EvaluatorRole):
         return _play(role, RunConnection(role.run, url))
-    place = RunConnection(role.run, url, secrets.secret, role.secret_file, role.tls_folder)
+    place = RunConnection(role.run, url, secret, role.secret_file, role.tls_folder)
     if isinstance(role, ReplayRole):
         from rmc.deploy.local import replay_process
 

@@ -10,7 +10,6 @@ from rich.console import Console
 
 from rmc.cli.ending import format_evaluation, print_result, print_stopped
 from rmc.cli.signals import signals_caught, signals_interrupt
-from rmc.common.bus.protocol import Bus
 from rmc.common.checkpoint import POLICY, CheckpointFolder
 from rmc.common.errors import ConfigError, RmcError
 from rmc.common.process.role import StopSignal
@@ -158,11 +157,8 @@ def _launch(config: RunConfig, folder: RunFolder, options: LaunchOptions, monito
 
     from rmc.deploy.local import lockstep
 
-    def watch(bus: Bus) -> None:
-        monitor.watch(bus)
-
     torch.set_num_threads(config.learner.threads or 1)  # the bits may depend on it, so it must not on the machine
-    lockstep.train(config, folder.path, watch, stop, options.device)
+    lockstep.train(config, folder.path, monitor.watch, stop, options.device)
     return not stop.requested
 
 
