@@ -6,9 +6,9 @@ The zoo's numbers are those of hyperparams/*.yml at its commit 00128b5, for MuJo
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from rmc.common.env.config import EnvConfig
+from rmc.common.env.config import EnvConfig, check_range
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import from_dict
+from rmc.deploy.run.config import from_dict, option
 from rmc.deploy.run.folder import RunFolder
 
 Algorithm = Literal["sac", "crossq", "td3", "ddpg", "ppo", "recurrent-ppo"]
@@ -81,11 +81,8 @@ def read(folder: RunFolder) -> BaselineConfig:
 def validate(config: BaselineConfig) -> None:
     """Raises ConfigError for the first number that makes no sense."""
     ranges = {"seed": (0, 2**32 - 1), "total_steps": (1, 2**53), "checkpoint_steps": (1, 2**53)}
-    for name, (low, high) in (ranges | {"episodes": (1, 10_000), "threads": (1, 1024)}).items():
-        value = getattr(config, name)
-        if not low <= value <= high:
-            fix = f"take a number from {low:,} to {high:,}".replace(",", "_")
-            raise ConfigError(f"--{name.replace('_', '-')}", value, fix)
+    for name, limits in (ranges | {"episodes": (1, 10_000), "threads": (1, 1024)}).items():
+        check_range(option(name), getattr(config, name), limits)
 
 
 @dataclass(frozen=True)

@@ -143,15 +143,11 @@ def describe(path: Path) -> About:
     folder = RunFolder(path)
     if folder.is_baseline():
         baseline = baseline_settings.read(folder)
-        return About(_with(baseline.name, _stack(baseline.env)), _env_label(baseline.env), baseline.seed)
+        return About(" ".join([baseline.name, *_stack(baseline.env)]), _env_label(baseline.env), baseline.seed)
     config = folder.config()
     name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
-    agent = _with(name, [*_changes(config), *_stack(config.env)])
+    agent = " ".join([name, *_changes(config), *_stack(config.env)])
     return About(agent, _env_label(config.env), config.seed)
-
-
-def _with(name: str, words: list[str]) -> str:
-    return " ".join([name, *words])
 
 
 def _changes(config: RunConfig) -> list[str]:

@@ -45,7 +45,7 @@ def rollouts(run: ReportRun) -> Medium:
         return Medium(run.name, note="A baseline has no world model.")
     picture = io.BytesIO()
     try:
-        insight = world_model_picture.inspect_to(run.folder, "latest", picture)
+        insight = world_model_picture.inspect_to(run.folder, picture)
     except RmcError as error:
         return Medium(run.name, note=f"No world-model rollouts: {_why(error)}.")
     ahead = ", ".join(f"{share:.0%} at {horizon}" for horizon, share in insight.open_loop.items())

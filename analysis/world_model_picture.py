@@ -135,10 +135,10 @@ def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, Remembered,
     return insight, memory, value_bias(agent, episodes, config.update.gamma)
 
 
-def inspect_to(folder: RunFolder, checkpoint: str, out: BinaryIO) -> Insight:
-    """Play, look, and write the picture of one episode as PNG to what is like a file. Raises ConfigError."""
-    config, agent = _grounded(folder, checkpoint)
-    with closing(Player(folder, agent, config, checkpoint)) as player:
+def inspect_to(folder: RunFolder, out: BinaryIO) -> Insight:
+    """Play the latest, look, and write the picture of one episode as PNG to what is like a file. Raises ConfigError."""
+    config, agent = _grounded(folder, "latest")
+    with closing(Player(folder, agent, config, "latest")) as player:
         insight = look(agent, player.play(), config.update.model_norm)
     draw(insight, _title(config), out)
     return insight

@@ -225,7 +225,9 @@ class SocketServer:
         if type(drawn_elsewhere_steps) is not int or not 0 <= drawn_elsewhere_steps < 2**62:
             raise MessageError("elsewhere", f"{drawn_elsewhere_steps!r}, want a number of steps")
         shared = connection.shared
-        if shared is None or shared.batch_size != batch_size:
+        if shared is not None and shared.batch_size != batch_size:
+            shared = None
+        if shared is None:
             for other in self._connections:
                 other.copy_pending()  # the draw takes a buffer that another client's batch may still lie in
             sample = self._server.sample(batch_size, drawn_elsewhere_steps)
@@ -234,7 +236,7 @@ class SocketServer:
         meta = {name: getattr(sample, name) for name in ("total_weight", "env_steps", "drawn_steps")}
         if sample.rows is None or sample.weights is None:
             connection.send(Kind.FINISHED if sample.status is SampleStatus.FINISHED else Kind.WAIT, meta)
-        elif shared is None or shared.batch_size != batch_size:
+        elif shared is None:
             connection.send(Kind.BATCH, meta, (sample.rows.view(np.uint8).data, sample.weights.data.cast("B")))
         else:
             connection.send(Kind.SHARED, meta | shared.put(sample.weights))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rmc.common.bus.protocol import MAX_EPOCH_GAP, Bus, Entry, EntryId, actor_role
 from rmc.common.errors import BusFull, MessageError
-from rmc.common.shard import WHOLE, Shard
+from rmc.common.shard import Shard
 from rmc.common.window import Rows, WindowSpec, joined
 from rmc.common.wire import decode_rows, max_entry_bytes
 from rmc.replay_server.commit_record import StreamPosition
@@ -36,7 +36,7 @@ class IngestBatch:
 class StreamReader:
     """Reads every actor's stream past where the ring is. Refused entries go to the dead letters, counted."""
 
-    def __init__(self, spec: WindowSpec, bus: Bus, actors: int, shard: Shard = WHOLE) -> None:
+    def __init__(self, spec: WindowSpec, bus: Bus, actors: int, shard: Shard) -> None:
         self.spec, self.bus, self._shard = spec, bus, shard
         self.refused: Counter[str] = Counter()  # dead letters by reason
         self.gaps = 0  # entries whose number does not follow their predecessor's

@@ -13,7 +13,6 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.process.role import run_role
 from rmc.common.replay import Replay
-from rmc.common.shard import Shard
 from rmc.deploy.local.role_process import Process, RunConnection, until_taken
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
@@ -70,7 +69,6 @@ def replay_clients(
 
         return address
 
-    count = config.replay.replay_shards
-    part = max(1, config.learner.batch_size // count)
-    roles = [Shard(index, count).role for index in range(count)]
-    return [ReplayClient(address_of(role), secret, config.window_spec(), part, pinned, context) for role in roles]
+    spec, part = config.window_spec(), max(1, config.learner.batch_size // config.replay.replay_shards)
+    addresses = [address_of(shard.role) for shard in config.shards()]
+    return [ReplayClient(address, secret, spec, part, pinned, context) for address in addresses]

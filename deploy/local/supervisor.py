@@ -172,7 +172,7 @@ class Supervisor:
         commands: list[RoleCommand],
         environment: Callable[[str], dict[str, str]],
         logs: Path,
-        patience: Callable[[str], float] = lambda _: 0.0,
+        patience: Callable[[str], float],
     ) -> None:
         """``environment`` is of each role by its name, beside this process's own.
 

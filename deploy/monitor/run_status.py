@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from statistics import mean
 from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite, is_whole
@@ -187,11 +186,6 @@ class RunStatus:
     def broken_episodes(self) -> int:
         """How many the environment's own faults have ended."""
         return sum(record.get("broken_episodes", 0) for record in self._of_this_start().values())
-
-    @property
-    def policy_lag(self) -> float | None:
-        """Weight versions between what acts and the newest, at insertion."""
-        return self.replay("policy_lag_mean", mean)
 
 
 def _number(value: Any) -> float:

@@ -112,7 +112,7 @@ def _details(status: RunStatus) -> list[Fact]:
         ("latent rank", f"{number(learner.get('latent_rank'), '.1f')}, "
                         f"{number(learner.get('model_unexplained'), '.0%')} of its change unexplained"),
         ("staleness", _staleness(learner)),
-        ("policy lag", f"{number(status.policy_lag, ',.1f')} updates"),
+        ("policy lag", f"{number(status.replay('policy_lag_mean', mean), ',.1f')} updates"),
     ]  # fmt: skip
     return [(name, text) for name, text in facts if re.search(r"\d|inf|nan", text)]
 

@@ -33,6 +33,6 @@ class TrackioRun:
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Log the end, and return when all has arrived."""
-        numbers = {name: value for name, value in summary.items() if isinstance(value, int | float)}
-        self._run.log({f"result/{name}": value for name, value in numbers.items()}, step=summary["env_steps"])
+        numbers = {f"result/{name}": value for name, value in summary.items() if isinstance(value, int | float)}
+        self._run.log(numbers, step=summary["env_steps"])
         self._run.finish()  # type: ignore[no-untyped-call]

@@ -133,13 +133,6 @@ def _ssh(config: dict[str, Any], address: str, command: str) -> str:
     auth = config.get("auth", {})
     key = ["-i", str(Path(auth["ssh_private_key"]).expanduser())] if "ssh_private_key" in auth else []
     options = ["-o", "BatchMode=yes", "-o", "StrictHostKeyChecking=no", "-o", "UserKnownHostsFile=/dev/null"]
-    words = [
-        "ssh",
-        "-q",
-        *key,
-        *options,
-        "-o",
-        "ConnectTimeout=10",
-        f"{auth.get('ssh_user', os.environ.get('USER', ''))}@{address}",
-    ]
-    return subprocess.run([*words, command], stdin=subprocess.DEVNULL, capture_output=True, text=True).stdout
+    login = f"{auth.get('ssh_user', os.environ.get('USER', ''))}@{address}"
+    words = ["ssh", "-q", *key, *options, "-o", "ConnectTimeout=10", login, command]
+    return subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, text=True).stdout

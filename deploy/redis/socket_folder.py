@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rmc.common.errors import ConfigError, RoleDied
+from rmc.common.process.file_lock import try_lock
 from rmc.deploy.redis.server import SOCKET_PATH_LIMIT
 
 PREFIX = "rmc-sockets-"
@@ -99,11 +100,8 @@ def _locked(folder: Path) -> int | None:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     except FileNotFoundError:
         return None
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if os.path.samestat(os.fstat(handle), folder.lstat()):
+    with suppress(FileNotFoundError):
+        if try_lock(handle, fcntl.LOCK_EX) and os.path.samestat(os.fstat(handle), folder.lstat()):
             return handle
-    except (BlockingIOError, FileNotFoundError):
-        pass
     os.close(handle)
     return None
