@@ -1,5 +1,7 @@
 """A policy's model card: what the hub shows of it."""
 
+from typing import Any
+
 from rmc.common.policy_header import PolicyHeader
 
 TEXT = """---
@@ -31,37 +33,40 @@ The file's header has the observation's layout, the action's bounds and all opti
 
 def card(header: PolicyHeader, repo: str, license_id: str | None) -> str:
     """Its text, with the data that the hub reads in front; the license is left to whoever pushes."""
-    from huggingface_hub import EvalResult, ModelCardData  # an extra
+    from huggingface_hub import ModelCardData  # an extra
 
-    results, judged = None, "not evaluated"
-    if header.eval_return_mean is not None and header.eval_return_std is not None:
-        mean, deviation = header.eval_return_mean, header.eval_return_std
-        judged = f"{mean:,.1f} ± {deviation:,.1f} over {header.eval_episodes} episodes"
-        results = [
-            EvalResult(
-                task_type="reinforcement-learning",
-                dataset_type=header.env.id,
-                dataset_name=header.env.id,
-                metric_type="mean_reward",
-                metric_value=f"{mean:.2f} +/- {deviation:.2f}",
-            )
-        ]
     data = ModelCardData(
         license=license_id,
         library_name="rmc",
         pipeline_tag="reinforcement-learning",
         tags=["reinforcement-learning", "rmc", header.env.id],
         model_name=repo.rpartition("/")[2],
-        eval_results=results,
+        eval_results=_results(header),
     )
     return TEXT.format(
         data=data.to_yaml(),
         env=header.env.id,
         preset=header.preset,
         seed=header.seed,
-        judged=judged,
+        judged=header.returns() or "not evaluated",
         steps=header.env_steps,
         sizes=", ".join(map(str, header.sizes().values())),
         rmc=header.rmc,
         repo=repo,
     )
+
+
+def _results(header: PolicyHeader) -> list[Any] | None:
+    """Its evaluation as the hub reads it, None where there was none."""
+    from huggingface_hub import EvalResult  # an extra
+
+    if not header.returns():
+        return None
+    result = EvalResult(
+        task_type="reinforcement-learning",
+        dataset_type=header.env.id,
+        dataset_name=header.env.id,
+        metric_type="mean_reward",
+        metric_value=f"{header.eval_return_mean:.2f} +/- {header.eval_return_std:.2f}",
+    )
+    return [result]

@@ -74,37 +74,28 @@ def compare(
     less_is_better: bool = False,
 ) -> list[Row]:
     """Ours, each peer and the ceiling in turn, so many rounds; a row a peer. A peer that is None is not installed."""
-    columns: dict[str, Measure | None] = {"ours": ours, **peers}
-    if limit is not None:
-        columns["limit"] = limit[1]
+    limit_is, measure_limit = limit or ("", None)
+    values = _turns({"ours": ours, **peers, "limit": measure_limit}, rounds)
+    rows = []
+    for peer in peers or {"": None}:
+        times = {"ours": values["ours"], "peer": values.get(peer, []), "limit": values["limit"]}
+        own, its, most = (statistics.median(samples) if samples else None for samples in times.values())
+        assert own is not None
+        ratios = [b / a if less_is_better else a / b for a, b in zip(times["ours"], times["peer"], strict=False)]
+        ratio = statistics.median(ratios) if ratios else None
+        spread = {key: (min(samples), max(samples)) for key, samples in times.items() if samples}
+        rows.append(Row(name, unit, own, peer, its, ratio, most, limit_is, spread, rounds, command()))
+    return rows
+
+
+def _turns(columns: dict[str, Measure | None], rounds: int) -> dict[str, list[float]]:
+    """What each measured, once a round; nothing of one that is None."""
     values: dict[str, list[float]] = {key: [] for key in columns}
     for _ in range(rounds):
         for key, measure in columns.items():
             if measure is not None:
                 values[key].append(measure())
-    rows = []
-    for peer in peers or {"": None}:
-        pairs = list(zip(values["ours"], values.get(peer, []), strict=False))
-        ratios = [b / a if less_is_better else a / b for a, b in pairs]
-        times = {"ours": values["ours"], "peer": values.get(peer, []), "limit": values.get("limit", [])}
-        medians = {key: statistics.median(samples) if samples else None for key, samples in times.items()}
-        assert medians["ours"] is not None
-        rows.append(
-            Row(
-                name,
-                unit,
-                medians["ours"],
-                peer,
-                medians["peer"],
-                statistics.median(ratios) if ratios else None,
-                medians["limit"],
-                limit[0] if limit else "",
-                {key: (min(samples), max(samples)) for key, samples in times.items() if samples},
-                rounds,
-                command(),
-            )
-        )
-    return rows
+    return values
 
 
 def command() -> str:

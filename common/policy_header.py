@@ -56,11 +56,15 @@ class PolicyHeader:
 
     def summary(self) -> str:
         """Where it comes from and how good it is, in a line."""
-        judged = "not evaluated"
-        if self.eval_return_mean is not None and self.eval_return_std is not None:
-            mean, deviation = self.eval_return_mean, self.eval_return_std
-            judged = f"return {mean:,.1f} ± {deviation:,.1f} over {self.eval_episodes} episodes"
+        returns = self.returns()
+        judged = f"return {returns}" if returns else "not evaluated"
         return f"{self.env.id} after {self.env_steps:,} environment steps, {judged}"
+
+    def returns(self) -> str:
+        """Its evaluation in words; empty where there was none."""
+        if self.eval_return_mean is None or self.eval_return_std is None:
+            return ""
+        return f"{self.eval_return_mean:,.1f} ± {self.eval_return_std:,.1f} over {self.eval_episodes} episodes"
 
     def metadata(self) -> dict[str, str]:
         """For a file's own metadata, which holds text."""

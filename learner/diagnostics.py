@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rmc.common.agent import Agent
+from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.critic import critic_input
 from rmc.common.window import BoolArray, Rows, WindowSpec
 from rmc.learner import losses
@@ -106,15 +106,9 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
     joined = (torch.from_numpy(x).to(device).unsqueeze(0) for x in _joined(episode, spec))
     observation, missing, privileged, action = joined
     stored = torch.from_numpy(episode["state"][-1:].copy()).to(device)
-    o, start = agent.normalizer(observation, missing), torch.zeros_like(stored)
-    prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
-    window = slice(-spec.steps - 1, -1)  # its steps; the bootstrap observation starts none
-    past = slice(None, -spec.steps - 1)
-    _, _, before = agent.unroll(o[:, past], missing[:, past], prev_action[:, past], start)
-    replayed, recomputed = (
-        agent.unroll(o[:, window], missing[:, window], prev_action[:, window], state)[0] for state in (stored, before)
-    )
-    beside = agent.normalized_privileged(privileged[:, window])
+    o = agent.normalizer(observation, missing)
+    before, recomputed, replayed = _unrolled(agent, spec.steps, (o, missing, action), stored)
+    beside = agent.normalized_privileged(privileged[:, -spec.steps - 1 : -1])
     q, q_replayed = (
         agent.critic(critic_input(agent.features(remembered), beside), action[:, -spec.steps :]).mean(0).squeeze(0)
         for remembered in (recomputed, replayed)
@@ -133,6 +127,23 @@ def staleness(agent: Agent, spec: WindowSpec, episode: Rows) -> dict[str, float]
             "stale_q_last_burned": gap[-1],
         }
     return {name: float(value) for name, value in metrics.items()}
+
+
+def _unrolled(
+    agent: Agent, steps: int, episode: tuple[Tensor, Tensor, Tensor], stored: Tensor
+) -> tuple[Tensor, MemoryOutput, MemoryOutput]:
+    """The state before the last window, recomputed (1, S), and the memory along it from that and from the stored one.
+
+    ``episode`` is o (1, n + 1, O), what is missing (1, n + 1, M), actions (1, n, A).
+    """
+    o, missing, action = episode
+    prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
+    past, window = slice(None, -steps - 1), slice(-steps - 1, -1)  # the bootstrap observation starts no step
+    _, _, before = agent.unroll(o[:, past], missing[:, past], prev_action[:, past], torch.zeros_like(stored))
+    recomputed, replayed = (
+        agent.unroll(o[:, window], missing[:, window], prev_action[:, window], state)[0] for state in (before, stored)
+    )
+    return before, recomputed, replayed
 
 
 def _distance(replayed: Tensor, recomputed: Tensor) -> Tensor:

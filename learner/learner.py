@@ -79,31 +79,40 @@ class Learner:
         self._published: Version | None = None  # last
         self._save_at, self._checkpoint_error = 0.0, ""
         self._slowest, self._save_seconds = 0.0, checkpoints.last_save()  # of an update, of the last save
-        torch.set_flush_denormal(True)  # into which Adam's moments of idle units decay: 13 % slower on a CPU
-        torch.manual_seed(seed)  # the networks' initial weights
-        self.agent = Agent(spec.obs_dim, spec.action_dim, agent, spec.missing, spec.privileged)
-        self.agent.start_gates(spec.steps)
-        self.agent.to(self.device)
-        bf16 = set_precision(config.precision, self.device)
-        self.update = make_update(self.agent, update, seed, bf16)
-        self._updated: DeviceUpdate | PipelinedUpdate = (
-            PipelinedUpdate(self.update, spec, config.batch_size)
-            if two_processes
-            else DeviceUpdate(self.update, spec, config.batch_size)
-        )
+        self._make_networks(agent, update, seed, two_processes)
         self._threads, self._processes = ThreadTrial(threads, self._updated.use_threads), 1 + two_processes
         self._drawn: deque[Drawn] = deque()  # what is being learnt from
         self._metrics = LearnerMetrics(self.agent, spec, replay)
         self._returning: deque[tuple[NDArray[np.int64], HostCopy]] = deque()  # priorities, and of which windows
-        checkpoints.lock()
+        self._begin()
+
+    def _make_networks(self, agent: AgentConfig, update: UpdateConfig, seed: int, two_processes: bool) -> None:
+        """The agent on its device, and its update, which runs here or has a process for each half."""
+        torch.set_flush_denormal(True)  # into which Adam's moments of idle units decay: 13 % slower on a CPU
+        torch.manual_seed(seed)  # the networks' initial weights
+        spec = self.spec
+        self.agent = Agent(spec.obs_dim, spec.action_dim, agent, spec.missing, spec.privileged)
+        self.agent.start_gates(spec.steps)
+        self.agent.to(self.device)
+        bf16 = set_precision(self.config.precision, self.device)
+        self.update = make_update(self.agent, update, seed, bf16)
+        updated = PipelinedUpdate if two_processes else DeviceUpdate
+        self._updated: DeviceUpdate | PipelinedUpdate = updated(self.update, spec, self.config.batch_size)
+
+    def _begin(self) -> None:
+        """Lock the checkpoints, go on from the newest, and become the run's one learner, in an epoch of its own.
+
+        Raises ConfigError where another process has them locked, CheckpointError where none is valid.
+        """
+        self.checkpoints.lock()
         try:
-            floor = max(self._resume(), checkpoints.last_epoch())
-            self.epoch = bus.take_epoch(self.name, floor)
-            checkpoints.note_epoch(self.epoch)
-            replay.register_learner(self.epoch)
+            floor = max(self._resume(), self.checkpoints.last_epoch())
+            self.epoch = self.bus.take_epoch(self.name, floor)
+            self.checkpoints.note_epoch(self.epoch)
+            self.replay.register_learner(self.epoch)
             self.publish()
         except BaseException:
-            checkpoints.unlock()
+            self.checkpoints.unlock()
             raise
 
     def step(self) -> bool:

@@ -56,17 +56,11 @@ class ReplayServer:
         self._own_actors = [actor for actor in range(actors) if shard.owns(actor)]
         self._share = len(self._own_actors) / actors  # of all that is collected
         self._reader = StreamReader(spec, bus, actors, shard)
-        self._store = open_store(folder, spec, -(-config.capacity // shard.count), config.priority_exponent)
-        try:
-            epoch = self._take_over()
-            self._begin_epoch(epoch, config.replay_ratio, shard.part(config.warmup_steps, actors))
-        except BaseException:
-            self._store.close()
-            raise
-        self.owner = ReplayOwner(self.name, epoch)
+        warmup_steps = shard.part(config.warmup_steps, actors)
+        self.owner = ReplayOwner(self.name, self._open(folder, config, warmup_steps))
         self._limiter = RateLimiter(
             config.replay_ratio / self._share,  # a shard's steps are a share, what is drawn from all is the whole
-            shard.part(config.warmup_steps, actors),
+            warmup_steps,
             shard.part(total_steps, actors) - self._store.ring.progress.begun_env_steps,
             shard.part(slack_steps, actors),
         )
@@ -78,6 +72,18 @@ class ReplayServer:
         self._newest: Version | None = None  # of the weights, when last looked at
         self._look_at = 0.0
         self._means, self._rates = Means(), {name: Rate() for name in ("env_steps", "windows", "draws")}
+
+    def _open(self, folder: Path, config: ReplayConfig, warmup_steps: int) -> int:
+        """Open or recover the ring; the epoch that begins with it. Raises as the class does, the ring closed again."""
+        capacity = -(-config.capacity // self._shard.count)
+        self._store = open_store(folder, self.spec, capacity, config.priority_exponent)
+        try:
+            epoch = self._take_over()
+            self._begin_epoch(epoch, config.replay_ratio, warmup_steps)
+        except BaseException:
+            self._store.close()
+            raise
+        return epoch
 
     def _take_over(self) -> int:
         """Our epoch. What was published is read once we have it: the server before us commits nothing after that."""

@@ -76,19 +76,17 @@ def open_run(
     ``options`` say how it is started, for its history, and what a new one begins with.
     """
     options = options or LaunchOptions(run_dir)
-    folder = RunFolder(run_dir or Path("runs") / default_name(config.env.id, config.preset, config.seed))
-    if os.fsencode(folder.path).decode(errors="replace") != str(folder.path):
-        raise ConfigError("--run-dir", str(folder.path), "is no UTF-8; give another")
+    folder = _named(run_dir or Path("runs") / default_name(config.env.id, config.preset, config.seed))
     there = run_dir is not None and if_exists != "new" and (folder.path / "config.json").exists()
     tracking, before, initial = choose_tracking(options), config, None
     if there:
         before = taken_up(folder, config, if_exists, options)
     else:
         validate_windows(config)
-    if not there and options.init_from is not None:
-        from rmc.deploy.run import warm_start  # imports torch
+        if options.init_from is not None:
+            from rmc.deploy.run import warm_start  # imports torch
 
-        initial = warm_start.prepare(config, options.init_from, options.init_parts)
+            initial = warm_start.prepare(config, options.init_from, options.init_parts)
     if run_dir is None or if_exists == "new":
         folder = new_folder(folder.path)
     elif not there and has_more_than_a_start(folder):
@@ -109,6 +107,14 @@ def open_run(
     except BaseException:  # a notebook lives on, and would keep the lock
         folder.unlock()
         raise
+    return folder
+
+
+def _named(path: Path) -> RunFolder:
+    """A folder that may not be there yet. Raises ConfigError where a file could not hold its whole path as text."""
+    folder = RunFolder(path)
+    if os.fsencode(folder.path).decode(errors="replace") != str(folder.path):
+        raise ConfigError("--run-dir", str(folder.path), "is no UTF-8; give another")
     return folder
 
 

@@ -68,7 +68,7 @@ def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, consol
 
 
 def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
-    status, tracker, env_steps = 1, None, 0
+    status, tracker, monitor = 1, None, None
     end: dict[str, Any] = {"state": "failed"}
     try:
         console.print(f"run folder {folder.path}", soft_wrap=True)
@@ -78,18 +78,7 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
         console.print(f"before training: {format_evaluation(before)}")
         tracker = start_tracker(folder)
         monitor = Monitor(folder, config, console, tracker)
-        if options.metrics_port is not None:
-            console.print(f"metrics on {options.metrics_host}, port {options.metrics_port}", soft_wrap=True)
-        if options.launcher == "manual":
-            console.print(f"start the roles with --run {shlex.quote(folder.name)}", soft_wrap=True)
-        try:
-            # before and after, nothing runs that Ctrl-C could not end at once
-            with signals_caught() as stop, _metrics_served(folder, monitor, options):
-                finished = _launch(config, folder, options, monitor, stop)
-        finally:
-            monitor.close()
-            env_steps = monitor.status.env_steps
-        if not finished:
+        if not _trained(config, folder, options, monitor, console):
             raise KeyboardInterrupt
         result = _result(config, folder, monitor, before, console)
         folder.write_result(result)
@@ -101,7 +90,7 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
         raise
     except KeyboardInterrupt:  # also amid the first evaluation, or the last
         status, end = STOPPED, {"state": "stopped"}
-        return print_stopped(folder, env_steps, console)
+        return print_stopped(folder, monitor.status.env_steps if monitor else 0, console)
     finally:
         try:
             if tracker is not None:
@@ -110,6 +99,20 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
             folder.unlock(status)
     console.print(f"before training: {format_evaluation(before)}")
     return print_result(folder, console)
+
+
+def _trained(config: RunConfig, folder: RunFolder, options: LaunchOptions, monitor: Monitor, console: Console) -> bool:
+    """Train, with what others need to take part said before; whether that came to its end. Closes the monitor."""
+    if options.metrics_port is not None:
+        console.print(f"metrics on {options.metrics_host}, port {options.metrics_port}", soft_wrap=True)
+    if options.launcher == "manual":
+        console.print(f"start the roles with --run {shlex.quote(folder.name)}", soft_wrap=True)
+    try:
+        # before and after, nothing runs that Ctrl-C could not end at once
+        with signals_caught() as stop, _metrics_served(folder, monitor, options):
+            return _launch(config, folder, options, monitor, stop)
+    finally:
+        monitor.close()
 
 
 def _metrics_served(folder: RunFolder, monitor: Monitor, options: LaunchOptions) -> AbstractContextManager[None]:
