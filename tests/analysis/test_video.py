@@ -83,11 +83,8 @@ def test_what_a_module_does_as_it_is_imported_is_the_environments_alone(tmp_path
     (tmp_path / "moves.py").write_text(MOVES)
     monkeypatch.syspath_prepend(tmp_path)
     make_run(tmp_path / "run", AGENTS["robust"], "moves:Moves-v0", env_kwargs={"picture": "sound"})
-    done = subprocess.run(
-        [sys.executable, "-m", "rmc.cli.main", "evaluate", "run", "--episodes", "1", "--json", "--video", "film.mp4"],
-        capture_output=True, text=True, timeout=170, check=False, cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.getcwd()},
-    )  # fmt: skip
+    words = ("evaluate", "run", "--episodes", "1", "--json", "--video", "film.mp4")
+    done = rmc(*words, timeout=170, cwd=tmp_path, env={**os.environ, "PYTHONPATH": os.getcwd()})
     assert (done.returncode, done.stderr.splitlines()) == (0, ["a banner"])
     assert json.loads(done.stdout)["eval_episodes"] == 1
     assert (tmp_path / "film.mp4").exists()

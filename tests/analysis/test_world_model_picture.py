@@ -101,7 +101,7 @@ def test_an_episode_that_never_ends_is_looked_at_for_a_while(
 def test_a_horizon_at_which_nothing_was_seen_has_no_share(config: RunConfig, tmp_path: Path) -> None:
     """Zero would read as a perfect prediction."""
     blind = dataclasses.replace(config, env=dataclasses.replace(config.env, flicker=1.0))
-    folder = make_run(tmp_path / "run", blind)
+    folder = run_of(tmp_path / "run", blind)
     assert inspect(folder.path, "latest", tmp_path / "out.png")[0].open_loop == {}
 
 
