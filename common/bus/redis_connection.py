@@ -103,10 +103,10 @@ class RedisConnection:
         """A number as it stands in a value; 0 where there is none."""
         return (self.integers(raw, 1) or [0])[0]
 
-    def get_each(self, keys: list[str]) -> list[Any]:
-        """What each key holds, in one round trip; the replies stay apart."""
+    def each(self, command: str, keys: list[str], *words: object) -> list[Any]:
+        """The same command for each key in one round trip; the replies stay apart."""
         pipe = self.redis.pipeline(transaction=False)
         for key in keys:
-            pipe.get(key)
+            pipe.execute_command(command, key, *words)
         replies: list[Any] = self.call(pipe.execute)
         return replies

@@ -88,7 +88,7 @@ class WeightStore:
         if head is None:
             return None
         version, count, crc = head
-        pieces = self._connection.get_each(self._piece_keys(version, count, evaluate))
+        pieces = self._connection.each("get", self._piece_keys(version, count, evaluate))
         try:
             return version, join_pieces(pieces, crc)
         except MessageError:
