@@ -1,6 +1,7 @@
 """Which environment, and what is changed about it; readable without gymnasium."""
 
 import json
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ RANGES: dict[str, tuple[float, float]] = {  # of EnvConfig's numbers, both ends 
     "env_timeout": (0.1, 1e6),
 }
 PYTHONS = {"True": True, "False": False, "None": None}  # as Python writes what JSON writes otherwise
+NUMBER = re.compile(r"[+-]?((0|[1-9][0-9]*)\.?|(0|[1-9][0-9]*)?\.[0-9]+)([eE][+-]?[0-9]+)?")  # no 007, 1_000 or inf
 
 
 @dataclass(frozen=True)
@@ -108,11 +110,18 @@ def check_kwargs(kwargs: dict[str, Any]) -> None:
 def _typed(value: str) -> Any:
     if value in PYTHONS:
         return PYTHONS[value]
-    for kind in (int, float, json.loads):
-        with suppress(ValueError):
-            return kind(value)
+    with suppress(ValueError, RecursionError):
+        if NUMBER.fullmatch(value):
+            return float(value) if set(".eE").intersection(value) else int(value)
+        return json.loads(value, parse_constant=_refuse)
     return value
 
 
+def _refuse(constant: str) -> Any:
+    raise ValueError(f"{constant} is not JSON's")
+
+
 def _word(value: Any) -> str:
-    return value if isinstance(value, str) and _typed(value) == value else json.dumps(value)
+    """Quoted where it would be read as another value, or refused."""
+    plain = isinstance(value, str) and _typed(value) == value and not value.startswith(("[", "{"))
+    return value if plain else json.dumps(value)

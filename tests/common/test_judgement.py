@@ -128,7 +128,14 @@ def test_keywords_are_typed_and_written_as_they_are_read() -> None:
     words = [
         "goal=1.5",
         "least=.5",
-        "many=1_000",
+        "tag=1_000",
+        "map=007",
+        "limit=inf",
+        "gap=NaN",
+        "minus=-Infinity",
+        "wide=\N{FULLWIDTH DIGIT ONE}",
+        "whole=2.",
+        "more=+5",
         "most=-1e3",
         "size=3",
         "name=maze",
@@ -141,9 +148,9 @@ def test_keywords_are_typed_and_written_as_they_are_read() -> None:
     ]
     kwargs = read_kwargs(words)
     assert kwargs == {
-        "goal": 1.5, "least": 0.5, "many": 1000, "most": -1000.0, "size": 3, "name": "maze", "at": [0, 1],
-        "deep": True, "no": None, "text": "3", "empty": "",
-        "e": "a=b",
+        "goal": 1.5, "least": 0.5, "tag": "1_000", "map": "007", "limit": "inf", "gap": "NaN", "minus": "-Infinity",
+        "wide": "\N{FULLWIDTH DIGIT ONE}", "whole": 2.0, "more": 5, "most": -1000.0, "size": 3, "name": "maze",
+        "at": [0, 1], "deep": True, "no": None, "text": "3", "empty": "", "e": "a=b",
     }  # fmt: skip
     assert read_kwargs(write_kwargs(kwargs)) == kwargs
 
@@ -155,14 +162,19 @@ def test_keywords_are_typed_and_written_as_they_are_read() -> None:
         (["a-b=1"], "--env-kwargs='a-b=1'"),
         (["a=1", "a=2"], "a is there twice"),
         (["a=[b,c]"], "no JSON; keep its quotes from the shell"),
-        (["a=nan"], "--env-kwargs a=nan: take finite numbers"),
-        (["a=1", "b=-inf"], "--env-kwargs b=-inf: take finite numbers"),
+        (["a=[NaN]"], "no JSON"),
+        (["a=1", "b=-1e999"], "--env-kwargs b=-inf: take finite numbers"),
     ],
 )
 def test_other_words_are_refused(words: list[str], says: str) -> None:
     with pytest.raises(ConfigError) as caught:
         read_kwargs(words)
     assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["{robot}", "[a", "[1, 2]", "{}", "3", "007", "inf", "true", "None", " 5", '"x"', ""])
+def test_text_comes_back_as_text_whatever_it_looks_like(text: str) -> None:
+    assert read_kwargs(write_kwargs({"name": text})) == {"name": text}
 
 
 def test_a_missing_keyword_comes_with_its_remedy() -> None:
