@@ -7,6 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+
 from rmc.common.errors import ConfigError
 
 RANGES: dict[str, tuple[float, float]] = {  # of EnvConfig's numbers, both ends included
@@ -98,13 +100,19 @@ def check_kwargs(kwargs: dict[str, Any]) -> None:
     """Raises ConfigError where a value is none that config.json can hold and give back."""
     for name, value in kwargs.items():
         try:
-            same = json.loads(json.dumps(value, allow_nan=False)) == value
-        except (TypeError, ValueError):
+            same = json.loads(json.dumps({name: value}, allow_nan=False, default=plain)) == {name: value}
+        except (TypeError, ValueError, RecursionError):
             same = False
         if not same:
-            raise ConfigError(
-                f"--env-kwargs {name}", value, "take finite numbers, text, true, false, null, or lists of such"
-            )
+            fix = "take finite numbers, text, true, false, null, lists of such (no tuples), or dicts of such by text"
+            raise ConfigError(f"--env-kwargs {name}", value, fix)
+
+
+def plain(value: Any) -> Any:
+    """One of numpy's numbers as Python's own, for json.dumps. Raises TypeError for what JSON has not."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} is not JSON's")
 
 
 def _typed(value: str) -> Any:

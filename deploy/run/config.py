@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.metrics_record import LARGEST
-from rmc.common.env.config import EnvConfig, write_kwargs
+from rmc.common.env.config import EnvConfig, check_kwargs, plain, write_kwargs
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.make import env_layout
 from rmc.common.env.wrappers import Env
@@ -146,11 +146,14 @@ def checked(config: RunConfig) -> RunConfig:
     """The same, as it would come out of ``config.json``. Raises ConfigError for a value of a wrong type or choice."""
     if not isinstance(config, RunConfig):
         raise ConfigError("config", config, "take a RunConfig, like one of rmc.presets")
-    try:
-        raw = json.loads(json.dumps(dataclasses.asdict(config)))
-    except TypeError as error:
-        raise ConfigError("config", type(config).__name__, f"a value in it is not JSON's ({error})") from None
-    return from_dict(RunConfig, raw, "")
+    if isinstance(kwargs := getattr(config.env, "env_kwargs", None), dict):
+        check_kwargs(kwargs)
+    for path, value in flat(config).items():
+        try:
+            json.dumps(value, default=plain)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(path, value, f"{error}; take numbers, text, True, False or lists of such") from None
+    return from_dict(RunConfig, json.loads(json.dumps(dataclasses.asdict(config), default=plain)), "")
 
 
 def to_registration(config: RunConfig) -> bytes:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import rmc
+from rmc.deploy.run.config import checked, to_json
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import PATH_VARIABLE
 
@@ -33,12 +34,54 @@ def test_a_preset_takes_an_id_as_well() -> None:
         ({"env": "Ant-v5"}, r"env='Ant-v5': must be an object"),
         ({"agent": dataclasses.replace(CONFIG.agent, head_input="all")}, r"agent.head_input='all': must be one of"),
         ({"agent": dataclasses.replace(CONFIG.agent, heads=(8, 8, 8))}, r"agent.heads=\[8, 8, 8\]: must be tuple"),
-        ({"actors": np.int64(2)}, r"config='RunConfig': a value in it is not JSON's \(.*int64"),
+        ({"actors": np.float64(2)}, r"actors=2.0: must be int"),
+        ({"seed": {1}}, r"seed=\{1\}: set is not JSON's; take numbers, text"),
+        (
+            {"agent": dataclasses.replace(CONFIG.agent, heads=np.ones(2))},
+            r"agent.heads=array.*: ndarray is not JSON's",
+        ),
     ],
 )
 def test_a_value_of_a_wrong_type_is_named(changes: dict[str, Any], line: str, tmp_path: Path) -> None:
     with pytest.raises(rmc.ConfigError, match=f"^{line}"):
         rmc.train(dataclasses.replace(CONFIG, **changes), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_numbers_of_numpy_are_taken() -> None:
+    kwargs = {"size": np.int64(4), "at": [np.float64(0.5)], "deep": np.bool_(True)}
+    given = dataclasses.replace(
+        CONFIG,
+        env=rmc.EnvConfig("InvertedPendulum-v5", flicker=np.float32(0.5), env_kwargs=kwargs),  # type: ignore[arg-type]
+        seed=np.int64(3),  # type: ignore[arg-type]
+        actors=np.uint8(2),  # type: ignore[arg-type]
+        agent=dataclasses.replace(CONFIG.agent, heads=tuple(np.array([8, 16]))),
+    )
+    config = checked(given)
+    assert to_json(config) == to_json(checked(config))
+    assert (config.seed, config.actors, config.agent.heads, config.env.flicker) == (3, 2, (8, 16), 0.5)
+    assert config.env.env_kwargs == {"size": 4, "at": [0.5], "deep": True}
+    assert {type(config.seed), type(config.env.env_kwargs["size"])} == {int}
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"w": {1: 2, "1": 3}},
+        {"w": {1: 2}},
+        {1: 2},
+        {"w": (0.2, 1.0)},
+        {"w": [(1,)]},
+        {"w": float("nan")},
+        {"w": np.ones(2)},
+    ],
+)
+def test_keywords_that_json_would_change_are_refused(kwargs: dict[Any, Any], tmp_path: Path) -> None:
+    env = rmc.EnvConfig("InvertedPendulum-v5", env_kwargs=kwargs)
+    with pytest.raises(
+        rmc.ConfigError, match=r"^--env-kwargs [w1]=.*: take finite numbers, .* \(no tuples\), or dicts"
+    ):
+        rmc.train(dataclasses.replace(CONFIG, env=env), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
