@@ -205,12 +205,29 @@ def find_spec(env_id: str) -> EnvSpec:
     try:
         return gym.spec(name)
     except gym.error.Error:
-        close = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
-        fix = f"did you mean {', '.join(close)}?" if close else "use a gymnasium id or module:EnvId-v0"
-        if close and not module:
-            fix = f"{fix} One of your own is module:{name}"
-        fault = f"{module} registers no {name} (gymnasium.register)" if module else "no such environment"
-        raise ConfigError("ENV", env_id, f"{fault}; {fix}") from None
+        raise ConfigError("ENV", env_id, _shadow_fault(module) or _unknown(module, name)) from None
+
+
+def _unknown(module: str, name: str) -> str:
+    """That no such environment is registered, and which one may be meant."""
+    close = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
+    fix = f"did you mean {', '.join(close)}?" if close else "use a gymnasium id or module:EnvId-v0"
+    if close and not module:
+        fix = f"{fix} One of your own is module:{name}"
+    file = getattr(sys.modules.get(module), "__file__", None)
+    where = f"{module} ({file})" if file else module
+    return f"{where} registers no {name} (gymnasium.register); {fix}" if module else f"no such environment; {fix}"
+
+
+def _shadow_fault(module: str) -> str | None:
+    """Which module was imported in place of the one in the working folder, whose name it has; None where none was."""
+    parts = module.split(".")
+    own = [path for path in (Path(*parts[:-1], f"{parts[-1]}.py"), Path(*parts, "__init__.py")) if path.is_file()]
+    file = getattr(sys.modules.get(module), "__file__", None)
+    if not own or (file is not None and Path(file).resolve() == own[0].resolve()):
+        return None
+    other = getattr(sys.modules.get(parts[0]), "__file__", None) or "a part of Python"
+    return f"{parts[0]} is {other}, which is found before yours; give {own[0]} another name"
 
 
 def _import_users_module(env_id: str, module: str) -> None:
@@ -228,7 +245,8 @@ def _import_users_module(env_id: str, module: str) -> None:
     except ModuleNotFoundError as error:
         ours = error.name is not None and (module == error.name or module.startswith(f"{error.name}."))
         fix = f"start from the folder that holds {module}" if ours else f"{module} needs it; install it"
-        raise ConfigError("ENV", env_id, f"{error}; {fix}") from None
+        fault = _shadow_fault(module) if ours else None
+        raise ConfigError("ENV", env_id, fault or f"{error}; {fix}") from None
     except RAISED as error:
         raise ConfigError("ENV", env_id, f"{module} cannot be imported: {describe_error(error)}") from None
 

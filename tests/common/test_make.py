@@ -1,6 +1,7 @@
 """Environments: what comes out, what is refused in one line, and that MuJoCo keeps quiet."""
 
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -150,7 +151,7 @@ def test_the_outermost_actions_are_within_the_bounds(bound: float, dtype: type) 
         (odd("Unbounded-v0", VECTOR, Box(-np.inf, np.inf, (2,))), "action space is unbounded"),
         (odd("Endless-v0", VECTOR, Box(-3e38, 3e38, (2,))), "action space is unbounded"),
         (odd("Whole-v0", VECTOR, Box(0, 3, (2,), np.int64)), "actions are int64"),
-        (EnvConfig("json:Nothing-v0"), "json registers no Nothing-v0"),
+        (EnvConfig("json:Nothing-v0"), "json/__init__.py) registers no Nothing-v0"),
         (odd("Multi-v0", VECTOR, gym.spaces.MultiDiscrete([2, 2])), "actions are MultiDiscrete"),
         (EnvConfig("Pendulum-v1", env_kwargs={"g": math.inf}), "--env-kwargs g=inf: take finite numbers"),
         (EnvConfig("Pendulum-v1", env_kwargs={"gg": 9}), "unexpected keyword argument 'gg'; it takes (render_mode"),
@@ -164,6 +165,27 @@ def test_refused_in_one_line(config: EnvConfig, says: str) -> None:
     assert says in message
     assert "\n" not in message
     assert message.startswith(("ENV=", "--"))
+
+
+@pytest.mark.parametrize(
+    ("module", "own", "other"),
+    [
+        ("code", "code.py", "code is .*/code.py, which"),
+        ("json", "json/__init__.py", "json is .*/json/__init__.py, which"),
+        ("json.mine", "json/mine.py", "json is .*/json/__init__.py, which"),
+        ("time", "time.py", "time is a part of Python, which"),
+    ],
+)
+def test_a_module_that_has_the_name_of_one_of_pythons_is_to_be_renamed(
+    module: str, own: str, other: str, tmp_path: Path
+) -> None:
+    (tmp_path / own).parent.mkdir(exist_ok=True)
+    (tmp_path / own).write_text("import gymnasium\ngymnasium.register('Mine-v0', entry_point=object)")
+    words = [sys.executable, "-P", "-m", "rmc.cli.main", "check-env", f"{module}:Mine-v0"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    line = f"rmc: ENV='{module}:Mine-v0': {other} is found before yours; give {own} another name\n"
+    assert re.fullmatch(line, done.stderr), done.stderr
 
 
 @pytest.mark.parametrize(
