@@ -36,7 +36,7 @@ from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError, first_line
 from rmc.common.process.role import StopSignal
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.config import changes, option
+from rmc.deploy.run.config import changes, layout_sizes, option
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.metrics_tail import wall_seconds
@@ -91,13 +91,12 @@ def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: 
     return 0
 
 
-def _sizes(config: BaselineConfig) -> dict[str, int]:
+def _sizes(config: BaselineConfig) -> dict[str, Any]:
     """What its networks are made for. Raises ConfigError."""
-    layout = env_layout(config.env)
-    return {"observations": layout.obs_dim, "actions": layout.action_dim}
+    return layout_sizes(env_layout(config.env))
 
 
-def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, int]) -> RunFolder:
+def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, Any]) -> RunFolder:
     """Make or take up a run's folder, locked, as ``open_run``. Raises ConfigError."""
     name = default_name(config.env.id, f"{config.algorithm}-{config.settings}", config.seed)
     folder = RunFolder(run_dir) if run_dir is not None else new_folder(Path("runs").resolve() / name)

@@ -19,7 +19,7 @@ from rmc.common.env.make import first_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 from rmc.common.policy_header import PolicyHeader
-from rmc.deploy.run.config import RunConfig, check_sizes, env_sizes
+from rmc.deploy.run.config import RunConfig, check_sizes, env_sizes, layout_sizes
 
 FINAL_EPISODES = 10  # of a run's first and last evaluation
 SAY_SECONDS = 10.0  # between lines that an evaluation goes on
@@ -70,7 +70,7 @@ def policy_env(header: PolicyHeader, config: EnvConfig) -> Env:
     """An environment for a policy to act in. Raises ConfigError, also where its sizes are not the policy's."""
     env = first_env(config)
     try:
-        check_sizes(config.id, {"observations": header.obs_dim, "actions": header.action_dim}, env_sizes(env))
+        check_sizes(config.id, layout_sizes(header.layout), env_sizes(env))
     except ConfigError:
         env.close()
         raise

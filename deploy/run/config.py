@@ -18,6 +18,7 @@ from rmc.common.bus.metrics_record import LARGEST
 from rmc.common.env.config import EnvConfig, check_kwargs, plain, write_kwargs
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.make import env_layout
+from rmc.common.env.spaces import bounds
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 from rmc.common.policy_header import PolicyHeader
@@ -29,6 +30,7 @@ from rmc.replay_server.config import ReplayConfig
 
 Preset = Literal["robust", "memory", "paper", "debug"]
 FLAGS = "flags of what is missing"
+LOWEST, HIGHEST = "the lowest actions", "the highest actions"
 LARGEST_WINDOW = 32 << 20  # bytes, half of what our Redis takes as a value
 ConfigT = TypeVar("ConfigT")
 
@@ -103,12 +105,12 @@ class RunConfig:
         """What the files of this run's policies say about themselves, before any step. Raises ConfigError."""
         return PolicyHeader(FORMAT, version("rmc-rl"), self.env, self.layout, self.agent, self.preset, self.seed)
 
-    def sizes(self) -> dict[str, int]:
-        """What a run's networks and windows were made for, in words. Raises ConfigError."""
+    def sizes(self) -> dict[str, Any]:
+        """What a run's networks and windows were made for, in words, bounds as lists. Raises ConfigError."""
         spec = self.window_spec()
         whole = {"steps an episode": spec.train} if self.actor.state_strategy == "episode" else {}
         privileged = {"privileged numbers": spec.privileged} if spec.privileged else {}
-        return {"observations": spec.obs_dim, "actions": spec.action_dim, FLAGS: spec.missing, **privileged, **whole}
+        return {**layout_sizes(self.layout), FLAGS: spec.missing, **privileged, **whole}
 
     def shards(self) -> list[Shard]:
         """The replay servers."""
@@ -170,18 +172,27 @@ def from_registration(text: bytes) -> RunConfig:
     return config
 
 
-def env_sizes(env: Env) -> dict[str, int]:
-    """An environment's sizes, as ``RunConfig.sizes`` names them."""
+def layout_sizes(layout: EnvLayout) -> dict[str, Any]:
+    """Those that every agent depends on, as ``RunConfig.sizes`` names them."""
+    extremes = {LOWEST: list(layout.action_low), HIGHEST: list(layout.action_high)}
+    return {"observations": layout.obs_dim, "actions": layout.action_dim, **extremes}
+
+
+def env_sizes(env: Env) -> dict[str, Any]:
+    """The same of an environment as ``make_env`` gives it."""
     assert env.observation_space.shape
     assert env.action_space.shape
-    return {"observations": env.observation_space.shape[0], "actions": env.action_space.shape[0]}
+    low, high = bounds(env.get_wrapper_attr("raw_action_space"))
+    sizes = {"observations": env.observation_space.shape[0], "actions": env.action_space.shape[0]}
+    return {**sizes, LOWEST: low.tolist(), HIGHEST: high.tolist()}
 
 
-def check_sizes(env_id: str, before: dict[str, Any], sizes: dict[str, int]) -> None:
+def check_sizes(env_id: str, before: dict[str, Any], sizes: dict[str, Any]) -> None:
     """Raises ConfigError where the environment has other ``sizes`` than ``before``, when the run began."""
     for name, now in sizes.items():
         if before.get(name, now) != now:
-            fault = f"the environment now has {now} {name}, the run was trained with {before[name]!r}"
+            what = f"{name} {now}" if isinstance(now, list) else f"{now} {name}"
+            fault = f"the environment now has {what}, the run was trained with {before[name]!r}"
             raise ConfigError("ENV", env_id, f"{fault}; undo that, or train another run")
 
 

@@ -121,7 +121,7 @@ class RunFolder:
         """Write ``initial.json``, whole or not at all."""
         write_whole(self.initial_file, f"{json.dumps(played, indent=2)}\n".encode())
 
-    def check_sizes(self, env_id: str, sizes: dict[str, int]) -> None:
+    def check_sizes(self, env_id: str, sizes: dict[str, Any]) -> None:
         """Raises ConfigError where the environment has other ``sizes`` than when the run began."""
         try:
             before = read_object(self.sizes_file)  # of an older version, some are unknown
@@ -129,7 +129,7 @@ class RunFolder:
             return
         check_sizes(env_id, before, sizes)
 
-    def write_sizes(self, sizes: dict[str, int]) -> None:
+    def write_sizes(self, sizes: dict[str, Any]) -> None:
         """Write ``sizes.json``, whole or not at all."""
         write_whole(self.sizes_file, f"{json.dumps(sizes)}\n".encode())
 

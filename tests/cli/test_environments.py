@@ -92,6 +92,23 @@ def test_an_environment_that_has_gained_an_observation_is_named_by_every_command
     assert sorted(path.name for path in run.path.iterdir()) == before
 
 
+def test_an_environment_whose_actions_have_other_bounds_is_named(
+    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, kept = (make_run(tmp_path / name, AGENTS["robust"], SLIDE) for name in ("run", "kept"))
+    kept.write_sizes({"observations": 3, "actions": 2, "flags of what is missing": 1})  # as an older version
+    monkeypatch.setattr(habits.Slide, "action_space", Box(-1.0, np.float32([1, 5]), (2,), np.float32))
+    says = f"ENV='{SLIDE}': the environment now has the highest actions [1.0, 5.0], the run was trained with [1.0, 1.0]"
+    for words in (["resume"], ["evaluate"], ["inspect", "--out", str(tmp_path / "a.png")]):
+        assert f"{says}; undo that, or train another run" in complaint([*words, str(run.path)], capsys)
+    with pytest.raises(ConfigError, match="now has the highest actions"):
+        load_policy(kept.path).make_env()
+    open_run(kept.config(), kept.path, "resume").unlock()
+    monkeypatch.undo()
+    with pytest.raises(ConfigError, match=r"the highest actions \[1.0, 1.0\], the run was trained with \[1.0, 5.0\]"):
+        open_run(kept.config(), kept.path, "resume")
+
+
 def test_a_run_keeps_its_number_of_flags(tmp_path: Path) -> None:
     config = debug(EnvConfig("Pendulum-v1", drop_sensors=0.2))
     run = open_run(config, tmp_path / "run", "fail")
