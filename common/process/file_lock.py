@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 def take_lock(path: Path, patience: float = LOCK_SECONDS) -> int | None:
     """A handle that holds the lock until it is closed; None where another process keeps it."""
-    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)  # whoever may enter the folder may look
     began = time.monotonic()
     warned = False
     while not try_lock(handle, fcntl.LOCK_EX):

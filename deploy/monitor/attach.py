@@ -5,7 +5,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from pathlib import Path
 
 from rich.console import Console
 
@@ -63,13 +63,26 @@ def launcher_pid(folder: RunFolder) -> int:
     return trainer
 
 
+def _owner(process: int) -> str:
+    """Whose it is, by name."""
+    try:
+        return Path(f"/proc/{process}").owner()
+    except (OSError, KeyError):  # hidden, or without a name
+        return "another user"
+
+
 def stop(folder: RunFolder) -> int:
     """Ask the launcher to end the run cleanly, and wait until it has; its exit status. Raises ConfigError."""
     trainer = launcher_pid(folder)
     if (host := folder.trainer_host()) not in ("", socket.gethostname()):
         raise ConfigError("RUN", str(folder.path), f"is trained on {host}; stop it there")
-    with suppress(ProcessLookupError):  # it has just ended
+    try:
         os.kill(trainer, signal.SIGTERM)
+    except ProcessLookupError:  # it has just ended
+        pass
+    except PermissionError:
+        fix = f"is trained by {_owner(trainer)} (process {trainer}); only they can stop it, or root"
+        raise ConfigError("RUN", str(folder.path), fix) from None
     seconds = STOP_SECONDS + CheckpointFolder(folder.checkpoints).patience(0.0)
     deadline = time.monotonic() + seconds
     while folder.trainer() is not None:

@@ -17,7 +17,10 @@ from rmc.deploy.monitor.run_status import EvaluationStatus, RunStatus
 SIDE_WIDTH = 120  # from which the roles stand beside the figures
 LABEL = 13  # columns of a figure's name
 BAR = 60  # most columns of the bar
-STYLES = {"finished": "green", "training": "cyan", "stopped": "yellow", "failed": "red", "lost": "red", "new": ""}
+STYLES = {
+    "finished": "green", "training": "cyan", "stopped": "yellow", "failed": "red", "lost": "red",
+    "new": "", "unknown": "",
+}  # fmt: skip
 Fact = tuple[str, str]  # a figure's name and its text
 
 

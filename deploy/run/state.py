@@ -4,12 +4,22 @@ from typing import Literal
 
 from rmc.deploy.run.folder import RunFolder
 
-State = Literal["new", "training", "finished", "stopped", "failed", "lost"]
+State = Literal["new", "training", "finished", "stopped", "failed", "lost", "unknown"]
 STOPPED = 130  # exit status after Ctrl-C, as shells have it
 
 
 def run_state(folder: RunFolder) -> State:
-    """Lost is one whose launcher was killed: it neither trains nor has ended. Raises ConfigError."""
+    """Lost is one whose launcher was killed: it neither trains nor has ended. Raises ConfigError, OSError.
+
+    Unknown is one whose lock its owner alone may read, as versions before made it.
+    """
+    try:
+        return _locked_state(folder)
+    except PermissionError:
+        return "unknown" if folder.result() is None else "finished"
+
+
+def _locked_state(folder: RunFolder) -> State:
     if folder.trainer() is not None:
         return "training"
     if folder.result() is not None:
