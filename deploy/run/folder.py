@@ -19,7 +19,7 @@ from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite, is_metric
 from rmc.common.errors import ConfigError
-from rmc.common.process.file_lock import take_lock, try_lock
+from rmc.common.process.file_lock import WITHOUT_LOCKS, take_lock, try_lock
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import RunConfig, check_sizes, from_json, to_json
 from rmc.deploy.run.migrations import migrated
@@ -172,10 +172,9 @@ class RunFolder:
                 file.write(secrets.token_hex(SECRET_LENGTH // 2) + "\n")
                 file.flush()
                 os.fsync(handle)
-            with suppress(FileExistsError):
-                os.link(temporary, self.secret_file)
+            _link(temporary, self.secret_file)
         finally:
-            os.unlink(temporary)
+            Path(temporary).unlink(missing_ok=True)
 
     def lock(self) -> None:
         """Be the one launcher of this run. Raises ConfigError where another one is."""
@@ -220,6 +219,10 @@ class RunFolder:
                 return None if free or word != "training" else int(rest[0])
         except (FileNotFoundError, ValueError, IndexError):
             return None
+        except OSError as error:
+            if error.errno not in WITHOUT_LOCKS:
+                raise
+            return None  # a copy: no launcher trains where it cannot lock
 
     def trainer_host(self) -> str:
         """The machine whose launcher trains this run; empty where none does."""
@@ -237,6 +240,16 @@ class RunFolder:
             return None
         except ValueError as error:
             raise ConfigError("RUN", str(self.path), f".lock is damaged ({error}); remove that file") from None
+
+
+def _link(temporary: str, path: Path) -> None:
+    """Give a file its name, if no other has that."""
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        pass
+    except OSError:  # a disk without hard links: who trains has locked the folder, and is the one who makes it
+        Path(temporary).rename(path)
 
 
 def read_object(path: Path, *numbers: str) -> dict[str, Any]:

@@ -151,7 +151,8 @@ def make(folder: RunFolder) -> None:
     try:
         folder.path.mkdir(parents=True, exist_ok=True)
         if not (folder.path / "config.json").exists():
-            folder.path.chmod(0o700)  # what a later owner opens to others stays open
+            with suppress(OSError):  # a folder of another owner, which we may write; a disk without modes
+                folder.path.chmod(0o700)  # what a later owner opens to others stays open
         for path in (folder.checkpoints, folder.logs):
             path.mkdir(exist_ok=True)
     except OSError as error:

@@ -5,9 +5,10 @@ import errno
 import json
 import os
 import resource
+import shutil
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,8 +28,9 @@ from rmc.deploy.run.config import to_json
 from rmc.deploy.run.folder import RESULT, RunFolder
 from rmc.deploy.run.launch_options import IfExists
 from rmc.deploy.run.metrics_tail import wall_seconds
-from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.opening import make, open_run
 from rmc.deploy.run.presets import debug
+from rmc.deploy.run.state import run_state
 
 
 def test_a_secret_is_made_once(tmp_path: Path) -> None:
@@ -75,6 +77,62 @@ def test_a_full_disk_leaves_none(tmp_path: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert list(tmp_path.iterdir()) == []
     assert len(RunFolder(tmp_path).secret()) == 64
+
+
+@pytest.mark.parametrize("fault", [errno.EOPNOTSUPP, errno.EPERM])
+def test_a_disk_without_hard_links_has_a_secret_too(
+    fault: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "link", raising(fault))
+    secret = RunFolder(tmp_path).secret()
+    assert len(bytes.fromhex(secret.decode())) == 32
+    assert RunFolder(tmp_path).secret() == secret
+    assert stat.S_IMODE((tmp_path / "secret").stat().st_mode) == 0o600
+    assert [path.name for path in tmp_path.iterdir()] == ["secret"]
+
+
+@pytest.mark.parametrize("fault", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
+def test_a_disk_without_locks_is_one_line_before_there_is_a_run(
+    fault: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fcntl.flock", raising(fault))
+    with pytest.raises(ConfigError, match=r"^lock='.*/run/.lock': its disk locks no files \(.+\); take a folder on an"):
+        open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
+def test_a_copy_on_a_disk_without_locks_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    shutil.copytree(folder.path, tmp_path / "copy")
+    folder.unlock()
+    monkeypatch.setattr("fcntl.flock", raising(errno.ENOSYS))
+    assert run_state(RunFolder(tmp_path / "copy")) == "lost"
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can be somebody else")
+def test_a_folder_of_another_owner_that_can_be_written_is_taken(tmp_path: Path) -> None:
+    for path in (tmp_path, *tmp_path.parents):
+        if not path.stat().st_mode & 0o001:
+            path.chmod(0o711)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run").chmod(0o777)
+    folder = RunFolder(tmp_path / "run")
+    with as_nobody():
+        make(folder)
+        folder.lock()
+        folder.unlock()
+        folder.secret()
+    assert folder.secret_file.stat().st_uid == folder.checkpoints.stat().st_uid == 65534
+    assert stat.S_IMODE(folder.secret_file.stat().st_mode) == 0o600
+
+
+def raising(fault: int) -> Callable[..., None]:
+    """What a call does on a disk that has not what it asks for."""
+
+    def call(*_: object, **__: object) -> None:
+        raise OSError(fault, os.strerror(fault))
+
+    return call
 
 
 @pytest.mark.parametrize("left", ["", "\n", "ab" * 31 + "\n"])
