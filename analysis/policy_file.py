@@ -16,6 +16,7 @@ from rmc.common.bus.metrics_record import is_finite, is_whole
 from rmc.common.checkpoint import POLICY, PROGRESS
 from rmc.common.errors import ConfigError, MessageError, first_line
 from rmc.common.policy_header import METADATA_KEY, PolicyHeader
+from rmc.common.user_path import user_path
 from rmc.deploy.monitor.recorded import empty_status
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import from_dict
@@ -51,7 +52,7 @@ def read_policy(source: str | Path, checkpoint: str = "latest") -> PolicyFile:
     """
     if str(source).startswith(hub.SCHEME):
         source = hub.pull(str(source).removeprefix(hub.SCHEME).lstrip("/"))
-    path = Path(source)
+    path = user_path(source)
     if path.is_dir():
         return _of_run(RunFolder(path), checkpoint)
     if checkpoint != "latest":

@@ -8,6 +8,7 @@ from rmc.analysis.policy_file import read_policy
 from rmc.common.env.config import check_range
 from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
+from rmc.common.user_path import user_path
 from rmc.deploy.run.folder import RunFolder
 
 MOST_EPISODES = 10_000
@@ -30,7 +31,7 @@ def evaluate_run(
         raise ConfigError("--episodes", episodes, f"take 1 to {MOST_EPISODES:_}")
     if flicker is not None:
         check_range("--flicker", flicker, (0.0, 1.0))
-    folder = RunFolder(Path(source))
+    folder = RunFolder(user_path(source))
     if not (folder.path.is_dir() and folder.is_baseline()):
         policy = read_policy(source, checkpoint)
         policy = policy if env_timeout is None else policy.with_timeout(env_timeout)

@@ -19,6 +19,7 @@ from rmc.common.env.make import DM_CONTROL, PYBULLET
 from rmc.common.env.process_state import torch_as_imported
 from rmc.common.errors import ConfigError
 from rmc.common.process import watchdog
+from rmc.common.user_path import user_path
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig, checked
 from rmc.deploy.run.folder import RunFolder
@@ -59,7 +60,7 @@ def train(
     if isinstance(track_tags, str):
         raise ConfigError("track_tags", track_tags, "take a list of texts")
     options = LaunchOptions(
-        None if run_dir is None else Path(run_dir),
+        None if run_dir is None else user_path(run_dir),
         if_exists,
         launcher,
         str(device),
@@ -95,7 +96,7 @@ def resume(
 
     Other options that may change are given to ``train``, with the run's whole config. Raises as ``train`` does.
     """
-    folder = RunFolder(Path(run_dir))
+    folder = RunFolder(user_path(run_dir))
     config, options = folder.config(), last_launch(folder, launcher)
     settings: dict[str, Any] = {"total_steps": total_steps, "actors": actors}
     how: dict[str, Any] = {"device": device and str(device), "redis_url": redis_url, "metrics_port": metrics_port}

@@ -6,7 +6,6 @@ The learner takes a checkpoint up as ever; so does the one that is started again
 import io
 import json
 from dataclasses import dataclass, fields
-from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
 
@@ -19,6 +18,7 @@ from rmc.common.agent_config import POLICY_PARTS
 from rmc.common.checkpoint import PROGRESS, STATE
 from rmc.common.errors import ConfigError, first_line
 from rmc.common.replay import ObservationStatistics
+from rmc.common.user_path import user_path
 from rmc.common.window import WindowSpec
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import FLAGS, RunConfig, option
@@ -78,12 +78,12 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
 
 
 def _split(init_from: str) -> tuple[RunFolder, str]:
-    if Path(init_from).exists():
-        return RunFolder(Path(init_from)), "latest"
+    if user_path(init_from).exists():
+        return RunFolder(user_path(init_from)), "latest"
     run, colon, which = init_from.rpartition(":")
-    if not (colon and Path(run).exists()):
+    if not (colon and user_path(run).exists()):
         raise ConfigError(OPTION, init_from, "no such run; give the folder of a run, or RUN:CHECKPOINT")
-    return RunFolder(Path(run)), which
+    return RunFolder(user_path(run)), which
 
 
 def _check_sizes(

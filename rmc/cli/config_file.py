@@ -9,6 +9,7 @@ from typing import Any
 
 from rmc.common.env.config import check_kwargs, write_kwargs
 from rmc.common.errors import ConfigError
+from rmc.common.user_path import user_path
 from rmc.deploy.run.config import option_words
 
 RENAMED = {
@@ -47,8 +48,8 @@ def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
 
 
 def _named(words: Sequence[str]) -> Path | None:
-    named = [Path(word.partition("=")[2]) for word in words if word.startswith(f"{OPTION}=")]
-    named += [Path(after) for word, after in itertools.pairwise(words) if word == OPTION]
+    named = [user_path(word.partition("=")[2]) for word in words if word.startswith(f"{OPTION}=")]
+    named += [user_path(after) for word, after in itertools.pairwise(words) if word == OPTION]
     if len(named) > 1:
         raise ConfigError(OPTION, " ".join(map(str, named)), "is there twice; give one file")
     return named[0] if named else None

@@ -16,7 +16,7 @@ import tyro
 from rmc.cli import hub_options, role_options, run_options, sweep_options, train_options
 from rmc.cli.config_file import KWARGS, RENAMED, with_file
 from rmc.cli.help_text import ALL_OPTIONS, BASIC, only_basic
-from rmc.cli.numerals import NUMERALS
+from rmc.cli.primitives import PRIMITIVES
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig, flat
@@ -141,7 +141,7 @@ def _parsed(words: list[str], defaults: dict[str, Any]) -> Any:
     ]
     kinds: Any = functools.reduce(operator.or_, subcommands)
     read = functools.partial(
-        tyro.cli, kinds, prog="rmc", description=DESCRIPTION, args=words, config=FLAT, registry=NUMERALS
+        tyro.cli, kinds, prog="rmc", description=DESCRIPTION, args=words, config=FLAT, registry=PRIMITIVES
     )
     if words[:1] == ["sweep"]:  # what it does not know, rmc train may
         command, others = read(return_unknown_args=True)

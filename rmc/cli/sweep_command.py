@@ -12,6 +12,7 @@ from rmc.cli.signals import signals_caught
 from rmc.cli.sweep_check import Checked
 from rmc.cli.sweep_options import Sweep
 from rmc.common.errors import ConfigError
+from rmc.common.user_path import user_path
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig, option
 from rmc.deploy.run.folder import RunFolder
@@ -58,7 +59,7 @@ def read(command: Sweep) -> Spec:
     if command.what.endswith(".toml"):
         names = ("seeds", "grid", "search", "trials", "sampler_seed", "prune")
         _check_usual(command, names, f"belongs into {command.what}, beside the rest of the sweep")
-        return read_spec(Path(command.what), command.train_words)
+        return read_spec(user_path(command.what), command.train_words)
     search = None
     if not command.search:
         _check_usual(command, ("trials", "sampler_seed", "prune"), "is for a search; give --search, or leave it")

@@ -17,6 +17,7 @@ import rmc
 from rmc.deploy.run.config import checked, to_json
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import PATH_VARIABLE
+from rmc.deploy.run.opening import open_run
 
 CONFIG = rmc.presets.debug("InvertedPendulum-v5")
 
@@ -101,6 +102,19 @@ def test_a_choice_that_there_is_none_of_is_refused(options: dict[str, Any], line
     with pytest.raises(rmc.ConfigError, match=f"^{line}$"):
         rmc.train(CONFIG, tmp_path / "run", **options)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_tilde_is_the_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    open_run(CONFIG, tmp_path / "run", "fail").unlock()
+    with pytest.raises(rmc.ConfigError, match=rf"^--run-dir='{tmp_path}/run': is there already"):
+        rmc.train(CONFIG, "~/run", if_exists="fail")
+    with pytest.raises(rmc.ConfigError, match=f"^RUN='{tmp_path}/none': no config.json there"):
+        rmc.resume("~/none")
+    with pytest.raises(rmc.ConfigError, match=f"^RUN='{tmp_path}/none': cannot be read"):
+        rmc.evaluate("~/none")
+    with pytest.raises(rmc.ConfigError, match="--init-from='~/run': it has no checkpoint yet"):
+        rmc.train(CONFIG, tmp_path / "other", init_from="~/run")
 
 
 def test_what_is_no_config_is_refused() -> None:

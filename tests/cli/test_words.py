@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from rmc.cli import main, parser
-from rmc.cli.numerals import read_whole
+from rmc.cli.primitives import read_whole
 from rmc.common.errors import ConfigError
 from tests.cli.test_main import PENDULUM, complaint, flags
 
@@ -46,6 +46,20 @@ def test_the_command_line_wins_over_the_file(file: Path) -> None:
     assert (config.env.id, config.preset, config.total_steps) == ("Hopper-v5", "paper", 500)
     assert config.update.learning_rate == 1e-3
     assert config.env.env_kwargs == {"healthy_reward": 2.0}
+
+
+def test_a_tilde_is_the_home_where_no_shell_reads_it(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    home = file.parent
+    monkeypatch.setenv("HOME", str(home))
+    assert parser.parse(["train", PENDULUM, "--run-dir=~/runs/x"]).run_dir == home / "runs" / "x"
+    assert parser.parse(["evaluate", "~/run", "--video=~/a.mp4"]).video == home / "a.mp4"
+    assert parser.parse(["plot", "~/runs/*", "x~"]).runs == (home / "runs" / "*", Path("x~"))
+    assert parser.parse(["train", PENDULUM, "--run-dir=~nobody-of-that-name/x"]).run_dir == Path(
+        "~nobody-of-that-name/x"
+    )
+    file.write_text(f'run_dir = "~/runs/y"\n{FILE}')
+    command = parser.parse(["train", f"--config=~/{file.name}"])
+    assert (command.run_dir, command.config_file) == (home / "runs" / "y", file)
 
 
 @pytest.mark.parametrize(
