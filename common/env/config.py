@@ -104,7 +104,7 @@ def check_kwargs(kwargs: dict[str, Any]) -> None:
         except (TypeError, ValueError, RecursionError):
             same = False
         if not same:
-            fix = "take finite numbers, text, true, false, null, lists of such (no tuples), or dicts of such by text"
+            fix = "take finite numbers, text, true, false, null, lists (no tuples), or dicts with text as keys"
             raise ConfigError(f"--env-kwargs {name}", value, fix)
 
 
@@ -131,5 +131,5 @@ def _refuse(constant: str) -> Any:
 
 def _word(value: Any) -> str:
     """Quoted where it would be read as another value, or refused."""
-    plain = isinstance(value, str) and _typed(value) == value and not value.startswith(("[", "{"))
-    return value if plain else json.dumps(value)
+    bare = isinstance(value, str) and _typed(value) == value and not value.startswith(("[", "{"))
+    return value if bare else json.dumps(value)

@@ -222,9 +222,9 @@ def _unknown(module: str, name: str) -> str:
 def _shadow_fault(module: str) -> str | None:
     """Which module was imported in place of the one in the working folder, whose name it has; None where none was."""
     parts = module.split(".")
-    own = [path for path in (Path(*parts[:-1], f"{parts[-1]}.py"), Path(*parts, "__init__.py")) if path.is_file()]
+    own = [*filter(os.path.isfile, (Path(*parts[:-1], f"{parts[-1]}.py"), Path(*parts, "__init__.py")))]
     file = getattr(sys.modules.get(module), "__file__", None)
-    if not own or (file is not None and Path(file).resolve() == own[0].resolve()):
+    if not module or not own or (file is not None and Path(file).resolve() == own[0].resolve()):
         return None
     other = getattr(sys.modules.get(parts[0]), "__file__", None) or "a part of Python"
     return f"{parts[0]} is {other}, which is found before yours; give {own[0]} another name"

@@ -5,6 +5,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console
@@ -63,6 +64,16 @@ def launcher_pid(folder: RunFolder) -> int:
     return trainer
 
 
+def _ask(folder: RunFolder, trainer: int) -> None:
+    """Tell the launcher to end. Raises ConfigError where it is another user's."""
+    try:
+        with suppress(ProcessLookupError):  # it has just ended
+            os.kill(trainer, signal.SIGTERM)
+    except PermissionError:
+        fix = f"is trained by {_owner(trainer)} (process {trainer}); only they can stop it, or root"
+        raise ConfigError("RUN", str(folder.path), fix) from None
+
+
 def _owner(process: int) -> str:
     """Whose it is, by name."""
     try:
@@ -76,13 +87,7 @@ def stop(folder: RunFolder) -> int:
     trainer = launcher_pid(folder)
     if (host := folder.trainer_host()) not in ("", socket.gethostname()):
         raise ConfigError("RUN", str(folder.path), f"is trained on {host}; stop it there")
-    try:
-        os.kill(trainer, signal.SIGTERM)
-    except ProcessLookupError:  # it has just ended
-        pass
-    except PermissionError:
-        fix = f"is trained by {_owner(trainer)} (process {trainer}); only they can stop it, or root"
-        raise ConfigError("RUN", str(folder.path), fix) from None
+    _ask(folder, trainer)
     seconds = STOP_SECONDS + CheckpointFolder(folder.checkpoints).patience(0.0)
     deadline = time.monotonic() + seconds
     while folder.trainer() is not None:

@@ -188,6 +188,15 @@ def test_a_module_that_has_the_name_of_one_of_pythons_is_to_be_renamed(
     assert re.fullmatch(line, done.stderr), done.stderr
 
 
+def test_an_unknown_id_is_no_module_of_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "__init__.py").touch()
+    with pytest.raises(ConfigError, match=r"^ENV='HalfCheeta-v5': no such environment; did you mean HalfCheetah-v5"):
+        make_env(EnvConfig("HalfCheeta-v5"))
+    with pytest.raises(ConfigError, match="start from the folder that holds aaa"):
+        make_env(EnvConfig(f"{'a' * 300}:Mine-v0"))
+
+
 @pytest.mark.parametrize(
     ("source", "says"),
     [
