@@ -100,12 +100,19 @@ def check_kwargs(kwargs: dict[str, Any]) -> None:
     """Raises ConfigError where a value is none that config.json can hold and give back."""
     for name, value in kwargs.items():
         try:
-            same = json.loads(json.dumps({name: value}, allow_nan=False, default=plain)) == {name: value}
+            same = json.loads(json.dumps({name: value}, allow_nan=False, default=plain)) == _listed({name: value})
         except (TypeError, ValueError, RecursionError):
             same = False
         if not same:
-            fix = "take finite numbers, text, true, false, null, lists (no tuples), or dicts with text as keys"
+            fix = "take finite numbers, text, true, false, null, lists, or dicts with text as keys"
             raise ConfigError(f"--env-kwargs {name}", value, fix)
+
+
+def _listed(value: Any) -> Any:
+    """Tuples as lists, which is what the environment gets of them."""
+    if isinstance(value, dict):
+        return {name: _listed(one) for name, one in value.items()}
+    return [*map(_listed, value)] if isinstance(value, list | tuple) else value
 
 
 def plain(value: Any) -> Any:
