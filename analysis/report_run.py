@@ -15,7 +15,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import changes, flat
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import preset_config
-from rmc.deploy.run.state import run_state
+from rmc.deploy.run.state import State, run_state
 
 Series = tuple[list[float], list[float]]
 
@@ -29,6 +29,7 @@ class ReportRun:
     history: History | None  # None before the first evaluation
     records: list[Record]
     options: dict[str, Any]
+    state: State
 
     @staticmethod
     def read(path: Path) -> "ReportRun":
@@ -41,17 +42,12 @@ class ReportRun:
         except ConfigError:
             folder.result()  # damaged, it is an error; a missing evaluation is none
             past = None
-        return ReportRun(folder, about, past, records, flat(folder.settings()))
+        return ReportRun(folder, about, past, records, flat(folder.settings()), run_state(folder))
 
     @property
     def name(self) -> str:
         """The folder's."""
         return self.folder.path.name
-
-    @property
-    def state(self) -> str:
-        """What became of it."""
-        return run_state(self.folder)
 
     @property
     def env_steps(self) -> int:

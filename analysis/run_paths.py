@@ -35,11 +35,28 @@ def expanded(path: Path) -> list[Path]:
 
 
 def run_folders(folder: Path) -> Iterator[Path]:
-    """Those of rmc train, rmc baseline and sweeps, however deep; nothing below a run is looked at."""
-    for path, below, files in os.walk(folder, onerror=lambda error: log.warning("%s (left out)", error)):
-        if "checkpoints" in below and not {"config.json", "metrics.jsonl", ".lock"}.isdisjoint(files):
+    """Those of rmc train, rmc baseline and sweeps, however deep; nothing below a run is looked at.
+
+    Links are followed, each folder once.
+    """
+    seen: set[str] = set()
+    for path, below, files in os.walk(
+        folder, onerror=lambda error: log.warning("%s (left out)", error), followlinks=True
+    ):
+        where = os.path.realpath(path)
+        is_run, is_new = _is_run(below, files), where not in seen
+        seen.add(where)
+        if is_run or not is_new:
             below.clear()
+        if is_run and is_new:
             yield Path(path)
+
+
+def _is_run(folders: list[str], files: list[str]) -> bool:
+    """By what is in a folder: also a copy without checkpoints, or one whose config.json is lost."""
+    trained = not {"metrics.jsonl", "result.json"}.isdisjoint(files)
+    begun = not {"config.json", "metrics.jsonl", ".lock"}.isdisjoint(files)
+    return ("config.json" in files and trained) or ("checkpoints" in folders and begun)
 
 
 def each_readable(
@@ -55,7 +72,7 @@ def each_readable(
     for path in once.values():
         try:
             found.append(read(path))
-        except ConfigError as error:
+        except (ConfigError, OSError) as error:
             if len(once) == 1:
                 raise
             log.warning("%s (left out)", error)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -159,12 +160,20 @@ def test_a_folder_of_runs_at_any_depth_and_a_pattern_can_be_plotted(tmp_path, ca
         record = {"role": "evaluator", "time": 1.0, "eval_update": 5, "eval_return_mean": 7.0, "eval_return_std": 1.0}
         (folder / "metrics.jsonl").write_text(json.dumps(record) + "\n")
     (tmp_path / "runs" / "sweep.jsonl").write_text("{}\n")
+    (tmp_path / "runs" / "deep" / "three").rename(tmp_path / "elsewhere")
+    (tmp_path / "runs" / "deep" / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "runs" / "deep" / "around").symlink_to(tmp_path / "runs" / "deep")
+    shutil.rmtree(tmp_path / "runs" / "one" / "checkpoints")  # as a copy leaves them out
     (tmp_path / "empty").mkdir()
     out = ["--out", str(tmp_path / "out.png")]
     for words in ([str(tmp_path / "runs")], [str(tmp_path / "runs" / "*")], [str(tmp_path / "runs" / "*")] * 2):
         assert run(["plot", *words, *out]) == 0
         assert "7 (7, 7, 7)" in capsys.readouterr().out
     assert run(["plot", str(tmp_path / "runs" / "d*"), *out]) == 0
+    assert "7 (7, 7)" in capsys.readouterr().out
+    (tmp_path / "elsewhere" / "metrics.jsonl").unlink()
+    (tmp_path / "elsewhere" / "metrics.jsonl").mkdir()  # which nobody can read
+    assert run(["plot", str(tmp_path / "runs"), *out]) == 0
     assert "7 (7, 7)" in capsys.readouterr().out
     for words, fault in {"empty": "no run in there", "no*": "matches nothing"}.items():
         assert run(["plot", str(tmp_path / words), *out]) == 2
