@@ -65,7 +65,7 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
         state = torch.load(io.BytesIO(files[STATE]), map_location="cpu", weights_only=True)
         _check_sizes(init_from, parts, source, config, state["agent"])
         update = _begun(config, state, parts, bool(source.update.policy_ema_updates))
-        progress = _progress(config.window_spec(), update.agent, json.loads(files[PROGRESS])["env_steps"], parts)
+        progress = _progress(config.window_spec(), update.agent, json.loads(files[PROGRESS]), parts)
     except (KeyError, RuntimeError, ValueError, EOFError, UnpicklingError) as error:
         fix = f"its checkpoint {number} cannot be used ({first_line(error)}); use another"
         raise ConfigError(OPTION, init_from, fix) from None
@@ -123,13 +123,18 @@ def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages:
     return update
 
 
-def _progress(spec: WindowSpec, agent: Agent, env_steps: int, parts: InitParts) -> LearnerProgress:
-    """Of a learner that has done nothing. What normalises what it reads weighs as much as the steps it is from."""
+def _progress(spec: WindowSpec, agent: Agent, source: dict[str, Any], parts: InitParts) -> LearnerProgress:
+    """Of a learner that has done nothing. What normalises what it reads weighs as much as the steps it is from.
+
+    Those are of the ``source``, and of the run that it began with itself.
+    """
     normalizers = [agent.normalizer, *([agent.privileged_normalizer] if agent.privileged_normalizer else [])]
     mean, std = (torch.cat([getattr(one, name) for one in normalizers]).double() for name in ("mean", "std"))
-    count = torch.full((spec.counts,), env_steps)
+    before = source.get("observed_before")
+    earlier = 0 if before is None else int(ObservationStatistics.from_json(before).count.max())
+    count = torch.full((spec.counts,), source["env_steps"] + earlier)
     if parts != "all":
         count[spec.obs_dim :] = 0  # what critics alone read is new
     total, total_square = mean * count, (std.square() + mean.square()) * count
-    before = ObservationStatistics(count.numpy(), total.numpy(), total_square.numpy())
-    return LearnerProgress(0, 0, 0, observed_before=before, policy_learnt="policy.".startswith(PARTS[parts]))
+    observed = ObservationStatistics(count.numpy(), total.numpy(), total_square.numpy())
+    return LearnerProgress(0, 0, 0, observed_before=observed, policy_learnt="policy.".startswith(PARTS[parts]))

@@ -79,7 +79,8 @@ def parse(words: list[str]) -> Any:
     A run that is there gives the defaults: it is known once the words are parsed with those of the preset.
     """
     words, env = with_file(words, option_names(train_options.Train)) if words[:1] == ["train"] else (words, "")
-    _check_once(KWARGS, words)
+    for option in (KWARGS, *(("--grid", "--search") if words[:1] == ["sweep"] else ())):
+        _check_once(option, words)
     defaults = _defaults(preset_config(_named_preset(words), EnvConfig(env)), LaunchOptions(None))
     without_help = [word for word in words if word not in HELP]
     if without_help != words and words[0] in defaults:

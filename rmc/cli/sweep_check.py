@@ -78,10 +78,10 @@ def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:
     return checked
 
 
-def config_of(job: Job) -> RunConfig:
-    """Of a run's words, which can be read. What they do not say is the preset's, whatever its folder has."""
-    config: RunConfig = parser.parse(list(job.words)).config()
-    return config
+def read(job: Job) -> tuple[RunConfig, LaunchOptions]:
+    """A run's words, which can be read. What they do not say is the preset's, whatever its folder has."""
+    command = parser.parse(list(job.words))
+    return command.config(), command.launch_options()
 
 
 def with_length(job: Job, config: RunConfig) -> Job:
@@ -101,7 +101,13 @@ def _checked(job: Job, on_this_machine: bool) -> Checked:
     if on_this_machine:
         check_machine(config, options)
     else:
+        if options.device not in ("cpu", "cuda", "cuda:0"):
+            raise ConfigError("--device", options.device, "a run on a node sees one GPU; take cuda")
         config.sizes()  # the environment's, which the nodes make, too
+    if options.init_from is not None and not (job.folder / "config.json").exists():
+        from rmc.deploy.run import warm_start  # imports torch
+
+        warm_start.prepare(config, options.init_from, options.init_parts)
     return Checked(job, config, options)
 
 

@@ -29,6 +29,7 @@ from rmc.sweep.pool import OVER, Ending, Place, SweepPlan, conduct, drop_replay
 from rmc.sweep.spec import Range, Search, Spec, read_grid, read_ranges, read_seeds, read_spec
 from rmc.sweep.table import result_table, run_line
 
+WIDEST = 1_000  # characters of a table's line
 log = logging.getLogger(__name__)
 
 
@@ -103,12 +104,12 @@ class Work:
 def grid_work(checked: list[Checked], index: Index) -> Work:
     """All runs that have no result yet. Raises ConfigError."""
     jobs = [one.job for one in checked]
-    todo = [one.job for one in checked if not is_finished(one.job, one.config)]
+    todo = [one.job for one in checked if not is_finished(one.job, one.config, one.options)]
     waiting = {job.name for job in todo}
     for job in jobs:
         if job.name not in waiting:
             index.put(job, "finished")
-        elif index.state(job) in OVER or job.name not in index.lines:  # longer than before, or new
+        elif index.state(job) in (*OVER, "running") or job.name not in index.lines:  # longer, killed, or new
             index.put(job, "waiting")
     index.write()
     return Work(Grid(todo), jobs, todo, len(jobs))
@@ -125,14 +126,14 @@ def search_work(spec: Spec, search: Search, config: RunConfig, index: Index, fol
 
     def make(name: str, values: dict[str, Any]) -> Job:
         job = make_job(spec, folder / name, values, spec.seeds[0])
-        return sweep_check.with_length(job, sweep_check.config_of(job))
+        return sweep_check.with_length(job, sweep_check.read(job)[0])
 
     def finished(job: Job) -> bool:
-        return is_finished(job, sweep_check.config_of(job))
+        return is_finished(job, *sweep_check.read(job))
 
     plan = SearchPlan(search, distributions, index, make, finished, config.learner.checkpoint_steps)
     for job in plan.todo:
-        if index.state(job) in OVER:
+        if index.state(job) in (*OVER, "running"):
             index.put(job, "waiting")
     index.write()
     total = max(search.trials, len(plan.jobs))
@@ -163,7 +164,7 @@ def _conduct(command: Sweep, work: Work, checked: list[Checked], index: Index) -
                 _warn_of_empty_rings(work.todo)
                 conduct(work.plan, place, stop, index.begin, ended)
     if work.jobs:
-        console.print(result_table(work.jobs, index))
+        terminal(max(console.width, WIDEST)).print(result_table(work.jobs, index))  # a cut return is none
     remaining = work.total - sum(index.state(job) in OVER for job in work.jobs)
     if remaining:
         console.print(

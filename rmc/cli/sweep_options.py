@@ -20,7 +20,7 @@ class Sweep:
     seeds: str | None = None
     """Seeds of each value of the grid, like 1-5 or 1,4,7; by default 0."""
     grid: tuple[str, ...] = ()
-    """Options of rmc train and their values, like learning_rate=3e-4,1e-3 heads=[64,64],[256,256]."""
+    """Options of rmc train and their values, like learning_rate=3e-4,1e-3 'heads=[64,64],[256,256]'."""
     search: tuple[str, ...] = ()
     """In place of a grid: options to search, like learning_rate=1e-5..1e-2:log n_step=1..5 (extra: optuna)."""
     trials: int = 20

@@ -8,7 +8,9 @@ from typing import Any
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, flat, option, option_words
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import SAME_AGENT
+from rmc.deploy.run.starts import starts
 from rmc.sweep.job import Job, run_name
 from rmc.sweep.pool import Ending
 from rmc.sweep.spec import Spec
@@ -27,7 +29,7 @@ def make_job(spec: Spec, folder: Path, values: dict[str, Any], seed: int) -> Job
     return Job(folder, ("train", spec.env, *options, *spec.words, *own, "--seed", str(seed)), seed, values)
 
 
-def is_finished(job: Job, config: RunConfig) -> bool:
+def is_finished(job: Job, config: RunConfig, options: LaunchOptions) -> bool:
     """Whether its run has a result after as many steps. Raises ConfigError where the folder has another run."""
     folder = RunFolder(job.folder)
     if not (folder.path / "config.json").exists():
@@ -37,8 +39,17 @@ def is_finished(job: Job, config: RunConfig) -> bool:
         if path not in SAME_AGENT and was.get(path) != now[path]:
             fix = f"the run in {job.folder} has {was.get(path)!r}; use that, or another --sweep-dir"
             raise ConfigError(option(path), now[path], fix)
+    began = next((start.init_from for start in starts(folder) if start.init_from is not None), {})
+    asked = None if options.init_from is None else [options.init_from, options.init_parts]
+    if began.get("asked") != asked:
+        fix = f"the run in {job.folder} began {_with(began)}; use that, or another --sweep-dir"
+        raise ConfigError("--init-from", options.init_from, fix)
     result = folder.result()
     return result is not None and result["env_steps"] >= config.total_steps
+
+
+def _with(began: dict[str, Any]) -> str:
+    return "with {parts} of {run}".format(**began) if began else "with nothing of another"
 
 
 class Grid:

@@ -69,18 +69,17 @@ class Index:
 
 
 def newest_return(job: Job) -> tuple[float | None, int]:
-    """Of its result, or else of its newest evaluation, and the environment steps there."""
+    """Of its newest evaluation that was not cut, and the environment steps so far."""
     folder = RunFolder(job.folder)
-    result = folder.result()
-    if result is not None:
-        return result["eval_return_mean"], result["env_steps"]
     if not (folder.path / "config.json").exists():
         return None, 0
+    result = folder.result()
+    steps = result["env_steps"] if result is not None else 0
     try:
-        last = of_run(folder).evaluations[-1]
-    except ConfigError:  # not evaluated yet
-        return None, 0
-    return last.return_mean, last.env_steps
+        last = of_run(folder, only_whole=True).evaluations[-1]
+    except ConfigError:  # none yet
+        return None, steps
+    return last.return_mean, steps or last.env_steps
 
 
 def values_of(line: dict[str, Any]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ except ImportError as missing:
 
     raise ConfigError("search", "", f"Optuna is not installed; {how_to_install('optuna')}") from missing
 
+import numpy as np
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import TrialState
 
@@ -64,7 +65,8 @@ class SearchPlan:
         """Tell Optuna of a trial of before, or take it up again."""
         name, values = str(line["run"]), values_of(line)
         job = self._make(name, values)
-        over = line["state"] == "pruned" or (line["state"] == "finished" and self._is_finished(job))
+        is_finished = self._is_finished(job)  # raises for other options, whatever its state
+        over = line["state"] == "pruned" or (line["state"] == "finished" and is_finished)
         try:
             trial = self._frozen(job, line, TRIAL_STATES[line["state"]] if over else TrialState.FAIL)
         except (KeyError, ValueError):
@@ -114,7 +116,8 @@ class SearchPlan:
         line = self._index.lines.get(name)
         if line is not None:
             self._study.enqueue_trial(self._params(values_of(line)))
-        seed = self._search.sampler_seed + int(name.removeprefix(TRIAL))
+        apart = np.random.SeedSequence([self._search.sampler_seed, int(name.removeprefix(TRIAL))])
+        seed = int(apart.generate_state(1)[0])  # of neighbouring seeds no two draw alike
         self._study.sampler = optuna.samplers.TPESampler(seed=seed, constant_liar=True)
         trial = self._study.ask(self._distributions)
         job = self._make(name, self._values(trial.params))

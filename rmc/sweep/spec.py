@@ -7,7 +7,7 @@ import difflib
 import json
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ NAMES = {path.rpartition(".")[2] for path in flat(robust(EnvConfig("")))} - OWN 
     "init_from",
     "init_parts",
 }
+EVERY_RUNS = NAMES | {"track", "track_project", "track_tags", "video_every"}  # which no two runs differ in
 RUN_LAUNCHERS = ("local", "lockstep")
 MOST = 1_000_000  # runs and trials
 
@@ -65,14 +66,13 @@ class Spec:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for names and lists that make no sense; values are judged by the parser of rmc train."""
-        for part, table in (("options", self.options), ("grid", self.grid)):
-            for name, value in table.items():
-                check_name(f"{part}.{name}", name, value)
+        for name, value in self.options.items():
+            check_name(f"options.{name}", name, value, EVERY_RUNS)
         for name, values in self.grid.items():
+            check_name(f"grid.{name}", name, values)
             if not isinstance(values, list) or not values:
                 raise ConfigError(f"grid.{name}", values, "write a list of values, like [3e-4, 1e-3]")
-            if len({repr(value) for value in values}) < len(values):
-                raise ConfigError(f"grid.{name}", values, "has a value twice; give each once")
+            _check_each_once(f"grid.{name}", values)
         if self.search is not None:
             self._check_search(self.search)
         varied = {**self.grid, **(self.search.ranges if self.search else {})}
@@ -96,14 +96,21 @@ class Spec:
             check_name(f"search.{name}", name, values)
             if isinstance(values, list) and not values:
                 raise ConfigError(f"search.{name}", values, "write a list of choices, or a range")
+            if isinstance(values, list):
+                _check_each_once(f"search.{name}", values)
 
 
-def check_name(place: str, name: str, value: Any) -> None:
+def _check_each_once(place: str, values: list[Any]) -> None:
+    if len({repr(value) for value in values}) < len(values):
+        raise ConfigError(place, values, "has a value twice; give each once")
+
+
+def check_name(place: str, name: str, value: Any, names: Set[str] = NAMES) -> None:
     """Raises ConfigError where that is no option that a sweep's runs may have."""
     if name in OWN:
         raise ConfigError(place, value, "every run has its own; give env and seeds")
-    if name not in NAMES:
-        near = difflib.get_close_matches(name, NAMES, 1)
+    if name not in names:
+        near = difflib.get_close_matches(name, names, 1)
         hint = f"did you mean {near[0]}?" if near else "rmc train --help lists them"
         raise ConfigError(place, value, f"no option that a sweep's runs take; {hint}")
     for one in value if isinstance(value, list) else [value]:
@@ -202,7 +209,7 @@ def read_ranges(words: Sequence[str]) -> dict[str, Range | list[Any]]:
     """Of ``NAME=LOW..HIGH``, ``NAME=LOW..HIGH:log`` or ``NAME=CHOICE,CHOICE…`` words. Raises ConfigError."""
     ranges: dict[str, Range | list[Any]] = {}
     for name, text in _pairs("--search", words):
-        ends = re.fullmatch(r"(.+?)\.\.(.+?)(:log)?", text)
+        ends = re.fullmatch(r"([^,]+?)\.\.([^,]+?)(:log)?", text)
         if ends is None:
             ranges[name] = read_values(text)
         else:

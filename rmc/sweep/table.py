@@ -28,12 +28,14 @@ def result_table(jobs: Sequence[Job], index: Index) -> Table:
 
 def _row(runs: list[Job], index: Index) -> tuple[float, list[str]]:
     """Its mean return, by which it is sorted, and its cells."""
-    returns = [line["return"] for job in runs if (line := index.lines.get(job.name)) and line["state"] == "finished"]
+    finished = [index.lines[job.name] for job in runs if index.state(job) == "finished"]
+    returns = [line["return"] for line in finished if line["return"] is not None]
     mean = float(np.mean(returns)) if returns else -np.inf
     deviation = f" ± {np.std(returns):,.1f}" if len(returns) > 1 else ""
     others = [index.state(job) for job in runs if index.state(job) != "finished"]
     counts = ", ".join(f"{others.count(state)} {state}" for state in dict.fromkeys(others))
-    values = (f"{one:.4g}" if isinstance(one, float) else shown(one) for one in runs[0].values.values())
+    is_trial = runs[0].name.startswith(TRIAL)  # whose values were drawn, with all their digits
+    values = (f"{one:.4g}" if is_trial and isinstance(one, float) else shown(one) for one in runs[0].values.values())
     text = f"{mean:,.1f}{deviation}" if returns else "-"
     return mean, [runs[0].name.removeprefix(TRIAL), *values, str(len(returns)), text, counts]
 

@@ -127,6 +127,15 @@ def test_the_normaliser_goes_on_from_the_sources(source: RunFolder, tmp_path: Pa
         torch.testing.assert_close(published(run)["normalizer.mean"], mean.float(), atol=1e-3, rtol=1e-3)
 
 
+def test_the_normaliser_of_a_source_that_has_not_begun_is_its_own_sources(source: RunFolder, tmp_path: Path) -> None:
+    first = begin(OTHER, tmp_path / "first", source)
+    second = begin(OTHER, tmp_path / "second", first)
+    newest = (CheckpointFolder(folder.checkpoints).latest() for folder in (first, second))
+    numbers = [json.loads(one[1]["progress.json"]) for one in newest if one is not None]
+    assert numbers[0]["observed_before"] == numbers[1]["observed_before"]
+    assert len(numbers) == 2
+
+
 def test_a_numbered_checkpoint_and_the_history(source: RunFolder, tmp_path: Path) -> None:
     numbers = CheckpointFolder(source.checkpoints).numbers()
     folder = begin(OTHER, tmp_path / "run", source, "policy", f":{numbers[0]}")

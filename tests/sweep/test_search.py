@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rmc.cli.main import run
-from rmc.cli.sweep_check import config_of
+from rmc.cli.sweep_check import read
 from rmc.cli.sweep_command import search_work
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
@@ -38,12 +38,12 @@ def spec_of(trials: int = 20, **kwargs: Any) -> Spec:
 def work_of(folder: Path, index: Index, spec: Spec) -> Any:
     assert spec.search is not None
     corner = make_job(spec, folder / "trial-0", {}, 0)
-    return search_work(spec, spec.search, config_of(corner), index, folder)
+    return search_work(spec, spec.search, read(corner)[0], index, folder)
 
 
 def pretend(job: Job, returns: list[float], finished: bool, steps: int = 1000) -> None:
     """The folder of a run that was evaluated every so many steps."""
-    config, folder = config_of(job), RunFolder(job.folder)
+    config, folder = read(job)[0], RunFolder(job.folder)
     job.folder.mkdir(parents=True, exist_ok=True)
     folder.write_config(config)
     records: list[dict[str, Any]] = []
@@ -100,8 +100,8 @@ def test_values_are_drawn_from_the_ranges_and_a_search_that_goes_on_draws_what_i
     assert [job.name for job in again.todo] == ["trial-3", "trial-4", "trial-5"]
     assert [play(again, index, [float(at)] * 4).values for at in range(3, 6)] == values[3:]
     index.lines.clear()
-    other = work_of(tmp_path, index, spec_of(6, sampler_seed=7))
-    assert other.plan.next().values != values[0]
+    other = work_of(tmp_path, index, spec_of(6, sampler_seed=1))
+    assert all(other.plan.next().values not in values for _ in range(5))  # a neighbour's draws are no repetition
 
 
 def test_a_run_below_the_median_is_pruned_once_enough_are_finished(tmp_path: Path, index: Index) -> None:
@@ -140,6 +140,7 @@ def test_an_evaluation_that_was_cut_is_not_what_a_search_looks_for(tmp_path: Pat
     work.plan.end(job, Ending("finished", 1.0))
     index.end(job, Ending("finished", 1.0))
     assert [trial.value for trial in work.plan._study.trials] == [-800.0]
+    assert index.lines[job.name]["return"] == -800.0
     assert [trial.value for trial in work_of(tmp_path, index, spec_of()).plan._study.trials] == [-800.0]
     lost = work.plan.next()
     pretend(lost, [-20.0], finished=False)
@@ -156,6 +157,14 @@ def test_other_ranges_than_those_of_its_trials_are_refused(tmp_path: Path, index
         spec = Spec("InvertedPendulum-v5", words=("--preset", "debug"), search=Search(ranges))
         with pytest.raises(ConfigError, match=r"trial-0 has .* which these ranges do not hold"):
             work_of(tmp_path, index, spec)
+
+
+def test_a_search_that_goes_on_has_the_options_of_its_trials(tmp_path: Path, index: Index) -> None:
+    work = work_of(tmp_path, index, spec_of())
+    play(work, index, [1.0] * 4, finished=False)
+    spec = Spec("InvertedPendulum-v5", words=("--preset", "debug", "--gamma", "0.9"), search=Search(RANGES))
+    with pytest.raises(ConfigError, match=r"^--gamma=0.9: the run in .*trial-0 has 0.99; use that"):
+        work_of(tmp_path, index, spec)
 
 
 def test_a_range_is_of_numbers(tmp_path: Path, index: Index) -> None:

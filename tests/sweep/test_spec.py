@@ -31,8 +31,8 @@ def test_words_and_file_say_the_same(tmp_path: Path) -> None:
     assert len(ours) == 24
     assert [(job.name, job.seed, job.values) for job in ours] == [(job.name, job.seed, job.values) for job in theirs]
     assert [job.seed for job in ours] == [1] * 8 + [2] * 8 + [3] * 8  # what is compared goes on side by side
-    configs = [sweep_check.config_of(job) for job in ours]
-    assert configs == [sweep_check.config_of(job) for job in theirs]
+    configs = [sweep_check.read(job)[0] for job in ours]
+    assert configs == [sweep_check.read(job)[0] for job in theirs]
     last = configs[-1]
     assert (last.update.learning_rate, last.agent.heads, last.agent.grounding) == (1e-3, (32, 32), False)
     assert (last.seed, last.preset) == (3, "debug")
@@ -43,7 +43,7 @@ def test_options_of_train_come_after_the_environment_or_the_file(tmp_path: Path)
     for what in (PENDULUM, str(tmp_path / "spec.toml")):
         spec = spec_of(what, "--preset", "debug", "--heads", "8", "8", "--env-kwargs", "a=1", "b=2", "--jobs", "1")
         (job,) = grid_jobs(spec, tmp_path)
-        config = sweep_check.config_of(job)
+        config = sweep_check.read(job)[0]
         assert (config.agent.heads, config.env.env_kwargs, config.preset) == ((8, 8), {"a": 1, "b": 2}, "debug")
 
 
@@ -73,6 +73,17 @@ def test_a_search_has_ranges_and_choices() -> None:
     assert search is not None
     ranges = {"learning_rate": Range(1e-5, 1e-2, log=True), "n_step": Range(1, 5), "scheme": [1, 3]}
     assert (search.ranges, search.trials, search.prune) == (ranges, 7, False)
+    choices = spec_of(PENDULUM, "--search", "init_from=../a,../b").search
+    assert choices is not None
+    assert choices.ranges == {"init_from": ["../a", "../b"]}
+
+
+def test_a_tracker_is_of_every_run(tmp_path: Path) -> None:
+    path = tmp_path / "spec.toml"
+    path.write_text('env = "InvertedPendulum-v5"\n[options]\ntrack = "off"\ntrack_tags = ["a", "b"]\nvideo_every = 2\n')
+    (job,) = grid_jobs(spec_of(str(path)), tmp_path)
+    options = sweep_check.read(job)[1]
+    assert (options.track, options.track_tags, options.video_every) == ("off", ("a", "b"), 2)
 
 
 def test_names_of_folders_are_plain_and_tell_values_apart() -> None:
@@ -150,6 +161,13 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(
         ([PENDULUM, "--seed", "5"], "--seed='--seed 5': a sweep has several: give --seeds"),
         ([PENDULUM, "--grid", "learning_rate"], "--grid='learning_rate': write NAME=VALUE"),
         ([PENDULUM, "--grid", "scheme=1", "scheme=2"], "has an option twice"),
+        ([PENDULUM, "--grid", "scheme=1,3", "--grid", "n_step=1,2"], "--grid='--grid --grid': is there twice"),
+        ([PENDULUM, "--search", "scheme=1,3", "--search=n_step=1..2"], "is there twice; give all of NAME=VALUE"),
+        ([PENDULUM, "--search", "scheme=1,1,3"], "search.scheme=[1, 1, 3]: has a value twice"),
+        ([PENDULUM, "--search", "n_step=1..3,5"], "search.n_step='1..3': "),
+        ([PENDULUM, "--init-from", "runs/none"], "--init-from='runs/none': no such run"),
+        ([PENDULUM, "--grid", "track=wandb,off"], "grid.track=['wandb', 'off']: no option that a sweep's runs take"),
+        ([PENDULUM, "--device", "cuda:1", "--launcher", "ray"], "--device='cuda:1': a run on a node sees one GPU"),
         ([PENDULUM, "--grid", "lr=1"], "grid.lr=[1]: no option"),
         ([PENDULUM, "--grid", "scheme=1,2", "--scheme", "3"], "scheme=[1, 2]: is an option of every run"),
         ([PENDULUM, "--grid", "grounding=true,false", "--no-grounding"], "grounding=[True, False]: is an option"),

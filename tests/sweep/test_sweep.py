@@ -1,24 +1,34 @@
 """Sweeps as a user starts, interrupts and repeats them."""
 
+import dataclasses
 import errno
+import io
 import os
 import re
 import signal
 import time
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import psutil
 import pytest
+from rich.console import Console
 
 from rmc.cli.main import run
+from rmc.cli.sweep_check import Checked, read
+from rmc.cli.sweep_command import grid_work
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
 from rmc.sweep import local_runs, pool, room
+from rmc.sweep.grid import is_finished
+from rmc.sweep.index import Index
 from rmc.sweep.job import Job
 from rmc.sweep.pool import drop_replay
+from rmc.sweep.table import result_table
 from tests.integration.running import alive
 from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
 
@@ -176,6 +186,40 @@ def test_a_full_disk_ends_a_sweep_but_its_runs_save_first(tmp_path: Path, monkey
     assert at_work[0].done[0] == "stop"
     assert "kill" not in at_work[0].done
     assert at_work[1].done == []
+
+
+def test_runs_that_began_with_nothing_are_no_results_of_a_warm_start(tmp_path: Path, capsys) -> None:
+    job = made(tmp_path / "sweep" / "seed=0")
+    config, options = read(job)
+    assert is_finished(job, config, options)
+    with pytest.raises(ConfigError, match=r"^--init-from='x': the run in .*seed=0 began with nothing of another; use"):
+        is_finished(job, config, dataclasses.replace(options, init_from="x"))
+
+
+def test_a_killed_sweeps_runs_are_not_told_as_running_and_tables_are_not_cut(tmp_path: Path) -> None:
+    with closing(Index(tmp_path / "sweep")) as index:
+        jobs = [made(tmp_path / "sweep" / f"{at}", gamma) for at, gamma in enumerate((0.99991, 0.99992))]
+        index.put(jobs[0], "running")
+        jobs[0].folder.joinpath("result.json").unlink()
+        grid_work([Checked(job, *read(job)) for job in jobs], index)
+        assert [index.state(job) for job in jobs] == ["waiting", "finished"]
+        console = Console(file=io.StringIO(), width=1_000)
+        console.print(result_table(jobs, index))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "0.99991" in text
+    assert "0.99992" in text
+
+
+def made(folder: Path, gamma: float = 0.99) -> Job:
+    """A run that is over."""
+    words = ("train", "InvertedPendulum-v5", "--preset", "debug", "--gamma", str(gamma), "--seed", "0")
+    job = Job(folder, words, 0, {"gamma": gamma})
+    config = read(job)[0]
+    run_folder = open_run(config, folder, "fail")
+    run_folder.unlock()
+    result = {"updates": 1, "wall_s": 1.0, "eval_return_mean": 12_345.6, "eval_return_std": 0.0, "eval_episodes": 1}
+    run_folder.write_result({**result, "env_steps": config.total_steps, "initial_return_mean": 0.0})
+    return job
 
 
 def test_cores_are_shared_out() -> None:
