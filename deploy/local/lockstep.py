@@ -116,6 +116,8 @@ def train(config: RunConfig, folder: Path, watch: Callable[[Bus], None], stop: S
                 run.emit_metrics(clock)
                 watch(run.bus)
         run.emit_metrics(clock)
+        if run.finished:
+            run.bus.emit(run.learner.name, {"finished": 1})
     finally:
         run.close()
         watch(run.bus)

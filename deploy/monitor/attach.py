@@ -12,7 +12,7 @@ from rich.console import Console
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError
-from rmc.deploy.monitor.recorded import catch_up, empty_status
+from rmc.deploy.monitor.recorded import catch_up, empty_status, take_start
 from rmc.deploy.monitor.view import View
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
@@ -28,6 +28,7 @@ def watch(folder: RunFolder, console: Console, gone: Callable[[], bool]) -> int 
     """Show a run until its launcher ends, and give its exit status; None where it is ``gone`` without one."""
     config, tail = folder.config(), MetricsTail(folder.metrics)
     status = empty_status(folder, (*config.roles(), "launcher"))
+    take_start(status, folder)
     catch_up(status, tail)
     view = View(status, console)
     try:

@@ -10,6 +10,7 @@ from rmc.deploy.monitor.notices import notices
 from rmc.deploy.monitor.run_status import RunStatus
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import RECENT_BYTES, MetricsTail
+from rmc.deploy.run.starts import starts
 from rmc.deploy.run.state import run_state
 
 
@@ -24,8 +25,14 @@ def recorded_status(folder: RunFolder, recent_bytes: int = RECENT_BYTES) -> RunS
 def take_state(status: RunStatus, folder: RunFolder) -> None:
     """Take in what has become of the run. Raises ConfigError where that is damaged."""
     status.state = run_state(folder)
+    take_start(status, folder)
     result = folder.result() if status.state == "finished" else None
     status.final_steps = None if result is None else int(result["env_steps"])
+
+
+def take_start(status: RunStatus, folder: RunFolder) -> None:
+    """Take in when the run was started last: who spoke before need not speak now."""
+    status.began = max((start.time for start in starts(folder)[-1:] if is_finite(start.time)), default=0.0)
 
 
 def status_json(folder: RunFolder, status: RunStatus) -> dict[str, Any]:

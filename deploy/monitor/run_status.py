@@ -37,6 +37,8 @@ class RunStatus:
     ) -> None:
         """``expected`` are the roles that are about to speak."""
         self._since = dict.fromkeys(expected, time.time())  # of those that have not spoken
+        self.began = 0.0  # the newest start, by the clock; 0 where that is not known
+        self._spoke_last, self._is_trained = 0.0, False  # anybody, and whether the learner's last word was its end
         self.state: State | None = "training"  # None where it has ended, and how is not known
         self.env, self.preset, self.seed, self.total_steps = env, preset, seed, total_steps
         self.replay_ratio = replay_ratio
@@ -60,17 +62,27 @@ class RunStatus:
         current = self.roles.get(role, {})
         if role == "launcher" and _number(record.get("start_s")) < _number(current.get("start_s")):
             self._pace.forget()  # of another start
+            self._is_trained = False
         room = MOST_NAMES - len(current)
         new = record if len(record) <= room else {name: record[name] for name in record if name in current}
         if role in self.roles:
             self.roles[role] = current | new
         else:  # afresh: another thread may be going through the old one
             self.roles = {**self.roles, role: dict(new)}
+        self._note_word(record)
         self._note_checkpoint(record)
         self.take_evaluation(record)
         self._note_movement(_number(self.get("learner", "time")))
         if role.startswith("replay") and "env_steps" in record and _number(self.get("learner", "updates_per_s")) > 0:
             self._pace.note(_number(record.get("time")), self.env_steps)
+
+    def _note_word(self, record: dict[str, Any]) -> None:
+        spoke = _number(record.get("time"))
+        if self._spoke_last < self.began <= spoke:  # the first of this start, before which all may take its time
+            self._since = dict.fromkeys(self._since, time.time())
+        self._spoke_last = spoke
+        if record["role"] == "learner":
+            self._is_trained = bool(record.get("finished"))
 
     def _note_checkpoint(self, record: dict[str, Any]) -> None:
         update, steps = _steps(record.get("checkpoint_update")), _steps(record.get("checkpoint_env_steps"))
@@ -101,26 +113,40 @@ class RunStatus:
 
     def silent(self) -> dict[str, float]:
         """Who has said nothing for long, and for how many seconds. While Redis is away, which is why, it alone."""
-        if self.is_over:
+        if not self._is_training:
             return {}
         now, launcher = time.time(), self.roles.get("launcher", {})
         if launcher.get("redis_away_s"):
             return {"Redis": launcher["redis_away_s"] + now - launcher.get("time", now)}
         heard = self._of_this_start()
         unheard = {role: now - since for role, since in self._since.items() if role not in heard}
+        return {role: seconds for role, seconds in unheard.items() if seconds > UNHEARD_SECONDS} | self._quiet(heard)
+
+    def speaking(self) -> set[str]:
+        """Who has said something of late, or cannot, as Redis is away."""
+        heard = self._of_this_start()
+        return set(heard) - set({} if self.get("launcher", "redis_away_s") else self._quiet(heard))
+
+    def _quiet(self, heard: dict[str, dict[str, Any]]) -> dict[str, float]:
+        now = time.time()
         quiet = {role: now - record.get("time", now) for role, record in heard.items() if self.heard in ("*", role)}
-        return {role: seconds for role, seconds in unheard.items() if seconds > UNHEARD_SECONDS} | {
+        return {
             role: seconds
             for role, seconds in sorted(quiet.items())
             if seconds > (LAUNCHER_SECONDS if role == "launcher" else SILENT_SECONDS)
         }
 
     @property
+    def _is_training(self) -> bool:
+        """Whether roles are to speak: not before the first word of this start, nor once the learner is at its end."""
+        return not (self.is_over or self._is_trained) and self._spoke_last >= self.began
+
+    @property
     def stalled_s(self) -> float:
         """Seconds without a step and an update while learner, replay servers and actors all wait; 0 where one works."""
         said = {role: record for role, record in self._of_this_start().items() if role not in ("launcher", "evaluator")}
         work = [role for role, record in said.items() if _number(record.get("waiting_share")) < WAITING_SHARE]
-        if work or self.is_over or self.silent() or self.get("learner", "waiting_for") in (None, "disk"):
+        if work or not self._is_training or self.silent() or self.get("learner", "waiting_for") in (None, "disk"):
             return 0.0
         return max(0.0, _number(self.get("learner", "time")) - self._moved_at)
 

@@ -86,7 +86,7 @@ class LauncherActor(RoleActor):
         """How the run is. Raises ConfigError where its folder is damaged."""
         folder = RunFolder(self._folder)
         status, past_starts = recorded_status(folder, LISTED_BYTES), starts(folder)
-        heard = set(status.roles) - set(status.silent())
+        heard = status.speaking()
         at = self._claim.read_text().split()[:1] if "learner" in heard else []
         address = next((node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] in at), None)
         actors = sum(role.startswith("actor-") for role in heard)

@@ -16,8 +16,10 @@ import pytest
 from rich.console import Console
 
 from rmc.common.errors import ConfigError
-from rmc.deploy.monitor import view
+from rmc.deploy.monitor import run_status, view
 from rmc.deploy.monitor.attach import launcher_pid, stop, watch
+from rmc.deploy.monitor.notices import notices
+from rmc.deploy.monitor.recorded import empty_status, recorded_status, take_start
 from rmc.deploy.run.folder import RunFolder
 
 HOLDER = """
@@ -78,14 +80,59 @@ def test_nobody_to_stop_is_said(folder: RunFolder, tmp_path: Path) -> None:
         stop(RunFolder(tmp_path))
 
 
+def begun(folder: RunFolder, ago: float) -> None:
+    """Make its newest start one of so many seconds ago."""
+    start = json.loads(folder.history_file.read_bytes())
+    folder.history_file.write_text(json.dumps(start | {"time": time.time() - ago}) + "\n")
+
+
 def test_who_attaches_hears_who_is_silent(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     """By what the launcher has written, and if that is nothing, that it is the launcher."""
     monkeypatch.setattr(view, "LINE_SECONDS", 0.1)
     monkeypatch.setattr(view, "REFRESH_SECONDS", 0.05)
     printed, looks = io.StringIO(), itertools.count()
+    begun(folder, 60.0)
     spoke = {"learner": 9.0, "launcher": 40.0}
     folder.metrics.write_text(
         "".join(json.dumps({"role": role, "time": time.time() - ago}) + "\n" for role, ago in spoke.items())
     )
     watch(folder, Console(file=printed, width=500), lambda: next(looks) > 2)
     assert re.search("silent: launcher for 40 s, learner for (9|10) s", printed.getvalue())
+
+
+@pytest.mark.parametrize("words", [{}, {"learner": 900.0, "launcher": 901.0}, {"launcher": 40.0, "learner": 31.0}])
+def test_before_the_roles_and_after_them_nobody_is_silent(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, words: dict[str, float]
+) -> None:
+    """Amid the first evaluation; at a resume, where others spoke before; and amid the last one."""
+    monkeypatch.setattr(view, "LINE_SECONDS", 0.1)
+    monkeypatch.setattr(view, "REFRESH_SECONDS", 0.05)
+    monkeypatch.setattr(run_status, "UNHEARD_SECONDS", 0.2)
+    printed, looks = io.StringIO(), itertools.count()
+    begun(folder, 60.0)
+    said = [{"role": role, "time": time.time() - ago} for role, ago in words.items()]
+    ended = [{**said[-1], "finished": 1}] if words.get("launcher") == 40.0 else []
+    folder.metrics.write_text("".join(json.dumps(one) + "\n" for one in [*said, *ended]))
+    folder.lock()
+    watch(folder, Console(file=printed, width=500), lambda: next(looks) > 2)
+    assert "0 of" in printed.getvalue()
+    assert "silent" not in printed.getvalue()
+    assert recorded_status(folder).state == "training"
+    assert "silent" not in notices(recorded_status(folder))
+    folder.unlock()
+
+
+def test_who_speaks_and_then_falls_silent_in_a_start_that_goes_on(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though an earlier start has come to its end; roles are given their time from this start's first word on."""
+    status, now = empty_status(folder, ("learner", "actor-0")), time.time()
+    status.take({"role": "launcher", "time": now - 80.0, "start_s": 5.0})
+    status.take({"role": "learner", "time": now - 79.0, "finished": 1})
+    begun(folder, 60.0)
+    take_start(status, folder)
+    assert (status.silent(), status.speaking()) == ({}, set())
+    status.take({"role": "launcher", "time": now, "start_s": 0.1})
+    assert (status.silent(), status.speaking()) == ({}, {"launcher"})
+    monkeypatch.setattr(time, "time", lambda: now + 40.0)
+    assert set(status.silent()) == {"launcher", "learner", "actor-0"}

@@ -137,6 +137,8 @@ def test_an_evaluation_is_played_step_by_step_between_which_a_signal_is_heard(tm
 
 def test_the_last_checkpoint_is_evaluated_too(tmp_path):
     said: list[dict[str, float]] = []
-    train(CONFIG, tmp_path, lambda bus: said.extend(bus.records({"evaluator": "0"})[0]), StopSignal())
+    heard = {"evaluator": "0", "learner": "0"}
+    train(CONFIG, tmp_path, lambda bus: said.extend(bus.records(heard)[0]), StopSignal())
     evaluated = {record["eval_update"] for record in said if "eval_update" in record}
     assert evaluated >= set(CheckpointFolder(tmp_path / "checkpoints").numbers())  # the newest are kept
+    assert [record for record in said if record["role"] == "learner"][-1]["finished"] == 1
