@@ -9,6 +9,7 @@ from statistics import mean
 from typing import Any, TypeGuard
 
 from rmc.common.bus.metrics_record import is_finite
+from rmc.deploy.monitor.run_status import LAUNCHER_SECONDS
 
 SPAN_SECONDS = 600.0  # the newest so much is judged
 NEW_START_SECONDS = 60.0  # without a word of anybody: what comes after it is another start of the run
@@ -113,11 +114,16 @@ def _newest(records: Iterable[Record], span: float) -> list[Record]:
     """Those of the newest span of the newest start."""
     kept: list[Record] = []
     end = 0.0  # a record that could not be sent at once comes later
+    trained, began = 0.0, 0.0  # seconds of this start, and when it was
     for record in records:
         if not is_finite(record.get("time")):
             continue
+        if record["role"] == "launcher" and is_finite(seconds := record.get("start_s")):
+            if seconds < trained:
+                kept, end = [], 0.0
+            trained, began = seconds, record["time"] - seconds - LAUNCHER_SECONDS
         if kept and record["time"] - end > NEW_START_SECONDS:
             kept.clear()
         kept.append(record)
         end = max(end, record["time"])
-    return [record for record in kept if record["time"] >= end - span]
+    return [record for record in kept if record["time"] >= max(began, end - span)]

@@ -114,6 +114,17 @@ def test_only_the_newest_start_counts() -> None:
     assert Vitals([*before, *records(actor_0=shares(0.1, "credit"))]).busy("actor") == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize("seconds", [90, 2])
+def test_a_resume_within_the_minute_is_another_start(seconds: int) -> None:
+    """What the start before said does not count: not the actors that it had more, nor that it came to its end."""
+    before = records(seconds, learner={"finished": 1}, actor_1=shares(1.0), launcher={"start_s": lambda s: 0.1 + s})
+    after = records(120, learner={"updates": 5}, replay={"env_steps": 7}, launcher={"start_s": lambda s: 0.2 + s})
+    newest = Vitals([*before, *(one | {"time": one["time"] + seconds + 20.0} for one in after)])
+    assert newest.roles == ["actor-0", "launcher", "learner", "replay"]
+    assert run_faults.silent(newest, CONFIG) is None
+    assert run_faults.stalled(newest, CONFIG) is not None
+
+
 def test_a_deadlock_is_named_with_its_waits() -> None:
     still = records(
         120,
@@ -160,6 +171,8 @@ def test_an_evaluator_that_cannot_keep_up() -> None:
     assert finding.advice.startswith("--checkpoint-steps 50000 gives it the time, --episodes 1")
     sound = vitals(learner=checkpoints, evaluator={"eval_update": lambda s: max(0, s // 10 * 100 - 100)})
     assert run_faults.evaluator_starved(sound, CONFIG) is None
+    resumed = vitals(40, learner={"checkpoint_update": lambda s: 500 + s // 15 * 100}, evaluator={"eval_update": 600})
+    assert run_faults.evaluator_starved(resumed, CONFIG) is None  # the start before has played the first
     none = dataclasses.replace(CONFIG, evaluator=dataclasses.replace(CONFIG.evaluator, episodes=0))
     assert run_faults.evaluator_starved(starving, none) is None
 
