@@ -25,6 +25,7 @@ from rmc.analysis.statistics import (
 )
 from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
+from rmc.deploy.monitor.figures import return_text
 
 Axis = Literal["env_steps", "updates", "wall_s"]
 LABELS = {"env_steps": "environment steps", "updates": "updates", "wall_s": "wall time (s)"}
@@ -153,15 +154,15 @@ def _cells(runs: list[History]) -> list[str]:
     steps = f"{min(ends):,}" + (f" to {max(ends):,}" if min(ends) < max(ends) else "")
     counts = [np.median([getattr(run, name) for run in runs]) for name in ("updates", "wall_s")]
     worst = min(one.return_mean for run in runs for one in run.evaluations[-LAST:])
-    return [seeds, _returns(runs), f"{worst:,.0f}", steps, *(f"{count:,.0f}" for count in counts)]
+    return [seeds, _returns(runs), return_text(worst), steps, *(f"{count:,.0f}" for count in counts)]
 
 
 def _returns(runs: list[History]) -> str:
     scores = last_returns(runs)
     if len(runs) >= ENOUGH_SEEDS:
         low, high = interval(interquartile_mean, scores)
-        return f"{interquartile_mean(scores):,.0f} [{low:,.0f}, {high:,.0f}]"
-    return f"{scores.mean():,.0f} ({', '.join(f'{score:,.0f}' for score in scores[:, 0])})"
+        return f"{return_text(interquartile_mean(scores))} [{return_text(low)}, {return_text(high)}]"
+    return f"{return_text(scores.mean())} ({', '.join(map(return_text, scores[:, 0]))})"
 
 
 def _beside(runs: list[History], reference: list[History]) -> list[str]:

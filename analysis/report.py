@@ -14,6 +14,7 @@ from rmc.analysis.out_file import check_writable
 from rmc.analysis.report_run import ReportRun
 from rmc.common.extra import check_installed
 from rmc.common.whole_file import write_whole
+from rmc.deploy.monitor.figures import return_text
 from rmc.deploy.run.config import option
 from rmc.deploy.run.starts import format_starts
 
@@ -95,14 +96,14 @@ def final_row(agent: str, past: list[History]) -> list[str]:
     last = [run.evaluations[-1].return_mean for run in past]
     worst = min(one.return_mean for run in past for one in run.evaluations[-LAST:])
     numbers = [mean(getattr(run, name) for run in past) for name in ("env_steps", "updates", "wall_s")]
-    deviation = f" ± {pstdev(last):,.1f}" if len(last) > 1 else ""
-    each = ", ".join(f"{value:,.0f}" for value in last)
+    deviation = f" ± {return_text(pstdev(last))}" if len(last) > 1 else ""
+    each = ", ".join(map(return_text, last))
     return [
         agent,
         f"{len(past)}",
-        f"{mean(last):,.1f}{deviation}",
+        f"{return_text(mean(last))}{deviation}",
         each,
-        f"{worst:,.1f}",
+        return_text(worst),
         *(f"{n:,.0f}" for n in numbers),
     ]
 

@@ -13,6 +13,11 @@ def number(value: Any, form: str = ",.3g") -> str:
     return NONE_YET if value is None else format(value, form)
 
 
+def return_text(value: float) -> str:
+    """A return: whole where it is large, else four digits of it."""
+    return number(value, ",.0f" if abs(value) >= 1000 else ",.4g")
+
+
 def time_and_eta(elapsed_s: float | None, eta_s: float | None, is_over: bool) -> str:
     """Like 0:21:10, ETA 2:31:00; of what is over no ETA."""
     return duration(elapsed_s) if is_over else f"{duration(elapsed_s)}, ETA {duration(eta_s)}"

@@ -1,6 +1,6 @@
 """The state of a run as one line, for where there is no terminal."""
 
-from rmc.deploy.monitor.figures import number, time_and_eta
+from rmc.deploy.monitor.figures import number, return_text, time_and_eta
 from rmc.deploy.monitor.notices import notices, waits
 from rmc.deploy.monitor.run_status import RunStatus
 
@@ -23,9 +23,4 @@ def line(status: RunStatus) -> str:
 def _evaluation(status: RunStatus) -> str:
     if status.last is None or status.best is None:
         return f"eval {number(None)}"
-    return f"eval {_return(status.last.return_mean)} (best {_return(status.best.return_mean)})"
-
-
-def _return(value: float) -> str:
-    """Whole where it is large."""
-    return number(value, ",.0f" if abs(value) >= 1000 else ",.4g")
+    return f"eval {return_text(status.last.return_mean)} (best {return_text(status.best.return_mean)})"

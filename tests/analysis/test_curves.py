@@ -230,6 +230,15 @@ def test_the_table_compares_with_a_reference():
         curves.tables(curves.grouped(runs), "PPO")
 
 
+def test_returns_below_one_are_told_apart():
+    few = [history_of(seed=s, last=last) for s, last in enumerate((0.46, 0.3, 0.64))]
+    text = shown(curves.tables(curves.grouped(few), None))
+    assert "0.4667 (0.46, 0.3, 0.64)" in text
+    assert " 0.1 " in text  # the worst
+    many = [history_of(seed=s, last=0.46) for s in range(5)]
+    assert "0.46 [0.46, 0.46]" in shown(curves.tables(curves.grouped(many), None))
+
+
 def test_the_command_draws_and_prints(tmp_path, capsys):
     lines = tmp_path / "study.jsonl"
     lines.write_text("\n".join(history_of(seed=seed).to_line() for seed in range(2)) + "\n")

@@ -111,9 +111,11 @@ def test_the_table_is_of_all_runs_of_an_agent(trained: Path, other: Path) -> Non
     past = [History("RMC", "E", seed, 200, 20, 2.0, 0.0, scores, True) for seed, scores in enumerate(evaluations)]
     row = report.final_row("RMC", past)
     assert dict(zip(report.COLUMNS, row, strict=True)) == {
-        "agent": "RMC", "runs": "2", "return": "15.0 ± 5.0", "each run": "10, 20", "worst of last 5": "5.0",
+        "agent": "RMC", "runs": "2", "return": "15 ± 5", "each run": "10, 20", "worst of last 5": "5",
         "steps": "200", "updates": "20", "wall s": "2",
     }  # fmt: skip
+    small = report.final_row("RMC", [History("RMC", "E", 0, 100, 10, 1.0, 0.0, [Evaluation(100, 10, 1.0, 0.46, 0.0)])])
+    assert small[2:5] == ["0.46", "0.46", "0.46"]
     runs = [ReportRun.read(path) for path in (trained, other)]
     assert {run.about.agent for run in runs} == {"RMC debug --replay-ratio 64.0"}
     assert len(report.newest(runs)) == 1  # of an agent one policy is played
