@@ -38,7 +38,11 @@ def replay_bound(vitals: Vitals, config: RunConfig) -> Finding | None:
     waiting = f"the learner waited {1 - learner:.0%} and actors {sum(waits.values()):.0%}"
     measured = f"the replay server was busy {busy:.0%} while {waiting}"
     more = f" with --actors {shards * ceil(config.actors / shards)}" if config.actors % shards else ""
-    return Finding("replay-bound", measured, f"--replay-shards {shards}{more}, or a larger --chunk-windows, would help")
+    return Finding(
+        "replay-bound",
+        measured,
+        f"--replay-shards {shards}{more} in a new run, or a larger --chunk-windows, would help",
+    )
 
 
 def learner_bound(vitals: Vitals, config: RunConfig) -> Finding | None:

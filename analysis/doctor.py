@@ -15,7 +15,7 @@ from rmc.deploy.run.validation import validate
 
 LEAST_SECONDS = 5.0  # of training; fewer say nothing
 Diagnosis = Callable[[Vitals, RunConfig], Finding | None]
-ALWAYS: tuple[Diagnosis, ...] = (run_faults.stalled, run_faults.silent, run_faults.long_warm_up)
+ALWAYS: tuple[Diagnosis, ...] = (run_faults.not_saved, run_faults.stalled, run_faults.silent, run_faults.long_warm_up)
 IN_TRAINING: tuple[Diagnosis, ...] = (
     bottleneck,
     host_faults.threads_fight,

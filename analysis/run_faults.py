@@ -23,9 +23,17 @@ def redis_away(vitals: Vitals, _: RunConfig) -> Finding | None:
     return Finding("redis away", f"no answer for {seconds:.0f} s", "every role waits for it; look at its server")
 
 
-def stalled(vitals: Vitals, _: RunConfig) -> Finding | None:
+def not_saved(vitals: Vitals, _: RunConfig) -> Finding | None:
+    """All is trained, and the last checkpoint finds no room: a stop would lose what came after the one before."""
+    if vitals.last("learner", "finished") or vitals.waiting_for("learner") != "disk":
+        return None
+    measured = f"the learner has waited {vitals.last('learner', 'waiting_s'):.0f} s to write its last checkpoint"
+    return Finding("not saved", measured, "make room on the disk; do not stop the run")
+
+
+def stalled(vitals: Vitals, config: RunConfig) -> Finding | None:
     """Deadlock: every role speaks, none gets on. A run that has finished is none."""
-    if vitals.last("learner", "finished"):
+    if vitals.last("learner", "finished") or not_saved(vitals, config):
         return None
     still = _still_seconds(vitals)
     if still < STALLED_SECONDS:
@@ -69,7 +77,9 @@ def long_warm_up(vitals: Vitals, config: RunConfig) -> Finding | None:
         f"{steps:,.0f} of {config.replay.warmup_steps:,} steps at {sum(rates):,.0f} a second, {seconds:,.0f} s to go"
     )
     return Finding(
-        "long warm-up", measured, f"--warmup-steps {config.replay.warmup_steps // 4}, or more --actors, would help"
+        "long warm-up",
+        measured,
+        f"--warmup-steps {config.replay.warmup_steps // 4} in a new run, or more --actors, would help",
     )
 
 
@@ -137,4 +147,4 @@ def oversized_ring(vitals: Vitals, config: RunConfig) -> Finding | None:
         return None
     needed = typed_number(1.1 * end * capacity)
     measured = f"of {capacity:,} windows {end:.0%} will be used at the end of the run"
-    return Finding("ring never fills", measured, f"--capacity {needed} holds the whole run")
+    return Finding("ring never fills", measured, f"--capacity {needed} in a new run holds all of it")

@@ -80,7 +80,7 @@ def test_the_replay_server_holds_both_back() -> None:
     )
     assert finding is not None
     assert finding.name == "replay-bound"
-    assert "--replay-shards 2 with --actors 2" in finding.advice
+    assert "--replay-shards 2 with --actors 2 in a new run, or" in finding.advice
 
 
 @pytest.mark.parametrize(
@@ -142,6 +142,19 @@ def test_a_deadlock_is_named_with_its_waits() -> None:
     assert run_faults.stalled(vitals(replay={"env_steps": lambda s: s}), CONFIG) is None
 
 
+def test_a_disk_that_is_full_at_the_end_is_no_deadlock() -> None:
+    full = records(
+        120, learner=shares(0.0, "disk") | {"updates": 20, "waiting_s": float}, actor_0=shares(0.0, "the end"),
+        replay=shares(0.0, "windows") | {"env_steps": 30},
+    )  # fmt: skip
+    assert [str(one) for one in examine(full, CONFIG)] == [
+        "not saved: the learner has waited 119 s to write its last checkpoint; "
+        "make room on the disk; do not stop the run"
+    ]
+    saved = Vitals([*full, {"role": "learner", "time": 1120.0, "finished": 1}])
+    assert run_faults.not_saved(saved, CONFIG) is None
+
+
 def test_a_role_that_fell_silent_is_named() -> None:
     finding = run_faults.silent(
         Vitals([one for one in records() if one["role"] != "actor-0" or one["time"] < 1010.0]), CONFIG
@@ -157,7 +170,7 @@ def test_a_warm_up_that_takes_long_is_told() -> None:
     finding = run_faults.long_warm_up(vitals(**metrics), CONFIG)
     assert finding is not None
     assert "1,000 of 5,000 steps at 10 a second, 400 s to go" in finding.measured
-    assert "--warmup-steps 1250" in finding.advice
+    assert "--warmup-steps 1250 in a new run, or" in finding.advice
     metrics["replay"]["env_steps_per_s"] = 100.0
     assert run_faults.long_warm_up(vitals(**metrics), CONFIG) is None
 
@@ -220,7 +233,7 @@ def test_a_ring_that_never_fills() -> None:
     finding = run_faults.oversized_ring(little, short)
     assert str(finding) == (
         "ring never fills: of 70,000 windows 10% will be used at the end of the run; "
-        "--capacity 7800 holds the whole run"
+        "--capacity 7800 in a new run holds all of it"
     )
     assert run_faults.oversized_ring(little, CONFIG) is None  # a million steps fill it
 
