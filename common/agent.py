@@ -162,7 +162,8 @@ class WorldModel(nn.Module):
 class ObservationImputer(nn.Module):
     """g(h_t, o_t, a_t): the normalised o_{t+1} that fills a missing frame. It trains nothing but itself.
 
-    It reads o_t, which the world model does not: where that one did, returns fell (``studies/notebook.md``).
+    It reads o_t, whatever the heads read. It is not the world model: where one did both, returns fell
+    (``studies/notebook.md``).
     """
 
     def __init__(self, obs_dim: int, action_dim: int, config: AgentConfig) -> None:
