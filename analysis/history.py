@@ -6,7 +6,7 @@ A file of JSON lines holds many, one a line, so that results can be kept without
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,7 @@ def of_run(folder: RunFolder, only_whole: bool = False) -> History:
     With ``only_whole`` evaluations are left out that were cut, or in which an episode broke.
     """
     about = describe(folder.path)
-    evaluations = _evaluations([record for record in folder.records() if is_whole(record) or not only_whole])
+    evaluations = _evaluations(record for record in folder.records() if is_whole(record) or not only_whole)
     result = folder.result() or {}
     if result and (is_whole(result) or not only_whole):
         ours = not folder.is_baseline()  # of its last checkpoint's own evaluation only the update is known
@@ -176,17 +176,22 @@ def _env_label(env: EnvConfig) -> str:
     return ", ".join([env.id, *write_kwargs(env.env_kwargs), *options])
 
 
-def _evaluations(records: list[dict[str, Any]]) -> list[Evaluation]:
+def _evaluations(records: Iterable[dict[str, Any]]) -> list[Evaluation]:
     """In order of environment steps; of a checkpoint played twice, what came last."""
-    steps = {r["updates"]: r["env_steps"] for r in records if _says(r, "learner", "updates", "env_steps")}
-    walls = {r["time"]: r["wall_s"] for r in records if _says(r, "launcher", "time", "wall_s")}
-    evaluations = {}
+    steps, walls, played = {}, {}, []  # all that is kept of what a long run has said
     for record in records:
-        if _says(record, "evaluator", "time", "eval_update", "eval_return_mean", "eval_return_std"):
-            updates, own = record["eval_update"], _says(record, "evaluator", "eval_env_steps")
-            at = int(record["eval_env_steps"] if own else _between(updates, steps))  # of ours only the update is known
-            wall, mean, std = _between(record["time"], walls), record["eval_return_mean"], record["eval_return_std"]
-            evaluations[at] = Evaluation(at, updates, wall, mean, std)
+        if _says(record, "learner", "updates", "env_steps"):
+            steps[record["updates"]] = record["env_steps"]
+        elif _says(record, "launcher", "time", "wall_s"):
+            walls[record["time"]] = record["wall_s"]
+        elif _says(record, "evaluator", "time", "eval_update", "eval_return_mean", "eval_return_std"):
+            played.append(record)
+    evaluations = {}
+    for record in played:
+        updates, own = record["eval_update"], _says(record, "evaluator", "eval_env_steps")
+        at = int(record["eval_env_steps"] if own else _between(updates, steps))  # of ours only the update is known
+        wall, mean, std = _between(record["time"], walls), record["eval_return_mean"], record["eval_return_std"]
+        evaluations[at] = Evaluation(at, updates, wall, mean, std)
     return [evaluations[at] for at in sorted(evaluations)]
 
 

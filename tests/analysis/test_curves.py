@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -65,6 +66,19 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     (tmp_path / "result.json").write_text(json.dumps({**result, "updates": 90, "initial_return_mean": -1.0}))
     (past,) = history.read(tmp_path)  # the evaluator has played that checkpoint before
     assert [one.env_steps for one in past.evaluations] == [500, 1000]
+
+
+def test_what_a_long_run_has_said_is_not_kept(tmp_path):
+    (tmp_path / "config.json").write_text(to_json(robust(EnvConfig("Hopper-v5"))))
+    said = {"role": "actor-0", "time": 1.0, **{f"metric_{i}": float(i) for i in range(20)}}
+    played = {"role": "evaluator", "time": 2.0, "eval_update": 9, "eval_return_mean": 7.0, "eval_return_std": 1.0}
+    (tmp_path / "metrics.jsonl").write_text(f"{json.dumps(said)}\n" * 2_000 + f"{json.dumps(played)}\n")
+    tracemalloc.start()
+    (past,) = history.read(tmp_path)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(past.evaluations) == 1
+    assert most < 500_000
 
 
 def test_a_run_is_described_without_its_environment(tmp_path):
