@@ -93,7 +93,7 @@ class Lockstep:
         self._restart_due, self._playing = True, self.evaluator is not None
 
     def emit_metrics(self, clock: BusyClock) -> None:
-        """Of every role; all have one thread, and so its shares."""
+        """Of every role; all have one thread, whose shares the learner's record has. The others' are 0."""
         for role in self.roles:
             self.bus.emit(role.name, {**role.metrics(), **clock.shares()})
 
