@@ -331,6 +331,7 @@ class _Run(BaseCallback):
 
     def result(self) -> dict[str, Any]:
         """As that of ``rmc train``."""
+        wall_s = self._wall()
         return {
             "env": self.config.env.id,
             "preset": self.config.name,
@@ -340,7 +341,7 @@ class _Run(BaseCallback):
             **self._play(FINAL_EPISODES, final=True),
             **missing_shares(self.config.env),
             "initial_return_mean": self._initial,
-            "wall_s": self._wall(),
+            "wall_s": wall_s,
         }
 
 

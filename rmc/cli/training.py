@@ -74,13 +74,16 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
         console.print(f"run folder {folder.path}", soft_wrap=True)
         if note := reach_note(config):
             console.print(note, soft_wrap=True)
-        before = _before(config, folder, console)
+        seconds = (
+            0.0 if options.launcher == "lockstep" else config.evaluator.evaluation_seconds
+        )  # there no clock decides
+        before = _before(config, folder, seconds, console)
         console.print(f"before training: {format_evaluation(before)}")
         tracker = start_tracker(folder)
         monitor = Monitor(folder, config, console, tracker)
         if not _trained(config, folder, options, monitor, console):
             raise KeyboardInterrupt
-        result = _result(config, folder, monitor, before, console)
+        result = _result(folder, seconds, monitor, before, console)
         folder.write_result(result)
         status, end = 0, {"state": "finished", **result}
         if tracker is not None:
@@ -165,7 +168,7 @@ def _launch(config: RunConfig, folder: RunFolder, options: LaunchOptions, monito
     return not stop.requested
 
 
-def _before(config: RunConfig, folder: RunFolder, console: Console) -> dict[str, Any]:
+def _before(config: RunConfig, folder: RunFolder, seconds: float, console: Console) -> dict[str, Any]:
     """How the policy plays that the run begins with: at its first start it does so, later ones read it."""
     kept = folder.initial()
     if kept is not None:
@@ -174,25 +177,25 @@ def _before(config: RunConfig, folder: RunFolder, console: Console) -> dict[str,
 
     number, files = CheckpointFolder(folder.checkpoints).latest() or (0, {})
     policy = files[POLICY] if files and number == 0 else evaluation.initial_policy(config)
-    header, seconds = config.policy_header(), config.evaluator.evaluation_seconds
     progress = evaluation.EvaluationProgress(console, "before training")
-    played = evaluation.evaluate_blob(header, policy, evaluation.FINAL_EPISODES, None, seconds, progress)
+    header, episodes = config.policy_header(), evaluation.FINAL_EPISODES
+    played = evaluation.evaluate_blob(header, policy, episodes, None, seconds, progress)
     folder.write_initial(played)
     return played
 
 
 def _result(
-    config: RunConfig, folder: RunFolder, monitor: Monitor, before: dict[str, Any], console: Console
+    folder: RunFolder, seconds: float, monitor: Monitor, before: dict[str, Any], console: Console
 ) -> dict[str, Any]:
     from rmc.analysis.evaluation import FINAL_EPISODES, EvaluationProgress, evaluate_policy
     from rmc.analysis.policy_file import read_policy
 
-    progress, seconds = EvaluationProgress(console, "after training"), config.evaluator.evaluation_seconds
+    wall_s, progress = monitor.wall_seconds, EvaluationProgress(console, "after training")
     after = evaluate_policy(read_policy(folder.path), FINAL_EPISODES, None, seconds, progress)
     return {
         **after,
         "initial_return_mean": before["eval_return_mean"],
-        "wall_s": monitor.wall_seconds,
+        "wall_s": wall_s,
         "replay_ratio": monitor.status.replay("replay_ratio", mean),
         "restarts": sum(monitor.restarts().values()),
     }

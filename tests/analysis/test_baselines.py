@@ -16,6 +16,7 @@ from gymnasium.spaces import Box
 from rich.console import Console
 
 from rmc import api
+from rmc.analysis import baselines
 from rmc.analysis.baseline_settings import Algorithm, BaselineConfig, Settings, choose, read
 from rmc.analysis.baselines import evaluate, train
 from rmc.analysis.history import of_run
@@ -66,6 +67,14 @@ def test_every_one_trains_stops_and_goes_on(algorithm, tmp_path):
     assert second.initial_return == first.initial_return
     assert second.wall_s > first.wall_s
     assert second.updates >= first.updates
+
+
+def test_its_last_evaluation_is_no_training_time(tmp_path, monkeypatch):
+    played, scores = [], {"eval_return_mean": 1.0, "eval_return_std": 0.0, "eval_episodes": 1}
+    monkeypatch.setattr(baselines._Run, "_play", lambda *_, **__: played.append(1) or scores)
+    monkeypatch.setattr(baselines._Run, "_wall", lambda _: float(len(played)))
+    assert run(config(), tmp_path / "run") == 0
+    assert RunFolder(tmp_path / "run").result()["wall_s"] == len(played) - 1
 
 
 def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):

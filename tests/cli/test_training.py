@@ -114,6 +114,27 @@ def test_an_evaluation_without_end_shows_that_it_goes_on_and_is_cut(tmp_path, mo
     assert "--seconds=nan: take 0 or more" in capsys.readouterr().err
 
 
+def test_in_lockstep_no_clock_cuts_an_evaluation_and_none_counts_as_training(tmp_path, monkeypatch):
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+    monkeypatch.setattr(training, "_launch", lambda *_: True)
+    limits, play = [], evaluation.evaluate_blob
+
+    def noted(header, blob, episodes, flicker, seconds, *others):
+        limits.append(seconds)
+        time.sleep(1.0)
+        return play(header, blob, episodes, flicker, seconds, *others)
+
+    monkeypatch.setattr(evaluation, "evaluate_blob", noted)
+    for launcher in ("lockstep", "local"):
+        folder.initial_file.unlink(missing_ok=True)
+        folder.lock()
+        options = LaunchOptions(folder.path, "resume", launcher, "cpu", None)
+        assert conduct(folder.config(), folder, options, Console(quiet=True)) == 0
+    assert limits == [0.0, 0.0, 300.0, 300.0]
+    trained = [record["wall_s"] for record in folder.records() if record["role"] == "launcher"]
+    assert json.loads(folder.result_file.read_bytes())["wall_s"] < trained[-1] + 0.5
+
+
 def test_it_imports_torch_without_its_compiler(tmp_path):
     """Which takes more than a second, of each learner that starts."""
     command = [sys.executable, "-c", TRAINS_AND_GOES_ON]
