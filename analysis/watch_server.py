@@ -6,6 +6,7 @@ import secrets
 import socket
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import suppress
 from importlib.resources import files
 from typing import Any
 
@@ -22,6 +23,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from rmc.analysis.live_run import LiveRun
 
 LOOK_SECONDS = 0.5  # between looks at the runs
+PING_SECONDS = 15.0  # without news, after which a page is told that we are there
+PING = b"event: ping\ndata: -\n\n"
 BACKLOG = 64  # looks that a page may be behind; beyond, it is told everything again
 LOOPBACK = ["127.0.0.1", "localhost", "[::1]"]  # no other name: it could be a web page's that leads here
 HEADERS = {
@@ -68,13 +71,19 @@ class Broadcast:
         told = self._count
         yield self._everything()
         while not self._is_over:
-            if told == self._count:
-                await self._next.wait()
+            if told == self._count and not await self._news():
+                yield PING
             missed, told = self._count - told, self._count
             if missed > len(self._looks):
                 yield self._everything()
             elif missed:
                 yield b"".join(list(self._looks)[-missed:])
+
+    async def _news(self) -> bool:
+        """Whether there are some before a ping is due."""
+        with suppress(TimeoutError):
+            return await asyncio.wait_for(self._next.wait(), PING_SECONDS)
+        return False
 
     def _everything(self) -> bytes:
         return b"".join(_event(i, run.everything()) for i, run in enumerate(self._runs))

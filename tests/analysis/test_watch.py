@@ -1,5 +1,6 @@
 """rmc watch: a real browser and raw sockets at a real server, of runs whose lines the tests write."""
 
+import asyncio
 import dataclasses
 import http.client
 import importlib.util
@@ -23,7 +24,7 @@ import pytest
 from imageio_ffmpeg import write_frames
 from matplotlib.image import imsave
 
-from rmc.analysis import live_run
+from rmc.analysis import live_run, watch_server
 from rmc.analysis.live_run import POINTS, Curve, LiveRun
 from rmc.cli.main import run
 from rmc.common.env.config import EnvConfig
@@ -114,6 +115,33 @@ def test_a_browser_shows_each_new_line_the_end_and_a_resume(serve: Serve, folder
         assert page.js("document.querySelectorAll('b').length") == 0
         again.unlock(130)
         shows("stopped")
+
+
+def test_a_page_whose_connection_dies_without_a_word_says_so_and_finds_it_again(
+    serve: Serve, folder: RunFolder, tmp_path: Path
+) -> None:
+    url, server = serve(str(folder.path))
+    with opened(url, tmp_path) as page:
+        page.seconds_until("document.body.innerText.includes('training')")
+        assert page.js("document.getElementById('lost').hidden")
+        server.suspend()
+        page.js("quietSeconds = 2")
+        page.seconds_until("!document.getElementById('lost').hidden")
+        server.resume()
+        say(folder, "learner", env_steps=700, updates_per_s=77.25)
+        page.seconds_until("document.getElementById('lost').hidden")
+        page.js("quietSeconds = 40")
+        page.seconds_until("document.body.innerText.includes('77.25 /s')")
+
+
+def test_a_page_without_news_is_told_that_its_server_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watch_server, "PING_SECONDS", 0.01)
+
+    async def first(count: int) -> list[bytes]:
+        stream = watch_server.Broadcast([]).stream()
+        return [await anext(stream) for _ in range(count)]
+
+    assert asyncio.run(first(3)) == [b"", watch_server.PING, watch_server.PING]
 
 
 def test_runs_stand_side_by_side_with_their_newest_picture_and_video(serve: Serve, tmp_path: Path) -> None:
