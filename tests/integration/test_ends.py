@@ -54,7 +54,7 @@ def test_a_role_that_dies_at_once_ends_the_run_with_its_traceback(tmp_path: Path
     assert "3 times in a row" in training.text()
 
 
-@pytest.mark.parametrize("when", ["before", "after"])
+@pytest.mark.parametrize("when", ["before", pytest.param("after", marks=pytest.mark.long)])
 def test_who_stops_it_amid_its_first_or_last_evaluation_is_told_how_to_go_on(when: str, tmp_path: Path) -> None:
     """Ten episodes of 50 steps take 5 s."""
     steps = ("--total-steps", "400", "--warmup-steps", "100", "--episodes", "0")
