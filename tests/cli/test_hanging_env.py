@@ -27,19 +27,25 @@ def check_ends(words: list[str], place: str, call: str, seconds: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "call"), [("import", "make"), ("make", "make"), ("reset", "reset"), ("step", "step"), ("close", "close")]
-)
+    ("place", "call"),
+    [
+        ("import", "make"), pytest.param("make", "make", marks=pytest.mark.long), ("step", "step"),
+        pytest.param("reset", "reset", marks=pytest.mark.long), pytest.param("close", "close", marks=pytest.mark.long),
+    ],
+)  # fmt: skip
 def test_check_env(place: str, call: str) -> None:
     check_ends(["check-env", ENV, "--env-timeout", "1.5"], place, call, 1.5)
 
 
-@pytest.mark.parametrize("words", [("evaluate",), ("evaluate", "--json"), ("inspect",)])
+@pytest.mark.parametrize(
+    "words", [("evaluate",), pytest.param(("evaluate", "--json"), marks=pytest.mark.long), ("inspect",)]
+)
 def test_what_plays_a_run_takes_the_runs(tmp_path: Path, words: tuple[str, ...]) -> None:
     folder = run_of(tmp_path / "run", debug(EnvConfig(ENV, env_timeout=2.0)))
     check_ends([words[0], str(folder.path), *words[1:]], "step", "step", 2)
 
 
-@pytest.mark.parametrize("place", ["reset", "step"])
+@pytest.mark.parametrize("place", [pytest.param("reset", marks=pytest.mark.long), "step"])
 def test_training_in_its_first_evaluation(tmp_path: Path, place: str) -> None:
     check_ends(["train", ENV, "--run-dir", str(tmp_path / "run"), "--env-timeout", "1"], place, place, 1)
 
