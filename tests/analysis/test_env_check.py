@@ -94,7 +94,7 @@ for _name, _sizes in {
     gym.register(f"{_name}-v0", Rewarded, kwargs=dict(zip(("size", "rare"), _sizes, strict=False)))
 gym.register("Odd-v0", entry_point=Odd)
 gym.register("Faint-v0", entry_point=Faint)
-gym.register("Still-v0", entry_point=Still)
+gym.register("Constant-v0", entry_point=Still)
 gym.register("Mended-v0", entry_point=mended)
 gym.register("Untold-v0", entry_point=Untold)
 gym.register("Late-v0", entry_point=Late)
@@ -123,7 +123,7 @@ def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
     assert "the same seed and actions gave other observations" in text
     assert "--curiosity" in checked("Unrewarded-v0", capsys, "--steps", "100")[1]
     assert "observations 0, 1, 2 vary by less than 0.01; scale them up" in checked("Faint-v0", capsys)[1]
-    still = checked("Still-v0", capsys)[1]
+    still = checked("Constant-v0", capsys)[1]
     assert "observations 0, 1, 2 never changed" in still
     assert "scale them up" not in still
 

@@ -131,9 +131,8 @@ def test_they_end_with_a_command_in_which_a_call_hangs(tmp_path: Path) -> None:
     assert alive(theirs) == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.long)])
-def test_they_end_with_a_command_that_is_told_to(number: signal.Signals, tmp_path: Path) -> None:
+def test_they_end_with_a_command_that_is_told_to(tmp_path: Path) -> None:
     process, theirs = checked(tmp_path)
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     assert process.wait(60.0) == STOPPED
     assert alive(theirs) == []
