@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -150,3 +153,31 @@ def test_check_env_train_and_evaluate_say_the_same(
         assert says in (captured.err if words[0] != "check-env" else captured.out)
         assert len(captured.err.splitlines()) <= 1
         assert len(caplog.records) <= 1
+
+
+@pytest.mark.parametrize(
+    ("module", "own", "other"),
+    [
+        ("code", "code.py", "code is .*/code.py, which"),
+        ("json", "json/__init__.py", "json is .*/json/__init__.py, which"),
+        ("json.mine", "json/mine.py", "json is .*/json/__init__.py, which"),
+        ("time", "time.py", "time is a part of Python, which"),
+    ],
+)
+def test_a_module_that_has_the_name_of_one_of_pythons_is_to_be_renamed(
+    module: str, own: str, other: str, tmp_path: Path
+) -> None:
+    (tmp_path / own).parent.mkdir(exist_ok=True)
+    (tmp_path / own).write_text("import gymnasium\ngymnasium.register('Mine-v0', entry_point=object)")
+    words = [
+        sys.executable,
+        "-P",
+        "-m",
+        "rmc.cli.main",
+        "check-env",
+        f"{module}:Mine-v0",
+    ]  # -P as the command itself has
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    line = f"rmc: ENV='{module}:Mine-v0': {other} is found before yours; give {own} another name\n"
+    assert re.fullmatch(line, done.stderr), done.stderr

@@ -1,7 +1,6 @@
 """Environments: what comes out, what is refused in one line, and that MuJoCo keeps quiet."""
 
 import math
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -165,27 +164,6 @@ def test_refused_in_one_line(config: EnvConfig, says: str) -> None:
     assert says in message
     assert "\n" not in message
     assert message.startswith(("ENV=", "--"))
-
-
-@pytest.mark.parametrize(
-    ("module", "own", "other"),
-    [
-        ("code", "code.py", "code is .*/code.py, which"),
-        ("json", "json/__init__.py", "json is .*/json/__init__.py, which"),
-        ("json.mine", "json/mine.py", "json is .*/json/__init__.py, which"),
-        ("time", "time.py", "time is a part of Python, which"),
-    ],
-)
-def test_a_module_that_has_the_name_of_one_of_pythons_is_to_be_renamed(
-    module: str, own: str, other: str, tmp_path: Path
-) -> None:
-    (tmp_path / own).parent.mkdir(exist_ok=True)
-    (tmp_path / own).write_text("import gymnasium\ngymnasium.register('Mine-v0', entry_point=object)")
-    words = [sys.executable, "-P", "-m", "rmc.cli.main", "check-env", f"{module}:Mine-v0"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    line = f"rmc: ENV='{module}:Mine-v0': {other} is found before yours; give {own} another name\n"
-    assert re.fullmatch(line, done.stderr), done.stderr
 
 
 def test_an_unknown_id_is_no_module_of_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
