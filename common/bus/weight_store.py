@@ -38,9 +38,8 @@ class WeightStore:
     def _make_newest(self, version: Version, head: str, pieces: list[str], evaluate: bool) -> bool:
         """Name the version as the newest, and keep its pieces: those of a learner that did not come so far expire.
 
-        Whether all are there still. Raises FencedError.
-
-        Those of the version before expire rather than vanish: a reader amid them can finish.
+        Those of the version before expire rather than vanish: a reader amid them can finish. Whether all of this one's
+        are there still; if not, nothing is named. Raises FencedError.
         """
         epoch_key, head_key = self._connection.key("epoch", "learner"), self._connection.key(KINDS[evaluate])
 
