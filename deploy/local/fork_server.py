@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -17,6 +18,7 @@ from rmc.common.process import parent_death
 from rmc.deploy.local.role_environment import SINGLE_THREAD, inherited, working_folder
 
 POLL_SECONDS = 0.01
+LOOK_SECONDS = 0.2  # between looks at whether to stop
 END_SECONDS = 2.0
 IMPORT_SECONDS, REPLY_SECONDS = 120.0, 10.0  # until one that does not answer counts as gone
 LARGEST = 65_536  # bytes of a request
@@ -56,18 +58,20 @@ class ForkedProcess:
 class ForkServer:
     """Started with the first role, and again if it is killed: with it go those it forked."""
 
-    def __init__(self, log: Path) -> None:
-        self._log = log
+    def __init__(self, log: Path, stopped: Callable[[], bool] = lambda: False) -> None:
+        """``stopped`` says whether it is no longer needed: nobody waits then for what it imports."""
+        self._log, self._stopped = log, stopped
         self._program: subprocess.Popen[bytes] | None = None
         self._generation = 0  # of the program
         self._status: int | None = None  # with which the last one ended; None where it hung
         self._ours: socket.socket | None = None
+        self._is_importing = False
 
     def fork(self, words: tuple[str, ...], environment: dict[str, str], log: int) -> ForkedProcess:
         """A process of ``rmc`` and these words, its output to ``log``.
 
         Raises RoleDied where no fork server comes up; OSError where the system has no room for a process, or somebody
-        killed that server as it came up.
+        killed that server as it came up; KeyboardInterrupt where ``stopped`` says so while it imports.
         """
         request = {"words": words, "environment": environment}
         for _ in range(2):  # one that was killed since is found out by asking it
@@ -104,21 +108,36 @@ class ForkServer:
                 pass_fds=(theirs.fileno(),), cwd=working_folder(),
             )  # fmt: skip
         self._generation += 1
-        self._ours.settimeout(IMPORT_SECONDS)
+        self._ours.settimeout(LOOK_SECONDS)
+        self._is_importing = True
 
     def _ask(self, request: Any, descriptor: int | None = None) -> Any:
         """Its reply, or None where it is gone."""
         assert self._ours is not None
         try:
             socket.send_fds(self._ours, [msgpack.packb(request)], [] if descriptor is None else [descriptor])
-            reply = self._ours.recv(LARGEST)
-            self._ours.settimeout(REPLY_SECONDS)
+            reply = self._reply(self._ours)
         except OSError:  # or it hangs
             reply = b""
         if not reply:
             self.close()
             return None
         return msgpack.unpackb(reply)
+
+    def _reply(self, ours: socket.socket) -> bytes:
+        """Empty where it has ended. Raises TimeoutError where it hangs; KeyboardInterrupt as ``fork`` does."""
+        deadline = time.monotonic() + (IMPORT_SECONDS if self._is_importing else REPLY_SECONDS)
+        while True:
+            try:
+                reply = ours.recv(LARGEST)
+            except TimeoutError:
+                if self._is_importing and self._stopped():
+                    raise KeyboardInterrupt from None
+                if time.monotonic() >= deadline:
+                    raise
+            else:
+                self._is_importing = False
+                return reply
 
     def close(self) -> None:
         """End it, and with it those that it forked."""

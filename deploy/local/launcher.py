@@ -59,6 +59,7 @@ class LocalRun:
             lambda role: {URL_VARIABLE: self._redis.url(role), PATIENCE_VARIABLE: str(OUTAGE_SECONDS)},
             folder.logs,
             lambda role: CheckpointFolder(folder.checkpoints).patience(0.0) if role == "learner" else 0.0,
+            lambda: stop.requested,
         )
 
     def tend(self) -> None:

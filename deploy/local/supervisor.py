@@ -173,14 +173,16 @@ class Supervisor:
         environment: Callable[[str], dict[str, str]],
         logs: Path,
         patience: Callable[[str], float],
+        stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         """``environment`` is of each role by its name, beside this process's own.
 
         ``patience``, asked at the end, is how many seconds a role may need to end cleanly, if more than is usual.
+        ``stopped`` says whether to wait no longer for a role's start, which then raises KeyboardInterrupt.
         """
         self._patience = patience
         self._fork_server = (
-            ForkServer(logs / "fork_server.log") if sys.platform == "linux" else None
+            ForkServer(logs / "fork_server.log", stopped) if sys.platform == "linux" else None
         )  # elsewhere a fork may crash
         self.roles = {
             command.name: RoleProcess(command, environment(command.name), logs, self._fork_server)

@@ -98,6 +98,20 @@ def test_one_that_is_killed_as_it_starts_is_tried_again_later(tmp_path: Path, mo
     one.close()
 
 
+def test_nobody_who_stops_waits_for_what_it_imports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C in the first seconds of a run, which are many on a busy machine or a slow disk."""
+    slow = tmp_path / "python"
+    slow.write_text("#!/bin/sh\nexec sleep 100\n")
+    slow.chmod(0o700)
+    monkeypatch.setattr(fork_server.sys, "executable", str(slow))
+    began = time.monotonic()
+    one = ForkServer(tmp_path / "fork_server.log", lambda: time.monotonic() - began > 1)
+    with pytest.raises(KeyboardInterrupt):
+        fork(one, tmp_path / "log", "actor")
+    one.close()
+    assert time.monotonic() - began < IMPORT_SECONDS / 4
+
+
 def test_one_that_hangs_is_given_up_for_another(
     shared: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
