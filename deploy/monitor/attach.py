@@ -60,7 +60,8 @@ def launcher_pid(folder: RunFolder) -> int:
     while (trainer := folder.trainer()) is None:
         if time.monotonic() >= deadline:
             folder.settings()
-            raise ConfigError("RUN", str(folder.path), f"nobody trains it now; {resume_command(folder)} continues it")
+            over, more = ("it is finished", " --total-steps N") if folder.result() else ("nobody trains it now", "")
+            raise ConfigError("RUN", str(folder.path), f"{over}; {resume_command(folder)}{more} continues it")
         time.sleep(LOOK_SECONDS)
     return trainer
 

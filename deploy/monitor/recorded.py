@@ -65,7 +65,7 @@ def catch_up(status: RunStatus, tail: MetricsTail) -> None:
 
 
 def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus:
-    """By ``config.json`` alone. Raises ConfigError."""
+    """By ``config.json`` and the steps that the run had at its newest start. Raises ConfigError."""
     settings = folder.settings()
     env = _part(settings, "env").get("id")
     preset = settings.get("preset") or f"{settings.get('algorithm')}-{settings.get('settings')}"
@@ -75,6 +75,7 @@ def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus
         fix = "config.json has no env, seed or total_steps; restore it, or take another run"
         raise ConfigError("RUN", str(folder.path), fix)
     status = RunStatus(env, str(preset), seed, total, ratio, expected)
+    status.steps_before = max((start.env_steps for start in starts(folder)[-1:]), default=0)
     if folder.is_baseline():
         status.heard = "launcher"
     return status

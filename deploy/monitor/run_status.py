@@ -38,6 +38,7 @@ class RunStatus:
         """``expected`` are the roles that are about to speak."""
         self._since = dict.fromkeys(expected, time.time())  # of those that have not spoken
         self.began = 0.0  # the newest start, by the clock; 0 where that is not known
+        self.steps_before = 0  # environment steps that the run had then, until its roles say more
         self._spoke_last, self._is_trained = 0.0, False  # anybody, and whether the learner's last word was its end
         self.state: State | None = "training"  # None where it has ended, and how is not known
         self.env, self.preset, self.seed, self.total_steps = env, preset, seed, total_steps
@@ -167,7 +168,7 @@ class RunStatus:
         """Environment steps committed to the ring."""
         if self.final_steps is not None:
             return self.final_steps
-        steps = self.replay("env_steps", sum) or self.get("learner", "env_steps") or 0
+        steps = self.replay("env_steps", sum) or self.get("learner", "env_steps") or self.steps_before
         return _steps(steps) or 0
 
     @property

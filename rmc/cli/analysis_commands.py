@@ -21,7 +21,7 @@ from rmc.analysis.policy_file import PolicyFile, read_policy
 from rmc.analysis.run_evaluation import check_baselines, evaluate_run
 from rmc.analysis.run_paths import each_readable
 from rmc.cli import run_options
-from rmc.cli.ending import cut_note
+from rmc.cli.ending import cut_note, episode_count
 from rmc.cli.signals import signals_caught
 from rmc.common.env.config import check_range
 from rmc.common.errors import ConfigError
@@ -91,7 +91,7 @@ def _result_line(played: dict[str, Any]) -> str:
     shares = {"frames": played["eval_flicker"], "sensors": played["eval_drop_sensors"]}
     missing = " and ".join(f"{share:.0%} of the {name}" for name, share in shares.items() if share)
     env = f"{played['env']} with {missing} missing" if missing else played["env"]
-    text = f"{env}: return {mean:,.1f} ± {deviation:,.1f} over {played['eval_episodes']} episodes"
+    text = f"{env}: return {mean:,.1f} ± {deviation:,.1f} over {episode_count(played['eval_episodes'])}"
     return f"{text}{cut_note(played)}, after {played['env_steps']:,} environment steps"
 
 

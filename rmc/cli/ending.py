@@ -34,8 +34,13 @@ def print_end(folder: RunFolder, console: Console) -> int:
 def format_evaluation(evaluation: dict[str, Any]) -> str:
     """Mean and deviation of the returns, and how many there are."""
     mean, deviation = evaluation["eval_return_mean"], evaluation["eval_return_std"]
-    over = f"over {evaluation['eval_episodes']} deterministic episodes{cut_note(evaluation)}"
+    over = f"over {episode_count(evaluation['eval_episodes'], 'deterministic ')}{cut_note(evaluation)}"
     return f"return {mean:,.1f} ± {deviation:,.1f} {over}"
+
+
+def episode_count(count: int, kind: str = "") -> str:
+    """So many, in words."""
+    return f"{count:,} {kind}episode{'s' * (count != 1)}"
 
 
 def cut_note(evaluation: dict[str, Any]) -> str:

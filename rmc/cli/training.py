@@ -17,6 +17,7 @@ from rmc.deploy.local import launcher
 from rmc.deploy.local.supervisor import EXIT_CONFIG
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.monitor.output import Output
+from rmc.deploy.monitor.recorded import empty_status
 from rmc.deploy.monitor.tracker import start_tracker
 from rmc.deploy.redis.connect import connect
 from rmc.deploy.redis.socket_folder import place_for_sockets
@@ -26,6 +27,7 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.memory_reach import reach_note
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine
+from rmc.deploy.run.starts import resume_command
 from rmc.deploy.run.state import STOPPED
 from rmc.deploy.run.validation import validate, validate_launch
 
@@ -74,6 +76,9 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
         console.print(f"run folder {folder.path}", soft_wrap=True)
         if note := reach_note(config):
             console.print(note, soft_wrap=True)
+        if folder.result() is not None:  # no step is missing: it would be gone else
+            text = f"all {config.total_steps:,} steps are trained; {resume_command(folder)} --total-steps N goes on"
+            console.print(text, soft_wrap=True)
         seconds = (
             0.0 if options.launcher == "lockstep" else config.evaluator.evaluation_seconds
         )  # there no clock decides
@@ -93,7 +98,7 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
         raise
     except KeyboardInterrupt:  # also amid the first evaluation, or the last
         status, end = STOPPED, {"state": "stopped"}
-        return print_stopped(folder, monitor.status.env_steps if monitor else 0, console)
+        return print_stopped(folder, (monitor.status if monitor else empty_status(folder)).env_steps, console)
     finally:
         try:
             if tracker is not None:

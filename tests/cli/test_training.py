@@ -104,7 +104,7 @@ def test_an_evaluation_without_end_shows_that_it_goes_on_and_is_cut(tmp_path, mo
     assert 1.0 < time.monotonic() - began < 60
     for when in ("before training:", "after training:"):
         assert f"{when} episode 1 of 10, " in output.getvalue()
-    assert output.getvalue().count("over 1 deterministic episodes, cut when its seconds were over") == 3
+    assert output.getvalue().count("over 1 deterministic episode, cut when its seconds were over") == 3
     assert json.loads(folder.result_file.read_bytes())["eval_cut"] == 1
     assert main.run(["evaluate", str(folder.path), "--seconds", "0.5", "--json"]) == 0
     captured = capsys.readouterr()
@@ -155,6 +155,29 @@ def test_a_stop_signal_amid_the_evaluations_stops_the_run(tmp_path, monkeypatch)
             assert conduct(folder.config(), folder, placement, Console(quiet=True)) == STOPPED
         assert folder.ended() == STOPPED
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_a_run_that_goes_on_knows_its_steps_before_a_role_speaks(tmp_path, monkeypatch):
+    folder, output = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5"), io.StringIO()
+    folder.history_file.write_text(json.dumps({"time": 1.0, "version": "0", "env_steps": 1_400}) + "\n")
+    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
+    monkeypatch.setattr(training, "_launch", lambda *_: True)
+    for amid in ("_before", "_result"):
+        with monkeypatch.context() as patch:
+            patch.setattr(training, amid, lambda *_: signal.raise_signal(signal.SIGTERM))
+            folder.lock()
+            assert conduct(folder.config(), folder, placement, Console(file=output, width=200)) == STOPPED
+    assert output.getvalue().count("stopped at environment step 1,400; to go on:") == 2
+
+
+def test_a_finished_run_that_is_resumed_says_that_no_step_is_missing(tmp_path, monkeypatch):
+    folder, output = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5"), io.StringIO()
+    monkeypatch.setattr(training, "_launch", lambda *_: True)
+    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
+    for times in (0, 1):
+        folder.lock()
+        assert conduct(folder.config(), folder, placement, Console(file=output, width=200)) == 0
+        assert output.getvalue().count(f"steps are trained; rmc resume {folder.path} --total-steps N goes on") == times
 
 
 def test_a_second_ctrl_c_amid_the_upload_leaves_no_lock(tmp_path, monkeypatch):

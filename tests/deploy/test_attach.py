@@ -20,7 +20,7 @@ from rmc.deploy.monitor import run_status, view
 from rmc.deploy.monitor.attach import launcher_pid, stop, watch
 from rmc.deploy.monitor.notices import notices
 from rmc.deploy.monitor.recorded import empty_status, recorded_status, take_start
-from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.folder import RESULT, RunFolder
 
 HOLDER = """
 import sys, time
@@ -78,6 +78,12 @@ def test_nobody_to_stop_is_said(folder: RunFolder, tmp_path: Path) -> None:
         stop(folder)
     with pytest.raises(ConfigError, match=r"no config\.json there"):
         stop(RunFolder(tmp_path))
+
+
+def test_a_finished_run_is_said_to_be(folder: RunFolder) -> None:
+    folder.result_file.write_text(json.dumps(dict.fromkeys(RESULT, 1)))
+    with pytest.raises(ConfigError, match=r"it is finished; rmc resume \S+ --total-steps N continues it"):
+        stop(folder)
 
 
 def begun(folder: RunFolder, ago: float) -> None:

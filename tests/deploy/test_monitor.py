@@ -324,6 +324,20 @@ def says(monitor: Monitor, ago: dict[str, float], **launcher: float) -> None:
     monitor.status.take({"role": "launcher", "time": time.time(), "redis_away_s": 0.0, **launcher})
 
 
+def test_a_run_that_goes_on_is_drawn_from_where_it_was(monitor: Monitor, config: RunConfig, tmp_path: Path) -> None:
+    """Until its replay servers speak, too: curves would go back to step 0."""
+    monitor.close()
+    folder = RunFolder(tmp_path / "run")
+    folder.history_file.write_text(json.dumps({"time": 1.0, "version": "0", "env_steps": 1_400}) + "\n")
+    again = Monitor(folder, config, Console(quiet=True, force_terminal=False))
+    assert "| 1,400 of " in line(again.status)
+    again.watch(MemoryBus())
+    again.take({"role": "replay", "time": time.time(), "env_steps": 1_500})
+    again.close()
+    steps = [event.step for event in EventAccumulator(str(folder.path)).Reload().Scalars("launcher/wall_s")]
+    assert steps[-2:] == [1_400, 1_500]
+
+
 def test_every_view_says_who_is_silent_and_for_how_long(monitor: Monitor) -> None:
     says(monitor, {"learner": 12.2, "actor-0": 0.5, "replay": 4.0, "evaluator": 0.0})
     for text_of in shown(monitor.status):
