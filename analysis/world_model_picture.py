@@ -41,7 +41,7 @@ Floats = NDArray[np.float32]
 class Insight:
     """What the world model says of an episode."""
 
-    real: Floats  # (T, O), the next observations
+    real: Floats  # (T, O), the next observations, NaN where they are missing
     predicted: Floats  # (T, O), one step ahead
     curiosity: Floats  # (T,), the world model's error of the online memory's change
     reward: Floats  # (T,)
@@ -75,7 +75,7 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     memory, seen = remembered(agent, episode)
     prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
     latent_change = memory.hidden[0].diff(dim=0)
-    real = episode.observation[0, 1:]
+    real = episode.observation[0, 1:].masked_fill(episode.missing[0, 1:], torch.nan)
     ahead = _open_loop(agent, memory, seen[0, :-1], episode.action[0])
     return Insight(
         real=real.numpy(),
@@ -160,7 +160,7 @@ def draw(insight: Insight, title: str, out: Path | BinaryIO, memory: Remembered 
     """Predicted against real amid the episode, curiosity and reward over all of it; then what is remembered."""
     from matplotlib.figure import Figure  # an extra
 
-    shown = np.argsort(-np.abs(np.diff(insight.real, axis=0)).mean(0))[:SHOWN]
+    shown = np.argsort(-np.nan_to_num(np.abs(np.diff(insight.real, axis=0))).mean(0))[:SHOWN]
     count = len(shown) + 2 + (memory.panels if memory is not None else 0)
     figure = Figure(figsize=(11, 2.0 * count), layout="constrained")
     every = list(figure.subplots(count, 1))
@@ -170,7 +170,7 @@ def draw(insight: Insight, title: str, out: Path | BinaryIO, memory: Remembered 
     time = np.arange(1, len(insight.real) + 1)
     start = max(1, (len(time) - SHOWN_STEPS) // 2)
     for axis, dimension in zip(axes, shown, strict=False):
-        axis.plot(time, insight.real[:, dimension], color="black", linewidth=2.0, label="real")
+        axis.plot(time, insight.real[:, dimension], "k.-", linewidth=2.0, markersize=4.0, label="real")
         for horizon, predicted in insight.ahead.items():
             label = f"{horizon} step{'s' * (horizon > 1)} ahead"
             axis.plot(time[horizon - 1 :], predicted[:, dimension], linewidth=1.0, label=label)

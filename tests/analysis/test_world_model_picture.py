@@ -62,6 +62,8 @@ def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -
             np.testing.assert_allclose(insight.ahead[horizon][start], wanted, atol=1e-5)
     seen = episode.seen.numpy().squeeze(-1)
     assert 0 < seen.sum() < 40  # some frames were blank, and are left out
+    missing = np.broadcast_to(episode.missing[0, 1:].numpy(), insight.real.shape)
+    np.testing.assert_array_equal(np.isnan(insight.real), missing)  # a gap in the picture, no zero
     before = np.concatenate([episode.observation[0, :1].numpy(), insight.real[:-1]])
     error, change = (np.abs(x - insight.real)[seen].sum(0) for x in (insight.predicted, before))
     np.testing.assert_allclose(insight.unexplained, error / change, rtol=1e-4)
