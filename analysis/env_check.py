@@ -143,7 +143,9 @@ def _facts(env: Env, played: Played) -> Iterator[str]:
         yield f"{np.mean(played.missing):.0%} of what is observed is missing"
     if played.lengths:
         ended = f"{played.terminated} of them terminated, the others cut off"
-        yield f"{len(played.lengths)} episodes of {min(played.lengths)} to {max(played.lengths)} steps, {ended}"
+        shortest, longest = min(played.lengths), max(played.lengths)
+        steps = f"{shortest} to {longest}" if shortest < longest else f"{longest}"
+        yield f"{len(played.lengths)} episode{'s' * (len(played.lengths) != 1)} of {steps} steps, {ended}"
 
 
 def _reach(env: Env, config: EnvConfig) -> str:

@@ -129,7 +129,7 @@ def _random_state() -> tuple[Any, ...]:
 
 
 DESCRIPTIONS = {
-    "folder": "its working folder ({})",
+    "folder": "the working folder ({})",
     "numpy_errors": "numpy's error state",
     "dtype": "torch's default dtype ({})",
     "gradients": "torch's grad mode ({})",

@@ -12,7 +12,8 @@ def format_reach(trained_steps: int, time_limit: int | None) -> str:
     if time_limit is not None and time_limit <= trained_steps:
         return f"the memory can learn over whole episodes, of up to {time_limit:,} steps"
     if time_limit is None:
-        length, more = "episodes have no time limit", "--trained-steps, or --time-limit and --state-strategy episode"
+        length = "episodes have no known time limit"
+        more = "--trained-steps, or --time-limit and --state-strategy episode"
     else:
         length, more = f"episodes last up to {time_limit:,}", "--trained-steps, or --state-strategy episode"
     return f"the memory cannot learn of anything older than {trained_steps:,} steps; {length} ({more})"

@@ -106,7 +106,7 @@ def test_a_sound_environment(capsys):
     assert status == 0
     assert "observations 17, actions 6, time limit 1000" in text
     assert re.search(r"2,000 random steps, [\d,]+ a second; reward -?[\d.]+ ± [\d.]+", text)
-    assert "2 episodes of 1000 to 1000 steps, 0 of them terminated" in text
+    assert "2 episodes of 1000 steps, 0 of them terminated" in text
     assert "cannot learn of anything older than 15 steps; episodes last up to 1,000 (--trained-steps, or " in text
     assert text.endswith("it can be trained on\n")
     assert "note" not in text
@@ -117,7 +117,7 @@ def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
     assert status == 0
     for words in (
         "observations 1 never changed", "observations reach", "--reward-scale 0.001", "--time-limit",
-        "episodes have no time limit (--trained-steps, or --time-limit and --state-strategy episode)",
+        "episodes have no known time limit (--trained-steps, or --time-limit and --state-strategy episode)",
     ):  # fmt: skip
         assert words in text
     assert "the same seed and actions gave other observations" in text

@@ -64,7 +64,7 @@ def test_check_env_names_what_is_changed(capsys: pytest.CaptureFixture[str]) -> 
     output = capsys.readouterr().out
     for words in (
         "note: it changes", "torch's default dtype (torch.float64)", "torch's grad mode (False)",
-        "its working folder (/",
+        "the working folder (/",
         "torch's threads (3)", "numpy's error state", "torch's default device (meta)", "the handlers of signals",
         "the random generators that all share",
     ):  # fmt: skip

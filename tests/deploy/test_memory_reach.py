@@ -30,7 +30,7 @@ def test_the_line_names_both_lengths_and_the_options() -> None:
         "(--trained-steps, or --state-strategy episode)"
     )
     assert format_reach(15, None) == (
-        "the memory cannot learn of anything older than 15 steps; episodes have no time limit "
+        "the memory cannot learn of anything older than 15 steps; episodes have no known time limit "
         "(--trained-steps, or --time-limit and --state-strategy episode)"
     )
     assert format_reach(100, 100) == "the memory can learn over whole episodes, of up to 100 steps"
