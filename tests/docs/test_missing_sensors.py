@@ -12,7 +12,7 @@ PAGE = (DOCS / "missing-sensors.md").read_text()
 def test_the_page_runs(tmp_path: Path) -> None:
     check, train, evaluate = commands(PAGE)
     checked = ran(tmp_path, *check)
-    ran(tmp_path, *train, *LOCKSTEP)
+    ran(tmp_path, *train, *LOCKSTEP, "--total-steps", "700")
     played = ran(tmp_path, *evaluate)
     assert "it can be trained on" in checked
     config = RunFolder(tmp_path / "runs" / "late").config()

@@ -15,7 +15,7 @@ from tests.docs.running import DOCS, LOCKSTEP, commands, ran
 
 POLICY, HUB = (DOCS / "policy.md").read_text(), (DOCS / "hub.md").read_text()
 ALONE = "import sys\nsys.modules |= dict.fromkeys(['torch', 'rmc', 'gymnasium', 'safetensors'])\n"
-SHORTER = ["--total-steps", "1000", *LOCKSTEP, "--episodes", "1"]
+SHORTER = ["--total-steps", "700", *LOCKSTEP, "--episodes", "1"]
 
 
 def python(*words: str, folder: Path, **more: str) -> str:

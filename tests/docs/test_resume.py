@@ -22,10 +22,10 @@ from tests.docs.running import DOCS, LOCKSTEP, commands, ran
 RESUME, WARM = ((DOCS / name).read_text() for name in ("resume.md", "warm-start.md"))
 
 
-def execute(page: str, folder: Path) -> int:
-    """Its commands, in order; how many they are."""
+def execute(page: str, folder: Path, *shorter: str) -> int:
+    """Its commands, in order, its trainings with these options; how many they are."""
     for words in commands(page):
-        ran(folder, *words, *(LOCKSTEP if words[0] == "train" else ()))
+        ran(folder, *words, *((*LOCKSTEP, *shorter) if words[0] == "train" else ()))
     return len(commands(page))
 
 
@@ -49,7 +49,7 @@ def test_the_options_that_may_change_are_in_the_table() -> None:
 
 
 def test_runs_begin_with_anothers_networks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert execute(WARM, tmp_path) == 3
+    assert execute(WARM, tmp_path, "--total-steps", "700", "--checkpoint-steps", "600") == 3
     (code,) = re.findall(r"```python\n(.*?)```", WARM, re.DOTALL)
     debug = presets.debug
     monkeypatch.setattr(presets, "debug", lambda env: dataclasses.replace(debug(env), total_steps=600))

@@ -62,9 +62,11 @@ def test_runs_are_tracked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert len(list(tmp_path.glob("runs/tracked/wandb/offline-run-*/files/media/videos/*.mp4"))) == 1
     assert results(tmp_path / "trackio" / "pendulum.db", "here-") == [600]
     (code,) = re.findall(r"```python\n(.*?)```", TRACKERS, re.DOTALL)
+    assert code.count("train(config,") == 1
+    code = f"import dataclasses\n{code}".replace("train(config,", "train(dataclasses.replace(config, total_steps=600),")
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=150)
     assert (done.returncode, done.stderr) == (0, ""), done.stderr
-    assert len(results(tmp_path / "trackio" / "rmc.db", "python-")) == 1
+    assert results(tmp_path / "trackio" / "rmc.db", "python-") == [600]
 
 
 def results(file: Path, name: str) -> list[int]:
