@@ -16,10 +16,11 @@ from rmc.analysis import report
 from rmc.analysis.history import Evaluation, History
 from rmc.analysis.report_run import ReportRun
 from rmc.cli.main import run
+from rmc.deploy.local import trial
 from rmc.deploy.run.folder import RunFolder
 from tests.analysis import browser
 from tests.command import rmc
-from tests.docs.running import ran
+from tests.docs.running import DOCS, commands, ran
 
 BROWSER_SECONDS = 60
 PROBE = """<script>
@@ -52,6 +53,26 @@ def other(trained: Path, tmp_path: Path) -> Path:
     config["seed"], config["total_steps"] = 1, 1600
     (path / "config.json").write_text(json.dumps(config))
     return path
+
+
+def test_the_commands_of_its_page_and_of_the_doctors_run(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As docs/report.md and docs/doctor.md print them."""
+    monkeypatch.setattr(trial, "TRAINED_SECONDS", 2.0)
+    for name in ("first", "second"):
+        shutil.copytree(trained, tmp_path / "runs" / name)
+    of_report, of_doctor = ((DOCS / name).read_text() for name in ("report.md", "doctor.md"))
+    printed = [*commands(of_report), *commands(of_doctor)]
+    assert [words[0] for words in printed] == ["report", "report", "doctor", "train"]
+    outputs = [ran(tmp_path, *words) for words in printed]
+    assert outputs[0].startswith("report.html: 1 run, ")
+    assert outputs[1].startswith("both.html: 2 runs, ")
+    assert "learner-bound: actors waited " in outputs[2]
+    assert outputs[3].splitlines()[-1] == "it fits"
+    rows = re.findall(r"^\| (memory|disk|bandwidth|file handles|threads|time to the end)\b", of_doctor, re.MULTILINE)
+    assert rows
+    assert [row for row in rows if row not in outputs[3]] == []
 
 
 class Links(HTMLParser):
