@@ -1,7 +1,5 @@
-"""Ends that nobody asked for: the launcher killed by force, a role that dies again and again."""
+"""Ends that are told: of a role that dies again and again, amid an evaluation, of a tracked run."""
 
-import signal
-import subprocess
 import time
 from pathlib import Path
 
@@ -9,28 +7,7 @@ import pytest
 
 from rmc.deploy.run.folder import RunFolder
 from tests import wandb_file
-from tests.command import COMMAND, rmc
 from tests.integration.running import Training, alive
-
-ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
-
-
-def test_a_killed_launcher_takes_everything_along(tmp_path: Path) -> None:
-    with Training(tmp_path / "run", *ENDLESS) as training:
-        training.wait_for(lambda: training.role("replay") is not None)
-        processes = training.launcher.children(recursive=True)
-        sockets = training.sockets()
-        training.process.send_signal(signal.SIGKILL)
-        training.process.wait()
-        deadline = time.monotonic() + 5.0
-        while alive(processes) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert not alive(processes)
-    with Training(tmp_path / "run", *ENDLESS) as again:  # and what the kill left is swept
-        again.wait_for(lambda: again.role("replay") is not None)
-        assert sockets
-        assert not [path for path in sockets if path.exists()]
-        again.interrupt()
 
 
 @pytest.mark.long
@@ -85,24 +62,6 @@ class Broken(InvertedPendulumEnv):
 
 gymnasium.register("Broken-v0", Broken, max_episode_steps=100)
 """
-
-
-def test_a_run_is_watched_and_stopped_from_another_terminal(tmp_path: Path) -> None:
-    with Training(tmp_path / "run", "--total-steps", "10000000") as training:
-        training.wait_for_updates()
-        attach = [*COMMAND, "attach", str(tmp_path / "run")]
-        with subprocess.Popen(attach, stdout=subprocess.PIPE, text=True) as watcher:
-            assert watcher.stdout is not None
-            assert watcher.stdout.readline().startswith("0% | ")
-            done = rmc("stop", str(tmp_path / "run"), timeout=60)
-            assert (done.returncode, done.stderr) == (0, "")
-            assert "to go on:\n  rmc resume " in done.stdout
-            assert training.finish(30) == 130
-            assert "to go on:\n  rmc resume " in watcher.stdout.read()
-            assert watcher.wait(30) == 130
-    done = rmc("attach", str(tmp_path / "run"), timeout=60)
-    assert done.returncode == 2
-    assert "nobody trains it now" in done.stderr
 
 
 @pytest.mark.long  # docs/trackers.md's commands run in tests/docs/test_watching.py

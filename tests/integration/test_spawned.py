@@ -48,10 +48,15 @@ class Spawner(Training):
         return next(one for one in living if "rmc.cli.fork_server" in one.cmdline())
 
 
+def started(place: Path) -> Spawner:
+    """The run there, or the run again."""
+    return Spawner(place / "run", *ENDLESS, env=SPAWNING, environment={SPAWNED: str(place / "told")})
+
+
 @pytest.fixture
 def training(tmp_path: Path) -> Iterator[Spawner]:
     (tmp_path / "told").mkdir()
-    with Spawner(tmp_path / "run", *ENDLESS, env=SPAWNING, environment={SPAWNED: str(tmp_path / "told")}) as run:
+    with started(tmp_path) as run:
         run.wait_for_updates()
         yield run
         run.process.kill()
@@ -89,14 +94,22 @@ def test_they_end_with_a_role_that_is_killed_or_hangs_and_with_the_run(training:
     assert training.simulators() == []
 
 
-def test_they_end_where_the_launcher_is_killed(training: Spawner) -> None:
+def test_everything_ends_where_the_launcher_is_killed(training: Spawner) -> None:
+    """And what that leaves is swept by the next start."""
     training.pid_of("actor")
     assert training.simulators()
-    fork_server = training.fork_server()
+    fork_server, processes = training.fork_server(), training.launcher.children(recursive=True)
+    sockets = training.sockets()
     training.process.send_signal(signal.SIGKILL)
     training.process.wait()
     end_all(training)
     fork_server.wait(5.0)  # which has ended them
+    assert psutil.wait_procs(processes, 5.0)[1] == []
+    assert [path for path in sockets if path.exists()]
+    with started(training.folder.parent) as again:
+        again.wait_for(lambda: again.role("replay") is not None)
+        assert not [path for path in sockets if path.exists()]
+        again.interrupt()
 
 
 def test_those_of_a_group_end_where_the_fork_server_is_killed(training: Spawner) -> None:
