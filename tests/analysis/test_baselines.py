@@ -31,6 +31,7 @@ from tests import habits
 
 ENV = EnvConfig("InvertedPendulum-v5")
 ALGORITHMS = get_args(Algorithm)
+TRAINED_BELOW = "sac", "td3", "ppo"  # and gone on with
 
 
 def config(algorithm: Algorithm = "sac", settings: Settings = "paper", **other) -> BaselineConfig:
@@ -43,7 +44,9 @@ def run(settings: BaselineConfig, folder, stop: StopSignal | None = None) -> int
     return train(settings, folder, Console(quiet=True), stop or StopSignal())
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize(
+    "algorithm", [pytest.param(one, marks=[pytest.mark.long] * (one in TRAINED_BELOW)) for one in ALGORITHMS]
+)
 def test_every_one_trains_stops_and_goes_on(algorithm, tmp_path):
     folder = tmp_path / "run"
     assert run(config(algorithm), folder) == 0

@@ -83,16 +83,17 @@ gym.register("Mine-v0", MeddlingEnv, max_episode_steps=20)
 """
 
 
-@pytest.mark.parametrize("launcher", ["local", "lockstep"])
+@pytest.mark.parametrize("launcher", [pytest.param("local", marks=pytest.mark.long), "lockstep"])
 def test_training_does_not_notice(tmp_path: Path, launcher: str) -> None:
     """The module lies where the command is started, and meddles when it is imported, too; the run's folder is there."""
     (tmp_path / "mine.py").write_text(MODULE)
     words = ["train", "mine:Mine-v0", "--preset", "debug", "--run-dir", "run", "--launcher", launcher]
-    words += ["--total-steps", "1200", "--checkpoint-steps", "600"]
+    words += ["--total-steps", "700", "--checkpoint-steps", "600"]
     environment = {**os.environ, "PYTHONPATH": os.getcwd(), "RMC_SECRET": ""}
     done = rmc(*words, cwd=tmp_path, env=environment, timeout=170)
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "run" / "result.json").exists()
-    done = rmc("inspect", "run", "--out", "picture.png", cwd=tmp_path, env=environment, timeout=100)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert (tmp_path / "picture.png").exists()
+    if launcher == "lockstep":  # of the launcher, what plays knows nothing
+        done = rmc("inspect", "run", "--out", "picture.png", cwd=tmp_path, env=environment, timeout=100)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert (tmp_path / "picture.png").exists()

@@ -48,7 +48,14 @@ FORMAT_6 = """
 """.split()  # noqa: SIM905
 
 
-@pytest.fixture(params=["format-1-a", "format-1-b", "format-2", "format-3", "format-4", "format-5"])
+FORMATS = ("format-1-a", "format-1-b", "format-2", "format-3", "format-4", "format-5")
+BETWEEN = FORMATS[1:4]  # what brings the first up to date does so with these
+the_rest_at_length = pytest.mark.parametrize(
+    "old", [pytest.param(one, marks=[pytest.mark.long] * (one in BETWEEN)) for one in FORMATS], indirect=True
+)
+
+
+@pytest.fixture(params=FORMATS)
 def old(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
     with tarfile.open(RUNS / f"{request.param}.tar.xz") as archive:
         archive.extractall(tmp_path, filter="data")
@@ -82,6 +89,12 @@ def test_what_reads_reads_it(old: RunFolder, capsys: pytest.CaptureFixture[str])
     policy = load_policy(old.path)
     observation, info = policy.make_env().reset(seed=0)
     assert policy.act(observation, info["missing"]).shape == (1,)
+    assert (old.path / "config.json").read_bytes() == before
+
+
+@the_rest_at_length
+def test_what_exports_and_draws_reads_it(old: RunFolder) -> None:
+    before = (old.path / "config.json").read_bytes()
     assert main.run(["export", str(old.path), "--out", str(old.path / "policy.onnx")]) == 0
     assert main.run(["inspect", str(old.path), "--out", str(old.path / "inspect.png")]) == 0
     assert main.run(["plot", str(old.path), "--out", str(old.path / "curves.png")]) == 0
@@ -106,6 +119,7 @@ def test_its_ring_is_opened_whole(old: RunFolder) -> None:
     store.close()
 
 
+@the_rest_at_length
 def test_it_goes_on_with_ring_checkpoint_and_counters(old: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
     config, threads = old.config(), torch.get_num_threads()
     store = open_store(old.path / "replay", config.window_spec(), config.replay.capacity, 0.6)

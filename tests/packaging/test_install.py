@@ -38,7 +38,11 @@ TRAIN = (
     "train mine:Mine-v0 --launcher lockstep --preset debug --total-steps 200 --warmup-steps 100 --capacity 200 "
     "--run-dir run"
 )
-POLICY = "from rmc import load_policy; import learner, common.errors; print(load_policy('run').act([0.0, 0.0]).shape)"
+POLICY = """
+from rmc import load_policy
+import learner, common.errors, rmc.common.errors
+print(load_policy("run").act([0.0, 0.0]).shape, rmc.common.errors.__file__)
+"""
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +56,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return copy
 
 
-@pytest.fixture(scope="module", params=["wheel", "editable"])
+@pytest.fixture(scope="module", params=["wheel", pytest.param("editable", marks=pytest.mark.long)])
 def binaries(request: pytest.FixtureRequest, sources: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The bin folder of a fresh environment that the package is installed into."""
     folder = tmp_path_factory.mktemp(request.param)
@@ -104,6 +108,7 @@ def test_a_folder_with_the_packages_names_is_no_hindrance(binaries: Path, projec
     rmc, python = str(binaries / "rmc"), str(binaries / "python")
     assert "check-env" in _run([rmc, "--help"], project)
     assert "after training:  return 20.0" in _run([rmc, *TRAIN.split()], project)
-    assert _run([python, "-c", POLICY], project) == "(1,)\n"
-    where = Path(_run([python, "-c", "import rmc.common.errors as e; print(e.__file__)"], project).strip())
+    shape, path = _run([python, "-c", POLICY], project).split(" ")
+    assert shape == "(1,)"
+    where = Path(path.strip())
     assert where.is_relative_to(binaries.parent) or where.parents[1].name.startswith("sources")
