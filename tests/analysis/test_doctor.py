@@ -18,6 +18,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import RunConfig, to_json
 from rmc.deploy.run.presets import debug, robust
 from tests.command import rmc
+from tests.docs.running import ran
 
 CONFIG = robust(EnvConfig("HalfCheetah-v5"))
 Record = dict[str, Any]
@@ -344,8 +345,7 @@ def test_a_real_run_whose_evaluator_starves(tmp_path: Path) -> None:
 def test_a_real_run_records_its_host(tmp_path: Path) -> None:
     config = dataclasses.replace(debug(EnvConfig("InvertedPendulum-v5")), total_steps=600)
     words = ["train", config.env.id, "--preset", "debug", "--total-steps", "600", "--launcher", "lockstep"]
-    done = rmc(*words, "--run-dir", str(tmp_path / "run"))
-    assert done.returncode == 0, done.stdout + done.stderr
+    ran(tmp_path, *words, "--run-dir", "run")
     lines = map(json.loads, (tmp_path / "run" / "metrics.jsonl").read_text().splitlines())
     last = [one for one in lines if one["role"] == "launcher"][-1]
     assert 0 < last["host_available_bytes"] <= last["host_memory_bytes"]
