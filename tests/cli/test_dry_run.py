@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from rmc.deploy.run.presets import debug, robust
 from rmc.replay_server.ring import file_bytes
 from tests.command import COMMAND, rmc
 from tests.integration.running import Training
+from tests.waiting import wait_until
 
 CONFIG = debug(EnvConfig("InvertedPendulum-v5"))
 MACHINE = Machine(4, 8 << 30, 100 << 30, 1024, 10e9)
@@ -187,10 +187,7 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
-        deadline = time.monotonic() + 60.0
-        while not list(tmp_path.glob("rmc-trial-*/run/metrics.jsonl")):
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        wait_until(lambda: list(tmp_path.glob("rmc-trial-*/run/metrics.jsonl")), 60.0)
         process.send_signal(signal.SIGINT)
         _, output = process.communicate(timeout=60.0)
     finally:

@@ -11,9 +11,10 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from contextlib import suppress
 from pathlib import Path
+
+from tests.waiting import wait_until
 
 SSHD = "/usr/sbin/sshd"
 NEEDED = ["ip", "unshare", "ssh", "ssh-keygen", "rsync"]
@@ -105,10 +106,7 @@ class Machine:
 
     def wait(self) -> None:
         """Until it can be reached."""
-        deadline = time.monotonic() + START_SECONDS
-        while self.run("true", check=False).returncode:
-            assert time.monotonic() < deadline, (self._home / "log").read_text()
-            time.sleep(0.1)
+        wait_until(lambda: self.run("true", check=False).returncode == 0, START_SECONDS, (self._home / "log").read_text)
 
     def _ssh(self, command: str) -> list[str]:
         options = ["StrictHostKeyChecking=no", "UserKnownHostsFile=/dev/null", "ConnectTimeout=3", "BatchMode=yes"]
@@ -136,10 +134,7 @@ class Machine:
 
     def wait_until_gone(self, pattern: str, seconds: float) -> None:
         """Until no process has such a command line."""
-        deadline = time.monotonic() + seconds
-        while left := self.run(f"pgrep -fa {shlex.quote(pattern)}", check=False).stdout:
-            assert time.monotonic() < deadline, f"{self.name} still runs {left}"
-            time.sleep(0.5)
+        wait_until(lambda: not self.processes(pattern), seconds, lambda: f"{self.name}: {self.processes(pattern)}")
 
     def kill(self, pattern: str) -> None:
         """``kill -9`` them."""

@@ -19,6 +19,7 @@ from tests.cluster import machines
 from tests.command import rmc
 from tests.deploy.test_tls import lacks_tls
 from tests.integration.running import ENVIRONMENT, Training, free_port
+from tests.waiting import wait_until
 
 ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
 
@@ -27,10 +28,7 @@ ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
 def leaves_nothing_behind() -> Iterator[None]:
     """Ray keeps a few files of its own for later; no process may stay."""
     yield
-    deadline = time.monotonic() + 20.0
-    while left := _left():
-        assert time.monotonic() < deadline, left
-        time.sleep(0.2)
+    wait_until(lambda: not _left(), said=_left)
 
 
 def _left() -> list[str]:

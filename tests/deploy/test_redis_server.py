@@ -4,7 +4,6 @@ import signal
 import stat
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import psutil
@@ -13,6 +12,7 @@ import redis
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.redis.server import MAX_VALUE, RedisServer
+from tests.waiting import alive, wait_until
 
 HOLDER = """
 import sys, time
@@ -44,10 +44,7 @@ def test_dies_with_its_parent(tmp_path: Path) -> None:
     owner.send_signal(signal.SIGKILL)
     owner.wait()
     owner.stdout.close()
-    deadline = time.monotonic() + 5.0
-    while server.is_running() and server.status() != psutil.STATUS_ZOMBIE and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert not server.is_running() or server.status() == psutil.STATUS_ZOMBIE
+    wait_until(lambda: not alive([server]), 5.0)
 
 
 def test_takes_no_larger_value_than_a_role_may_need(tmp_path: Path) -> None:

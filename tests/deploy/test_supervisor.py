@@ -15,6 +15,7 @@ from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.local import supervisor
 from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.local.supervisor import QuickDeaths, RoleProcess, Supervisor
+from tests.waiting import wait_until
 
 
 @pytest.fixture
@@ -138,10 +139,7 @@ def test_a_learner_that_saves_for_long_is_not_killed_and_others_are(
     keeper = Supervisor(commands, lambda _: {}, quick, lambda name: 6.0 if name == "learner" else 0.0)
     for role in keeper.roles.values():
         role.start()
-    deadline = time.monotonic() + 10.0
-    while not output.exists() or len(output.read_text().split()) < 3:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until(lambda: output.exists() and len(output.read_text().split()) == 3)
     output.write_text("")
     keeper.stop()
     assert output.read_text().split() == ["learner", "replay"]

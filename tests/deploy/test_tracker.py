@@ -27,6 +27,7 @@ from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.tracking import Tracking, keep_tracking
 from tests import wandb_file
+from tests.waiting import alive, wait_until
 
 CLOSED = "http://127.0.0.1:9"  # no service of anyone's
 RESULT = {"state": "finished", "env_steps": 1500, "eval_return_mean": 11.5, "env": "InvertedPendulum-v5"}
@@ -44,8 +45,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
     return run
 
 
-def started(folder: RunFolder, name: Any) -> Tracker:
-    keep_tracking(folder, Tracking(name, "my-project", ("a", "b"), "0123abcd"))
+def started(folder: RunFolder, name: Any, video_every: int = 0) -> Tracker:
+    keep_tracking(folder, Tracking(name, "my-project", ("a", "b"), "0123abcd", video_every))
     tracker = start_tracker(folder)
     assert tracker is not None
     return tracker
@@ -80,11 +81,16 @@ def video(path: Path) -> str:
     return str(path)
 
 
-def test_wandb_has_the_run_over_its_starts(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
+def train_twice(folder: RunFolder, name: str) -> None:
+    """A start that is stopped, and one that finishes, with a video."""
     for env_steps, end in ((700, {"state": "stopped"}), (1500, {**RESULT, "video": video(folder.path / "video.mp4")})):
-        tracker = started(folder, "wandb")
+        tracker = started(folder, name)
         trained(folder, env_steps, env_steps / 100)
         tracker.close(end)
+
+
+def test_wandb_has_the_run_over_its_starts(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
+    train_twice(folder, "wandb")
     assert not caplog.messages
     starts = wandb_file.records(folder.path)
     assert len(starts) == 2
@@ -116,10 +122,7 @@ def test_wandb_has_the_run_over_its_starts(folder: RunFolder, caplog: pytest.Log
 def test_trackio_has_the_run_over_its_starts(
     folder: RunFolder, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    for env_steps, end in ((700, {"state": "stopped"}), (1500, {**RESULT, "video": video(folder.path / "video.mp4")})):
-        tracker = started(folder, "trackio")
-        trained(folder, env_steps, env_steps / 100)
-        tracker.close(end)
+    train_twice(folder, "trackio")
     assert not caplog.messages
     with sqlite3.connect(tmp_path / "trackio" / "my-project.db") as store:
         rows = store.execute("select run_name, run_id, step, metrics from metrics order by id").fetchall()
@@ -146,10 +149,7 @@ def test_mlflow_has_the_run_over_its_starts(
     store = f"sqlite:///{tmp_path}/mlflow.db"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", store)
     monkeypatch.chdir(tmp_path)  # where videos go
-    for env_steps, end in ((700, {"state": "stopped"}), (1500, {**RESULT, "video": video(folder.path / "video.mp4")})):
-        tracker = started(folder, "mlflow")
-        trained(folder, env_steps, env_steps / 100)
-        tracker.close(end)
+    train_twice(folder, "mlflow")
     assert not caplog.messages
     client = MlflowClient(store)
     experiment = client.get_experiment_by_name("my-project")
@@ -173,9 +173,7 @@ def test_every_second_evaluated_checkpoint_is_filmed(
     name: Any, folder: RunFolder, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     saved(folder)
-    keep_tracking(folder, Tracking(name, "my-project", (), "0123abcd", 2))
-    tracker = start_tracker(folder)
-    assert tracker is not None
+    tracker = started(folder, name, 2)
     for env_steps in (700, 1500):
         assert not (folder.path / "videos").exists()
         trained(folder, env_steps, 1.0)
@@ -185,14 +183,11 @@ def test_every_second_evaluated_checkpoint_is_filmed(
         "trackio": "../trackio/media/**/*.mp4",
         "videos": "videos/0*.mp4",
     }[name]
-    deadline = time.monotonic() + 60.0
-    while not (arrived := list(folder.path.glob(films))):
-        assert time.monotonic() < deadline, (folder.logs / "tracker.log").read_text()
-        time.sleep(0.2)
+    wait_until(lambda: list(folder.path.glob(films)), 60.0, (folder.logs / "tracker.log").read_text)
     tracker.close({"state": "stopped"})
     assert [path.name for path in (folder.path / "videos").iterdir()] == ["000000003.mp4"]
-    assert len(arrived) == 1
-    assert arrived[0].stat().st_size > 1_000
+    (arrived,) = folder.path.glob(films)
+    assert arrived.stat().st_size > 1_000
     assert not caplog.messages
 
 
@@ -212,47 +207,28 @@ def test_an_environment_that_says_much_holds_up_no_film(folder: RunFolder, monke
 
 
 def test_a_checkpoint_that_is_gone_is_one_warning(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
-    keep_tracking(folder, Tracking("trackio", "my-project", (), "0123abcd", 1))
-    tracker = start_tracker(folder)
-    assert tracker is not None
+    tracker = started(folder, "trackio", 1)
     trained(folder, 700, 1.0)
-    deadline = time.monotonic() + 60.0
-    while not caplog.messages:
-        assert time.monotonic() < deadline
-        tracker.look()
-        time.sleep(0.2)
+    wait_until(lambda: tracker.look() or caplog.messages, 60.0)
     tracker.close({"state": "stopped"})
     (message,) = caplog.messages
     assert message.startswith("trackio: no 000000003.mp4: ")
 
 
-def plays(process: psutil.Process) -> bool:
-    """Whether it is rmc evaluate."""
+def is_film(process: psutil.Process) -> bool:
+    """Whether it is rmc evaluate, of the lowest priority, which a film has a moment after its start."""
     try:
-        return "evaluate" in process.cmdline()
+        return "evaluate" in process.cmdline() and process.nice() == 19
     except psutil.Error:  # it has just ended
-        return False
-
-
-def lowest(process: psutil.Process) -> bool:
-    """Of the lowest priority, which a film has a moment after its start."""
-    try:
-        return process.nice() == 19
-    except psutil.Error:
         return False
 
 
 def test_a_film_that_is_being_made_ends_with_the_tracker(folder: RunFolder) -> None:
     saved(folder)
-    keep_tracking(folder, Tracking("trackio", "my-project", (), "0123abcd", 1))
-    tracker = start_tracker(folder)
-    assert tracker is not None
+    tracker, films = started(folder, "trackio", 1), set[psutil.Process]()
     trained(folder, 700, 1.0)
-    deadline = time.monotonic() + 60.0
     try:
-        while not (films := [one for one in psutil.Process().children(recursive=True) if plays(one) and lowest(one)]):
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        wait_until(lambda: films.update(filter(is_film, psutil.Process().children(recursive=True))) or films, 60.0)
     finally:
         tracker.close({"state": "stopped"})
     assert not any(one.is_running() for one in films)
@@ -326,10 +302,7 @@ def test_one_whose_launcher_was_killed_ends_by_itself(folder: RunFolder) -> None
         "os.kill(os.getpid(), 9)\n"
     )
     done = subprocess.run([sys.executable, "-c", code, str(folder.path)], capture_output=True, text=True, timeout=60)
-    deadline = time.monotonic() + 60
-    while psutil.pid_exists(int(done.stdout)) and psutil.Process(int(done.stdout)).status() != psutil.STATUS_ZOMBIE:
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
+    wait_until(lambda: not alive([one for one in psutil.process_iter() if one.pid == int(done.stdout)]), 60.0)
     (records,) = wandb_file.records(folder.path)
     assert wandb_file.exit_codes(records) == [1]
     assert wandb_file.summary(records)["state"] == "lost"

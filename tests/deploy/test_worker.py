@@ -9,13 +9,14 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 
 from rmc import deploy
+from tests.waiting import wait_until
 
 SCRIPT = Path(deploy.__file__).parent / "cluster" / "worker.sh"
 RAY = """#!/bin/bash
@@ -68,13 +69,6 @@ class Worker:
         return sum(line.startswith(action) for line in (self.folder / "calls").read_text().splitlines())
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 30.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
 @pytest.fixture
 def worker(tmp_path: Path) -> Iterator[Worker]:
     worker = Worker(tmp_path)
@@ -89,12 +83,12 @@ def test_it_is_started_again_once_the_head_answers(worker: Worker) -> None:
     (raylet,) = worker.processes("/raylet ")
     worker.head.close()
     os.kill(raylet, signal.SIGKILL)
-    wait_for(lambda: not worker.processes("--gcs-address"))  # what it left is ended, too
+    wait_until(lambda: not worker.processes("--gcs-address"))  # what it left is ended, too
     time.sleep(1.0)
     assert worker.calls("start") == 1
     worker.head = socket.create_server(("127.0.0.1", int(worker.address.rpartition(":")[2])))
-    wait_for(lambda: worker.calls("start") == 2)
-    wait_for(lambda: len(worker.processes("--gcs-address")) == 2)
+    wait_until(lambda: worker.calls("start") == 2)
+    wait_until(lambda: len(worker.processes("--gcs-address")) == 2)
     assert not (worker.folder / "ended-in-order").exists()
 
 
@@ -106,7 +100,7 @@ def test_what_is_kept_is_left_alone_but_with_other_options(worker: Worker) -> No
     worker.start("--num-cpus=2")
     assert len(worker.processes("--gcs-address")) == 2
     assert not set(raylets).intersection(worker.processes("--gcs-address"))
-    wait_for(lambda: len(worker.processes("worker.sh")) == 1)  # it looks by a process of its own
+    wait_until(lambda: len(worker.processes("worker.sh")) == 1)  # it looks by a process of its own
 
 
 def test_stop_ends_all_and_the_raylet_in_order(worker: Worker) -> None:

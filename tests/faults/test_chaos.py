@@ -4,7 +4,6 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Callable
 from contextlib import closing, suppress
 from itertools import islice, pairwise
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 from tests.faults.all_at_once import DISK_MB, chaos, judged
 from tests.faults.proxy import CALM, Interposed, Proxy, Weather, tcp_proxy
 from tests.faults.schedule import KINDS, LAUNCHER, NODE, Fault, schedule
+from tests.waiting import wait_until
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="a fork server, small disks, memory by /proc")
 root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a small disk")
@@ -111,7 +111,7 @@ def test_a_proxy_takes_the_place_of_a_socket_and_of_the_next_one_there(tmp_path:
     with closing(Interposed(lambda: path if path.exists() else None)) as proxy:
         for number in range(2):
             with listening(path) as listener, (tmp_path / "file").open("w+b") as file:
-                until(lambda before=number: proxy.placed > before)
+                wait_until(lambda before=number: proxy.placed > before)
                 with socket.socket(socket.AF_UNIX) as client:
                     client.connect(str(path))
                     server, _ = listener.accept()
@@ -124,10 +124,3 @@ def test_a_proxy_takes_the_place_of_a_socket_and_of_the_next_one_there(tmp_path:
                 file.seek(0)
                 assert file.read() == b"written"
     assert proxy.connections == 2
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)

@@ -1,4 +1,4 @@
-"""A real ``rmc train`` in a process of its own, and what can be seen of it from outside."""
+"""A real ``rmc`` in a process of its own, and what can be seen of a run from outside."""
 
 import json
 import os
@@ -6,15 +6,17 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
 import psutil
+
+from tests.command import COMMAND
+from tests.waiting import wait_until
 
 START_SECONDS = 120.0  # five processes import torch on two cores that other tests may use
 SMALL = (
@@ -32,88 +34,45 @@ def free_port() -> int:
         return int(free.getsockname()[1])
 
 
-class Training:
-    """Started at once; ``close`` kills what is left of it."""
+def records_of(run: Path, role: str) -> list[dict[str, Any]]:
+    """What a role of a run has said so far."""
+    path = run / "metrics.jsonl"
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    records = [json.loads(line) for line in lines if line.endswith("}\n")]
+    return [record for record in records if record["role"] == role]
 
-    def __init__(
-        self,
-        folder: Path,
-        *options: str,
-        env: str = "InvertedPendulum-v5",
-        preset: str = "debug",
-        environment: Mapping[str, str] = MappingProxyType({}),
-        command: tuple[str, ...] = (),
-    ) -> None:
-        """``command`` goes in the place of ``train`` and all of its options."""
-        self.folder = folder
-        self.output = folder.parent / f"{folder.name}.out"
-        train = ("train", env, "--preset", preset, "--run-dir", str(folder), *options)
-        words = [sys.executable, "-m", "rmc.cli.main", *(command or train)]
-        with self.output.open("ab") as output:
+
+class Command:
+    """``rmc``, started at once; ``close`` kills what is left of it."""
+
+    def __init__(self, output: Path, words: Sequence[str], environment: Mapping[str, str]) -> None:
+        """What it prints goes to the end of the file ``output``."""
+        self.output = output
+        with output.open("ab") as file:
             self.process = subprocess.Popen(
-                words, stdout=output, stderr=output, stdin=subprocess.DEVNULL, env={**ENVIRONMENT, **environment},
-                process_group=0,
+                [*COMMAND, *words], stdout=file, stderr=file, stdin=subprocess.DEVNULL,
+                env={**ENVIRONMENT, **environment}, process_group=0,
             )  # fmt: skip
-        self.launcher = psutil.Process(self.process.pid)
 
     def text(self) -> str:
         """All that it printed."""
         return self.output.read_text(errors="replace")
 
-    def sockets(self) -> list[Path]:
-        """The files of its temporary folder."""
-        folders = Path(tempfile.gettempdir()).glob(f"rmc-sockets-{self.process.pid}-*")
-        return [path for folder in folders for path in (folder, *folder.iterdir())]
-
-    def records(self, role: str) -> list[dict[str, Any]]:
-        """The role's metrics so far."""
-        path = self.folder / "metrics.jsonl"
-        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-        records = [json.loads(line) for line in lines if line.endswith("}\n")]
-        return [record for record in records if record["role"] == role]
-
-    def newest(self, role: str, name: str, default: Any = 0) -> Any:
-        """The newest value of a metric."""
-        values = [record[name] for record in self.records(role) if name in record]
-        return values[-1] if values else default
-
-    def role(self, name: str) -> psutil.Process | None:
-        """A role's process; the role's name is ``actor``, ``replay``, ``learner``, ``evaluator`` or ``redis``."""
-        pattern = "unixsocket" if name == "redis" else rf"rmc\.cli\.main role {name} "
-        for child in self.launcher.children(recursive=True):
-            try:
-                if re.search(pattern, " ".join(child.cmdline())):
-                    return child
-            except psutil.NoSuchProcess:
-                continue
-        return None
+    def logs(self) -> str:
+        """What else may tell why something has failed."""
+        return ""
 
     def wait_for(self, condition: Callable[[], Any], seconds: float = START_SECONDS) -> None:
-        """Wait until the condition holds, while the run goes on."""
-        deadline = time.monotonic() + seconds
-        while not condition():
-            assert self.process.poll() is None, f"the run has ended:\n{self.text()}"
-            assert time.monotonic() < deadline, f"waited {seconds} s in vain:\n{self.text()}\n{self.logs()}"
-            time.sleep(0.1)
+        """Wait until the condition holds, while it goes on."""
 
-    def wait_for_updates(self, more: int = 1) -> None:
-        """Wait until the learner has made so many more updates."""
-        goal = self.newest("learner", "updates") + more
-        self.wait_for(lambda: self.newest("learner", "updates") >= goal)
+        def holds() -> Any:
+            result = condition()
+            assert result or self.process.poll() is None, f"it has ended:\n{self.text()}"
+            return result
 
-    def logs(self) -> str:
-        """The ends of the roles' logs."""
-        logs = sorted((self.folder / "logs").glob("*.log"))
-        return "\n".join(f"== {path.name}\n{path.read_text(errors='replace')[-2000:]}" for path in logs)
+        wait_until(holds, seconds, lambda: f"waited {seconds} s in vain:\n{self.text()}\n{self.logs()}", 0.1)
 
-    def interrupt(self) -> float:
-        """Ctrl-C; how long everything took to end."""
-        began = time.monotonic()
-        self.process.send_signal(signal.SIGINT)
-        self.process.wait(30)
-        return time.monotonic() - began
-
-    def finish(self, seconds: float) -> int:
+    def finish(self, seconds: float = 150.0) -> int:
         """Wait for the end; the exit status."""
         try:
             return self.process.wait(seconds)
@@ -133,6 +92,62 @@ class Training:
         self.close()
 
 
-def alive(processes: list[psutil.Process]) -> list[psutil.Process]:
-    """Those that still run."""
-    return [process for process in processes if process.is_running() and process.status() != psutil.STATUS_ZOMBIE]
+class Training(Command):
+    """A run."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *options: str,
+        env: str = "InvertedPendulum-v5",
+        preset: str = "debug",
+        environment: Mapping[str, str] = MappingProxyType({}),
+        command: tuple[str, ...] = (),
+    ) -> None:
+        """``command`` goes in the place of ``train`` and all of its options."""
+        self.folder = folder
+        train = ("train", env, "--preset", preset, "--run-dir", str(folder), *options)
+        super().__init__(folder.parent / f"{folder.name}.out", command or train, environment)
+        self.launcher = psutil.Process(self.process.pid)
+
+    def sockets(self) -> list[Path]:
+        """The files of its temporary folder."""
+        folders = Path(tempfile.gettempdir()).glob(f"rmc-sockets-{self.process.pid}-*")
+        return [path for folder in folders for path in (folder, *folder.iterdir())]
+
+    def records(self, role: str) -> list[dict[str, Any]]:
+        """The role's metrics so far."""
+        return records_of(self.folder, role)
+
+    def newest(self, role: str, name: str, default: Any = 0) -> Any:
+        """The newest value of a metric."""
+        values = [record[name] for record in self.records(role) if name in record]
+        return values[-1] if values else default
+
+    def role(self, name: str) -> psutil.Process | None:
+        """A role's process; the role's name is ``actor``, ``replay``, ``learner``, ``evaluator`` or ``redis``."""
+        pattern = "unixsocket" if name == "redis" else rf"rmc\.cli\.main role {name} "
+        for child in self.launcher.children(recursive=True):
+            try:
+                if re.search(pattern, " ".join(child.cmdline())):
+                    return child
+            except psutil.NoSuchProcess:
+                continue
+        return None
+
+    def wait_for_updates(self, more: int = 1) -> None:
+        """Wait until the learner has made so many more updates."""
+        goal = self.newest("learner", "updates") + more
+        self.wait_for(lambda: self.newest("learner", "updates") >= goal)
+
+    def logs(self) -> str:
+        """The ends of the roles' logs."""
+        logs = sorted((self.folder / "logs").glob("*.log"))
+        return "\n".join(f"== {path.name}\n{path.read_text(errors='replace')[-2000:]}" for path in logs)
+
+    def interrupt(self) -> float:
+        """Ctrl-C; how long everything took to end."""
+        began = time.monotonic()
+        self.process.send_signal(signal.SIGINT)
+        self.process.wait(30)
+        return time.monotonic() - began

@@ -9,7 +9,8 @@ import pytest
 from rmc.deploy.run.folder import RunFolder
 from tests import wandb_file
 from tests.command import COMMAND, rmc
-from tests.integration.running import Training, alive
+from tests.integration.running import Training
+from tests.waiting import alive
 
 
 @pytest.mark.long

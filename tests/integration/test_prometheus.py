@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 import subprocess
-import time
 import urllib.parse
 import urllib.request
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, Self
 import pytest
 
 from tests.integration.running import Training, free_port
+from tests.waiting import wait_until
 
 MONITOR = Path(__file__).parents[2] / "deploy" / "monitor"
 HERE = "127.0.0.1"
@@ -95,7 +95,4 @@ def test_a_run_is_scraped_its_alerts_fire_and_the_dashboard_has_data(tmp_path: P
             (name, "ok", "") for name in re.findall(r"alert: (\w+)", alerts)
         }
         training.interrupt()
-        deadline = time.monotonic() + 30.0
-        while prometheus.values("up") != [0.0]:
-            assert time.monotonic() < deadline
-            time.sleep(0.2)
+        wait_until(lambda: prometheus.values("up") == [0.0], 30.0)

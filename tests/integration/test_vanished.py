@@ -12,7 +12,8 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
-from tests.integration.running import Training, alive
+from tests.integration.running import Training
+from tests.waiting import alive
 
 
 @pytest.mark.long

@@ -3,7 +3,6 @@
 import socket
 import ssl
 import threading
-import time
 from pathlib import Path
 
 from rmc.common.bus.memory_bus import MemoryBus
@@ -13,6 +12,7 @@ from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.server import ReplayServer
 from rmc.replay_server.socket_server import SocketServer
 from tests.replay_server.support import SPEC, Sender
+from tests.waiting import wait_until
 
 SECRET = b"a secret of the run"
 MAX_BATCH = 4096
@@ -68,7 +68,4 @@ class Served:
 
     def refused(self, reason: str) -> None:
         """Wait until a client was sent away for this reason."""
-        end = time.monotonic() + 5.0
-        while self.sockets.refused[reason] == 0:
-            assert time.monotonic() < end, f"nobody was refused for {reason}, but for {dict(self.sockets.refused)}"
-            time.sleep(0.005)
+        wait_until(lambda: self.sockets.refused[reason], 5.0, lambda: dict(self.sockets.refused))

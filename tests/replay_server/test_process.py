@@ -4,7 +4,6 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from rmc.replay_server.process import ReplayProcess
 from rmc.replay_server.server import ReplayServer
 from rmc.replay_server.socket_server import SocketServer
 from tests.replay_server.support import SPEC, Sender
+from tests.waiting import wait_until
 
 SECRET = b"the run's secret"
 
@@ -44,13 +44,6 @@ class Running:
         self.thread.join()
 
 
-def until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
-
-
 def client_of(bus: RedisBus, epoch: int = 0) -> ReplayClient:
     address = bus.replay_address("replay")
     assert address is not None
@@ -63,20 +56,22 @@ def test_windows_in_batches_out_and_metrics(redis_url: str, run_name: str, tmp_p
     bus = RedisBus(redis_url, run_name)
     running = Running(tmp_path, RedisBus(redis_url, run_name))
     try:
-        until(lambda: bus.replay_address("replay") is not None)
+        wait_until(lambda: bus.replay_address("replay") is not None)
         sender, client = Sender(bus), client_of(bus)
         assert client.sample(16).status is SampleStatus.WAIT
         for _ in range(10):
             sender.send(5)
-        until(lambda: running.server.stats()["windows"] == 50)
-        until(lambda: client.sample(16).status is SampleStatus.BATCH)
+        wait_until(lambda: running.server.stats()["windows"] == 50)
+        wait_until(lambda: client.sample(16).status is SampleStatus.BATCH)
         sample = client.sample(16)
         assert sample.rows is not None
         assert (sample.rows["reward"][:, 0] == sample.rows["serial"]).all()
         client.update_priorities(sample.rows["serial"].copy(), np.full(16, 5.0, np.float32))
         client.statistics()  # sends what is enqueued
-        until(lambda: running.server.stats()["max_priority"] == 5.0)
-        until(lambda: bus.records({"replay": "0"})[0][-1:] and bus.records({"replay": "0"})[0][-1]["windows"] == 50)
+        wait_until(lambda: running.server.stats()["max_priority"] == 5.0)
+        wait_until(
+            lambda: bus.records({"replay": "0"})[0][-1:] and bus.records({"replay": "0"})[0][-1]["windows"] == 50
+        )
         record = bus.records({"replay": "0"})[0][-1]
         assert record["env_steps"] == 200
         assert record["waiting_for"] == "draws"  # of which it would allow more
@@ -95,7 +90,7 @@ def test_a_replaced_learner_that_comes_first_is_not_served(
     stale, epoch = bus.take_epoch("learner"), bus.take_epoch("learner")
     running = Running(tmp_path, RedisBus(redis_url, run_name))
     try:
-        until(lambda: bus.replay_address("replay") is not None)
+        wait_until(lambda: bus.replay_address("replay") is not None)
         with pytest.raises(FencedError, match=f"the learner of epoch {stale} was replaced by {epoch}"):
             client_of(bus, stale).sample(16)
         metrics = running.process.metrics()
@@ -104,7 +99,7 @@ def test_a_replaced_learner_that_comes_first_is_not_served(
         assert client.sample(16).status is SampleStatus.WAIT
         bus.take_epoch("learner")  # by a third, which has not come yet
         with pytest.raises(FencedError):
-            until(lambda: client.sample(16).status is SampleStatus.BATCH)
+            wait_until(lambda: client.sample(16).status is SampleStatus.BATCH)
         client.close()
     finally:
         running.end()
@@ -119,21 +114,21 @@ def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_
     bus = RedisBus(redis_server.url(), "run")
     running = Running(tmp_path, RedisBus(redis_server.url(), "run"))
     try:
-        until(lambda: bus.replay_address("replay") is not None)
+        wait_until(lambda: bus.replay_address("replay") is not None)
         sender, client = Sender(bus), client_of(bus)
         sender.send(40)
-        until(lambda: client.sample(16).status is SampleStatus.BATCH)
+        wait_until(lambda: client.sample(16).status is SampleStatus.BATCH)
         redis_server.close()
         with pytest.raises(BusUnavailable):
             bus.ack(0)
-        until(lambda: running.process.waiting_for() == "redis")
+        wait_until(lambda: running.process.waiting_for() == "redis")
         started = time.monotonic()
         for _ in range(40):  # past several looks at the bus that is away
             assert client.sample(16).status is SampleStatus.BATCH
             time.sleep(0.05)
         assert time.monotonic() - started < 10.0
         redis_server.start()  # empty: it keeps no files
-        until(lambda: bus.ack(0) is not None)
+        wait_until(lambda: bus.ack(0) is not None)
         assert redis_server.process is not None
         os.kill(redis_server.process.pid, signal.SIGSTOP)  # it does not answer, either
         began, served = time.monotonic(), 0
@@ -142,11 +137,11 @@ def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_
             served += time.monotonic() - now < 1.0
         os.kill(redis_server.process.pid, signal.SIGCONT)
         assert served > 40
-        until(lambda: bus.ack(0) is not None)  # acks and address are said again
-        until(lambda: bus.replay_address("replay") is not None)
+        wait_until(lambda: bus.ack(0) is not None)  # acks and address are said again
+        wait_until(lambda: bus.replay_address("replay") is not None)
         sender.greet()
         sender.send(3)
-        until(lambda: running.server.stats()["windows"] == 43)
+        wait_until(lambda: running.server.stats()["windows"] == 43)
         assert running.server.stats()["entry_gaps"] == 0
         client.close()
     finally:

@@ -6,7 +6,6 @@ import io
 import os
 import re
 import signal
-import time
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,8 +28,8 @@ from rmc.sweep.index import Index
 from rmc.sweep.job import Job
 from rmc.sweep.pool import drop_replay
 from rmc.sweep.table import result_table
-from tests.integration.running import alive
 from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
+from tests.waiting import alive, wait_until
 
 SEEDS = (1, 2)
 OTHERS = ("seed=1", "seed=2")
@@ -143,10 +142,7 @@ def test_ctrl_c_ends_all_in_order_and_a_kill_leaves_nothing(tmp_path: Path) -> N
         assert len(processes) >= 2
         sweep.process.kill()
         sweep.process.wait()
-        deadline = time.monotonic() + 20.0
-        while alive(processes):
-            assert time.monotonic() < deadline, alive(processes)
-            time.sleep(0.1)
+        wait_until(lambda: not alive(processes), said=lambda: alive(processes))
 
 
 class Saving:
