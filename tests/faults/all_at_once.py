@@ -26,7 +26,7 @@ from tests.faults.row import Row
 from tests.faults.schedule import EACH_ACTOR, schedule
 from tests.faults.soak import RATIO_TOLERANCE, files_growth, memory_growth
 from tests.faults.witness import went_back
-from tests.integration.running import alive
+from tests.waiting import alive
 
 GAP_SECONDS = 3.5  # between the beginnings of faults, on average
 CALM_SHARE = 0.1  # steps without faults at the end, for one before
@@ -64,10 +64,9 @@ def judged(one: Chaos, name: str, back: float) -> Row:
         "left_behind": len(left_behind(one)),
     }
     ratio = [record["replay_ratio"] for record in RunFolder(one.folder).records() if "replay_ratio" in record][-1]
-    passed = not (verdict.lost or verdict.duplicated or any(never.values()))
     print(*one.unexpected, *left_behind(one), sep="\n", file=sys.stderr)
-    counts = (one.happened.total(), passed, verdict.acknowledged, verdict.lost, verdict.duplicated, round(back, 2))
-    return Row(name, *counts, {**never, **happened(one), **noticed(one.folder), "replay_ratio": round(ratio, 3)})
+    facts = {**never, **happened(one), **noticed(one.folder), "replay_ratio": round(ratio, 3)}
+    return Row.judged(name, one.happened.total(), not any(never.values()), verdict, back, facts)
 
 
 def is_held(one: Chaos, ratio: float) -> bool:

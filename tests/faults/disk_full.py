@@ -86,11 +86,9 @@ def _checkpoint(tries: int, folder: Path) -> Row:
             torn = sum(not line.endswith("}") for line in (run.folder / "metrics.jsonl").read_text().splitlines())
             verdict = run.end()
         broken = sum(_broken(checkpoints, number) for number in checkpoints.numbers())
-    passed = not (verdict.lost or verdict.duplicated or torn or broken or halves) and run.process.returncode == 130
-    return Row(
-        "disk full: no room for a checkpoint", tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated,
-        round(slowest, 2), {"torn_lines": torn, "broken_checkpoints": broken, "saved_without_room": halves},
-    )  # fmt: skip
+    passed = not (torn or broken or halves) and run.process.returncode == 130
+    facts = {"torn_lines": torn, "broken_checkpoints": broken, "saved_without_room": halves}
+    return Row.judged("disk full: no room for a checkpoint", tries, passed, verdict, slowest, facts)
 
 
 def goes_on_unsaved(run: Loaded) -> None:
@@ -123,11 +121,8 @@ def _log_of_redis(tries: int, folder: Path) -> Row:
                 time.sleep(FULL_SECONDS)
             slowest = max(slowest, run.until_all_go_on())
         verdict = run.end()
-    passed = not (verdict.lost or verdict.duplicated) and run.process.returncode == 130
-    return Row(
-        "disk full: no room for the log of Redis", tries, passed, verdict.acknowledged, verdict.lost,
-        verdict.duplicated, round(slowest, 2),
-    )  # fmt: skip
+    passed = run.process.returncode == 130
+    return Row.judged("disk full: no room for the log of Redis", tries, passed, verdict, slowest)
 
 
 def cannot_log(run: Loaded, server: LoggedRedis) -> None:

@@ -3,7 +3,6 @@
 Learner and replay server lock their folders, so that the other one has a copy or an empty one, as on another machine.
 """
 
-import dataclasses
 import os
 import re
 import shutil
@@ -20,7 +19,7 @@ from rmc.deploy.local.role_environment import URL_VARIABLE
 from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.row import Row, at_length
 from tests.faults.witness import went_back
-from tests.integration.running import alive
+from tests.waiting import alive
 
 ENDS_S = 10.0
 PATIENT = ("--env-timeout", "1000")  # an actor that stood still does not take its environment for hung
@@ -32,10 +31,7 @@ def freeze_all(tries: int, folder: Path, seconds: float = 90.0) -> Iterator[Row]
         with Loaded(folder / role, *ROOMY, *PATIENT) as run:
             run.begin()
             row = freeze(run, role, tries, seconds)
-            verdict = run.end()
-        passed = row.passed and not (verdict.lost or verdict.duplicated)
-        counts = {"acknowledged": verdict.acknowledged, "lost": verdict.lost, "duplicated": verdict.duplicated}
-        yield dataclasses.replace(row, passed=passed, **counts)
+            yield row.with_verdict(run.end())
 
 
 def freeze(run: Loaded, role: str, tries: int, seconds: float) -> Row:

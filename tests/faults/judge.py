@@ -5,6 +5,8 @@ so a gap shows what was lost, and an origin (actor, epoch, seq, k) that stands t
 """
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ import numpy as np
 from rmc.common.bus.protocol import EntryId
 from rmc.common.window import Rows
 from rmc.deploy.run.folder import RunFolder
-from rmc.replay_server.recovery import open_store
+from rmc.replay_server.recovery import ReplayStore, open_store
 
 Acks = dict[tuple[int, int], int]
 
@@ -26,21 +28,37 @@ class Judgement:
     duplicated: int
     acted_on_older: int  # windows of older weights than the same environment's before; only one learner's can be told
 
+    @property
+    def sound(self) -> bool:
+        """Whether nothing was lost or doubled."""
+        return not (self.lost or self.duplicated)
 
-def judge(folder: Path, acks: Acks) -> Judgement:
-    """``acks``: the largest number of an entry that was acknowledged, by actor and epoch. Raises ConfigError."""
+
+@contextmanager
+def opened(folder: Path) -> Iterator[ReplayStore]:
+    """The ring of a run that nobody trains. Raises ConfigError."""
     run = RunFolder(folder)
     config = run.config()
     store = open_store(
         run.path / "replay", config.window_spec(), config.replay.capacity, config.replay.priority_exponent
     )
     try:
-        progress, capacity = store.ring.progress, store.ring.capacity
-        serials = np.arange(progress.valid_from, progress.next_serial)
-        rows = store.ring.rows[serials % capacity].copy()
+        yield store
     finally:
         store.close()
-    return judge_rows(rows, acks, full=progress.valid_from > 0)
+
+
+def judge(folder: Path, acks: Acks) -> Judgement:
+    """``acks``: the largest number of an entry that was acknowledged, by actor and epoch. Raises ConfigError."""
+    with opened(folder) as store:
+        return judge_rows(rows_of(store), acks, full=store.ring.progress.valid_from > 0)
+
+
+def rows_of(store: ReplayStore) -> Rows:
+    """A ring's windows in the order of their serials."""
+    progress = store.ring.progress
+    rows: Rows = store.ring.rows[np.arange(progress.valid_from, progress.next_serial) % store.ring.capacity]
+    return rows
 
 
 def judge_rows(rows: Rows, acks: Acks, full: bool) -> Judgement:

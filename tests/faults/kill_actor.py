@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rmc.deploy.run.folder import RunFolder
-from rmc.replay_server.recovery import open_store
+from tests.faults.judge import opened, rows_of
 from tests.faults.loaded import ACTORS, Loaded
 from tests.faults.row import Row, at_length
 
@@ -26,23 +25,16 @@ def kill_actors(tries: int, folder: Path) -> Iterator[Row]:
         run.until_all_go_on()
         verdict = run.end()
     repeated = _repeated_starts(folder / "run")
-    passed = not (verdict.lost or verdict.duplicated or repeated) and slowest < RECOVERY_S
-    yield Row(
-        "kill -9 of an actor", tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated, round(slowest, 2),
-        {"repeated_episodes": repeated},
-    )  # fmt: skip
+    passed = not repeated and slowest < RECOVERY_S
+    yield Row.judged("kill -9 of an actor", tries, passed, verdict, slowest, {"repeated_episodes": repeated})
 
 
 def _repeated_starts(folder: Path) -> int:
     """Episodes that begin with an observation which another one began with."""
-    run = RunFolder(folder)
-    config = run.config()
-    store = open_store(run.replay, config.window_spec(), config.replay.capacity, config.replay.priority_exponent)
-    progress = store.ring.progress
-    rows = store.ring.rows[np.arange(progress.valid_from, progress.next_serial) % store.ring.capacity]
+    with opened(folder) as store:
+        rows = rows_of(store)
     begun = rows[rows["episode_step"] == 0]
     first = begun["observation"][np.arange(len(begun)), begun["first"]]
-    store.close()
     return len(first) - len(np.unique(first, axis=0))
 
 

@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.deploy.run.folder import RunFolder
-from rmc.replay_server.recovery import open_store
-from tests.faults.judge import Acks, judge
+from tests.faults.judge import Acks, judge, opened
 from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.row import Row, at_length
 from tests.faults.witness import went_back
@@ -46,20 +44,15 @@ def kill_everything(tries: int, folder: Path) -> Iterator[Row]:
     verdict = judge(place, acks)
     differs = sum(not one["same"] for one in run.events("resumed"))
     table = {name: f"{reported.get(name, '-')} said last, {left[name]} on disk" for name in left}
-    passed = not (verdict.lost or verdict.duplicated or less or differs or went_back(versions)) and slowest < RECOVERY_S
-    yield Row(
-        "kill -9 of every process at once", tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated,
-        round(slowest, 2), {"learner_state_differs": differs, "counters_fell": less, **table},
-    )  # fmt: skip
+    passed = not (less or differs or went_back(versions)) and slowest < RECOVERY_S
+    facts = {"learner_state_differs": differs, "counters_fell": less, **table}
+    yield Row.judged("kill -9 of every process at once", tries, passed, verdict, slowest, facts)
 
 
 def on_disk(place: Path) -> Kept:
     """What the next start goes on with."""
-    run = RunFolder(place)
-    config = run.config()
-    store = open_store(run.replay, config.window_spec(), config.replay.capacity, config.replay.priority_exponent)
-    store.close()
-    progress, checkpoint = store.ring.progress, CheckpointFolder(run.checkpoints).latest()
+    with opened(place) as store:
+        progress, checkpoint = store.ring.progress, CheckpointFolder(place / "checkpoints").latest()
     learnt = store.priorities[: progress.next_serial] != 1.0
     return {
         "env_steps": progress.env_steps,

@@ -107,12 +107,12 @@ def kill_embedded(tries: int, folder: Path) -> Iterator[Row]:
 
 def _row(fault: str, run: Loaded, tries: int, slowest: float) -> Row:
     verdict = run.end()
-    passed = not (verdict.lost or verdict.duplicated or verdict.acted_on_older) and slowest < RECOVERY_S
+    passed = not verdict.acted_on_older and slowest < RECOVERY_S
     facts = {
         "acted_on_older_weights": verdict.acted_on_older,
         "its_log_lacked_weights": went_back(run.witness.versions),
     }
-    return Row(fault, tries, passed, verdict.acknowledged, verdict.lost, verdict.duplicated, round(slowest, 2), facts)
+    return Row.judged(fault, tries, passed, verdict, slowest, facts)
 
 
 def both(tries: int, folder: Path) -> Iterator[Row]:

@@ -1,5 +1,6 @@
 """A loss that is no number, forced, under load: ``python -m tests.faults.nan_loss [--tries 5]``."""
 
+import dataclasses
 import io
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +10,7 @@ import torch
 
 from rmc.common.checkpoint import STATE, CheckpointFolder
 from rmc.deploy.local.supervisor import QUICK_DEATHS
-from tests.faults.judge import judge
+from tests.faults.judge import Judgement, judge
 from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.row import Row, at_length
 from tests.faults.witness import went_back
@@ -24,7 +25,7 @@ def force_nan(tries: int, folder: Path) -> Iterator[Row]:
     Then once more, too soon: the run ends with the cause.
     """
     slowest, facts = 0.0, {"causes_said": 0, "checkpoints_spoilt": 0, "weights_went_back": 0}
-    acknowledged = lost = doubled = 0
+    verdicts = []
     for number in range(tries):
         with Loaded(folder / f"run-{number}", *ROOMY, "--checkpoint-steps", "500") as run:
             run.begin()
@@ -34,21 +35,14 @@ def force_nan(tries: int, folder: Path) -> Iterator[Row]:
             run.arm("nan")
             status = run.process.wait(60)
             text = run.text()
-        verdict = judge(run.folder, run.witness.acks)
+        verdicts.append(dataclasses.astuple(judge(run.folder, run.witness.acks)))
         log = (run.folder / "logs" / "learner.log").read_text()
         facts["causes_said"] += log.count(CAUSE) // QUICK_DEATHS + (status == 1 and CAUSE in text)
         facts["checkpoints_spoilt"] += sum(not _sound(checkpoints.load(one)) for one in checkpoints.numbers())
         facts["weights_went_back"] += went_back(run.witness.versions)
-        acknowledged, lost, doubled = (
-            acknowledged + verdict.acknowledged,
-            lost + verdict.lost,
-            doubled + verdict.duplicated,
-        )
     passed = facts == {"causes_said": 2 * tries, "checkpoints_spoilt": 0, "weights_went_back": 0}
-    passed = passed and not (lost or doubled) and slowest < RECOVERY_S
-    yield Row(
-        "NaN in a loss", QUICK_DEATHS * tries, passed, acknowledged, lost, doubled, round(slowest, 2), {**facts},
-    )  # fmt: skip
+    total = Judgement(*map(sum, zip(*verdicts, strict=True)))
+    yield Row.judged("NaN in a loss", QUICK_DEATHS * tries, passed and slowest < RECOVERY_S, total, slowest, facts)
 
 
 def _once(run: Loaded) -> float:

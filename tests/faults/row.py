@@ -7,10 +7,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Self
+
+from tests.faults.judge import Judgement
 
 RESULTS = Path(__file__).parent / "results.json"
+Found = Mapping[str, float | int | str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,8 +28,20 @@ class Row:
     lost: int | None = None
     duplicated: int | None = None
     recovery_s_max: float | None = None
-    found: dict[str, float | int | str] = dataclasses.field(default_factory=dict)
+    found: Found = dataclasses.field(default_factory=dict)
     """What else it measured."""
+
+    @classmethod
+    def judged(
+        cls, fault: str, tries: int, passed: bool, verdict: Judgement, slowest: float, found: Found | None = None
+    ) -> Self:
+        """Of a run that has ended; ``slowest``: seconds until all went on. Passed where its ring is sound, too."""
+        return cls(fault, tries, passed, recovery_s_max=round(slowest, 2), found=found or {}).with_verdict(verdict)
+
+    def with_verdict(self, verdict: Judgement) -> Self:
+        """The same with what its ring holds."""
+        counts = {"acknowledged": verdict.acknowledged, "lost": verdict.lost, "duplicated": verdict.duplicated}
+        return dataclasses.replace(self, passed=self.passed and verdict.sound, **counts)
 
     def keep(self) -> None:
         """Put it into the file, in the place of an earlier one of the same fault."""

@@ -1,6 +1,5 @@
 """At full speed, the ring full and wrapping: ``python -m tests.faults.soak [--minutes 80]``."""
 
-import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,10 +21,7 @@ def soak(minutes: int, folder: Path) -> Iterator[Row]:
     with Loaded(folder / "run", *WRAPPING) as run:
         run.begin()
         row = soaked(run, 60 * minutes, min(SETTLED_SECONDS, 30 * minutes))
-        verdict = run.end()
-    passed = row.passed and not (verdict.lost or verdict.duplicated)
-    counts = {"acknowledged": verdict.acknowledged, "lost": verdict.lost, "duplicated": verdict.duplicated}
-    yield dataclasses.replace(row, passed=passed, **counts)
+        yield row.with_verdict(run.end())
 
 
 def soaked(
