@@ -17,7 +17,7 @@ import torch
 from safetensors.torch import save
 
 from benchmarks import harness
-from benchmarks.harness import ENDLESS, Measure, Peer, Row, compare, peer_python, replay_process, speed
+from benchmarks.harness import ENDLESS, Measure, Row, compare, replay_process, speed, started_peer
 from rmc.actors.actor import Actor
 from rmc.actors.config import ActorConfig
 from rmc.common.agent import Agent
@@ -90,14 +90,14 @@ def main() -> None:
     parser.add_argument("--envs", type=int, nargs="+", default=[8, 32, 64, 128], help="environments of the actor")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    python = peer_python("peers")
     for envs in options.envs:
         with ExitStack() as stack:
-            peers: dict[str, Measure | None] = {}
-            for peer_envs in (DEFAULT_ENVS, 1) if envs == DEFAULT_ENVS else ():
-                peer = stack.enter_context(Peer(python, "sb3_actor", options.env, str(peer_envs))) if python else None
-                name = f"stable-baselines3 SAC, {peer_envs} at a time"
-                peers[name] = partial(peer.measure, options.seconds) if peer else None
+            peers = {
+                f"stable-baselines3 SAC, {peer_envs} at a time": started_peer(
+                    stack, "peers", "sb3_actor", options.seconds, options.env, peer_envs
+                )
+                for peer_envs in ((DEFAULT_ENVS, 1) if envs == DEFAULT_ENVS else ())
+            }
             harness.save(measure(options.env, envs, peers, options.rounds, options.seconds))
 
 

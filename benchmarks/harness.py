@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -171,6 +171,15 @@ def peer_python(environment: str) -> Path | None:
     """The Python of a peer's environment, as ``make peers`` made it, or None."""
     python = HERE.parent / f".venv-{environment}" / "bin" / "python"
     return python if python.exists() else None
+
+
+def started_peer(stack: ExitStack, environment: str, script: str, seconds: float, *words: object) -> Measure | None:
+    """A peer's turns of so many seconds, until the stack is closed; None where it is not installed."""
+    python = peer_python(environment)
+    if python is None:
+        return None
+    peer = stack.enter_context(Peer(python, script, *map(str, words)))
+    return lambda: peer.measure(seconds)
 
 
 @contextmanager

@@ -17,16 +17,15 @@ import psutil
 from benchmarks.harness import (
     ENDLESS,
     Measure,
-    Peer,
     Row,
     argument_parser,
     compare,
-    peer_python,
     random_rows,
     replay_process,
     running,
     save,
     speed,
+    started_peer,
 )
 from benchmarks.sender import CHUNK, Sender
 from rmc.common.env.config import EnvConfig
@@ -81,15 +80,13 @@ def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
     layout = env_layout(EnvConfig(env_id))
     obs_dim, action_dim = layout.obs_dim, layout.action_dim
     spec, cores = WindowSpec(obs_dim, action_dim, HIDDEN), sorted(os.sched_getaffinity(0))
-    words = [str(word) for word in (cores[0], cores[-1], obs_dim, action_dim, HIDDEN, WINDOWS[env_id], CHUNK)]
-    python, peers = peer_python("reverb"), dict[str, Measure | None]()
+    words = cores[0], cores[-1], obs_dim, action_dim, HIDDEN, WINDOWS[env_id], CHUNK
     with ExitStack() as stack:
         own = stack.enter_context(ours(spec, WINDOWS[env_id], seconds))
-        for name, layout in LAYOUTS.items():
-            peers[name] = None
-            if python is not None:
-                peer = stack.enter_context(Peer(python, "reverb_ingest", layout, *words))
-                peers[name] = lambda peer=peer: peer.measure(seconds)  # type: ignore[misc]
+        peers = {
+            name: started_peer(stack, "reverb", "reverb_ingest", seconds, columns, *words)
+            for name, columns in LAYOUTS.items()
+        }
         limit = ("one copy in memory", copy(spec, seconds))
         return compare(f"ingest, {CHUNK} windows an entry, {env_id}", "windows/s", own, peers, limit, rounds)
 

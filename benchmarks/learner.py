@@ -24,16 +24,15 @@ from benchmarks.harness import (
     ENDLESS,
     SECRET,
     Measure,
-    Peer,
     Row,
     argument_parser,
     compare,
     on_cores,
-    peer_python,
     random_rows,
     replay_process,
     save,
     speed,
+    started_peer,
 )
 from benchmarks.sender import Sender
 from rmc.common.agent import Agent
@@ -155,13 +154,9 @@ def cut(run: RunConfig, longest: int, seconds: float, rounds: int) -> list[Row]:
 
 def _sac(stack: ExitStack, spec: WindowSpec, threads: int, seconds: float) -> Measure | None:
     """SAC in an environment of its own, on as many cores as it has threads."""
-    cores, python = sorted(os.sched_getaffinity(0)), peer_python("peers")
-    if python is None:
-        return None
-    words = [str(word) for word in (spec.obs_dim, spec.action_dim, SAC_BATCH, threads)]
+    cores, words = sorted(os.sched_getaffinity(0)), (spec.obs_dim, spec.action_dim, SAC_BATCH, threads)
     with on_cores({cores[0]} if threads == 1 else {cores[0], cores[-1]}):
-        peer = stack.enter_context(Peer(python, "sb3_learner", *words))
-    return lambda: peer.measure(seconds)
+        return started_peer(stack, "peers", "sb3_learner", seconds, *words)
 
 
 def main() -> None:

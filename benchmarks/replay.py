@@ -21,16 +21,15 @@ from benchmarks.harness import (
     RUN,
     SECRET,
     Measure,
-    Peer,
     Row,
     argument_parser,
     compare,
-    peer_python,
     random_rows,
     replay_process,
     running,
     save,
     speed,
+    started_peer,
 )
 from benchmarks.peers.turns import send_at
 from benchmarks.sender import CHUNK, Sender
@@ -56,7 +55,7 @@ REVERB = {  # where its server is, and how a window is laid out
     "Reverb, server in the learner": ("learner", "fields"),
     "Reverb, server in the learner, packed windows": ("learner", "packed"),
 }
-IN_FLIGHT = 256  # samples, and below where another number was faster; a dataset reads, which was faster than the client
+IN_FLIGHT = 256  # samples, and below where another number was faster
 IN_FLIGHT_OF = {("Humanoid-v5", "server", "packed"): 16, ("Humanoid-v5", "learner", "packed"): 64}
 
 
@@ -145,25 +144,17 @@ def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
     obs_dim, action_dim = layout.obs_dim, layout.action_dim
     spec, windows = WindowSpec(obs_dim, action_dim, HIDDEN), WINDOWS[env_id]
     core = max(os.sched_getaffinity(0))
-    sizes = [str(size) for size in (core, obs_dim, action_dim, HIDDEN, windows, BATCH, RATE, CHUNK)]
+    sizes = core, obs_dim, action_dim, HIDDEN, windows, BATCH, RATE, CHUNK
     with ExitStack() as stack:
         own = stack.enter_context(ours(spec, windows, seconds))
         peers: dict[str, Measure | None] = {}
         for name, (place, layout) in REVERB.items():
             in_flight = IN_FLIGHT_OF.get((env_id, place, layout), IN_FLIGHT)
-            words = [place, "dataset", layout, str(in_flight), *sizes]
-            peers[name] = _peer(stack, "reverb", "reverb_replay", words, seconds)
-        peers["cpprb, in the learner"] = _peer(stack, "peers", "cpprb_replay", sizes, seconds)
+            words = place, layout, in_flight, *sizes
+            peers[name] = started_peer(stack, "reverb", "reverb_replay", seconds, *words)
+        peers["cpprb, in the learner"] = started_peer(stack, "peers", "cpprb_replay", seconds, *sizes)
         limit = ("numpy gather in memory", gather(spec, windows, seconds))
         return compare(f"replay, mixed load, batch {BATCH}, {env_id}", "batches/s", own, peers, limit, rounds)
-
-
-def _peer(stack: ExitStack, environment: str, script: str, words: list[str], seconds: float) -> Measure | None:
-    python = peer_python(environment)
-    if python is None:
-        return None
-    peer = stack.enter_context(Peer(python, script, *words))
-    return lambda: peer.measure(seconds)
 
 
 def main() -> None:

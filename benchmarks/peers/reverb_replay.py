@@ -1,8 +1,8 @@
 """Reverb under mixed load on one core: batches a second drawn by priority, priorities sent back, windows coming in.
 
-    python reverb_replay.py PLACE READER LAYOUT IN_FLIGHT CORE O A H COUNT BATCH RATE CHUNK
+    python reverb_replay.py PLACE LAYOUT IN_FLIGHT CORE O A H COUNT BATCH RATE CHUNK
 
-PLACE: ``server`` (a process of its own) or ``learner`` (in the learner's process). READER: ``dataset`` or ``client``.
+PLACE: ``server`` (a process of its own) or ``learner`` (in the learner's process).
 """
 
 import json
@@ -32,7 +32,7 @@ def start(script: str, *words: object) -> subprocess.Popen[str]:
 
 
 def read_dataset(port: int, batch: int, in_flight: int) -> Iterator[Batch]:
-    """Batches made by tf.data."""
+    """Batches made by tf.data, which is faster than stacking the client's samples."""
     dataset = reverb.TrajectoryDataset.from_table_signature(
         f"localhost:{port}", TABLE, max_in_flight_samples_per_worker=in_flight
     ).batch(batch, drop_remainder=True)
@@ -41,18 +41,8 @@ def read_dataset(port: int, batch: int, in_flight: int) -> Iterator[Batch]:
         yield info.key.numpy(), info.probability.numpy(), int(info.table_size[0]), columns
 
 
-def read_client(port: int, batch: int, names: list[str]) -> Iterator[Batch]:
-    """Batches stacked from the client's samples."""
-    client = reverb.Client(f"localhost:{port}")
-    while True:
-        samples = list(client.sample(TABLE, batch, emit_timesteps=False))
-        columns = {name: np.stack([one.data[k] for one in samples]) for k, name in enumerate(names)}
-        keys = np.array([one.info.key for one in samples], np.uint64)
-        yield keys, np.array([one.info.probability for one in samples]), samples[0].info.table_size, columns
-
-
 def main() -> None:
-    place, reader, layout, *numbers = sys.argv[1:]
+    place, layout, *numbers = sys.argv[1:]
     in_flight, core, observation, action, hidden, count, batch, rate, chunk = map(int, numbers)
     sizes = Sizes(observation, action, hidden)
     pin(core)
@@ -68,9 +58,7 @@ def main() -> None:
     sender = start("reverb_sender", port, *sizes, layout, rate, chunk)
     sender.stdout.readline()
     like, client = random_columns(sizes, 1), reverb.Client(f"localhost:{port}")
-    names = sorted(columns_of(sizes, 1, layout))
-    batches = read_dataset(port, batch, in_flight) if reader == "dataset" else read_client(port, batch, names)
-    rng = np.random.default_rng(0)
+    batches, rng = read_dataset(port, batch, in_flight), np.random.default_rng(0)
 
     def one() -> None:
         keys, probabilities, windows, columns = next(batches)
