@@ -12,7 +12,7 @@ import pytest
 
 from rmc.deploy.run.folder import RunFolder
 from tests.analysis.test_policy import AGENTS, make_run
-from tests.deploy.test_attach import HOLDER
+from tests.deploy.test_attach import holder
 
 NOBODY = 65534
 COLLEAGUE = """
@@ -48,10 +48,7 @@ def folder(tmp_path: Path) -> RunFolder:
 
 @pytest.fixture
 def training(folder: RunFolder) -> Iterator["subprocess.Popen[str]"]:
-    words = [sys.executable, "-c", HOLDER, str(folder.path), "130"]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as owner:
-        assert owner.stdout is not None
-        owner.stdout.readline()
+    with holder(folder, 130) as owner:
         yield owner
         if owner.poll() is None:
             owner.communicate("\n")

@@ -1,7 +1,6 @@
-"""Ctrl-C, a killed Redis or evaluator, a frozen learner: nothing is left behind; the other faults: tests/faults."""
+"""Ctrl-C, a killed Redis or evaluator: nothing is left behind; the other faults: tests/faults."""
 
 import sys
-import time
 from collections.abc import Iterator
 
 import pytest
@@ -43,22 +42,6 @@ def test_a_killed_redis_comes_back(endless: Training) -> None:
     steps = endless.newest("replay", "env_steps")
     endless.wait_for_updates(100)
     endless.wait_for(lambda: endless.newest("replay", "env_steps") > steps + 100)
-
-
-def test_a_frozen_learner_stops_the_actors_at_their_credit(endless: Training) -> None:
-    learner = endless.role("learner")
-    assert learner is not None
-    learner.suspend()
-    try:
-        endless.wait_for(lambda: endless.newest("actor-0", "waiting_share") > 0.99)
-        endless.wait_for(lambda: endless.newest("actor-0", "waiting_for", "") == "credit")
-        time.sleep(3.0)  # what the replay server says is older
-        steps = endless.newest("replay", "env_steps")
-        time.sleep(3.0)
-        assert endless.newest("replay", "env_steps") == steps
-    finally:
-        learner.resume()
-    endless.wait_for(lambda: endless.newest("replay", "env_steps") > steps)
 
 
 def test_a_second_launcher_is_refused(endless: Training) -> None:
