@@ -130,6 +130,5 @@ class EnvPool:
                 raise EnvFault(f"{fault}; give as many at every reset")
 
     def close(self) -> None:
-        """Close all of them."""
         for env in self._envs:
             env.close()

@@ -269,7 +269,6 @@ class _Run(BaseCallback):
         self._write_progress()
 
     def close(self) -> None:
-        """Close files and environments."""
         self._metrics.close()
         self._vec.close()
 

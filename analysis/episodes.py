@@ -162,7 +162,6 @@ class Player:
         return dataclasses.replace(episode, terminated=bool(terminated))
 
     def close(self) -> None:
-        """Close the environment."""
         self._env.close()
 
     def _episode(

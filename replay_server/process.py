@@ -62,6 +62,5 @@ class ReplayProcess:
         return {**self.server.metrics(), "refused_clients": refused.total(), **reasons}
 
     def close(self) -> None:
-        """Close the socket, then the server."""
         self.sockets.close()
         self.server.close()

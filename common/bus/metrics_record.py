@@ -21,7 +21,6 @@ LARGEST = 2.0**63  # of a number; metrics are far below
 
 
 def encode_record(record: Mapping[str, Any]) -> bytes:
-    """One record."""
     packed: bytes = msgpack.packb(dict(record), use_bin_type=True)
     return packed
 

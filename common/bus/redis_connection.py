@@ -51,7 +51,6 @@ class RedisConnection:
         self._rests_until = 0.0  # by the monotonic clock: a Redis that hangs is left alone for as long as it took
 
     def key(self, *parts: object) -> str:
-        """A key of the run."""
         return ":".join([self.prefix, *map(str, parts)])
 
     @contextmanager

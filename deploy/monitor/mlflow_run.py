@@ -35,16 +35,13 @@ class MlflowRun:
             self._client.log_batch(self._run, params=params[first : first + MOST_PARAMS])
 
     def log(self, values: dict[str, Any], env_steps: int) -> None:
-        """A row of numbers at an environment step."""
         now = int(1e3 * time.time())
         self._client.log_batch(self._run, [Metric(name, value, now, env_steps) for name, value in values.items()])
 
     def log_video(self, video: Path, env_steps: int) -> None:
-        """An episode of the policy as it was at an environment step."""
         self._client.log_artifact(self._run, str(video), f"videos/{env_steps}")
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Log the end."""
         numbers = {f"result/{name}": value for name, value in summary.items() if isinstance(value, int | float)}
         self.log(numbers, summary["env_steps"])
         self._client.set_terminated(self._run, STATES.get(summary["state"], "FAILED"))

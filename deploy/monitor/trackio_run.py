@@ -24,15 +24,12 @@ class TrackioRun:
         )
 
     def log(self, values: dict[str, Any], env_steps: int) -> None:
-        """A row of numbers at an environment step."""
         self._run.log(values, step=env_steps)
 
     def log_video(self, video: Path, env_steps: int) -> None:
-        """An episode of the policy as it was at an environment step."""
         self._run.log({"video": trackio.Video(video)}, step=env_steps)
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Log the end, and return when all has arrived."""
         numbers = {f"result/{name}": value for name, value in summary.items() if isinstance(value, int | float)}
         self._run.log(numbers, step=summary["env_steps"])
         self._run.finish()  # type: ignore[no-untyped-call]

@@ -30,15 +30,12 @@ class WandbRun:
         self._run.define_metric("*", step_metric=STEPS)
 
     def log(self, values: dict[str, Any], env_steps: int) -> None:
-        """A row of numbers at an environment step."""
         self._run.log({STEPS: env_steps, **values})
 
     def log_video(self, video: Path, env_steps: int) -> None:
-        """An episode of the policy as it was at an environment step."""
         self._run.log({STEPS: env_steps, "video": wandb.Video(str(video), format="mp4")})
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Log the end, and return when all has arrived."""
         self._run.summary.update(summary)
         self._run.finish(exit_code=0 if summary["state"] in ("finished", "stopped") else KILLED)
 

@@ -93,7 +93,6 @@ class RunFolder:
             raise ConfigError("RUN", str(self.path), str(error)) from None
 
     def write_config(self, config: RunConfig) -> None:
-        """Write ``config.json``, whole or not at all."""
         write_whole(self.path / "config.json", f"{to_json(config)}\n".encode())
 
     def result(self) -> dict[str, Any] | None:
@@ -118,7 +117,6 @@ class RunFolder:
             return None
 
     def write_initial(self, played: dict[str, Any]) -> None:
-        """Write ``initial.json``, whole or not at all."""
         write_whole(self.initial_file, f"{json.dumps(played, indent=2)}\n".encode())
 
     def check_sizes(self, env_id: str, sizes: dict[str, Any]) -> None:
@@ -130,7 +128,6 @@ class RunFolder:
         check_sizes(env_id, before, sizes)
 
     def write_sizes(self, sizes: dict[str, Any]) -> None:
-        """Write ``sizes.json``, whole or not at all."""
         write_whole(self.sizes_file, f"{json.dumps(sizes)}\n".encode())
 
     def reopen(self, total_steps: int) -> None:

@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 
 
 def evaluate(command: run_options.Evaluate) -> int:
-    """Play a checkpoint and print how it did."""
     if not command.seconds >= 0.0:
         raise ConfigError("--seconds", command.seconds, "take 0 or more")
     for flicker in command.flicker:
@@ -96,7 +95,6 @@ def _result_line(played: dict[str, Any]) -> str:
 
 
 def export_policy(command: run_options.Export) -> int:
-    """Write a policy as ONNX, or as a policy file."""
     check_writable("--out", command.out, (".onnx", ".safetensors"))
     policy, console = read_policy(command.run, command.checkpoint), terminal()
     if command.out.suffix.lower() == ".safetensors":
@@ -110,7 +108,6 @@ def export_policy(command: run_options.Export) -> int:
 
 
 def inspect(command: run_options.Inspect) -> int:
-    """Write a picture of what the world model knows and the memory holds, and say it in numbers."""
     console = terminal(max(terminal().width, memory_picture.WIDTH))
     insight, memory, value = world_model_picture.inspect(command.run, command.checkpoint, command.out)
     ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in insight.open_loop.items())
@@ -129,14 +126,12 @@ def inspect(command: run_options.Inspect) -> int:
 
 
 def check_env(command: run_options.CheckEnv) -> int:
-    """Say what the agent will make of an environment."""
     if not 1 <= command.steps <= 10_000_000:
         raise ConfigError("--steps", command.steps, "take 1 to 10_000_000")
     return env_check.check(command.env.config(), command.steps, terminal())
 
 
 def baseline(command: run_options.Baseline) -> int:
-    """Train an agent of stable-baselines3."""
     check_baselines(command.algorithm)
     from rmc.analysis import baselines  # an extra, and slow to import
 
@@ -145,7 +140,6 @@ def baseline(command: run_options.Baseline) -> int:
 
 
 def plot(command: run_options.Plot) -> int:
-    """Draw curves and print their table."""
     groups, console = curves.grouped(_histories(command.runs)), terminal(max(terminal().width, curves.WIDTH))
     console.print(*curves.tables(groups, command.reference), sep="\n")
     curves.draw(groups, command.by, command.out)

@@ -16,7 +16,6 @@ from rmc.deploy.ray.launcher_actor import ClusterRunSummary
 
 
 def list_runs(address: str, as_json: bool) -> int:
-    """Print a table of the runs that are trained on a cluster."""
     with _joined(address):
         summaries = cluster_runs.summaries()
     if as_json:
@@ -28,7 +27,6 @@ def list_runs(address: str, as_json: bool) -> int:
 
 
 def stop(run: str, address: str) -> int:
-    """End a run of a cluster cleanly."""
     with _joined(address):
         summary = cluster_runs.stop(run)
     terminal().print(f"{run} has ended; its folder is {summary.folder} on {summary.host}", soft_wrap=True)

@@ -23,7 +23,6 @@ log = logging.getLogger(__name__)
 
 
 def train(command: train_options.Train) -> int:
-    """Train a run, or continue one."""
     warn_of_password(command.redis_url or "")
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     if command.dry_run:
@@ -32,7 +31,6 @@ def train(command: train_options.Train) -> int:
 
 
 def stats(command: run_options.Stats) -> int:
-    """Print the newest metrics of a run, and its result if it has one."""
     folder, console = RunFolder(command.run), terminal()
     status = recorded_status(folder)
     if command.json:
@@ -47,7 +45,6 @@ def stats(command: run_options.Stats) -> int:
 
 
 def list_runs(command: run_options.List) -> int:
-    """Print a table of the runs in a folder, or on a Ray cluster."""
     if command.ray_address is not None:
         _check_ray(command.ray_address)
         from rmc.cli import cluster_commands
@@ -69,7 +66,6 @@ def _check_ray(address: str) -> None:
 
 
 def doctor(command: run_options.Doctor) -> int:
-    """Say what holds a run back."""
     findings, seconds = examine_run(RunFolder(command.run))
     console = terminal()
     for finding in findings:
@@ -81,7 +77,6 @@ def doctor(command: run_options.Doctor) -> int:
 
 
 def attach(command: run_options.Attach) -> int:
-    """Watch a run until it ends, or until Ctrl-C."""
     folder, console = RunFolder(command.run), terminal()
     attachment.launcher_pid(folder)
     try:
@@ -93,7 +88,6 @@ def attach(command: run_options.Attach) -> int:
 
 
 def stop(command: run_options.Stop) -> int:
-    """End a run cleanly."""
     if command.ray_address is not None:
         _check_ray(command.ray_address)
         from rmc.cli import cluster_commands
@@ -109,7 +103,6 @@ def stop(command: run_options.Stop) -> int:
 
 
 def cluster(command: run_options.Cluster) -> int:
-    """Bring a cluster up, or take it down."""
     check_installed("ray", ("ray", "yaml"), "CONFIG", str(command.config))
     from rmc.deploy.ray import machines  # needs what only the extra "ray" installs
 

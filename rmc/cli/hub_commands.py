@@ -10,7 +10,6 @@ from rmc.deploy.monitor.view import terminal
 
 
 def run_hub(command: hub_options.Hub) -> int:
-    """Push or pull."""
     action = command.action
     return _push(action) if isinstance(action, hub_options.Push) else _pull(action)
 

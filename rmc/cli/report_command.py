@@ -8,7 +8,6 @@ from rmc.deploy.monitor.view import terminal
 
 
 def report(command: run_options.Report) -> int:
-    """Write one page about runs."""
     check_report(command.out)
     runs = each_readable(command.runs, lambda path: ReportRun.read(path.resolve()))
     write_report(runs, command.out, command.video)

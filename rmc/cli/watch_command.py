@@ -16,7 +16,6 @@ ANY = ("0.0.0.0", "::")
 
 
 def watch(command: run_options.Watch) -> int:
-    """Serve the page until Ctrl-C."""
     check_installed("watch", ("starlette", "uvicorn"), "RUNS", " ".join(map(str, command.runs)))
     from rmc.analysis.live_run import LiveRun
     from rmc.analysis.watch_server import serve  # an extra

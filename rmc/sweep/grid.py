@@ -59,7 +59,6 @@ class Grid:
         self._jobs = iter(jobs)
 
     def next(self) -> Job | None:
-        """The next one; None where all have begun."""
         return next(self._jobs, None)
 
     def is_hopeless(self, job: Job) -> bool:  # noqa: ARG002 - none is

@@ -46,12 +46,10 @@ class Index:
         return str(self.lines.get(job.name, {}).get("state", "waiting"))
 
     def begin(self, job: Job) -> None:
-        """Note that it runs."""
         self.put(job, "running")
         self.write()
 
     def end(self, job: Job, ending: Ending) -> None:
-        """Note how it ended."""
         self.put(job, ending.state, ending.seconds, ending.reason)
         self.write()
 

@@ -18,11 +18,9 @@ class LocalRuns:
         self._free = core_parts(at_once)
 
     def has_room(self) -> bool:
-        """Whether a part of the cores is free."""
         return bool(self._free)
 
     def start(self, job: Job) -> "RunProcess":
-        """Start one on a part of the cores."""
         return RunProcess(job, self._free.pop(0), self._free)
 
 
@@ -36,14 +34,12 @@ class RunProcess:
             os.sched_setaffinity(self._process.pid, part)
 
     def status(self) -> int | None:
-        """Its exit status, once it has one."""
         status = self._process.poll()
         if status is not None:
             self._free.append(self._part)
         return status
 
     def stop(self) -> None:
-        """As rmc stop does."""
         self._process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
@@ -52,7 +48,6 @@ class RunProcess:
         self._process.wait()
 
     def last_words(self) -> str:
-        """The last line of its log."""
         return last_log_line(self._log)
 
 

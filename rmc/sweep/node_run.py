@@ -44,7 +44,6 @@ class NodeRun:
         return status, parcel, log
 
     def stop(self) -> None:
-        """As rmc stop does."""
         self._process.send_signal(signal.SIGTERM)
 
 

@@ -117,5 +117,4 @@ class RayRun:
             ray.kill(self._actor)
 
     def last_words(self) -> str:
-        """Why it failed."""
         return self._lost or last_log_line(self._job.log)

@@ -109,7 +109,6 @@ class SearchPlan:
                 yield f"{TRIAL}{number}"
 
     def next(self) -> Job | None:
-        """The next trial's run."""
         name = next(self._names, None)
         if name is None:
             return None
@@ -152,7 +151,6 @@ class SearchPlan:
         return sorted(by_step.items(), key=lambda pair: pair[0])
 
     def end(self, job: Job, ending: Ending) -> None:
-        """Tell Optuna."""
         at_work = self._at_work.pop(job.name)
         self._report(at_work, job)
         judged = self._evaluations(job) if ending.state == "finished" else []
