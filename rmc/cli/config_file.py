@@ -48,11 +48,21 @@ def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
 
 
 def _named(words: Sequence[str]) -> Path | None:
-    named = [user_path(word.partition("=")[2]) for word in words if word.startswith(f"{OPTION}=")]
-    named += [user_path(after) for word, after in itertools.pairwise(words) if word == OPTION]
+    named = [user_path(value) for value in values_of(OPTION, words)]
     if len(named) > 1:
         raise ConfigError(OPTION, " ".join(map(str, named)), "is there twice; give one file")
     return named[0] if named else None
+
+
+def values_of(option: str, words: Sequence[str]) -> list[str]:
+    """What an option is given, in its order, as ``--option VALUE`` or ``--option=VALUE``."""
+    pairs = itertools.zip_longest(words, words[1:])
+    found = (
+        after if word == option else word.removeprefix(f"{option}=")
+        for word, after in pairs
+        if word.partition("=")[0] == option
+    )
+    return [value for value in found if value is not None]
 
 
 def _read(path: Path) -> dict[str, Any]:

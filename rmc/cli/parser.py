@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import importlib
-import itertools
 import logging
 import operator
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from typing import Annotated, Any, cast, get_args, get_type_hints
 import tyro
 
 from rmc.cli import hub_options, role_options, run_options, sweep_options, train_options
-from rmc.cli.config_file import KWARGS, RENAMED, with_file
+from rmc.cli.config_file import KWARGS, RENAMED, values_of, with_file
 from rmc.cli.help_text import ALL_OPTIONS, BASIC, only_basic
 from rmc.cli.primitives import PRIMITIVES
 from rmc.common.env.config import EnvConfig
@@ -181,6 +180,5 @@ def _check_once(option: str, words: list[str]) -> None:
 
 def _named_preset(words: list[str]) -> Preset:
     """The preset must be known before the options, whose defaults it gives; a wrong one is refused later."""
-    presets = [word.partition("=")[2] for word in words if word.startswith("--preset=")]
-    presets += [after for word, after in itertools.pairwise(words) if word == "--preset"]
-    return next((name for name in get_args(Preset) if name in presets[-1:]), "robust")
+    newest = values_of("--preset", words)[-1:]
+    return next((name for name in get_args(Preset) if name in newest), "robust")

@@ -56,6 +56,12 @@ def test_every_preset_gives_its_defaults(name: Preset) -> None:
     )
 
 
+def test_of_two_presets_the_last_gives_its_defaults() -> None:
+    expected = preset_config("debug", EnvConfig(PENDULUM))
+    for given in (("--preset=paper", "--preset", "debug"), ("--preset", "paper", "--preset=debug")):
+        assert parsed("train", PENDULUM, *given)[0] == expected
+
+
 def test_what_is_said_is_all_that_changes(run: RunFolder) -> None:
     words = ("--total-steps", 20_000, "--replay-ratio", "7.5", "--launcher", "local", "--no-missing-flag")
     for command in (
