@@ -23,11 +23,11 @@ def interquartile_mean(scores: Scores) -> float:
 
 
 def interval(
-    statistic: Callable[..., float], *matrices: Scores, seed: int = 0, resamples: int = RESAMPLES
+    statistic: Callable[[Scores], float], scores: Scores, seed: int = 0, resamples: int = RESAMPLES
 ) -> tuple[float, float]:
-    """Percentile bootstrap of a statistic of (R, E) matrices, runs drawn anew within each environment."""
+    """Percentile bootstrap of a statistic of (R, E) scores, runs drawn anew within each environment."""
     random = np.random.default_rng(seed)
-    estimates = [statistic(*(_resampled(matrix, random) for matrix in matrices)) for _ in range(resamples)]
+    estimates = [statistic(_resampled(scores, random)) for _ in range(resamples)]
     low, high = np.quantile(estimates, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)
 

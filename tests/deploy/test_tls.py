@@ -22,16 +22,12 @@ from rmc.deploy.redis.users import LAUNCHER, RedisUsers
 from rmc.deploy.run import tls
 from rmc.learner.replay_client import ReplayClient
 from rmc.replay_server.config import ReplayConfig
+from tests.integration.running import free_port
 from tests.replay_server.served import Served
 from tests.replay_server.support import SPEC
 
 SECRET = b"encrypted"
 USERS = RedisUsers("encrypted", SECRET, ("learner", "actor-0"))
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture(scope="module")
