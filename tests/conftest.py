@@ -29,6 +29,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch starts its threads
 TEMPORARY = tempfile.mkdtemp(prefix="rmct-")  # so that what other runs on this machine leave is not taken for ours
 os.environ["TMPDIR"] = tempfile.tempdir = TEMPORARY
 
+from rmc.common.env.process_state import ApartCall  # noqa: E402
 from rmc.deploy.redis.server import RedisServer  # noqa: E402
 
 hypothesis.settings.register_profile("unhurried", deadline=None)  # a core is shared
@@ -136,6 +137,13 @@ def _running_children() -> list[psutil.Process]:
         except psutil.NoSuchProcess:
             continue
     return results
+
+
+@pytest.fixture(autouse=True)
+def no_environment_has_changed_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that changed it in an earlier test is forgotten."""
+    monkeypatch.setattr(ApartCall, "env_state", None)
+    monkeypatch.setattr(ApartCall, "changed", {})
 
 
 @pytest.fixture(autouse=True)

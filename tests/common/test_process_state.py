@@ -17,12 +17,6 @@ from tests.command import rmc
 from tests.counting_env import CountingEnv
 
 
-@pytest.fixture(autouse=True)
-def nothing_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ApartCall, "env_state", None)
-    monkeypatch.setattr(ApartCall, "changed", {})
-
-
 @pytest.mark.parametrize("when", ["early", "late"])
 @pytest.mark.parametrize("habit", meddling_env.HABITS)
 def test_both_find_the_process_as_they_left_it(habit: str, when: str) -> None:
