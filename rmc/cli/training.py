@@ -79,9 +79,8 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
         if folder.result() is not None:  # no step is missing: it would be gone else
             text = f"all {config.total_steps:,} steps are trained; {resume_command(folder)} --total-steps N goes on"
             console.print(text, soft_wrap=True)
-        seconds = (
-            0.0 if options.launcher == "lockstep" else config.evaluator.evaluation_seconds
-        )  # there no clock decides
+        by_clock = options.launcher != "lockstep"
+        seconds = config.evaluator.evaluation_seconds if by_clock else 0.0
         before = _before(config, folder, seconds, console)
         console.print(f"before training: {format_evaluation(before)}")
         tracker = start_tracker(folder)
