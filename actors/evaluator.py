@@ -253,11 +253,11 @@ def evaluation_metrics(rollout: Rollout) -> dict[str, Any]:
         "eval_return_std": float(np.std(rollout.returns)),
         "eval_episodes": len(rollout.returns),
         "eval_cut": int(rollout.cut),
+        "eval_broken_episodes": rollout.broken,
     }
 
 
 def _record(rollout: Rollout, version: Version) -> dict[str, Any]:
-    broken = {"eval_broken_episodes": rollout.broken}
     if not rollout.returns:
-        return broken
-    return broken | evaluation_metrics(rollout) | {"eval_steps": rollout.steps, "eval_update": version.update}
+        return {"eval_broken_episodes": rollout.broken}
+    return evaluation_metrics(rollout) | {"eval_steps": rollout.steps, "eval_update": version.update}

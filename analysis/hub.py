@@ -67,6 +67,8 @@ def _in_one_line(repo: str, revision: str | None = None) -> Iterator[None]:
         status = error.response.status_code
         fix = "use a token that may" if status in (401, 403) else "try again"
         raise ConfigError("REPO", repo, f"the hub refuses it (HTTP {status}); {fix}") from None
+    except ValueError as error:  # its library's word for a model card that the hub refuses
+        raise ConfigError("REPO", repo, f"the hub refuses it ({' '.join(str(error).split())}); correct that") from None
     except (*UNREACHED, errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError, errors.HTTPError) as error:  # type: ignore[attr-defined]
         cause = error.__cause__ if isinstance(error, errors.LocalEntryNotFoundError) and error.__cause__ else error
         fix = f"cannot be reached ({first_line(cause)}); try again with a network"

@@ -154,10 +154,11 @@ class LiveRun:
 
     def _roles(self) -> list[dict[str, Any]]:
         """By kind, how busy they are and what they wait for, by what they said last."""
-        said = [record for record in self._status.roles.values() if is_finite(record.get("time"))]
+        present = self._status.of_this_start()
+        said = [record for record in present.values() if is_finite(record.get("time"))]
         said.sort(key=lambda record: record["time"])
         vitals, silent = Vitals(said, math.inf), self._status.silent()
-        kinds = {kind: [role for role in self._status.roles if role.partition("-")[0] == kind] for kind in KINDS}
+        kinds = {kind: [role for role in present if role.partition("-")[0] == kind] for kind in KINDS}
         return [
             {
                 "kind": kind,

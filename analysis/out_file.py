@@ -19,6 +19,6 @@ def check_writable(name: str, path: Path, suffixes: tuple[str, ...]) -> None:
     try:
         path.open("ab").close()
         if not there:
-            path.unlink()
+            path.resolve().unlink()  # of a link, what it leads to
     except OSError as error:
         raise ConfigError(name, str(path), f"cannot be written ({error.strerror}); give another") from None

@@ -130,6 +130,9 @@ def _course(run: ReportRun) -> dict[str, Any]:
 
 def differences(runs: Sequence[ReportRun]) -> dict[str, Any]:
     """Options that are not alike in the runs that have them; of one run, those that are not its preset's."""
+    if len(runs) == 1 and runs[0].folder.is_baseline():
+        options = [[option(path), _text(value)] for path, value in runs[0].options.items()]
+        return {"columns": [runs[0].name], "rows": options, "note": "Options. A baseline has no preset."}
     if len(runs) == 1:
         changed = runs[0].changed()
         rows = [[option(path), *map(_text, values)] for path, values in changed.items()]

@@ -14,10 +14,15 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import changes, flat
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import MetricsTail
 from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.state import State, run_state
 
 Series = tuple[list[float], list[float]]
+DRAWN = {  # of a record, which of a long run do not all fit in memory
+    "role", "time", "wall_s", "start_s", "busy_share", "waiting_share", "waiting_for", "env_steps", "env_steps_per_s",
+    "updates_per_s", "policy_lag_mean", "sample_age_mean", "stale_state_stored", "stale_state_burned",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class ReportRun:
     folder: RunFolder
     about: About
     history: History | None  # None before the first evaluation
-    records: list[Record]
+    records: list[Record]  # what is drawn of them
     options: dict[str, Any]
     state: State
 
@@ -36,7 +41,8 @@ class ReportRun:
         """From its folder. Raises ConfigError where it is none."""
         folder = RunFolder(path)
         about = history.describe(path)
-        records = [record for record in folder.records() if is_finite(record.get("time"))]
+        timed = (record for record in folder.records() if is_finite(record.get("time")))
+        records = [{name: value for name, value in one.items() if name in DRAWN} for one in timed]
         try:
             past = history.of_run(folder)
         except ConfigError:
@@ -59,7 +65,8 @@ class ReportRun:
         """What ``rmc doctor`` says; nothing of a baseline, or where there is too little to judge."""
         if self.folder.is_baseline():
             return []
-        return [str(finding) for finding in examine(self.records, self.folder.config())]
+        newest = MetricsTail(self.folder.metrics).take()
+        return [str(finding) for finding in examine(newest, self.folder.config())]
 
     def changed(self) -> dict[str, list[Any]]:
         """Options that are not the preset's, with both values; of a baseline there are none."""

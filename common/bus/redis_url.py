@@ -1,6 +1,7 @@
 """A Redis's URL as it may be shown: its user-info and its query, either of which may hold a password, are left out."""
 
 import re
+from typing import Any
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
 SCHEMES = ("redis", "rediss", "unix")
@@ -56,3 +57,10 @@ def has_password(url: str) -> bool:
 def without_passwords(word: str) -> str:
     """A word of a command line, the URL or the login that it may end with as it may be shown."""
     return re.sub(r"[\w+.-]*://.*|[^=]*@.*", lambda match: shown(match[0]), word, flags=re.DOTALL)
+
+
+def value_without_passwords(value: Any) -> Any:
+    """The same of a value out of a file, which may be a list."""
+    if isinstance(value, list):
+        return [value_without_passwords(one) for one in value]
+    return without_passwords(value) if isinstance(value, str) else value

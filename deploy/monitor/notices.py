@@ -32,7 +32,7 @@ def waits(status: RunStatus) -> str:
     """Who waits most of the time, and for what; roles of a kind that wait for the same are counted."""
     silent = status.silent()
     groups: dict[tuple[str, str], dict[str, float]] = defaultdict(dict)
-    for role, record in sorted(status.roles.items()):
+    for role, record in sorted(status.of_this_start().items()):
         share, reason = record.get("waiting_share", 0.0), record.get("waiting_for")
         if role not in silent and share > WAITING_SHARE and reason and role != "evaluator":
             groups[role.partition("-")[0], str(reason)][role] = share

@@ -119,13 +119,13 @@ class RunStatus:
         now, launcher = time.time(), self.roles.get("launcher", {})
         if launcher.get("redis_away_s"):
             return {"Redis": launcher["redis_away_s"] + now - launcher.get("time", now)}
-        heard = self._of_this_start()
+        heard = self.of_this_start()
         unheard = {role: now - since for role, since in self._since.items() if role not in heard}
         return {role: seconds for role, seconds in unheard.items() if seconds > UNHEARD_SECONDS} | self._quiet(heard)
 
     def speaking(self) -> set[str]:
         """Who has said something of late, or cannot, as Redis is away."""
-        heard = self._of_this_start()
+        heard = self.of_this_start()
         return set(heard) - set({} if self.get("launcher", "redis_away_s") else self._quiet(heard))
 
     def _quiet(self, heard: dict[str, dict[str, Any]]) -> dict[str, float]:
@@ -145,13 +145,13 @@ class RunStatus:
     @property
     def stalled_s(self) -> float:
         """Seconds without a step and an update while learner, replay servers and actors all wait; 0 where one works."""
-        said = {role: record for role, record in self._of_this_start().items() if role not in ("launcher", "evaluator")}
+        said = {role: record for role, record in self.of_this_start().items() if role not in ("launcher", "evaluator")}
         work = [role for role, record in said.items() if _number(record.get("waiting_share")) < WAITING_SHARE]
         if work or not self._is_training or self.silent() or self.get("learner", "waiting_for") in (None, "disk"):
             return 0.0
         return max(0.0, _number(self.get("learner", "time")) - self._moved_at)
 
-    def _of_this_start(self) -> dict[str, dict[str, Any]]:
+    def of_this_start(self) -> dict[str, dict[str, Any]]:
         """The roles that have spoken since the launcher's newest start: one before may have had others."""
         launcher = self.roles.get("launcher", {})
         if not (is_finite(launcher.get("time")) and is_finite(launcher.get("start_s"))):
@@ -182,8 +182,8 @@ class RunStatus:
         wall_s, spoke = self.get("launcher", "wall_s"), self.get("launcher", "time")
         if not is_finite(wall_s):
             return None
-        since = 0.0 if self.is_over or not is_finite(spoke) else max(0.0, time.time() - spoke)
-        return float(wall_s) + since
+        trains = not self.is_over and is_finite(spoke) and spoke >= self.began  # between two starts none does
+        return float(wall_s) + (max(0.0, time.time() - spoke) if trains else 0.0)
 
     @property
     def eta_s(self) -> float | None:
@@ -205,14 +205,14 @@ class RunStatus:
     @property
     def episode_return(self) -> float | None:
         """Mean of the actors' newest episode returns."""
-        said = self._of_this_start().values()
+        said = self.of_this_start().values()
         values = [record["episode_return_mean"] for record in said if "episode_return_mean" in record]
         return sum(values) / len(values) if values else None
 
     @property
     def broken_episodes(self) -> int:
         """How many the environment's own faults have ended."""
-        return sum(record.get("broken_episodes", 0) for record in self._of_this_start().values())
+        return sum(record.get("broken_episodes", 0) for record in self.of_this_start().values())
 
 
 def _number(value: Any) -> float:

@@ -31,7 +31,7 @@ def table(status: RunStatus, width: int, height: int | None = None) -> Renderabl
     warnings = notices(status)
     lines = [_title(status, columns), _bar(status, columns), *_lines(_essentials(status), columns)]
     lines += [row for fact in warnings.items() for row in _rows(*fact, columns, "yellow")]
-    everyone, room = len(status.roles), (height or 10**6) - len(lines)
+    everyone, room = len(status.of_this_start()), (height or 10**6) - len(lines)
     if beside:
         whole = Table.grid(padding=(0, 4, 0, 0))
         whole.add_row(
@@ -135,9 +135,9 @@ def _staleness(learner: dict[str, Any]) -> str:
 def _groups(status: RunStatus) -> list[dict[str, dict[str, Any]]]:
     """The roles by kind, the launcher left out."""
     kinds: dict[str, dict[str, dict[str, Any]]] = {}
-    for role in sorted(status.roles, key=lambda role: (len(role), role)):
+    for role, said in sorted(status.of_this_start().items(), key=lambda one: (len(one[0]), one[0])):
         if role != "launcher":
-            kinds.setdefault(role.partition("-")[0], {})[role] = status.roles[role]
+            kinds.setdefault(role.partition("-")[0], {})[role] = said
     return [kinds[kind] for kind in sorted(kinds, key=lambda kind: (kind == "actor", kind))]
 
 

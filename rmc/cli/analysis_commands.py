@@ -23,7 +23,7 @@ from rmc.analysis.run_paths import each_readable
 from rmc.cli import run_options
 from rmc.cli.ending import cut_note, episode_count
 from rmc.cli.signals import signals_caught
-from rmc.common.env.config import check_range
+from rmc.common.env.config import RANGES, check_range
 from rmc.common.errors import ConfigError
 from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor.view import terminal
@@ -37,6 +37,8 @@ def evaluate(command: run_options.Evaluate) -> int:
         raise ConfigError("--seconds", command.seconds, "take 0 or more")
     for flicker in command.flicker:
         check_range("--flicker", flicker, (0.0, 1.0))
+    if command.env_timeout is not None:
+        check_range("--env-timeout", command.env_timeout, RANGES["env_timeout"])
     aside = _said_aside if command.json else nullcontext
     if command.video is not None:
         with aside():

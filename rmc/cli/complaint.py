@@ -23,6 +23,7 @@ def as_line(boxed: str, words: Sequence[str]) -> str:
 def _near(words: Sequence[str]) -> str:
     """Of the first word that is wrong: a command or an option like it, or whose option it is; else nothing."""
     options = {name: list(map(option, option_names(kind))) for name, (kind, _) in COMMANDS.items()}
+    options["train"].append("--config")
     options["sweep"] += options["train"]
     command, *rest = words or [""]
     if command not in options:
@@ -31,7 +32,7 @@ def _near(words: Sequence[str]) -> str:
     for flag in flags:
         if flag.replace("--no-", "--", 1) in options[command]:
             continue
-        others = [f"rmc {other}" for other, known in options.items() if flag in known]
+        others = [f"rmc {other}" for other, known in options.items() if flag in known and other != "role"]
         return f"; {flag} is an option of {others[0]}" if others else _meant(flag, options[command])
     return ""
 

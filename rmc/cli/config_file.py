@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rmc.common.bus.redis_url import value_without_passwords
 from rmc.common.env.config import check_kwargs, write_kwargs
 from rmc.common.errors import ConfigError
 from rmc.common.user_path import user_path
@@ -75,9 +76,10 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _check(path: Path, name: str, value: Any, names: Sequence[str]) -> None:
+    told = value_without_passwords(value)
     if name not in names:
         near = difflib.get_close_matches(name, names, 1)
         fix = f"did you mean {near[0]}?" if near else "rmc train --help-all lists them"
-        raise ConfigError(f"{OPTION} {path}: {name}", value, f"is no option; {fix}")
+        raise ConfigError(f"{OPTION} {path}: {name}", told, f"is no option; {fix}")
     if not all(isinstance(one, str | bool | int | float) for one in (value if isinstance(value, list) else [value])):
-        raise ConfigError(f"{OPTION} {path}: {name}", value, "give a number, text, true, false or a list of such")
+        raise ConfigError(f"{OPTION} {path}: {name}", told, "give a number, text, true, false or a list of such")

@@ -8,7 +8,7 @@ import operator
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated, Any, cast, get_args, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 import tyro
 
@@ -163,11 +163,13 @@ def renamed(words: list[str]) -> list[str]:
 
 
 def option_names(kind: type) -> list[str]:
-    """The names of a command's options, also of those in its parts; what has no flag is left out."""
+    """The names of a command's options, also of those in its parts and subcommands; what has no flag is left out."""
     names: list[str] = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
-        if tyro.conf.Suppress not in getattr(hint, "__metadata__", ()):
-            names += option_names(cast(type, hint)) if dataclasses.is_dataclass(hint) else [name]
+        if {tyro.conf.Suppress, tyro.conf.Positional}.isdisjoint(getattr(hint, "__metadata__", ())):
+            parts = [getattr(part, "__origin__", part) for part in (hint, *get_args(hint))]
+            below = [part for part in parts if isinstance(part, type) and dataclasses.is_dataclass(part)]
+            names += [own for part in below for own in option_names(part)] or [name]
     return [name for name in names if name not in ("id", "config_file")]
 
 

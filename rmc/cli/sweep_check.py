@@ -9,6 +9,7 @@ from typing import Any
 
 from rmc.cli import complaint, parser
 from rmc.cli.train_options import Train
+from rmc.common.bus.redis_url import value_without_passwords, without_passwords
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, flat, option, option_words
 from rmc.deploy.run.launch_options import LaunchOptions
@@ -36,16 +37,17 @@ class Checked:
 def check_values(spec: Spec, on_this_machine: bool) -> None:
     """Raises ConfigError, which names the key, for the first value that rmc train would not read."""
     given = {word.partition("=")[0].replace("_", "-") for word in spec.words}
+    typed = " ".join(map(without_passwords, spec.words))
     ranges = spec.search.ranges if spec.search is not None else {}
     named = given | {option(name) for name in (*spec.options, *spec.grid, *ranges)}
     if not on_this_machine and (files := named.intersection(FILES)):
-        raise ConfigError(min(files), " ".join(spec.words), "the nodes do not have that file; leave it")
+        raise ConfigError(min(files), typed, "the nodes do not have that file; leave it")
     if "--seed" in given:
-        raise ConfigError("--seed", " ".join(spec.words), "a sweep has several: give --seeds")
+        raise ConfigError("--seed", typed, "a sweep has several: give --seeds")
     for name in RESERVED:
         if option(name) in given:
-            raise ConfigError(option(name), " ".join(spec.words), "a sweep's runs are given none; leave it")
-    _check("options of rmc train", " ".join(spec.words), spec, list(spec.words))
+            raise ConfigError(option(name), typed, "a sweep's runs are given none; leave it")
+    _check("options of rmc train", typed, spec, list(spec.words))
     ends = {name: [value.low, value.high] if isinstance(value, Range) else value for name, value in ranges.items()}
     for part, values in (("options", {name: [value] for name, value in spec.options.items()}), ("grid", spec.grid)):
         for name, tried in values.items():
@@ -59,9 +61,11 @@ def check_values(spec: Spec, on_this_machine: bool) -> None:
 def _check(place: str, value: Any, spec: Spec, words: list[str]) -> None:
     with contextlib.redirect_stderr(io.StringIO()) as output:
         try:
+            words = [without_passwords(word) for word in words]  # which the complaint quotes
             parser.parse(["train", spec.env, *words])
         except SystemExit:
-            raise ConfigError(place, value, complaint.as_line(output.getvalue(), ["sweep", *words])) from None
+            said = complaint.as_line(output.getvalue(), ["sweep", *words])
+            raise ConfigError(place, value_without_passwords(value), said) from None
 
 
 def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:
@@ -116,7 +120,9 @@ def _check_file(command: Train) -> None:
     defaults = {item.name: item.default for item in dataclasses.fields(Train)}
     for name in RESERVED:
         if (value := getattr(command, name)) != defaults[name]:
-            raise ConfigError(option(name), value, "a sweep's runs are given none; leave it out of that file")
+            raise ConfigError(
+                option(name), value_without_passwords(value), "a sweep's runs are given none; leave it out of that file"
+            )
     check_name(option("launcher"), "launcher", command.launcher)
 
 

@@ -137,7 +137,7 @@ def search_work(spec: Spec, search: Search, config: RunConfig, index: Index, fol
             index.put(job, "waiting")
     index.write()
     total = max(search.trials, len(plan.jobs))
-    new = [make(f"{TRIAL}{number}", {}) for number in range(len(plan.jobs), total)]
+    new = [make_job(spec, folder / f"{TRIAL}{number}", {}, spec.seeds[0]) for number in range(len(plan.jobs), total)]
     return Work(plan, plan.jobs, [*plan.todo, *new], total)
 
 

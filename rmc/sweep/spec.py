@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite
+from rmc.common.bus.redis_url import value_without_passwords
 from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import flat
@@ -107,12 +108,13 @@ def _check_each_once(place: str, values: list[Any]) -> None:
 
 def check_name(place: str, name: str, value: Any, names: Set[str] = NAMES) -> None:
     """Raises ConfigError where that is no option that a sweep's runs may have."""
+    told = value_without_passwords(value)
     if name in OWN:
-        raise ConfigError(place, value, "every run has its own; give env and seeds")
+        raise ConfigError(place, told, "every run has its own; give env and seeds")
     if name not in names:
         near = difflib.get_close_matches(name, names, 1)
         hint = f"did you mean {near[0]}?" if near else "rmc train --help lists them"
-        raise ConfigError(place, value, f"no option that a sweep's runs take; {hint}")
+        raise ConfigError(place, told, f"no option that a sweep's runs take; {hint}")
     for one in value if isinstance(value, list) else [value]:
         if name == "env_kwargs" and isinstance(one, dict):
             check_kwargs(one)

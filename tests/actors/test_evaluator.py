@@ -9,11 +9,12 @@ import pytest
 from safetensors.torch import save
 
 from rmc.actors.config import EvaluatorConfig
-from rmc.actors.evaluator import Evaluator, Rollout, first_start, play_episodes
+from rmc.actors.evaluator import Evaluator, Rollout, evaluation_metrics, first_start, play_episodes
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.bus.metrics_record import is_whole
 from rmc.common.bus.protocol import Bus, Version
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
@@ -175,6 +176,7 @@ def test_an_episode_that_breaks_is_left_out_and_its_environment_made_anew() -> N
     counter = itertools.count()
     some = play_episodes(runner, lambda: Dead(counting()) if next(counter) == 0 else counting(), 3, seed=4)
     assert (some.returns, some.broken) == (sound[1:], 1)
+    assert not is_whole(evaluation_metrics(some))
     with pytest.raises(RmcError, match="broke in each of 2 episodes"):
         play_episodes(runner, lambda: Dead(counting()), 2, seed=4)
 

@@ -40,7 +40,8 @@ class _Requests(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         body, path = self._body(), self.path.partition("?")[0]
         if path == "/api/validate-yaml":
-            return self._json({"errors": [], "warnings": []})
+            fault = [{"message": '"license" must be one of these'}] * ("license: foo" in json.loads(body)["content"])
+            return self._json({"errors": fault, "warnings": []}, 400 if fault else 200)
         if self.headers.get("Authorization") != f"Bearer {TOKEN}":
             return self._refuse(401, "")
         if path == "/api/repos/create":

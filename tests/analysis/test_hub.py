@@ -97,6 +97,11 @@ WRONG = [
     (["push", "run", "me/x"], "hf_reads", "REPO='me/x': the hub refuses it (HTTP 401); use a token that may"),
     (["push", "run", "others/x"], TOKEN, "REPO='others/x': the hub refuses it (HTTP 403); use a token that may"),
     (["push", "run", "a/b/c"], TOKEN, "REPO='a/b/c': no repository's name; give owner/name"),
+    (
+        ["push", "run", "me/x", "--license", "foo"],
+        TOKEN,
+        "REPO='me/x': the hub refuses it (Invalid metadata in README.md. - \"license\" must be one of these); correct",
+    ),
     (["push", "nothing", "me/x"], TOKEN, "RUN='nothing': cannot be read"),
     (["pull", "me/nothing"], "", "REPO='me/nothing': no such repository, or a private one"),
     (["pull", "me/empty"], "", "REPO='me/empty': it holds no policy.safetensors"),

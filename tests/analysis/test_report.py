@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from rmc.analysis import report
+from rmc.analysis.doctor import examine
 from rmc.analysis.history import Evaluation, History
-from rmc.analysis.report_run import ReportRun
+from rmc.analysis.report_run import DRAWN, ReportRun
 from rmc.cli.main import run
 from rmc.deploy.local import trial
 from rmc.deploy.run.folder import RunFolder
@@ -142,6 +143,14 @@ def test_the_table_is_of_all_runs_of_an_agent(trained: Path, other: Path) -> Non
     assert len(report.newest(runs)) == 1  # of an agent one policy is played
 
 
+def test_of_a_record_what_is_drawn_is_kept_and_findings_are_the_doctors(trained: Path) -> None:
+    """A long run's whole records do not fit in memory."""
+    read = ReportRun.read(trained)
+    assert set().union(*read.records) <= DRAWN
+    assert {metric for _, _, lines in report.CHARTS for _, metric in lines.values()} <= DRAWN
+    assert read.findings == [str(one) for one in examine(list(read.folder.records()), read.folder.config())]
+
+
 def test_wall_time_goes_over_all_starts(trained: Path, tmp_path: Path) -> None:
     path = tmp_path / "run"
     path.mkdir()
@@ -220,6 +229,8 @@ def test_a_baseline_stands_beside_a_run(trained: Path, tmp_path: Path) -> None:
     assert "A baseline records neither waits nor rates." in text
     alone = written(tmp_path / "report.html", str(path))
     assert "<td>finished</td>" in alone
+    assert "A baseline has no preset." in alone
+    assert "<code>--total-steps</code>" in alone
 
 
 @pytest.mark.parametrize(

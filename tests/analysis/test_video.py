@@ -106,7 +106,15 @@ def test_what_stands_in_the_way_is_one_line(tmp_path: Path, capsys: pytest.Captu
     assert "is a folder" in capsys.readouterr().err
     assert main.run([*words, str(tmp_path / "episode.txt")]) == 2
     assert "ends in .mp4" in capsys.readouterr().err
+    assert main.run([*words, str(tmp_path / "episode.mp4"), "--env-timeout=-1"]) == 2
+    assert "--env-timeout=-1.0: take a number from 0.1" in capsys.readouterr().err
+    link, behind = tmp_path / "link.mp4", tmp_path / "behind.mp4"
+    link.symlink_to(behind)
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    assert main.run([*words, str(link)]) == 2
+    capsys.readouterr()
+    assert link.is_symlink()
+    assert not behind.exists()
     assert main.run([*words, str(tmp_path / "episode.mp4")]) == 2
     errors = capsys.readouterr().err
     assert "nothing here can render (nonsense: " in errors

@@ -277,6 +277,15 @@ def test_a_curve_is_short_whole_and_the_same_at_every_page() -> None:
     assert curve.news() is None
 
 
+def test_roles_of_an_earlier_start_are_not_counted(folder: RunFolder) -> None:
+    for index in range(3):
+        say(folder, f"actor-{index}", time=time.time() - 1_000, busy_share=0.5)
+    say(folder, "launcher", start_s=1.0, wall_s=100.0)
+    say(folder, "actor-0", busy_share=0.5)
+    roles = (LiveRun("run", folder.path).look() or {})["roles"]
+    assert [one["count"] for one in roles if one["kind"] == "actor"] == [1]
+
+
 def test_counters_make_events_that_do_not_repeat(folder: RunFolder) -> None:
     watched = LiveRun("run", folder.path)
     assert (watched.look() or {})["state"] == "training"

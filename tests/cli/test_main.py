@@ -136,6 +136,23 @@ def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
             "Unrecognized or misplaced options: --if-exists new; --if-exists is an option of rmc train "
             "(see rmc resume --help-all)",
         ),
+        (
+            "train --config /dev/null --seed x",
+            "Error parsing --seed: 'x' is no whole number (see rmc train --help-all)",
+        ),
+        (
+            "train X --run runs/first",
+            "Unrecognized or misplaced options: --run runs/first; did you mean --run-dir? (see rmc train --help-all)",
+        ),
+        (
+            "resume x --config f.toml",
+            "Unrecognized or misplaced options: --config f.toml; --config is an option of rmc train "
+            "(see rmc resume --help-all)",
+        ),
+        (
+            "hub push x me/y --checkpoint best --licence mit",
+            "Unrecognized options: --licence, mit; did you mean --license? (see rmc hub --help)",
+        ),
     ],
 )
 def test_a_wrong_option_is_one_short_line(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from rmc.deploy.monitor import run_status
-from rmc.deploy.monitor.notices import notices
+from rmc.deploy.monitor.notices import notices, waits
 from rmc.deploy.monitor.plain_line import line
 from rmc.deploy.monitor.run_status import RunStatus
 from rmc.deploy.monitor.table import table
@@ -163,3 +163,20 @@ def test_the_time_goes_on_until_the_run_is_over(monkeypatch: pytest.MonkeyPatch)
     assert of.elapsed_s == 1270
     assert "ETA" not in line(of)
     assert "finished" in drawn(of, 80, None)[0]
+
+
+def test_the_pause_between_two_starts_is_no_time_trained(monkeypatch: pytest.MonkeyPatch) -> None:
+    of, now = full_status(), time.time()
+    of.began = now + 90
+    monkeypatch.setattr(run_status.time, "time", lambda: now + 100)
+    assert of.elapsed_s == pytest.approx(1270, abs=2)
+
+
+def test_who_was_there_in_an_earlier_start_alone_is_not_shown() -> None:
+    of, now = full_status(actors=4), time.time()
+    of.take({"role": "launcher", "time": now + 1_000, "wall_s": 1271.0, "start_s": 1.0})
+    of.take({"role": "actor-0", "time": now + 1_000, "waiting_share": 0.9, "waiting_for": "credit"})
+    assert waits(of) == "actor-0 90% for credit"
+    shown = "\n".join(drawn(of, 80, None))
+    assert "actor-0" in shown
+    assert "actor-3" not in shown

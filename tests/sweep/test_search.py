@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from rmc.cli import sweep_check
 from rmc.cli.main import run
 from rmc.cli.sweep_check import read
 from rmc.cli.sweep_command import search_work
@@ -102,6 +103,16 @@ def test_values_are_drawn_from_the_ranges_and_a_search_that_goes_on_draws_what_i
     index.lines.clear()
     other = work_of(tmp_path, index, spec_of(6, sampler_seed=1))
     assert all(other.plan.next().values not in values for _ in range(5))  # a neighbour's draws are no repetition
+
+
+def test_trials_to_come_are_not_parsed(tmp_path: Path, index: Index, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That takes 80 ms each, and of those to come the folders alone are known."""
+    spec, parsed, whole = spec_of(50), [], sweep_check.read
+    corner = read(make_job(spec, tmp_path / "trial-0", {}, 0))[0]
+    monkeypatch.setattr(sweep_check, "read", lambda job: parsed.append(job) or whole(job))
+    assert spec.search is not None
+    assert len(search_work(spec, spec.search, corner, index, tmp_path).todo) == 50
+    assert not parsed
 
 
 def test_a_run_below_the_median_is_pruned_once_enough_are_finished(tmp_path: Path, index: Index) -> None:

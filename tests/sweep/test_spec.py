@@ -102,6 +102,8 @@ FILES = {
     "[options]\ntotal_step = 5": "options.total_step=5: no option that a sweep's runs take; did you mean total_steps?",
     "[options]\nseed = 5": "options.seed=5: every run has its own",
     '[options]\nrun_dir = "x"': "options.run_dir='x': no option that a sweep's runs take",
+    '[options]\nredis_url = "redis://:pw@x"': "options.redis_url='redis://x': no option that a sweep's runs take",
+    '[grid]\nactors = ["redis://:pw@x"]': "grid.actors='redis://x': Error parsing --actors: 'redis://x' is no whole",
     '[options]\nlauncher = "ray"': "options.launcher='ray': a run's is local or lockstep",
     "[options]\nactors = 1.5": "options.actors=1.5: Error parsing --actors: '1.5' is no whole number",
     "[options]\nactors = 0": "--actors=0: take a number from 1",
@@ -156,7 +158,7 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(
         ([PENDULUM, "--run-dir", "x"], "--run-dir='--run-dir x': a sweep's runs are given none"),
         (
             [PENDULUM, "--redis_url", "redis://:pw@x"],
-            "--redis-url='--redis_url redis://:pw@x': a sweep's runs are given",
+            "--redis-url='--redis_url redis://x': a sweep's runs are given",
         ),
         ([PENDULUM, "--seed", "5"], "--seed='--seed 5': a sweep has several: give --seeds"),
         ([PENDULUM, "--grid", "learning_rate"], "--grid='learning_rate': write NAME=VALUE"),
