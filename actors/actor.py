@@ -74,7 +74,7 @@ class Actor:
     ) -> None:
         """``clock`` times polls and the chunk's timer; a lockstep run passes one that counts calls.
 
-        Without a ``priority_fn`` windows enter the replay with the largest priority seen.
+        Without a ``priority_fn`` windows enter the replay with the largest priority that is there.
         """
         self.name = f"actor-{index}"
         self._index, self._seed, self._spec, self._config = index, seed, spec, config

@@ -43,7 +43,7 @@ class AgentConfig:
     (filled itself if it was missing), the memory and the last action. The stored state then is h and that observation.
     Needs normalized observations."""
     initial_priority: Literal["max", "actor"] = "max"
-    """Priority that a window enters a prioritized replay with: the largest seen, or the TD error that its actor
+    """Priority that a window enters a prioritized replay with: the largest there, or the TD error that its actor
     computes. For the latter, actors are sent the critics, too."""
 
     def input_size(self, obs_dim: int, action_dim: int, missing: int) -> int:

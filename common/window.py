@@ -42,7 +42,7 @@ HEADER_FIELDS: list[Field] = [
     ("terminated", "<i4", ()),  # 1: step last - 1 ended in a true termination
     ("new_steps", "<i4", ()),  # trailing steps that no earlier window carried
     ("new_observations", "<i4", ()),  # trailing observations that no earlier window carried
-    ("initial_priority", "<f4", ()),  # 0: enter with the largest priority seen
+    ("initial_priority", "<f4", ()),  # 0: enter with the largest priority that is there
 ]
 
 

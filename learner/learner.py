@@ -70,7 +70,8 @@ class Learner:
         self.spec, self.config, self.replay, self.bus, self.checkpoints = spec, config, replay, bus, checkpoints
         self.device, self._header = torch.device(device), header
         self.updates = self.env_steps = self.last_checkpoint = self._checkpoint_steps = 0
-        self.finished = self._fenced = self._diverged = self._evaluation_due = False
+        self.finished = self._evaluation_due = False
+        self._may_save = True
         self._observed_before = ObservationStatistics.none(spec)  # by the run that this one began with
         self._policy_learnt = False  # by that run
         self._waiting = ""
@@ -122,7 +123,12 @@ class Learner:
         try:
             return self._step()
         except FencedError:
-            self._fenced = True
+            self._may_save = False
+            raise
+        except RmcError:  # Redis is away, or it has diverged: no update is half done
+            raise
+        except BaseException:
+            self._may_save = False  # the halves of an update may be of two moments
             raise
 
     def _step(self) -> bool:
@@ -230,8 +236,8 @@ class Learner:
         return replace(self._header, env_steps=self.env_steps, updates=self.updates).metadata()
 
     def _check_finite(self, state: Any) -> None:
-        self._diverged = not all_finite(state)
-        if self._diverged:
+        if not all_finite(state):
+            self._may_save = False
             raise RmcError(f"update {self.updates}: training has diverged, weights are not finite; {self._remedy()}")
 
     def _remedy(self) -> str:
@@ -332,9 +338,9 @@ class Learner:
         }
 
     def close(self) -> None:
-        """Save what a resumed run needs, unless that is done, a newer learner has taken over, or training diverged."""
+        """Save what a resumed run needs, unless that is done, or was taken over, has diverged or broke in an update."""
         try:
-            if not (self.finished or self._fenced or self._diverged):
+            if self._may_save and not self.finished:
                 self._flush()
                 if self.updates > self.last_checkpoint:
                     self.save()

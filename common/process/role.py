@@ -92,11 +92,10 @@ class Heartbeat:
             with suppress(BusUnavailable, BusFull):
                 if self._unsent:  # older than what the role hands out as it closes
                     self._emit(self._unsent)
-            last = self._metrics()
         finally:
             self._role.close()
         with suppress(BusUnavailable, BusFull):  # last, so that a Redis that hangs delays nothing
-            self._emit(last)
+            self._emit(self._metrics())
 
     def _emit(self, record: dict[str, Any]) -> None:
         self._unsent = record

@@ -127,6 +127,22 @@ def test_it_is_closed_even_where_the_bus_refuses_its_last_words():
     assert role.closed
 
 
+def test_what_it_hands_out_as_it_closes_comes_before_its_last_word():
+    """Of an evaluator, evaluations that are newer than those that it has said."""
+    stop, bus = StopSignal(), MemoryBus()
+
+    class Late(Forgetful):
+        def close(self) -> None:
+            for _ in range(2):
+                bus.emit(self.name, self.metrics())
+
+    role = Late(stop, 7)
+    run_role(role, bus, stop)
+    said = [record["said"] for record in bus.records({"counting": "0"})[0]]
+    assert said == sorted(said)
+    assert len(said) == role.said >= 3
+
+
 @pytest.mark.parametrize("refused", [set(), {1}, {1, 2}, {2}, {1, 3}])
 def test_what_could_not_be_sent_is_sent_later_and_in_order(monkeypatch, refused):
     monkeypatch.setattr("rmc.common.process.role.METRICS_PERIOD", 0.02)

@@ -290,6 +290,20 @@ def test_a_replaced_learner_is_fenced(setting):
     assert setting.learner.checkpoints.numbers() == saved
 
 
+def test_what_broke_amid_an_update_is_not_saved(setting, monkeypatch):
+    """The halves of an update may be of two moments by then."""
+    setting.feed(60)
+    for _ in range(3):
+        setting.learner.step()
+    saved = setting.learner.checkpoints.numbers()
+    monkeypatch.setattr(setting.learner.update, "value_pass", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        step_for_long(setting)
+    assert setting.learner.updates > 0
+    setting.learner.close()
+    assert setting.learner.checkpoints.numbers() == saved
+
+
 def test_the_next_epoch_is_above_the_one_in_the_folder(setting):
     setting.learner.close()
     setting.learner.checkpoints.note_epoch(9)
