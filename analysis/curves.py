@@ -171,5 +171,5 @@ def _beside(runs: list[History], reference: list[History]) -> list[str]:
     if not reference or not initial:
         return ["", ""]
     low, high = np.array([np.mean(initial)]), last_returns(reference).mean(0)
-    share = normalised(last_returns(runs), low, high).mean()
-    return [f"{share:.2f}", f"{probability_of_improvement(last_returns(runs), last_returns(reference)):.2f}"]
+    share = "" if high == low else f"{normalised(last_returns(runs), low, high).mean():.2f}"
+    return [share, f"{probability_of_improvement(last_returns(runs), last_returns(reference)):.2f}"]

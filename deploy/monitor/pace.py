@@ -30,9 +30,10 @@ class Pace:
     @property
     def steps_per_s(self) -> float | None:
         """None where too little is known, or no steps came."""
-        if not self._points:
+        points = self._points.copy()  # of a view in a thread of its own, while the next point is noted
+        if not points:
             return None
-        (begin, before), (end, after) = self._points[0], self._points[-1]
+        (begin, before), (end, after) = points[0], points[-1]
         if end - begin < LEAST_SECONDS or after <= before:
             return None
         return (after - before) / (end - begin)

@@ -231,6 +231,13 @@ def test_panels_without_an_environment_are_empty(tmp_path, monkeypatch):
     assert [panel.axison for panel in figures[0].axes] == [True] * 4 + [False] * 2
 
 
+def test_a_reference_that_learnt_nothing_is_no_scale():
+    runs = [history_of("RMC", last=5.0), history_of("SAC", last=0.0)]
+    ours = next(line for line in shown(curves.tables(curves.grouped(runs), "SAC")).splitlines() if "RMC" in line)
+    assert ours.split()[-1] == "1.00"
+    assert "inf" not in ours
+
+
 def test_the_table_compares_with_a_reference():
     runs = [history_of(seed=s, last=200.0) for s in range(5)] + [
         history_of("SAC", seed=s, last=100.0) for s in range(2)
