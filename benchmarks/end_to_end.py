@@ -49,6 +49,7 @@ def ours(env: str, seed: int, every: int) -> Iterator[Point]:
                 record = json.loads(line)
                 if "eval_return_mean" in record:
                     yield record["time"] - began, record["eval_return_mean"]
+            sys.exit(f"ours: rmc train has ended by itself, with status {process.wait()}")
         finally:
             _end(process)
 
@@ -114,10 +115,11 @@ def run(points: Iterator[Point], goals: list[float]) -> list[Point]:
     return curve
 
 
-def _saved_curve(key: dict[str, object]) -> list[Point] | None:
+def _saved_curve(key: dict[str, object], goal: float) -> list[Point] | None:
+    """One that was not cut at a lower goal, if there is one."""
     for line in CURVES.read_text().splitlines() if CURVES.exists() else []:
         row = json.loads(line)
-        if all(row[name] == value for name, value in key.items()):
+        if row.get("goal", 4000.0) >= goal and all(row[name] == value for name, value in key.items()):
             return [(seconds, value) for seconds, value in row["points"]]
     return None
 
@@ -151,12 +153,13 @@ def main() -> None:
     curves: dict[str, list[list[Point]]] = {who: [] for who in runners}
     for seed, who in product(options.seeds, runners):
         key = {"who": who, "env": options.env, "seed": seed, "every": options.every}
-        points = _saved_curve(key)
+        points = _saved_curve(key, max(options.goals))
         if points is None:
             print(f"{who}, seed {seed}", flush=True)
             points = run(runners[who](options.env, seed, options.every), options.goals)
             with CURVES.open("a") as file:
-                file.write(json.dumps({**key, "time": time.strftime("%Y-%m-%d %H:%M"), "points": points}) + "\n")
+                line = {**key, "goal": max(options.goals), "time": time.strftime("%Y-%m-%d %H:%M"), "points": points}
+                file.write(json.dumps(line) + "\n")
         curves[who].append(points)
     for goal in options.goals:
         times = {who: [reached(points, goal) or math.inf for points in all_] for who, all_ in curves.items()}

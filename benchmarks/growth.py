@@ -123,6 +123,8 @@ def main() -> None:
     parser = harness.argument_parser(__doc__)
     parser.add_argument("what", nargs="*", default=list(tables), help=", ".join(tables))
     options = parser.parse_args()
+    if unknown := set(options.what) - set(tables):
+        parser.error(f"{', '.join(sorted(unknown))}: take some of {', '.join(tables)}")
     torch.set_num_threads(1)
     for name in options.what:
         table = tables[name](options.rounds, options.seconds)

@@ -241,6 +241,8 @@ def replay_process(spec: WindowSpec, config: ReplayConfig) -> Iterator[RedisBus]
             server.start()
             while bus.replay_address("replay") is None:
                 time.sleep(0.05)
-            yield bus
-            bus.request_stop("done")
-            server.join()
+            try:
+                yield bus
+            finally:
+                bus.request_stop("done")
+                server.join()

@@ -59,9 +59,11 @@ def ours(spec: WindowSpec, windows: int, seconds: float) -> Iterator[Measure]:
                 sender.wait()
                 return (sender.seq - first) * CHUNK / (time.perf_counter() - start)
 
-        yield measure
-        for process in processes:  # a stopped one cannot end
-            process.resume()
+        try:
+            yield measure
+        finally:
+            for process in processes:  # a stopped one cannot end
+                process.resume()
 
 
 def copy(spec: WindowSpec, seconds: float) -> Measure:

@@ -68,7 +68,8 @@ def resident(env_id: str, preset: str, total_steps: int) -> list[Row]:
             _look(psutil.Process(process.pid), readings)
             time.sleep(LOOK_SECONDS)
         assert process.returncode == 0
-    return [row for role in ROLES for row in _exact(f"memory, {role}, {env_id}, {preset}", "MB", max(readings[role]))]
+    seen = [role for role in ROLES if readings[role]]  # not every run has a process for the model's half
+    return [row for role in seen for row in _exact(f"memory, {role}, {env_id}, {preset}", "MB", max(readings[role]))]
 
 
 def _look(launcher: psutil.Process, readings: dict[str, list[float]]) -> None:

@@ -119,11 +119,13 @@ def ours(spec: WindowSpec, windows: int, seconds: float) -> Iterator[Measure]:
                 assert min(orders.recv(), committed) > KEPT_UP * RATE, committed
                 return rate
 
-        yield measure
-        for process in processes:  # a stopped one cannot end
-            process.resume()
-        learner.client.close()
-        sender.kill()
+        try:
+            yield measure
+        finally:
+            for process in processes:  # a stopped one cannot end
+                process.resume()
+            learner.client.close()
+            sender.kill()
 
 
 def gather(spec: WindowSpec, windows: int, seconds: float) -> Measure:

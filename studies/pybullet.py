@@ -39,9 +39,10 @@ def report(path: Path) -> None:
     print(f"| environment | seed | steps | return | RESeL, {PUBLISHED_STEPS:,} steps | best before it |")
     print("|---|---|---|---|---|---|")
     for line in objects(path, "env", "seed", "env_steps", "eval_return_mean", "eval_return_std").values():
-        resel, before = PUBLISHED[line["env"]]
+        public = PUBLISHED.get(line["env"])
+        resel, before = ("–", "–") if public is None else (f"{score:,}" for score in public)
         ours = f"{line['eval_return_mean']:,.0f} ± {line['eval_return_std']:,.0f}"
-        print(f"| {line['env']} | {line['seed']} | {line['env_steps']:,} | {ours} | {resel:,} | {before:,} |")
+        print(f"| {line['env']} | {line['seed']} | {line['env_steps']:,} | {ours} | {resel} | {before} |")
 
 
 if __name__ == "__main__":

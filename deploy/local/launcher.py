@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.errors import BusFull, BusUnavailable, RmcError
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RmcError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local.role_command import (
     RoleCommand,
@@ -158,4 +158,15 @@ def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monito
         log.warning("Redis took no request to stop; end the run's roles by hand")
     registration.keep()
     _expire(bus)
+    if monitor.learner_finished():
+        _check_last(folder.checkpoints, monitor.status.get("learner", "checkpoint_update"))
     return monitor.learner_finished()
+
+
+def _check_last(checkpoints: Path, update: int | None) -> None:
+    """Raises ConfigError where a learner on another machine has saved its last checkpoint in a folder of its own."""
+    if update is not None and update not in CheckpointFolder(checkpoints).numbers():
+        fix = (
+            f"the learner's last checkpoint, of update {update}, is not there; bring its --folder here, then rmc resume"
+        )
+        raise ConfigError("checkpoints", str(checkpoints), fix)

@@ -44,7 +44,7 @@ class LauncherActor(RoleActor):
     """The launcher's, on the head: keeps the run's checkpoints in its folder, and ends itself with the run."""
 
     def __init__(self, task: Task, folder: str, keep: int) -> None:
-        self._folder = Path(folder)
+        self._folder, self._asked_to_end = Path(folder), False
         self._checkpoints = CheckpointFolder(self._folder / "checkpoints", keep)
         self._claim = self._folder / "learner-at"  # the node and the incarnation of the host that holds the learner
         super().__init__(task)
@@ -54,7 +54,7 @@ class LauncherActor(RoleActor):
 
     def is_final_exit(self, status: int) -> bool:
         """Only a launcher that was killed begins again, and not for ever; any other end is the run's."""
-        if status >= 0:
+        if status >= 0 or self._asked_to_end:
             return True
         deaths = self._folder / "launcher-deaths"
         recent: list[float] = []
@@ -96,6 +96,7 @@ class LauncherActor(RoleActor):
 
     def end(self) -> float:
         """Ask the run's launcher to end it cleanly; the seconds that this may take."""
+        self._asked_to_end = True  # one that still imports dies of the signal
         if self._role.pid is not None:
             with suppress(ProcessLookupError):  # it has just ended
                 os.kill(self._role.pid, signal.SIGTERM)

@@ -34,7 +34,10 @@ class LearnerActor(RoleActor):
         if newest is not None:
             self._folder.save(*newest)
             self._folder.note_save(ray.get(launcher.last_save.remote()))
-        self._archived = set(ray.get(launcher.numbers.remote()))
+        begins = max((one[0] for one in (local, newest) if one is not None), default=-1)
+        self._archived = {
+            one for one in ray.get(launcher.numbers.remote()) if one <= begins
+        }  # above it are damaged ones
         self._epoch: int = ray.get(launcher.last_epoch.remote())
         self._folder.note_epoch(max(self._epoch, self._folder.last_epoch()))
 

@@ -61,7 +61,10 @@ def unpack(parcel: Parcel, folder: Path, before: Stamps) -> None:
     """Make a copy like the folder that was packed. Of what is not in that, only what came ``before`` is removed."""
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     with tarfile.open(fileobj=io.BytesIO(parcel.tar)) as tar:
-        tar.extractall(folder, filter="data")
+        if hasattr(tarfile, "data_filter"):
+            tar.extractall(folder, filter="data")
+        else:  # before Python 3.11.4: what ``pack`` writes
+            tar.extractall(folder, [one for one in tar if one.isfile() and ".." not in Path(f"/{one.name}").parts])
     for name in parcel.folders:
         (folder / name).mkdir(parents=True, exist_ok=True)
     for name in before.keys() - parcel.stamps.keys():

@@ -1,5 +1,6 @@
 """Whole runs spread over a Ray cluster, each on the cores of one node; what they leave comes to this machine."""
 
+import errno
 import os
 import time
 from contextlib import suppress
@@ -16,6 +17,7 @@ from rmc.sweep.parcel import Parcel, Stamps, pack, unpack
 LOOK_SECONDS = 2.0
 BYTES_PER_SECOND = 1e6  # that copies of a run's files take at most, but for the last
 LOST = 1
+FULL = errno.ENOSPC, errno.EDQUOT  # what a full disk raises
 
 
 class RayRuns:
@@ -87,10 +89,16 @@ class RayRun:
         except ray.exceptions.RayError as error:
             self._lost = f"its node was lost, or could not start it ({last_line(error)})"
             return self._end(LOST)
-        self._pending, self._begun, self._look_at = None, True, now + LOOK_SECONDS
+        self._begun = True
         if parcel is not None:
-            self._take(parcel, log)
+            try:
+                self._take(parcel, log)
+            except OSError as error:
+                if error.errno not in FULL:
+                    raise
+                return None  # the next look takes the same answer, once there is room
             self._copy_at = now + len(parcel.tar) / BYTES_PER_SECOND
+        self._pending, self._look_at = None, now + LOOK_SECONDS
         return None if status is None else self._end(status)
 
     def _take(self, parcel: Parcel, log: bytes) -> None:

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner
 from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusUnavailable, ConfigError
 from rmc.common.process.role import StopSignal
@@ -80,8 +81,11 @@ def test_a_run_started_by_hand_is_told_to_stop_once_redis_takes_it(
     folder = RunFolder(tmp_path)
     folder.write_config(config)
     bus, monitor = RedisBus(redis_url, folder.name), Monitor(folder, config, Console(quiet=True))
-    bus.emit("learner", {"finished": 1})
+    bus.emit("learner", {"finished": 1, "checkpoint_update": 40})
     monkeypatch.setattr(monitor, "skip_old", lambda _: None)
+    with pytest.raises(ConfigError, match="the learner's last checkpoint, of update 40, is not there"):
+        launcher.attend(config, folder, redis_url, monitor, stop)  # it is on the learner's machine
+    CheckpointFolder(folder.checkpoints).save(40, {"policy.safetensors": b"weights"})
     assert launcher.attend(config, folder, redis_url, monitor, stop)
     assert bus.stop_requested() == "finished"
     monitor.close()

@@ -1,6 +1,8 @@
 """A role's host on Ray, without a cluster: what it does when its role ends or is ended."""
 
 import os
+import signal
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -14,6 +16,7 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.local import supervisor
 from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.ray import role_actor
+from rmc.deploy.ray.launcher_actor import LauncherActor
 from rmc.deploy.ray.learner_actor import LearnerActor
 from rmc.deploy.ray.role_actor import RoleActor, Task
 
@@ -98,6 +101,16 @@ class Learner(LearnerActor):
 
     def tend(self) -> None:
         pass
+
+
+def test_a_launcher_that_still_imports_when_it_is_to_end_is_not_started_again(tmp_path: Path) -> None:
+    launcher = LauncherActor.__new__(LauncherActor)
+    launcher._folder, launcher._checkpoints, launcher._asked_to_end = tmp_path, CheckpointFolder(tmp_path), False
+    with subprocess.Popen(["sleep", "60"]) as role:
+        launcher._role = role  # type: ignore[assignment]
+        assert not launcher.is_final_exit(-signal.SIGKILL)
+        launcher.end()
+        assert launcher.is_final_exit(role.wait(10))
 
 
 def test_a_learner_that_saves_for_long_is_not_killed(

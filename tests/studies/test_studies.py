@@ -246,3 +246,7 @@ def test_pybullets_walkers_stand_beside_what_is_public(tmp_path, monkeypatch, ca
     assert capsys.readouterr().out.splitlines()[2:] == [
         "| pybullet/AntPositions-v0 | 1 | 500,000 | 500,000 ± 500,000 | 3,045 | 2,597 |"
     ]
+    own = pybullet.play(job) | {"env": "pybullet/HopperPositions-v0"}
+    (tmp_path / "lines").write_text(json.dumps(own))
+    pybullet.report(tmp_path / "lines")
+    assert "| – | – |" in capsys.readouterr().out

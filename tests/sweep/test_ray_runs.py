@@ -1,21 +1,27 @@
 """Whole runs on a Ray of this machine: their folders come here without the ring, and go on from there."""
 
+import dataclasses
+import errno
 import io
 import os
 import shutil
 import tarfile
 import tempfile
 import time
+import types
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
 from rmc.deploy.run.folder import RunFolder
+from rmc.sweep import ray_runs
+from rmc.sweep.job import Job
 from rmc.sweep.node_run import _is_abandoned
 from rmc.sweep.parcel import pack, unpack
-from rmc.sweep.ray_runs import on_reserved_cores
+from rmc.sweep.ray_runs import RayRun, on_reserved_cores
 from tests.cluster.test_ray import leaves_nothing_behind
 from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
 
@@ -132,6 +138,51 @@ def test_the_lock_of_who_trains_there_and_no_ring_is_sent(tmp_path: Path) -> Non
     assert pack(tmp_path, {}).stamps == {}
     lock.write_text("ended 0")
     assert list(pack(tmp_path, {}).stamps) == [".lock"]
+
+
+def test_before_python_3_11_4_it_is_unpacked_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Debian 12's has no filter for archives."""
+    source, whole = tmp_path / "source", tarfile.TarFile.extractall
+    (source / "logs").mkdir(parents=True)
+    (source / "logs" / "learner.log").write_text("said")
+
+    def old(tar: tarfile.TarFile, path: Path, members: list[tarfile.TarInfo] | None = None) -> None:
+        whole(tar, path, members, filter="fully_trusted")
+
+    monkeypatch.setattr(tarfile.TarFile, "extractall", old)
+    monkeypatch.delattr(tarfile, "data_filter")
+    parcel, content = pack(source, {}), io.BytesIO()
+    with tarfile.open(fileobj=io.BytesIO(parcel.tar)) as tar, tarfile.open(fileobj=content, mode="w") as longer:
+        longer.addfile(tar.getmembers()[0], io.BytesIO(b"said"))
+        longer.addfile(tarfile.TarInfo("../outside"))
+    unpack(dataclasses.replace(parcel, tar=content.getvalue()), tmp_path / "copy", {})
+    assert _content(tmp_path / "copy") == {"logs/learner.log": "said"}
+    assert not (tmp_path / "outside").exists()
+
+
+def test_a_full_disk_here_is_waited_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, answer, tries = tmp_path / "source", object(), [errno.ENOSPC, 0]
+    source.mkdir()
+    (source / "result.json").write_text("{}")
+    monkeypatch.setattr(ray_runs.ray, "wait", lambda ids, timeout: (ids, []))
+    monkeypatch.setattr(ray_runs.ray, "get", lambda _: (0, pack(source, {}), b"log"))
+    monkeypatch.setattr(ray_runs.ray, "kill", lambda _: None)
+
+    def full_once(*of: Any) -> None:
+        if error := tries.pop(0):
+            raise OSError(error, "No space left on device")
+        unpack(*of)
+
+    monkeypatch.setattr(ray_runs, "unpack", full_once)
+    run, ended = RayRun.__new__(RayRun), []
+    run._runs, run._actor = types.SimpleNamespace(release=lambda: ended.append(1)), None  # type: ignore[assignment]
+    run._job = Job(tmp_path / "runs" / "one", (), 0, {})
+    run._log, run._stamps, run._pending, run._look_at = b"", {}, answer, 0.0
+    assert run.status() is None
+    assert run._pending is answer
+    assert run.status() == 0
+    assert (run._job.folder / "result.json").exists()
+    assert ended == [1]
 
 
 def test_a_copy_that_goes_back_is_not_sent_again(tmp_path: Path) -> None:
