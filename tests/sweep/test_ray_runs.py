@@ -202,7 +202,7 @@ def test_folders_may_vanish_as_they_are_packed(tmp_path: Path, monkeypatch: pyte
     scandir = os.scandir
 
     def gone(path: str) -> object:
-        if str(path).endswith("1"):
+        if str(path).endswith("/1"):
             shutil.rmtree(path)
         return scandir(path)
 
