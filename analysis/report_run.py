@@ -19,7 +19,7 @@ from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.state import State, run_state
 
 Series = tuple[list[float], list[float]]
-DRAWN = {  # of a record, which of a long run do not all fit in memory
+DRAWN = {  # of a record; whole records of a long run do not fit in memory
     "role", "time", "wall_s", "start_s", "busy_share", "waiting_share", "waiting_for", "env_steps", "env_steps_per_s",
     "updates_per_s", "policy_lag_mean", "sample_age_mean", "stale_state_stored", "stale_state_burned",
 }  # fmt: skip

@@ -59,13 +59,13 @@ def check_values(spec: Spec, on_this_machine: bool) -> None:
 
 
 def _check(place: str, value: Any, spec: Spec, words: list[str]) -> None:
-    with contextlib.redirect_stderr(io.StringIO()) as output:
-        try:
-            words = [without_passwords(word) for word in words]  # which the complaint quotes
-            parser.parse(["train", spec.env, *words])
-        except SystemExit:
-            said = complaint.as_line(output.getvalue(), ["sweep", *words])
-            raise ConfigError(place, value_without_passwords(value), said) from None
+    with contextlib.redirect_stderr(io.StringIO()), contextlib.suppress(SystemExit):
+        parser.parse(["train", spec.env, *words])
+        return
+    told = [without_passwords(word) for word in words]  # the complaint quotes them
+    with contextlib.redirect_stderr(io.StringIO()) as output, contextlib.suppress(SystemExit):
+        parser.parse(["train", spec.env, *told])
+    raise ConfigError(place, value_without_passwords(value), complaint.as_line(output.getvalue(), ["sweep", *told]))
 
 
 def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:

@@ -64,7 +64,9 @@ def unpack(parcel: Parcel, folder: Path, before: Stamps) -> None:
         if hasattr(tarfile, "data_filter"):
             tar.extractall(folder, filter="data")
         else:  # before Python 3.11.4: what ``pack`` writes
-            tar.extractall(folder, [one for one in tar if one.isfile() and ".." not in Path(f"/{one.name}").parts])
+            tar.extractall(
+                folder, [one for one in tar if one.isfile() and {"/", ".."}.isdisjoint(Path(one.name).parts)]
+            )
     for name in parcel.folders:
         (folder / name).mkdir(parents=True, exist_ok=True)
     for name in before.keys() - parcel.stamps.keys():

@@ -188,6 +188,7 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(
             "--ray-address='head:6379': give --launcher ray",
         ),
         ([PENDULUM, "--config", "f.toml"], "--config='f.toml': cannot be read"),
+        ([PENDULUM, "--config", "me@f.toml"], "--config='me@f.toml': cannot be read"),
         ([PENDULUM, "--trials", "3"], "--trials=3: is for a search"),
         (["spec.toml", "--seeds", "1"], "--seeds='1': belongs into spec.toml"),
         ([PENDULUM, "--search", "scheme=9..1"], "search.scheme={'low': 9"),
