@@ -71,6 +71,15 @@ class Still(Odd):
         return np.array([0.1, 0.3, 9.81], np.float32)
 
 
+class Spent(Odd):
+    """Has a level for one seed alone."""
+
+    def reset(self, *, seed: int | None = None, **options: Any) -> tuple[Any, dict[str, Any]]:
+        if seed == 1:
+            raise RuntimeError("no level has this seed")
+        return super().reset(seed=seed, **options)
+
+
 def mended(**kwargs: Any) -> gym.Env[Any, Any]:
     """What gymnasium would complain of, but for a wrapper of the user's."""
     space = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
@@ -97,6 +106,7 @@ gym.register("Faint-v0", entry_point=Faint)
 gym.register("Constant-v0", entry_point=Still)
 gym.register("Mended-v0", entry_point=mended)
 gym.register("Untold-v0", entry_point=Untold)
+gym.register("Spent-v0", entry_point=Spent)
 gym.register("Late-v0", entry_point=Late)
 gym.register("Unrewarded-v0", entry_point=Unrewarded)
 
@@ -173,6 +183,13 @@ def test_faults_are_named(fault, words, capsys):
     assert status == 1
     assert words in text
     assert "fix the fault first" in text
+
+
+def test_a_fault_at_another_seed_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    status, text = checked("Spent-v0", capsys, "--steps", "50")
+    assert status == 1
+    assert "fault: the environment's reset raises RuntimeError: no level has this seed" in text
+    assert "gave other observations" not in text
 
 
 def test_what_cannot_be_made_is_one_line(capsys):
