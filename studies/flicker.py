@@ -10,6 +10,8 @@ STUDY = Study(
     "flicker",
     {
         "RMC": "train ENV --flicker 0.5",
+        "RMC, 1e-3": "train ENV --flicker 0.5 --learning-rate 1e-3 --alpha-learning-rate 1e-3 "
+        "--memory-learning-scale 0.3",
         "RMC, policy at every update": "train ENV --flicker 0.5 --head-input hidden --policy-delay 1",
         "RMC, target critics": before("--flicker 0.5"),
         "SAC, 4 frames": "baseline sac ENV --flicker 0.5 --frame-stack 4",
