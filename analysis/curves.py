@@ -167,7 +167,7 @@ def _returns(runs: list[History]) -> str:
 
 def _beside(runs: list[History], reference: list[History]) -> list[str]:
     """The mean return scaled so that the reference's is 1 and an untrained agent's 0; the chance to beat it."""
-    initial = [run.initial_return for run in [*runs, *reference] if run.initial_return is not None]
+    initial = [run.initial_return for run in reference if run.initial_return is not None]
     if not reference or not initial:
         return ["", ""]
     low, high = np.array([np.mean(initial)]), last_returns(reference).mean(0)

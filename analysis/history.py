@@ -21,6 +21,7 @@ from rmc.deploy.run.config import RunConfig, changes, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import SAME_AGENT
 from rmc.deploy.run.presets import preset_config
+from rmc.deploy.run.starts import starts
 
 OMITTED = SAME_AGENT | {"seed", "preset", "env.id"}  # makes no other agent
 
@@ -99,22 +100,23 @@ def _of_line(raw: dict[str, Any], place: str) -> History:
     return history
 
 
-def of_run(folder: RunFolder, only_whole: bool = False) -> History:
+def of_run(folder: RunFolder) -> History:
     """A run's, finished or not. Raises ConfigError where it is none, or was not evaluated yet.
 
-    With ``only_whole`` evaluations are left out that were cut, or in which an episode broke.
+    Evaluations are left out that were cut, or in which an episode broke.
     """
     about = describe(folder.path)
-    evaluations = _evaluations(record for record in folder.records() if is_whole(record) or not only_whole)
-    result = folder.result() or {}
-    if result and (is_whole(result) or not only_whole):
+    evaluations = _evaluations(filter(is_whole, folder.records()))
+    result, initial = folder.result() or {}, folder.initial() or {}
+    if result and is_whole(result):
         ours = not folder.is_baseline()  # of its last checkpoint's own evaluation only the update is known
         below = result["env_steps"], result["updates"] if ours else math.inf
         evaluations = [one for one in evaluations if one.env_steps < below[0] and one.updates < below[1]]
         mean, std = result["eval_return_mean"], result["eval_return_std"]
         evaluations.append(Evaluation(result["env_steps"], result["updates"], result["wall_s"], mean, std))
     if not evaluations:
-        raise ConfigError("RUNS", str(folder.path), "it has no evaluation yet; train it for longer")
+        fix = "it has no evaluation yet that was played to its end; train it for longer"
+        raise ConfigError("RUNS", str(folder.path), fix)
     last = evaluations[-1]
     return History(
         about.agent,
@@ -123,7 +125,7 @@ def of_run(folder: RunFolder, only_whole: bool = False) -> History:
         last.env_steps,
         last.updates,
         last.wall_s,
-        result.get("initial_return_mean", (folder.initial() or {}).get("eval_return_mean")),
+        result.get("initial_return_mean", initial.get("eval_return_mean")) if is_whole(initial) else None,
         evaluations,
         bool(result),
     )
@@ -146,7 +148,7 @@ def describe(path: Path) -> About:
         return About(" ".join([baseline.name, *_stack(baseline.env)]), _env_label(baseline.env), baseline.seed)
     config = folder.config()
     name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
-    agent = " ".join([name, *_changes(config), *_stack(config.env)])
+    agent = " ".join([name, *_changes(config), *_stack(config.env), *_warm_start(folder)])
     return About(agent, _env_label(config.env), config.seed)
 
 
@@ -154,6 +156,15 @@ def _changes(config: RunConfig) -> list[str]:
     """Options that differ from the preset's, as they are typed."""
     changed = changes(preset_config(config.preset, config.env), config)
     return [_typed(path, now) for path, (_, now) in changed.items() if path not in OMITTED]
+
+
+def _warm_start(folder: RunFolder) -> list[str]:
+    """The run that it began with, where it did not begin anew."""
+    begun = [start.init_from for start in starts(folder) if start.init_from is not None]
+    if not begun:
+        return []
+    run, number, parts = (begun[0][name] for name in ("run", "checkpoint", "parts"))
+    return [f"--init-from {Path(run).name}:{number}", *([f"--init-parts {parts}"] if parts != "all" else [])]
 
 
 def _typed(path: str, value: Any) -> str:

@@ -74,7 +74,7 @@ def newest_return(job: Job) -> tuple[float | None, int]:
     result = folder.result()
     steps = result["env_steps"] if result is not None else 0
     try:
-        last = of_run(folder, only_whole=True).evaluations[-1]
+        last = of_run(folder).evaluations[-1]
     except ConfigError:  # none yet
         return None, steps
     return last.return_mean, steps or last.env_steps

@@ -144,7 +144,7 @@ class SearchPlan:
     def _evaluations(self, job: Job) -> list[tuple[int, Evaluation]]:
         """By which evaluation of a run it is: the steps themselves differ a little from run to run."""
         try:
-            evaluations = of_run(RunFolder(job.folder), only_whole=True).evaluations
+            evaluations = of_run(RunFolder(job.folder)).evaluations
         except ConfigError:  # none yet
             return []
         by_step = {round(one.env_steps / self._checkpoint_steps): one for one in evaluations}

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -66,6 +67,32 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     (tmp_path / "result.json").write_text(json.dumps({**result, "updates": 90, "initial_return_mean": -1.0}))
     (past,) = history.read(tmp_path)  # the evaluator has played that checkpoint before
     assert [one.env_steps for one in past.evaluations] == [500, 1000]
+
+
+def test_an_evaluation_that_was_cut_is_compared_with_no_other(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(to_json(robust("Hopper-v5")))
+    played = {"role": "evaluator", "time": 1.0, "eval_update": 50, "eval_env_steps": 500, "eval_return_std": 1.0}
+    whole = {"eval_return_mean": -210.0, "eval_cut": 0}
+    cut = {"eval_update": 90, "eval_return_mean": -20.0, "eval_cut": 1}
+    (tmp_path / "metrics.jsonl").write_text(f"{json.dumps(played | whole)}\n{json.dumps(played | cut)}\n")
+    ends = {"updates": 100, "env_steps": 1000, "wall_s": 2.0, "eval_episodes": 10, "initial_return_mean": -5.0}
+    (tmp_path / "result.json").write_text(json.dumps(ends | played | cut))
+    (tmp_path / "initial.json").write_text(json.dumps(ends | played | cut))
+    (past,) = history.read(tmp_path)
+    assert [one.return_mean for one in past.evaluations] == [-210.0]
+    assert (past.finished, past.initial_return) == (True, None)
+
+
+def test_a_warm_start_is_another_agent(tmp_path: Path) -> None:
+    """What it began with is no untrained agent's return."""
+    (tmp_path / "config.json").write_text(to_json(robust("Hopper-v5")))
+    began = {"asked": ["a:7", "policy"], "run": "/runs/a", "checkpoint": 7, "parts": "policy"}
+    start = {"time": 1.0, "version": "0.1.0", "env_steps": 0, "init_from": began}
+    (tmp_path / "history.jsonl").write_text(json.dumps(start) + "\n")
+    assert history.describe(tmp_path).agent == "RMC --init-from a:7 --init-parts policy"
+    runs = [history_of("RMC", last=100.0, initial=0.0), history_of("warm", last=300.0, initial=290.0)]
+    warm = next(line for line in shown(curves.tables(curves.grouped(runs), "RMC")).splitlines() if "warm" in line)
+    assert warm.split()[-2:] == ["3.00", "1.00"]
 
 
 def test_what_a_long_run_has_said_is_not_kept(tmp_path):
