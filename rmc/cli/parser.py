@@ -102,6 +102,8 @@ def _defaults_of_run(words: list[str], env: str, command: Any) -> dict[str, Any]
         return None
     if isinstance(command, train_options.Resume) and folder.is_baseline():
         return {"resume": run_options.resuming_baseline(folder)}
+    if isinstance(command, run_options.Baseline):
+        return {"baseline": run_options.known_baseline(folder)} if folder.is_baseline() else None
     config = folder.config()
     named = dataclasses.replace(config.env, id=env or config.env.id)
     config = dataclasses.replace(config, env=named)
@@ -115,7 +117,9 @@ def _defaults(config: RunConfig, launch: LaunchOptions) -> dict[str, Any]:
 
 def _known_run(command: Any) -> RunFolder | None:
     """The run that the command continues. Raises ConfigError where it must, and there is none."""
-    if not isinstance(command, train_options.Train) or command.run_dir is None or command.if_exists != "resume":
+    if not isinstance(command, train_options.Train | run_options.Baseline) or command.run_dir is None:
+        return None
+    if isinstance(command, train_options.Train) and command.if_exists != "resume":
         return None
     folder = RunFolder(command.run_dir)
     if isinstance(command, train_options.Resume):

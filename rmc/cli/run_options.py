@@ -1,6 +1,6 @@
 """The commands that look at a run or an environment, stop a run, or start a cluster, as dataclasses."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -91,6 +91,12 @@ class ResumeBaseline(Baseline):
     algorithm: Suppress[Algorithm]
     env: KnownEnvOptions
     run_dir: KnownRunDir = None
+
+
+def known_baseline(folder: RunFolder) -> Baseline:
+    """The command that would say all of such a run. Raises ConfigError."""
+    config = baseline_settings.read(folder)
+    return Baseline(**vars(config) | {"env": EnvOptions(**asdict(config.env))})
 
 
 def resuming_baseline(folder: RunFolder) -> ResumeBaseline:

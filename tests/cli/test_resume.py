@@ -186,3 +186,14 @@ def test_the_warning_reaches_the_terminal(capsys: pytest.CaptureFixture[str], tm
     words = ["train", PENDULUM, "--run-dir", str(tmp_path / "run"), "--policy-average", "-1"]
     assert main.run(words) == 2
     assert "--policy-ema-updates=-1: take a number from 0" in capsys.readouterr().err
+
+
+def test_a_baseline_that_is_named_again_is_as_it_was(tmp_path: Path) -> None:
+    from rmc.analysis import baselines
+
+    config = BaselineConfig("sac", EnvConfig(PENDULUM, flicker=0.5), total_steps=2_000, episodes=20, threads=4)
+    folder = baselines._open_folder(config, tmp_path / "run", baselines._sizes(config))
+    folder.unlock()
+    command = parser.parse(["baseline", "sac", PENDULUM, "--threads", "2", "--run-dir", str(folder.path)])
+    assert isinstance(command, run_options.Baseline)
+    assert command.config() == dataclasses.replace(config, threads=2)
