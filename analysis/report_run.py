@@ -76,9 +76,13 @@ class ReportRun:
         return changes(preset_config(config.preset, config.env), config)
 
     def series(self, kind: str, name: str) -> Series:
-        """A metric over wall time (s), the mean over the roles of a kind as each speaks; empty where nobody does."""
+        """A metric over wall time (s), of the roles of a kind as each speaks; empty where nobody does.
+
+        Several replay servers each collect a share of the environment steps.
+        """
         series = self._metric(kind, name)
-        return self.wall_seconds([time for time, _ in series]), [value for _, value in series]
+        shares = self.options.get("replay.replay_shards", 1) if name == "env_steps_per_s" else 1
+        return self.wall_seconds([time for time, _ in series]), [shares * value for _, value in series]
 
     def _metric(self, kind: str, name: str) -> list[tuple[float, float]]:
         return [

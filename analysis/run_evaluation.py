@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from rmc.analysis.evaluation import FINAL_EPISODES, Watch, evaluate_policy
-from rmc.analysis.policy_file import read_policy
+from rmc.analysis.policy_file import PolicyFile, read_policy
 from rmc.common.env.config import check_range
 from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
@@ -15,7 +15,7 @@ MOST_EPISODES = 10_000
 
 
 def evaluate_run(
-    source: str | Path,
+    source: str | Path | PolicyFile,
     episodes: int = FINAL_EPISODES,
     checkpoint: str = "latest",
     flicker: float | None = None,
@@ -31,9 +31,8 @@ def evaluate_run(
         raise ConfigError("--episodes", episodes, f"take 1 to {MOST_EPISODES:_}")
     if flicker is not None:
         check_range("--flicker", flicker, (0.0, 1.0))
-    folder = RunFolder(user_path(source))
-    if not (folder.path.is_dir() and folder.is_baseline()):
-        policy = read_policy(source, checkpoint)
+    if isinstance(source, PolicyFile) or not is_baseline(source):
+        policy = source if isinstance(source, PolicyFile) else read_policy(source, checkpoint)
         policy = policy if env_timeout is None else policy.with_timeout(env_timeout)
         return evaluate_policy(policy, episodes, flicker, seconds, watch)
     if checkpoint != "latest":
@@ -41,7 +40,13 @@ def evaluate_run(
     check_baselines(str(source))
     from rmc.analysis import baselines  # an extra
 
-    return baselines.evaluate(folder, episodes, flicker, seconds, watch, env_timeout)
+    return baselines.evaluate(RunFolder(user_path(source)), episodes, flicker, seconds, watch, env_timeout)
+
+
+def is_baseline(source: str | Path) -> bool:
+    """Whether it is a baseline's run."""
+    folder = RunFolder(user_path(source))
+    return folder.path.is_dir() and folder.is_baseline()
 
 
 def check_baselines(what: str) -> None:

@@ -18,7 +18,7 @@ from rmc.analysis.evaluation import EvaluationProgress
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.analysis.policy_file import PolicyFile, read_policy
-from rmc.analysis.run_evaluation import check_baselines, evaluate_run
+from rmc.analysis.run_evaluation import check_baselines, evaluate_run, is_baseline
 from rmc.analysis.run_paths import each_readable
 from rmc.cli import run_options
 from rmc.cli.ending import cut_note, episode_count
@@ -27,7 +27,6 @@ from rmc.common.env.config import RANGES, check_range
 from rmc.common.errors import ConfigError
 from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor.view import terminal
-from rmc.deploy.run.folder import RunFolder
 
 log = logging.getLogger(__name__)
 
@@ -40,20 +39,21 @@ def evaluate(command: run_options.Evaluate) -> int:
     if command.env_timeout is not None:
         check_range("--env-timeout", command.env_timeout, RANGES["env_timeout"])
     aside = _said_aside if command.json else nullcontext
-    if command.video is not None:
-        with aside():
-            video.prepare(_filmed(command).header.env, command.video)
+    with aside():
+        policy = _policy(command)
+        if policy is not None and command.video is not None:
+            video.prepare(policy.header.env, command.video)
     watch = EvaluationProgress(Console(stderr=True, markup=False, emoji=False, highlight=False), str(command.run))
     for probability in command.flicker or (None,):
         with aside():
             played = evaluate_run(
-                command.run, command.episodes, command.checkpoint, probability, command.seconds, watch,
+                policy or command.run, command.episodes, command.checkpoint, probability, command.seconds, watch,
                 command.env_timeout,
             )  # fmt: skip
         terminal().print(json.dumps(played) if command.json else _result_line(played), soft_wrap=True)
-    if command.video is not None:
+    if policy is not None and command.video is not None:
         with aside():
-            _film(command, command.video)
+            _film(command, policy, command.video)
     return 0
 
 
@@ -71,15 +71,17 @@ def _said_aside() -> Iterator[None]:
         os.close(kept)
 
 
-def _filmed(command: run_options.Evaluate) -> PolicyFile:
-    if command.run.is_dir() and RunFolder(command.run).is_baseline():
-        raise ConfigError("--video", str(command.video), "only runs of rmc train are filmed; leave it")
+def _policy(command: run_options.Evaluate) -> PolicyFile | None:
+    """Read once, as a run in training goes on to others; None of a baseline's run."""
+    if is_baseline(command.run):
+        if command.video is not None:
+            raise ConfigError("--video", str(command.video), "only runs of rmc train are filmed; leave it")
+        return None
     policy = read_policy(command.run, command.checkpoint)
     return policy if command.env_timeout is None else policy.with_timeout(command.env_timeout)
 
 
-def _film(command: run_options.Evaluate, file: Path) -> None:
-    policy = _filmed(command)
+def _film(command: run_options.Evaluate, policy: PolicyFile, file: Path) -> None:
     env = policy.header.env
     env = dataclasses.replace(env, flicker=command.flicker[0]) if command.flicker else env
     total = video.record(Policy(policy), env, policy.header.seed, file)

@@ -48,6 +48,8 @@ def check_values(spec: Spec, on_this_machine: bool) -> None:
         if option(name) in given:
             raise ConfigError(option(name), typed, "a sweep's runs are given none; leave it")
     _check("options of rmc train", typed, spec, list(spec.words))
+    if option("config") in given and (seed := parser.parse(["train", spec.env, *spec.words]).seed):
+        raise ConfigError("--seed", seed, "a sweep has several: give --seeds, and leave it out of that file")
     ends = {name: [value.low, value.high] if isinstance(value, Range) else value for name, value in ranges.items()}
     for part, values in (("options", {name: [value] for name, value in spec.options.items()}), ("grid", spec.grid)):
         for name, tried in values.items():

@@ -20,7 +20,8 @@ from rmc.actors.evaluator import first_start
 from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.policy import load_policy
 from rmc.analysis.policy_file import read_policy
-from rmc.cli import main
+from rmc.analysis.run_evaluation import evaluate_run
+from rmc.cli import analysis_commands, main
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.checkpoint import STATE, CheckpointFolder
@@ -132,6 +133,25 @@ def test_an_observation_in_the_environments_own_shape_is_one(tmp_path: Path) -> 
 
 
 @pytest.mark.long
+def test_all_probabilities_are_played_by_one_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Though the run trains on, and saves another checkpoint meanwhile."""
+    run = make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
+
+    def evaluate_and_save(*arguments: Any) -> dict[str, Any]:
+        played = evaluate_run(*arguments)
+        checkpoints = CheckpointFolder(run.checkpoints)
+        header = dataclasses.replace(run.config().policy_header(), updates=8)
+        files = checkpoints.load(7)
+        checkpoints.save(8, files | {"policy.safetensors": save(load(files["policy.safetensors"]), header.metadata())})
+        return played
+
+    monkeypatch.setattr(analysis_commands, "evaluate_run", evaluate_and_save)
+    assert main.run(["evaluate", str(run.path), "--episodes", "1", "--flicker", "0", "0.5", "--json"]) == 0
+    assert [json.loads(line)["updates"] for line in capsys.readouterr().out.splitlines()] == [7, 7]
+
+
 def test_an_evaluation_is_the_same_with_any_number_of_threads(tmp_path: Path) -> None:
     run = make_run(
         tmp_path / "run", AgentConfig(normalize_observations=True, impute_missing=True), "HalfCheetah-v5", 0.5

@@ -151,6 +151,16 @@ def test_of_a_record_what_is_drawn_is_kept_and_findings_are_the_doctors(trained:
     assert read.findings == [str(one) for one in examine(list(read.folder.records()), read.folder.config())]
 
 
+def test_all_replay_servers_count_in_the_throughput(trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    config["replay"]["replay_shards"] = 2
+    (tmp_path / "run" / "config.json").write_text(json.dumps(config))
+    rates = [{"role": f"replay-{shard}", "time": 1.0, "env_steps_per_s": 100.0} for shard in (0, 1)]
+    (tmp_path / "run" / "metrics.jsonl").write_text("".join(f"{json.dumps(rate)}\n" for rate in rates))
+    assert ReportRun.read(tmp_path / "run").series("replay", "env_steps_per_s")[1] == [200.0, 200.0]
+
+
 def test_wall_time_goes_over_all_starts(trained: Path, tmp_path: Path) -> None:
     path = tmp_path / "run"
     path.mkdir()

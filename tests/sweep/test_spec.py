@@ -208,7 +208,7 @@ def test_bad_words_are_one_line(
     "line",
     [
         "metrics_port = 9000", "dry_run = true", 'if_exists = "new"', 'run_dir = "x"', 'redis_url = "unix:///a"',
-        'launcher = "manual"',
+        'launcher = "manual"', "seed = 7",
     ],
 )  # fmt: skip
 def test_what_a_sweeps_runs_are_not_given_is_refused_in_the_file_of_config_too(
