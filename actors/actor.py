@@ -80,7 +80,7 @@ class Actor:
         self._index, self._seed, self._spec, self._config = index, seed, spec, config
         self._bus, self._clock, self._priority_fn = bus, clock, priority_fn
         self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, config.envs_per_actor, spec.missing)
-        self._envs = EnvPool(make_env, config.envs_per_actor, spec, self.name)
+        self._envs = EnvPool(make_env, config.envs_per_actor, spec, self.name, config.reward_scale)
         self._means, self._rate, self._episodes, self._resends = Means(), Rate(), 0, 0
         self._refused_weights = 0
         self._total_steps = 0

@@ -22,9 +22,12 @@ BROKEN_STARTS = 5  # episodes in a row that an environment breaks in their first
 class EnvPool:
     """Its buffers hold what the last step gave; ``begin`` starts each episode."""
 
-    def __init__(self, make_env: Callable[[], Env], n: int, spec: WindowSpec, name: str) -> None:
+    def __init__(
+        self, make_env: Callable[[], Env], n: int, spec: WindowSpec, name: str, reward_scale: float = 1.0
+    ) -> None:
         """``name`` is whose they are. Raises RmcError where one cannot be made beside the others."""
         self._make_env, self._spec, self._name = make_env, spec, name
+        self._largest_reward = np.float32(np.finfo(np.float32).max / max(1.0, reward_scale))  # finite, scaled, too
         self.broken = 0  # episodes that a fault ended
         self._seeds_due: dict[int, int] = {}  # by environment, which of the seeds its next episode begins by
         self._broken_starts: dict[int, int] = {}  # by environment, in a row
@@ -74,12 +77,13 @@ class EnvPool:
             given.privileged[i] = info["privileged"]
 
     def _mark_non_finite(self, faults: dict[int, Exception]) -> None:
-        """Whose observation or reward is not finite. What a broken environment left behind must not end an episode."""
+        """Whose observation or scaled reward is not finite. What a broken one left behind must not end an episode."""
         given = self._given
-        if not (np.isfinite(given.observation).all() and np.isfinite(given.reward).all()):
-            sound = np.isfinite(given.observation).all(1) & np.isfinite(given.reward)
+        rewarded = np.abs(given.reward) <= self._largest_reward
+        if not (np.isfinite(given.observation).all() and rewarded.all()):
+            sound = np.isfinite(given.observation).all(1) & rewarded
             for i in np.flatnonzero(~sound).tolist():
-                faults.setdefault(i, EnvFault("the environment's observation or reward is not finite"))
+                faults.setdefault(i, EnvFault("the environment's observation or scaled reward is not finite"))
         for i in faults:
             given.observation[i] = given.reward[i] = 0.0
             given.terminated[i] = given.truncated[i] = False

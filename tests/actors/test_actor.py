@@ -569,6 +569,24 @@ def test_a_reset_that_breaks_is_tried_once_more_on_a_new_environment() -> None:
     actor.close()
 
 
+def test_a_reward_that_the_scale_makes_infinite_breaks_the_episode() -> None:
+    """Else the replay server would refuse all windows of its entry."""
+
+    class Explodes(gym.Wrapper[Any, Any, Any, Any]):
+        def step(self, action: Any) -> Any:
+            observation, _, *rest = self.env.step(action)
+            return observation, 1e33 if observation[3] == 5.0 else 1.0, *rest
+
+    bus = MemoryBus()
+    publish(bus, 0)
+    config = dataclasses.replace(CONFIG, reward_scale=1e6)
+    actor, reader = make_actor(bus, config=config, make=lambda: Explodes(make_env(COUNTING))), Reader(bus)
+    play(bus, actor, reader, 1000)
+    assert actor.metrics()["broken_episodes"] > 0
+    assert np.isfinite(reader.rows()["reward"]).all()
+    actor.close()
+
+
 def test_an_environment_that_breaks_now_and_then_at_once_goes_on() -> None:
     """Five times in a row is too often; sound episodes in between end the row."""
     begun = itertools.count()
