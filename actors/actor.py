@@ -77,7 +77,7 @@ class Actor:
         Without a ``priority_fn`` windows enter the replay with the largest priority that is there.
         """
         self.name = f"actor-{index}"
-        self._index, self._seed, self._spec, self._config = index, seed, spec, config
+        self._index, self._seed, self._spec, self._config, self._hidden = index, seed, spec, config, agent.hidden
         self._bus, self._clock, self._priority_fn = bus, clock, priority_fn
         self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, config.envs_per_actor, spec.missing)
         self._envs = EnvPool(make_env, config.envs_per_actor, spec, self.name, config.reward_scale)
@@ -255,6 +255,7 @@ class Actor:
         action, state = self._runner.act(*now, noise)
         if self._version.update == UNTRAINED:
             action = self._rng.uniform(-1.0, 1.0, action.shape).astype(np.float32)
+            state[:, self._hidden :] = 0.0  # no frame was seen, as no statistics are there yet to normalise it by
         given, faults = self._envs.step(action)
         for i in faults:
             self._builder.end_before(i)

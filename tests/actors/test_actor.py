@@ -587,6 +587,24 @@ def test_a_reward_that_the_scale_makes_infinite_breaks_the_episode() -> None:
     actor.close()
 
 
+def test_a_frame_that_no_statistics_normalise_is_stored_as_none_seen() -> None:
+    """The learner, which knows them by then, would take raw numbers for normalised ones."""
+    agent = dataclasses.replace(AGENT, normalize_observations=True, impute_missing=True)
+    spec = WindowSpec(OBS_DIM, ACTION_DIM, agent.state_size(OBS_DIM), burn_in=4, train=6)
+    bus: Bus = MemoryBus()
+    clock: Callable[[], float] = itertools.count().__next__
+    actor = Actor(0, 1, lambda: make_env(COUNTING), spec, agent, CONFIG, bus, clock)
+    reader = Reader(bus)
+    for update in (0, 20):
+        bus.publish_weights(Version(1, update), save(Agent(OBS_DIM, ACTION_DIM, agent).policy_weights()))
+        play(bus, actor, reader, 500 if update else 300, final=bool(update))
+    rows = join_rows([decode_rows(entry.payload, spec) for entry in reader.entries], spec)
+    later = rows["state"].any(1)  # at an episode's start nothing is remembered
+    seen, trained = rows["state"][:, agent.hidden :].any(1), rows["weights_update"] > 0
+    assert (seen[later & trained].mean(), seen[~trained].any()) == (1.0, False)
+    actor.close()
+
+
 def test_an_environment_that_breaks_now_and_then_at_once_goes_on() -> None:
     """Five times in a row is too often; sound episodes in between end the row."""
     begun = itertools.count()
