@@ -10,6 +10,7 @@ OURS = {
     "CrossQ's form": "train ENV --head-input observation --hidden 8 --embedding 0 --no-impute-missing --no-grounding "
     "--scheme 2 --burn-in 0 --trained-steps 1 --capacity 110000 --batch-size 256 --replay-ratio 256 --policy-delay 3 "
     "--learning-rate 1e-3 --alpha-learning-rate 1e-3",
+    "RMC, rewards times 0.01": "train ENV --reward-scale 0.01",  # of HumanoidStandup-v5, whose are in the hundreds
     "RMC, heads of 1024": "train ENV --heads 1024 1024",
     "RMC, no contact forces": "train ENV --env-kwargs include_cfrc_ext_in_observation=false",
     "RMC, h alone": "train ENV --head-input hidden",
