@@ -97,7 +97,7 @@ WHEN = {
     "chunk_seconds": "rarely",
     "unacked_bytes": "down where actors have little memory",
     "capacity": "down for a small disk or memory: a window takes 3.7 kB for HalfCheetah, 41 kB for Humanoid",
-    "replay_ratio": "up for more learning from each step, down for more steps a second: the learner is what takes time",
+    "replay_ratio": "up for more learning from each step (240 is an update a step), down for more steps a second",
     "warmup_steps": "up where random actions rarely meet a reward",
     "priority_exponent": "0.6 for R2D2's prioritized replay, 0 for uniform",
     "importance_exponent": "rarely: uniform replay, as in `robust`, has no use for it",
