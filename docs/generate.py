@@ -101,7 +101,7 @@ WHEN = {
     "warmup_steps": "up where random actions rarely meet a reward",
     "priority_exponent": "0.6 for R2D2's prioritized replay, 0 for uniform",
     "importance_exponent": "rarely: uniform replay, as in `robust`, has no use for it",
-    "replay_shards": "up where one replay server is the bottleneck: with dozens of actors",
+    "replay_shards": "up where one replay server is the bottleneck: with dozens of actors, `--actors` a multiple of it",
     "learning_rate": "down when the losses jump or training diverges",
     "memory_learning_scale": "down to keep stored states fresh, at the price of a slower memory",
     "alpha_learning_rate": "up where exploration stays high for too long",
@@ -146,7 +146,8 @@ def page() -> str:
     lines = [
         "# Every option of `rmc train`",
         "",
-        "Written by `make docs` from the code. Defaults are `robust`'s; what `paper` has otherwise is in brackets.",
+        "Written by `make docs` from the code. Defaults are `robust`'s; what `paper` has otherwise is in brackets.\n"
+        "Beside these, `--config FILE.toml` takes [options from a file](command-line.md#options-from-a-file).",
     ]
     defaults, paper_config = robust(EnvConfig("")), paper(EnvConfig(""))
     for part, title in TITLES.items():

@@ -78,7 +78,7 @@ class LearnerConfig:
     publish_updates: int = 20
     """Updates between broadcasts of the policy."""
     checkpoint_steps: int = 10_000
-    """Environment steps between checkpoints, each of which the evaluator plays."""
+    """Environment steps between checkpoints. The evaluator plays the newest one whenever it is free."""
     keep_checkpoints: int = 3
     """Newest checkpoints kept, beside the best."""
     precision: Precision = "auto"
