@@ -27,8 +27,7 @@ def evaluate_run(
 
     Raises ConfigError; RmcError where the environment breaks in every episode.
     """
-    if not 1 <= episodes <= MOST_EPISODES:
-        raise ConfigError("--episodes", episodes, f"take 1 to {MOST_EPISODES:_}")
+    check_range("--episodes", episodes, (1, MOST_EPISODES))
     if flicker is not None:
         check_range("--flicker", flicker, (0.0, 1.0))
     if isinstance(source, PolicyFile) or not is_baseline(source):

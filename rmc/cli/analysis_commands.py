@@ -18,7 +18,7 @@ from rmc.analysis.evaluation import EvaluationProgress
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.analysis.policy_file import PolicyFile, read_policy
-from rmc.analysis.run_evaluation import check_baselines, evaluate_run, is_baseline
+from rmc.analysis.run_evaluation import MOST_EPISODES, check_baselines, evaluate_run, is_baseline
 from rmc.analysis.run_paths import each_readable
 from rmc.cli import run_options
 from rmc.cli.ending import cut_note, episode_count
@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 
 
 def evaluate(command: run_options.Evaluate) -> int:
+    check_range("--episodes", command.episodes, (1, MOST_EPISODES))
     if not command.seconds >= 0.0:
         raise ConfigError("--seconds", command.seconds, "take 0 or more")
     for flicker in command.flicker:
