@@ -286,7 +286,7 @@ class Learner:
         self._check_finite(state)  # critics or moments may be spoilt while the policy, for one more update, is not
         policy = self._serialize_finite(self.update.average.policy_weights(), self._metadata())
         progress = LearnerProgress(
-            self.updates, self.env_steps, self.epoch, self._threads.chosen, self._observed_before, self._policy_learnt
+            self.updates, self.env_steps, self.epoch, self._threads.found, self._observed_before, self._policy_learnt
         )
         self.checkpoints.save(self.updates, pack(state, policy, progress))
         self._save_seconds = time.monotonic() - began

@@ -29,6 +29,11 @@ class ThreadTrial:
         elif choices:
             use(choices[0])
 
+    @property
+    def found(self) -> int:
+        """What a trial of this run or an earlier start chose; 0 where none was needed."""
+        return self.chosen if len(self._seconds) > 1 else 0
+
     def take_up(self, number: int) -> None:
         """What an earlier start of the run chose, if it is a choice on this machine, too."""
         if number in self._seconds:

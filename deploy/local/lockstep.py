@@ -18,7 +18,9 @@ from rmc.common.shard import WHOLE
 from rmc.deploy.local.actor_process import make_actor, make_evaluator
 from rmc.deploy.local.learner_process import make_learner
 from rmc.deploy.local.replay_process import make_server
+from rmc.deploy.redis.progress_backup import ProgressBackup
 from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.folder import RunFolder
 
 
 class Lockstep:
@@ -29,7 +31,8 @@ class Lockstep:
     """
 
     def __init__(self, config: RunConfig, folder: Path, device: str = "cpu") -> None:
-        self.bus = MemoryBus()
+        self.bus, self._progress_backup = MemoryBus(), ProgressBackup(RunFolder(folder), 1)
+        self._progress_backup.restore(self.bus)
         with ExitStack() as opened:  # else a notebook would keep the locks of a start that failed
             self.server = make_server(config, folder / "replay", self.bus, WHOLE)
             opened.callback(self.server.close)
@@ -90,6 +93,7 @@ class Lockstep:
         """Save the ring beside the learner; the actors begin anew in the next step, as those of a resumed run do."""
         self._last_checkpoint = self.learner.last_checkpoint
         self.server.checkpoint()
+        self._progress_backup.keep(self.bus, at_once=True)
         self._restart_due, self._playing = True, self.evaluator is not None
 
     def emit_metrics(self, clock: BusyClock) -> None:
@@ -101,6 +105,7 @@ class Lockstep:
         """Close every role; the learner saves first."""
         for role in self.roles:
             role.close()
+        self._progress_backup.keep(self.bus, at_once=True)
 
 
 def train(config: RunConfig, folder: Path, watch: Callable[[Bus], None], stop: StopSignal, device: str = "cpu") -> None:

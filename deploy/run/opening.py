@@ -98,12 +98,12 @@ def open_run(
             forget_start(folder)
         if initial is not None:  # before there is a config, without which it is no run
             CheckpointFolder(folder.checkpoints).save(0, initial.files)
-        folder.reopen(config.total_steps)
         note_start(folder, changes(before, config), options, initial.origin if initial is not None else None)
         folder.write_config(config)
         folder.write_sizes(config.sizes())
         keep_tracking(folder, tracking)
         folder.secret()
+        folder.reopen(config.total_steps)  # last: a start that fails before takes no result along
     except BaseException:  # a notebook lives on, and would keep the lock
         folder.unlock()
         raise

@@ -73,8 +73,11 @@ def check_ring_fits(config: RunConfig, options: LaunchOptions) -> None:
     """
     size, capacity, row = ring_bytes(config), config.replay.capacity, config.window_spec().dtype.itemsize
 
+    is_there = options.run_dir is not None and (options.run_dir / "config.json").exists()
+    has_a_ring = is_there and options.if_exists != "new"  # which has this capacity for good
+
     def most(room: int) -> int:
-        return max(0, capacity - -(-(size - room) // row))
+        return 0 if has_a_ring else max(0, capacity - -(-(size - room) // row))
 
     free_disk = shutil.disk_usage(existing_parent((options.run_dir or Path("runs")).resolve())).free
     room = ring_bytes_there(config, options) + max(0, free_disk - DISK_RESERVE)
@@ -84,8 +87,8 @@ def check_ring_fits(config: RunConfig, options: LaunchOptions) -> None:
         raise ConfigError("--capacity", capacity, f"takes {_gb(size)} of disk, {rest}; {fix}")
     memory = _memory_limit()
     if size > memory:
-        fault = f"takes {_gb(size)} of {_gb(memory)} memory; take at most {most(memory)}"
-        raise ConfigError("--capacity", capacity, fault)
+        fix = f"take at most {most(memory)}" if most(memory) else "take a machine with more"
+        raise ConfigError("--capacity", capacity, f"takes {_gb(size)} of {_gb(memory)} memory; {fix}")
 
 
 def check_batch_fits(config: RunConfig) -> None:

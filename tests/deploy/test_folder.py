@@ -162,6 +162,21 @@ def test_a_run_that_is_made_longer_has_no_result_until_it_ends(tmp_path: Path) -
         assert (folder.result() is not None) == there
 
 
+def test_a_start_that_fails_takes_no_result_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = debug(EnvConfig("InvertedPendulum-v5"))
+    folder = open_run(config, tmp_path / "run", "fail")
+    folder.write_result(dict.fromkeys(RESULT, config.total_steps))
+    folder.unlock()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "no room")
+
+    monkeypatch.setattr("rmc.deploy.run.opening.note_start", full)
+    with pytest.raises(OSError, match="no room"):
+        open_run(dataclasses.replace(config, total_steps=config.total_steps + 1), folder.path, "resume")
+    assert folder.result() is not None
+
+
 @pytest.mark.parametrize("if_exists", ["resume", "fail", "new"])
 def test_starts_in_the_same_second_get_a_folder_each(
     if_exists: IfExists, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

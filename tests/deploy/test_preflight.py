@@ -55,6 +55,15 @@ def test_a_batch_of_long_windows_that_no_memory_holds_is_refused_with_the_larges
         check_batch_fits(dataclasses.replace(run(9_990, 1), agent=AgentConfig(hidden=4_096)))
 
 
+def test_a_run_that_goes_on_is_offered_no_capacity_that_it_would_refuse(memory: int, tmp_path: Path) -> None:
+    config = robust(EnvConfig("HalfCheetah-v5"))
+    (tmp_path / "config.json").write_text("{}")
+    for options in (LaunchOptions(tmp_path), LaunchOptions(None)):
+        with pytest.raises(ConfigError, match=r"^--capacity=70000: takes .* GB of 0.2 GB memory; ") as error:
+            check_ring_fits(config, options)
+        assert ("take at most" in str(error.value)) == (options.run_dir is None)
+
+
 def test_a_containers_memory_is_what_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from rmc.deploy.run import preflight
 

@@ -1,6 +1,7 @@
 """Lockstep: same seed, same bits; and the same bits again across checkpoint, stop and resume."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,15 @@ def test_same_seed_same_bits_also_after_a_stop(straight, tmp_path):
     stopped = run(CONFIG, tmp_path, stop_after_checkpoints=2)
     assert 0 < stopped.learner.updates < straight.learner.updates
     assert_same(straight, run(CONFIG, tmp_path))
+
+
+def test_counters_stay_where_the_ring_is_lost(tmp_path: Path) -> None:
+    stopped = run(CONFIG, tmp_path, stop_after_checkpoints=1)
+    shutil.rmtree(tmp_path / "replay")
+    again = Lockstep(CONFIG, tmp_path)
+    counts = [one.server.stats()["env_steps"] for one in (stopped, again)]
+    again.close()
+    assert counts[0] == counts[1] >= 400
 
 
 def test_priorities_of_actors_are_the_same_across_a_stop_too(tmp_path):

@@ -55,3 +55,12 @@ def test_nothing_is_tried_where_there_is_no_choice() -> None:
     one, none = ThreadTrial((3,), used.append), ThreadTrial((), used.append)
     none.note(1.0)
     assert (one.chosen, none.chosen, used) == (3, 0, [3])
+
+
+def test_what_was_not_tried_is_not_kept() -> None:
+    """A run that comes home from one core of a cluster tries what this machine has."""
+    away, home = ThreadTrial((1,), lambda _: None), ThreadTrial((1, 2, 4), lambda _: None)
+    home.take_up(away.found)
+    assert (away.chosen, away.found, home.chosen) == (1, 0, 0)
+    home.take_up(2)
+    assert home.found == 2
