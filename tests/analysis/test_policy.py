@@ -132,7 +132,6 @@ def test_an_observation_in_the_environments_own_shape_is_one(tmp_path: Path) -> 
     assert policy.act(np.zeros(2)).shape == (1,)
 
 
-@pytest.mark.long
 def test_all_probabilities_are_played_by_one_policy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -144,7 +143,9 @@ def test_all_probabilities_are_played_by_one_policy(
         checkpoints = CheckpointFolder(run.checkpoints)
         header = dataclasses.replace(run.config().policy_header(), updates=8)
         files = checkpoints.load(7)
-        checkpoints.save(8, files | {"policy.safetensors": save(load(files["policy.safetensors"]), header.metadata())})
+        policy = save(load(files["policy.safetensors"]), header.metadata())
+        progress = json.dumps({"updates": 8, "env_steps": 80}).encode()
+        checkpoints.save(8, files | {"policy.safetensors": policy, "progress.json": progress})
         return played
 
     monkeypatch.setattr(analysis_commands, "evaluate_run", evaluate_and_save)
@@ -152,6 +153,7 @@ def test_all_probabilities_are_played_by_one_policy(
     assert [json.loads(line)["updates"] for line in capsys.readouterr().out.splitlines()] == [7, 7]
 
 
+@pytest.mark.long
 def test_an_evaluation_is_the_same_with_any_number_of_threads(tmp_path: Path) -> None:
     run = make_run(
         tmp_path / "run", AgentConfig(normalize_observations=True, impute_missing=True), "HalfCheetah-v5", 0.5
