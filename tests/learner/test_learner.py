@@ -88,7 +88,8 @@ def test_gates_start_as_the_agent_says(start, tmp_path, monkeypatch):
 @pytest.mark.usefixtures("one_thread")
 def test_a_resumed_learner_takes_the_threads_that_were_chosen(setting):
     setting.learner.close()
-    setting.learner = setting.start(threads=(2,))
+    setting.learner = setting.start(threads=(1, 2))
+    setting.learner._threads.take_up(2)  # as if a trial had found it
     setting.feed(20)
     assert setting.learner.step()
     assert setting.learner.metrics()["threads"] == torch.get_num_threads() == 2
