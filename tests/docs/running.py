@@ -20,8 +20,8 @@ def commands(page: str) -> list[list[str]]:
     return [shlex.split(line)[1:] for line in lines if line.startswith("rmc ")]
 
 
-def ran(folder: Path, *words: str) -> str:
-    """What a command prints there; it must end well, with nothing to complain about."""
+def ran(folder: Path, *words: str, warning: str = "") -> str:
+    """What a command prints there; it must end well, and complain of nothing but, as a pattern, ``warning``."""
     output, errors = io.StringIO(), io.StringIO()
     logged = logging.StreamHandler(errors)
     logged.setLevel(logging.WARNING)
@@ -31,5 +31,6 @@ def ran(folder: Path, *words: str) -> str:
             status = main.run(list(words))
     finally:
         logging.getLogger().removeHandler(logged)
-    assert (status, errors.getvalue()) == (0, ""), output.getvalue() + errors.getvalue()
+    complained = errors.getvalue().strip()
+    assert (status, bool(re.fullmatch(warning, complained))) == (0, True), output.getvalue() + complained
     return output.getvalue()
