@@ -25,7 +25,10 @@ class EnvPool:
     def __init__(
         self, make_env: Callable[[], Env], n: int, spec: WindowSpec, name: str, reward_scale: float = 1.0
     ) -> None:
-        """``name`` is whose they are. Raises RmcError where one cannot be made beside the others."""
+        """``name`` is whose they are, ``reward_scale`` what multiplies rewards later.
+
+        Raises RmcError where one cannot be made beside the others.
+        """
         self._make_env, self._spec, self._name = make_env, spec, name
         self._largest_reward = np.float32(np.finfo(np.float32).max / max(1.0, reward_scale))  # finite, scaled, too
         self.broken = 0  # episodes that a fault ended

@@ -23,7 +23,7 @@ def evaluate_run(
     watch: Watch = lambda _: None,
     env_timeout: float | None = None,
 ) -> dict[str, Any]:
-    """As ``evaluate_policy``: a policy's file, or a run's checkpoint; of a baseline's run its last state.
+    """As ``evaluate_policy``: a policy, read or its file, or a run's checkpoint; of a baseline's run its last state.
 
     Raises ConfigError; RmcError where the environment breaks in every episode.
     """
