@@ -9,6 +9,7 @@ from rmc.analysis.host_faults import CROWDED
 from rmc.analysis.vitals import Vitals
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.trial import RoleUse, Trial
+from rmc.deploy.monitor.figures import duration
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import Machine
 from rmc.deploy.run.preflight import DISK_RESERVE, ring_bytes
@@ -144,10 +145,3 @@ def megabytes(size: float) -> str:
         (f"{size / unit:,.1f} {name}" for unit, name in ((1e9, "GB"), (1e6, "MB")) if size >= unit),
         f"{size / 1e3:.1f} kB",
     )
-
-
-def duration(seconds: float) -> str:
-    """Seconds as a user says them."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours:,} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"

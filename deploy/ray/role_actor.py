@@ -91,11 +91,9 @@ class RoleActor:
         self.prepare()
         logs = self.log_folder()
         logs.mkdir(exist_ok=True)
-        self._role = RoleProcess(self._on_this_node(task.command), self._environment(), logs)
+        command = replace(task.command, words=tuple(map(self._filled, task.command.words)))
+        self._role = RoleProcess(command, self._environment(), logs)
         self._start()
-
-    def _on_this_node(self, command: RoleCommand) -> RoleCommand:
-        return replace(command, words=tuple(map(self._filled, command.words)))
 
     def _filled(self, text: str) -> str:
         return (

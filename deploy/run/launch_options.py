@@ -37,3 +37,8 @@ class LaunchOptions:
     video_every: int | None = None
     metrics_port: int | None = None
     metrics_host: str = "127.0.0.1"
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether its folder has a run, which goes on."""
+        return self.run_dir is not None and self.if_exists != "new" and (self.run_dir / "config.json").exists()

@@ -73,22 +73,19 @@ def check_ring_fits(config: RunConfig, options: LaunchOptions) -> None:
     """
     size, capacity, row = ring_bytes(config), config.replay.capacity, config.window_spec().dtype.itemsize
 
-    is_there = options.run_dir is not None and (options.run_dir / "config.json").exists()
-    has_a_ring = is_there and options.if_exists != "new"  # which has this capacity for good
-
-    def most(room: int) -> int:
-        return 0 if has_a_ring else max(0, capacity - -(-(size - room) // row))
+    def most(room: int) -> int:  # a run that goes on has a ring of this capacity for good
+        return 0 if options.goes_on else max(0, capacity - -(-(size - room) // row))
 
     free_disk = shutil.disk_usage(existing_parent((options.run_dir or Path("runs")).resolve())).free
     room = ring_bytes_there(config, options) + max(0, free_disk - DISK_RESERVE)
     if size > room:
-        rest = f"{_gb(free_disk)} are free, {_gb(DISK_RESERVE)} of which are left for checkpoints and logs"
+        rest = f"{gb(free_disk)} are free, {gb(DISK_RESERVE)} of which are left for checkpoints and logs"
         fix = f"take at most {most(room)}" if most(room) else "make room"
-        raise ConfigError("--capacity", capacity, f"takes {_gb(size)} of disk, {rest}; {fix}")
+        raise ConfigError("--capacity", capacity, f"takes {gb(size)} of disk, {rest}; {fix}")
     memory = _memory_limit()
     if size > memory:
         fix = f"take at most {most(memory)}" if most(memory) else "take a machine with more"
-        raise ConfigError("--capacity", capacity, f"takes {_gb(size)} of {_gb(memory)} memory; {fix}")
+        raise ConfigError("--capacity", capacity, f"takes {gb(size)} of {gb(memory)} memory; {fix}")
 
 
 def check_batch_fits(config: RunConfig) -> None:
@@ -102,7 +99,7 @@ def check_batch_fits(config: RunConfig) -> None:
     window, memory = spec.dtype.itemsize + spec.train * step, min(_memory_limit(), psutil.virtual_memory().available)
     if size * window <= memory:
         return
-    fault = f"an update of windows of {spec.steps} steps takes {_gb(size * window)} of {_gb(memory)} free memory"
+    fault = f"an update of windows of {spec.steps} steps takes {gb(size * window)} of {gb(memory)} free memory"
     fix = f"take at most {memory // window}" if memory >= window else "take fewer steps a window"
     raise ConfigError("--batch-size", size, f"{fault}; {fix}")
 
@@ -116,7 +113,7 @@ def _memory_limit() -> int:
     return memory
 
 
-def _gb(size: int) -> str:
+def gb(size: int) -> str:
     return f"{size / 1e9:.3g} GB"
 
 

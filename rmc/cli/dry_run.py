@@ -69,9 +69,7 @@ def _check_start(config: RunConfig, options: LaunchOptions) -> None:
 
 def _there(options: LaunchOptions) -> RunFolder | None:
     """The run that goes on."""
-    path = options.run_dir
-    is_there = path is not None and options.if_exists != "new" and (path / "config.json").exists()
-    return RunFolder(path) if path is not None and is_there else None
+    return RunFolder(options.run_dir) if options.run_dir is not None and options.goes_on else None
 
 
 def _steps_made(options: LaunchOptions) -> int:

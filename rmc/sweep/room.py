@@ -9,7 +9,7 @@ import psutil
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.preflight import DISK_RESERVE, cores, existing_parent, ring_bytes
+from rmc.deploy.run.preflight import DISK_RESERVE, cores, existing_parent, gb, ring_bytes
 from rmc.sweep.job import Job
 
 PROCESS_BYTES = 400 << 20  # of one with torch and MuJoCo; measured in docs/performance.md: 203 to 498 MB
@@ -38,6 +38,6 @@ def check_disk(folder: Path, jobs: Sequence[Job], ring: int, at_once: int, dropp
     count = min(new, at_once) if dropped else new
     free = shutil.disk_usage(existing_parent(folder.resolve())).free - DISK_RESERVE
     if count * ring > max(0, free):
-        fix = f"{count} rings take {count * ring / 1e9:.3g} GB, {max(0, free) / 1e9:.3g} GB are free; "
+        fix = f"{count} rings take {gb(count * ring)}, {gb(max(0, free))} are free; "
         way = "take fewer --jobs or a smaller capacity" if dropped else "take --drop-replay, or a smaller capacity"
         raise ConfigError("--sweep-dir", str(folder), fix + way)

@@ -11,12 +11,13 @@ from typing import Any
 import psutil
 import pytest
 
-from rmc.analysis.needs import Need, duration, megabytes, needs, speed
+from rmc.analysis.needs import Need, megabytes, needs, speed
 from rmc.cli import dry_run as cli_dry_run
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.trial import RoleUse, Trial, trial_config
+from rmc.deploy.monitor.figures import duration
 from rmc.deploy.run.host import Machine, this_machine
 from rmc.deploy.run.preflight import ring_bytes
 from rmc.deploy.run.presets import debug, robust
@@ -68,7 +69,7 @@ def test_each_need_stands_beside_what_there_is() -> None:
     assert table["bandwidth from replay"].needs == f"{megabytes(8 * 16 * row)}/s"
     assert table["file handles of a role"].needs == "20 (learner)"
     assert table["threads"].needs == "3 learner + 3 others, 3.5 busy"  # the learner's, and half of the replay server
-    assert table["time to the end"].needs == "1 min 07 s at 60 steps/s, 8.0 updates/s"
+    assert table["time to the end"].needs == "0:01:06 at 60 steps/s, 8.0 updates/s"
     assert all(one.fits is not False for one in table.values())
 
 
@@ -103,7 +104,6 @@ def test_a_run_that_goes_on_needs_what_is_to_come() -> None:
 
 def test_numbers_are_told_in_units_that_suit_them() -> None:
     assert [megabytes(size) for size in (500, 2e6, 3.2e9)] == ["0.5 kB", "2.0 MB", "3.2 GB"]
-    assert [duration(seconds) for seconds in (9.4, 600, 7_260)] == ["0 min 09 s", "10 min 00 s", "2 h 01 min"]
 
 
 def test_a_trial_keeps_all_but_its_ring_and_warm_up() -> None:

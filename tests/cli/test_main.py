@@ -1,6 +1,5 @@
 """The command line: its flags, and that every error is one line and exit status 2 before anything starts."""
 
-import dataclasses
 import errno
 import json
 import math
@@ -324,9 +323,6 @@ def opened_run(folder: Path) -> RunFolder:
     ("words", "named"),
     [
         (["train", "InvertedDoublePendulum-v5", "--preset", "debug"], "ENV='InvertedDoublePendulum-v5'"),
-        (["train", PENDULUM, "--preset", "paper"], "--preset='paper'"),
-        ([*DEBUG, "--seed", "3"], "--seed=3"),
-        ([*DEBUG, "--hidden", "9"], "--hidden=9"),
         ([*DEBUG, "--if-exists", "fail"], "--if-exists"),
     ],
 )
@@ -417,15 +413,6 @@ def test_new_takes_a_folder_beside(tmp_path: Path) -> None:
     beside = open_run(config, tmp_path / "run", "new")
     beside.unlock()
     assert beside.path == tmp_path / "run-2"
-
-
-def test_a_run_may_be_made_longer(tmp_path: Path) -> None:
-    config = debug(EnvConfig(PENDULUM))
-    opened_run(tmp_path / "run")
-    longer = dataclasses.replace(config, total_steps=2 * config.total_steps)
-    run = open_run(longer, tmp_path / "run", "resume")
-    run.unlock()
-    assert run.config() == longer
 
 
 def test_a_runs_folder_is_its_owners_alone_until_they_open_it(tmp_path: Path) -> None:

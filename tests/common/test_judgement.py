@@ -71,6 +71,13 @@ WRONG = [
     (4, None, "info is None; return a dict, {} if it says nothing"),
     (4, [], "info is []; return a dict, {} if it says nothing"),
     (4, {"missing": "no"}, "info[\"missing\"] is 'no'; return a bool"),
+    (4, {"missing": [True, False]}, 'info["missing"] has shape (2,); return a bool, or an array of 3 bools'),
+    (
+        4,
+        {"missing": [True, False, True]},
+        'info["missing"] is an array, at its first reset it was none; '
+        "return an array from the first reset on, or bools alone",
+    ),
 ]
 
 

@@ -80,26 +80,6 @@ def test_without_the_option_what_it_gives_under_that_name_is_its_own() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "says"),
-    [
-        ({"missing": [True, False]}, 'info["missing"] has shape (2,); return a bool, or an array of 3 bools'),
-        (
-            {"missing": [True, False, True]},
-            'info["missing"] is an array, at its first reset it was none; '
-            "return an array from the first reset on, or bools alone",
-        ),
-    ],
-)
-def test_flags_are_judged(value: Any, says: str) -> None:
-    env = make_env(EnvConfig("tests.habits:Gives-v0", env_kwargs={"part": 4, "value": value}))
-    env.reset(seed=0)
-    env.step(np.zeros(2, np.float32))
-    with pytest.raises(EnvFault) as caught:
-        env.step(np.zeros(2, np.float32))
-    assert str(caught.value) == f"the environment's {says}"
-
-
-@pytest.mark.parametrize(
     ("first", "later", "says"),
     [
         ([1.0], None, "has shape None, at first (1,); return it in one shape, at each reset and step"),

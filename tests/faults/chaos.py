@@ -17,11 +17,10 @@ import psutil
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.errors import CheckpointError
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.state import STOPPED
 from tests.faults.broken_checkpoints import spoil
-from tests.faults.disk_full import filled
+from tests.faults.disk_full import filled, is_whole
 from tests.faults.kill_redis import LoggedRedis
 from tests.faults.ledger import Ledger
 from tests.faults.loaded import Loaded, anonymous_mb
@@ -353,7 +352,7 @@ class Chaos:
     def _damage_checkpoint(self, chance: random.Random) -> str:
         """The newest one's, and the learner is killed: the next one has to do without it."""
         place = CheckpointFolder(self.folder / "checkpoints")
-        *older, newest = [number for number in place.numbers() if _is_whole(place, number)] or [0]
+        *older, newest = [number for number in place.numbers() if is_whole(place, number)] or [0]
         learner = self._process(LEARNER)
         if len(older) < WHOLE_BESIDE or learner is None:
             return "too few whole ones beside it, or no learner"
@@ -363,11 +362,3 @@ class Chaos:
             return "it has just been replaced, or there is no room"
         learner.kill()
         return ""
-
-
-def _is_whole(place: CheckpointFolder, number: int) -> bool:
-    try:
-        place.load(number)
-    except CheckpointError:
-        return False
-    return True

@@ -85,7 +85,7 @@ def _checkpoint(tries: int, folder: Path) -> Row:
                 slowest = max(slowest, run.until(lambda last=before[-1]: checkpoints.numbers()[-1] > last))
             torn = sum(not line.endswith("}") for line in (run.folder / "metrics.jsonl").read_text().splitlines())
             verdict = run.end()
-        broken = sum(_broken(checkpoints, number) for number in checkpoints.numbers())
+        broken = sum(not is_whole(checkpoints, number) for number in checkpoints.numbers())
     passed = not (torn or broken or halves) and run.process.returncode == 130
     facts = {"torn_lines": torn, "broken_checkpoints": broken, "saved_without_room": halves}
     return Row.judged("disk full: no room for a checkpoint", tries, passed, verdict, slowest, facts)
@@ -98,12 +98,12 @@ def goes_on_unsaved(run: Loaded) -> None:
     run.until_all_go_on()
 
 
-def _broken(checkpoints: CheckpointFolder, number: int) -> bool:
+def is_whole(checkpoints: CheckpointFolder, number: int) -> bool:
     try:
         checkpoints.load(number)
     except CheckpointError:
-        return True
-    return False
+        return False
+    return True
 
 
 def _log_of_redis(tries: int, folder: Path) -> Row:

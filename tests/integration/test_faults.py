@@ -44,12 +44,6 @@ def test_a_killed_redis_comes_back(endless: Training) -> None:
     endless.wait_for(lambda: endless.newest("replay", "env_steps") > steps + 100)
 
 
-def test_a_second_launcher_is_refused(endless: Training) -> None:
-    with Training(endless.folder, *ENDLESS) as second:
-        assert second.process.wait(60) == 2
-    assert "is being trained; stop it first" in endless.text()
-
-
 def test_ctrl_c_saves_and_leaves_nothing(endless: Training) -> None:
     processes = endless.launcher.children(recursive=True)
     fork_server = sys.platform == "linux"  # that three roles come from
