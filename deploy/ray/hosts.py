@@ -1,7 +1,6 @@
 """The hosts of a run's roles on a Ray cluster: named, detached Ray actors, and the groups that keep their CPUs."""
 
 import logging
-import os
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,11 +12,11 @@ from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from rmc.common.errors import RoleDied
 from rmc.common.shard import WHOLE
-from rmc.deploy.local.role_environment import URL_VARIABLE
+from rmc.deploy.local.role_environment import URL_VARIABLE, working_folder
 from rmc.deploy.local.supervisor import QUICK_DEATHS
 from rmc.deploy.ray.placement import SHARD_CPUS, RolePlacement, bundle, places
 from rmc.deploy.ray.ring_nodes import RingLocations
-from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name
+from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, is_full
 from rmc.deploy.ray.role_handle import RoleHandle
 from rmc.deploy.redis.connect import PATIENCE_VARIABLE
 from rmc.deploy.run import tls
@@ -90,7 +89,9 @@ class Hosts:
         )  # fmt: skip
         environment = {URL_VARIABLE: f"file:{{scratch}}/redis-url-{name}", PATIENCE_VARIABLE: str(PATIENCE_SECONDS)}
         environment |= users_path()
-        return options.remote(Task(self._folder.name, place.command, environment, self._secrets(name), os.getcwd()))
+        return options.remote(
+            Task(self._folder.name, place.command, environment, self._secrets(name), working_folder())
+        )
 
     def _secrets(self, name: str) -> dict[str, bytes]:
         """Files of a role's, by name; roles on one node share the folder that they are in."""
@@ -115,6 +116,8 @@ class Hosts:
         """Of a host that Ray does not start again: the next ``place`` makes another."""
         log.warning("the host of %s is gone: %s", one.name, one.dead)
         del self._handles[one.name]
+        if is_full(one.dead):  # it begins once there is room, or elsewhere
+            return
         now = time.monotonic()
         lost = [when for when in self._lost.get(one.name, []) if now - when < LOST_SECONDS]
         self._lost[one.name] = [*lost, now]

@@ -18,6 +18,7 @@ except ImportError as missing:
 
 from rmc.common.errors import ConfigError, first_line, last_line
 from rmc.deploy.local.role_command import launcher_command
+from rmc.deploy.local.role_environment import working_folder
 from rmc.deploy.ray.head import check_head
 from rmc.deploy.ray.launcher_actor import LauncherActor
 from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name
@@ -74,7 +75,7 @@ def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None
         name=actor_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
         max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
     )  # fmt: skip
-    task = Task(folder.name, command, users_path(), {}, os.getcwd())
+    task = Task(folder.name, command, users_path(), {}, working_folder())
     host = actor.remote(task, str(folder.path), config.learner.keep_checkpoints)
     try:
         ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)

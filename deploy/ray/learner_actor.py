@@ -17,6 +17,7 @@ from rmc.deploy.ray.role_actor import (
     SETTLE_SECONDS,
     RoleActor,
     actor_name,
+    is_full,
 )
 
 
@@ -83,5 +84,7 @@ class LearnerActor(RoleActor):
             try:
                 self.tend()
                 return
-            except AWAY:
+            except AWAY as error:
+                if is_full(str(error)) and not (self._run_ends or self._replaced):  # the head, until it has room
+                    deadline = time.monotonic() + SETTLE_SECONDS
                 time.sleep(LOOK_SECONDS)

@@ -21,9 +21,9 @@ TOKEN = Path("~/.ray/auth_token")
 COUNT = (
     "import ray; ray.init(address='auto', logging_level='ERROR'); print('alive', sum(n['Alive'] for n in ray.nodes()))"
 )
-# how many processes of Ray, or that keep it, are on a machine, once they have had 10 s to end
+# how many of the user's processes of Ray, or that keep it, are on a machine, once they have had 10 s to end
 _RAYS = "[r]aylet/raylet|[g]cs_server|[r]ay::|/[r]ay/(dashboard|autoscaler|_private)/|[c]luster/worker.sh"
-LEFT = f"for i in $(seq 20); do n=$(pgrep -fc '{_RAYS}'); [ $n = 0 ] && break; sleep 0.5; done; echo $n"
+LEFT = f"for i in $(seq 20); do n=$(pgrep -u $(id -u) -fc '{_RAYS}'); [ $n = 0 ] && break; sleep 0.5; done; echo $n"
 
 
 def up(path: Path, console: Console) -> None:
@@ -77,7 +77,8 @@ def read(path: Path) -> dict[str, Any]:
 def expected_nodes(config: dict[str, Any]) -> int:
     """How many nodes there must be once all is up: the head and all workers that are always wanted."""
     if config["provider"]["type"] == "local":
-        return 1 + min(len(config["provider"]["worker_ips"]), int(config.get("max_workers", 10**9)))
+        there = len(config["provider"]["worker_ips"])
+        return 1 + min(there, *(int(config.get(limit, there)) for limit in ("min_workers", "max_workers")))
     kinds = config.get("available_node_types", {})
     head = config.get("head_node_type")
     return 1 + sum(int(kind.get("min_workers", 0)) for name, kind in kinds.items() if name != head)

@@ -1,5 +1,6 @@
 """Ray actors that hold a role each: its process, its files and its end. Ray starts them again where they die."""
 
+import errno
 import os
 import shutil
 import tempfile
@@ -26,6 +27,7 @@ ENDED_IN_ORDER = 0
 STOP_SECONDS = 5.0
 SETTLE_SECONDS = 60.0  # for the last checkpoint to reach the head
 CLAIM_SECONDS = 60.0  # for a launcher that is being started again
+FULL = tuple(map(os.strerror, (errno.ENOSPC, errno.EDQUOT)))
 AWAY = (ray.exceptions.RayError, ValueError, CheckpointError, OSError)  # of who keeps the checkpoints
 
 
@@ -70,6 +72,11 @@ def scratch_folder(run: str) -> Path:
     Short, for the sockets in it; the run's folder itself lies with its launcher, on the head.
     """
     return private_folder(Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{run[-8:]}")
+
+
+def is_full(error: str) -> bool:
+    """Whether it is a disk without room, by an error's text: Ray keeps no more of one on another node."""
+    return any(words in error for words in FULL)
 
 
 def actor_name(run: str, role: str) -> str:
@@ -199,6 +206,10 @@ class RoleActor:
 
 def _write_private(path: Path, content: bytes) -> None:
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)  # a run's hosts begin together
-    with os.fdopen(handle, "wb") as file:
-        file.write(content)
-    os.replace(temporary, path)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.replace(temporary, path)
+    except OSError:  # the disk is full: nothing of it stays
+        os.unlink(temporary)
+        raise

@@ -39,6 +39,7 @@ from rmc.deploy.run.folder import RunFolder
 
 NODES_SECONDS = 2.0  # between looks for nodes that came
 LEARNER_PENDING_SECONDS = 8.0  # without a node for the learner, after which actors make room
+STARTING_SECONDS = 60.0  # of an actor without a CPU, where there is one for each: another run may have its own
 GIVE_WAY_SECONDS = 300.0  # without a node for another run's learner, after which actors are placed all the same
 STOP_SECONDS = 20.0  # for all roles to end cleanly and for the last checkpoint to reach the head
 FIRST_PORT, LAST_PORT = 6380, 6479  # for Redis; 6379 is Ray's
@@ -94,15 +95,16 @@ class ClusterRun:
                 self._make_room()
 
     def _keep_low_actors(self) -> None:
-        """Where CPUs are lost for good, it is the highest actors that wait: the run's last steps go to the lowest."""
-        if cpus() >= reserved_cpus(self.config) + self.config.actors:  # they are only being started again
-            return
+        """Where CPUs are lost, it is the highest actors that wait: the run's last steps go to the lowest."""
+        lost = cpus() < reserved_cpus(self.config) + self.config.actors
+        overdue = time.monotonic() - (LEARNER_PENDING_SECONDS if lost else STARTING_SECONDS)
         actors = self.hosts.actors()
-        overdue = time.monotonic() - LEARNER_PENDING_SECONDS
-        waiting = [one for one in actors if not one.running and one.waits_since < overdue]
-        if waiting and actors[-1].running:
-            log.warning("%s waits for a CPU; %s gives it its own", waiting[0].name, actors[-1].name)
-            self.hosts.end(actors[-1])
+        waiting = [number for number, one in enumerate(actors) if not one.running and one.waits_since < overdue]
+        higher = [one for one in actors[waiting[0] :] if one.running] if waiting else []
+        if higher:
+            log.warning("%s waits for a CPU; %s gives it its own", actors[waiting[0]].name, higher[-1].name)
+            actors[waiting[0]].waits_since = time.monotonic()  # one exchange at a time
+            self.hosts.end(higher[-1])
 
     def _end_waiting_actors(self) -> None:
         """They would take the CPUs that become free for a learner, of this run or another."""

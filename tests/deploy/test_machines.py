@@ -1,16 +1,20 @@
 """The cluster files that the project ships are Ray's own idea of one, and say what must not be left to chance."""
 
 import json
+import os
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import jsonschema
+import psutil
 import pytest
 import ray.autoscaler
 
 from rmc import deploy
 from rmc.common.errors import ConfigError
 from rmc.deploy.ray import machines
+from tests.waiting import wait_until
 
 FOLDER = Path(deploy.__file__).parent / "cluster"
 FILES = sorted(FOLDER.glob("*.yaml"))
@@ -58,6 +62,34 @@ def test_every_cloud_machine_says_its_image(config: dict[str, Any]) -> None:
 def test_the_nodes_that_there_must_be() -> None:
     nodes = {path.stem: machines.expected_nodes(machines.read(path)) for path in FILES}
     assert nodes == {"aws": 3, "gcp": 3, "on-premise": 3}
+    local = machines.read(FOLDER / "on-premise.yaml")
+    assert [machines.expected_nodes(local | {"min_workers": number}) for number in (0, 1, 9)] == [1, 2, 3]
+
+
+@pytest.mark.parametrize("there", [(".bash_profile", ".bash_login", ".profile"), (".bash_login", ".profile"), ()])
+def test_a_login_shell_finds_the_programs(config: dict[str, Any], tmp_path: Path, there: tuple[str, ...]) -> None:
+    for name in there:
+        (tmp_path / name).touch()
+    for _ in range(2):
+        subprocess.run(["bash", "-c", config["setup_commands"][-1]], env={"HOME": str(tmp_path)}, check=True)
+    words = ["bash", "--login", "-c", "echo $RAY_AUTH_MODE $PATH"]
+    said = subprocess.run(words, env={"HOME": str(tmp_path), "PATH": "/bin"}, capture_output=True, text=True).stdout
+    assert said.startswith(f"token {tmp_path}/rmc-env/bin:")
+    assert said.count("rmc-env") == 1
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root starts a process of another user's")
+def test_what_another_user_runs_is_not_counted() -> None:
+    count = machines.LEFT.replace("seq 20", "seq 1")
+    raylet = 'exec -a "/x/raylet/raylet" sleep 30'
+    with subprocess.Popen(["setpriv", "--reuid", "65534", "--clear-groups", "bash", "-c", raylet]) as other:
+        found = subprocess.run(["bash", "-c", count], capture_output=True, text=True).stdout.split()
+        other.kill()
+    with subprocess.Popen(["bash", "-c", raylet]) as own:
+        wait_until(lambda: "raylet" in " ".join(psutil.Process(own.pid).cmdline()), 10)
+        found += subprocess.run(["bash", "-c", count], capture_output=True, text=True).stdout.split()
+        own.kill()
+    assert found == ["0", "1"]
 
 
 def test_a_file_that_is_none_is_named(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ pytest.importorskip("ray")
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.local import supervisor
 from rmc.deploy.local.role_command import RoleCommand
-from rmc.deploy.ray import role_actor
+from rmc.deploy.ray import learner_actor, role_actor
 from rmc.deploy.ray.launcher_actor import LauncherActor
 from rmc.deploy.ray.learner_actor import LearnerActor
 from rmc.deploy.ray.role_actor import RoleActor, Task
@@ -124,3 +124,24 @@ def test_a_learner_that_saves_for_long_is_not_killed(
     host.close()
     host.clear()
     assert log.read_text() == "saved\n"
+
+
+def test_a_head_without_room_is_waited_for_unless_the_run_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = LearnerActor.__new__(LearnerActor)
+    learner._run_ends = learner._replaced = False
+    tries: list[float] = []
+
+    def tend() -> None:
+        tries.append(time.monotonic())
+        if len(tries) < 6:
+            raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(learner, "tend", tend)
+    monkeypatch.setattr(learner_actor, "LOOK_SECONDS", 0.1)
+    monkeypatch.setattr(learner_actor, "SETTLE_SECONDS", 0.15)
+    learner.flush_artifacts()
+    assert len(tries) == 6
+    tries.clear()
+    learner._run_ends = True
+    learner.flush_artifacts()
+    assert len(tries) < 4

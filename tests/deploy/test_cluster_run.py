@@ -1,0 +1,102 @@
+"""What a launcher on Ray decides, without a cluster."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("ray")
+
+from rmc.common.env.config import EnvConfig
+from rmc.common.errors import RoleDied
+from rmc.deploy.local.role_command import RoleCommand
+from rmc.deploy.ray import hosts as ray_hosts
+from rmc.deploy.ray import run as ray_run
+from rmc.deploy.ray.hosts import Hosts
+from rmc.deploy.ray.placement import RolePlacement
+from rmc.deploy.ray.role_actor import RoleActor
+from rmc.deploy.ray.run import ClusterRun
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.presets import debug
+
+
+class Handle(SimpleNamespace):
+    """An actor's host, as the launcher sees it."""
+
+
+def exchanges(monkeypatch: pytest.MonkeyPatch, running: str, cluster: float) -> Callable[[], list[str]]:
+    """One look at actors of which 1 runs and 0 has waited for two minutes: names of those that are ended."""
+    waits = time.monotonic() - 120.0
+    actors = [Handle(name=f"actor-{i}", running=one == "1", waits_since=waits) for i, one in enumerate(running)]
+    run, ended = ClusterRun.__new__(ClusterRun), list[str]()
+
+    def end(one: Handle) -> None:
+        actors.remove(one)
+        ended.append(one.name)
+
+    run.config = SimpleNamespace(actors=len(running))  # type: ignore[assignment]
+    run.hosts = SimpleNamespace(actors=lambda: actors, end=end)  # type: ignore[assignment]
+    monkeypatch.setattr(ray_run, "cpus", lambda: cluster)
+    monkeypatch.setattr(ray_run, "reserved_cpus", lambda _: 2)
+
+    def look() -> list[str]:
+        run._keep_low_actors()
+        return ended
+
+    return look
+
+
+@pytest.mark.parametrize(
+    ("running", "cluster", "ended"),
+    [
+        ("0111", 100.0, ["actor-3"]),  # another run has the CPU of actor-0
+        ("0010", 3.0, ["actor-2"]),  # the highest waits, too
+        ("1100", 4.0, []),  # none that runs is above one that waits
+        ("1111", 100.0, []),
+    ],
+)
+def test_the_lowest_actors_run(monkeypatch: pytest.MonkeyPatch, running: str, cluster: float, ended: list[str]) -> None:
+    look = exchanges(monkeypatch, running, cluster)
+    assert look() == ended
+    assert look() == ended  # one at a time
+
+
+@pytest.fixture
+def hosts(tmp_path: Path) -> Hosts:
+    """Of a run that has none yet."""
+    folder: RunFolder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    folder.unlock()
+    return Hosts(folder, "cpu", False, lambda role: f"redis://{role}")
+
+
+@pytest.mark.parametrize(("why", "ends"), [("OSError: [Errno 28] No space left on device", False), ("killed", True)])
+def test_a_host_on_a_full_disk_is_tried_again(hosts: Hosts, why: str, ends: bool) -> None:
+    def lose() -> None:
+        one: Any = Handle(name="actor-0", dead=why)
+        hosts._handles["actor-0"] = one
+        hosts._forget_dead(one)
+
+    for _ in range(ray_hosts.QUICK_DEATHS - 1):
+        lose()
+    if ends:
+        with pytest.raises(RoleDied, match="the host of actor-0 could not be held"):
+            lose()
+    else:
+        lose()
+    assert not hosts._handles
+
+
+def test_a_launcher_may_lose_its_working_folder(hosts: Hosts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    remote = SimpleNamespace(options=lambda **_: SimpleNamespace(remote=made.append))
+    monkeypatch.setattr(ray_hosts.ray, "remote", lambda _: remote)
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    hosts._create("actor-0", RolePlacement(RoleActor, RoleCommand("actor-0", ("actor",)), 1.0, 0.0, ""))
+    assert [task.working_folder for task in made] == ["/"]
