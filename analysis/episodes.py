@@ -4,6 +4,7 @@ Shapes: T steps of an episode, O observation, A action, F numbers of the environ
 is missing, P privileged numbers, S state.
 """
 
+import copy
 import dataclasses
 from dataclasses import dataclass
 from math import isfinite
@@ -148,13 +149,13 @@ class Player:
         self._played += 1
         observation, info = env.reset(seed=first_start(self._config.seed, final=True) if is_first else None)
         policy.reset()
-        observations, own, infos, actions, rewards = [observation], [self._record.newest], [info], [], []
+        observations, own, infos, actions, rewards = [observation], [self._record.newest], [_kept(info)], [], []
         for _ in range(LONGEST_EPISODE if is_first else LONGEST_FURTHER):
             actions.append(policy.act(observation, info.get("missing", False)))
             observation, reward, terminated, truncated, info = env.step(actions[-1])
             observations.append(observation)
             own.append(self._record.newest)
-            infos.append(info)
+            infos.append(_kept(info))
             rewards.append(self._config.actor.reward_scale * float(reward))
             if terminated or truncated:
                 break
@@ -179,8 +180,13 @@ class Player:
             missing.unsqueeze(0),
             self._agent.normalized_privileged(beside).unsqueeze(0),
             own,
-            _probes([info.get("probe", {}) for info in infos], self._config.env.id),
+            _probes([info["probe"] for info in infos], self._config.env.id),
         )
+
+
+def _kept(info: dict[str, Any]) -> dict[str, Any]:
+    """``info`` as it is at this step: an environment may write its probe into the same dict again."""
+    return {**info, "probe": copy.deepcopy(info.get("probe", {}))}
 
 
 def _probes(values: list[Any], env_id: str) -> dict[str, NDArray[np.float64]]:

@@ -152,7 +152,10 @@ def _of_run(folder: RunFolder, checkpoint: str) -> PolicyFile:
             raise MessageError("weights", f"not a policy of this run (but of {policy.header.env.id})")
     except MessageError as error:
         raise ConfigError("--checkpoint", checkpoint, f"{error}; use another") from None
-    return replace(policy, header=_evaluated(policy.header, folder))
+    policy = replace(policy, header=_evaluated(policy.header, folder))
+    settings = folder.settings().get("env")
+    seconds = settings.get("env_timeout") if isinstance(settings, dict) else None  # a resume may have changed it
+    return policy.with_timeout(seconds) if is_finite(seconds) and seconds > 0 else policy
 
 
 def _of_older_run(folder: RunFolder, files: dict[str, bytes]) -> PolicyFile:

@@ -6,12 +6,14 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from rmc.actors.evaluator import LONGEST_EPISODE, first_start
@@ -24,13 +26,14 @@ from rmc.common.env.process_state import ApartCall
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError, EnvFault, RmcError, first_line
 from rmc.common.extra import check_installed
+from rmc.common.process import descendants, watchdog
 from rmc.common.whole_file import written_whole
 
 VIDEOS = (".mp4", ".mkv", ".mov", ".avi")  # that hold H.264
 BACKENDS = ("egl", "osmesa", "glfw")  # MuJoCo's, the ones that need no screen first
 RENDERERS = {"mujoco", "OpenGL", "glfw", "dm_control"}  # packages, and gymnasium's folder of MuJoCo's environments
-PROBE = "import sys; from rmc.analysis.video import probe; probe(sys.argv[1])"
-PROBE_SECONDS = 60
+PROBE = "import sys; from rmc.analysis.video import probe; probe(*sys.argv[1:])"
+PROBE_SECONDS = 60.0  # beside the time that the environment has to be made and to reset
 FRAMES_PER_SECOND = 30
 MODE, PICTURE = "rgb_array", "an array (height, width, 3) of uint8"
 ENVS_FAULT = 3  # exit status of a probe whose environment is at fault
@@ -50,9 +53,9 @@ def _mode_fault(env: EnvConfig) -> str | None:
     """Why an environment has no pictures, as far as it can be told without making it."""
     with ApartCall(env.id, "make", env.env_timeout):
         factory = call_env("entry point", lambda: entry_point(find_spec(env.id)))
-    metadata = getattr(factory, "metadata", None)
+    metadata = getattr(factory, "metadata", None)  # of a wrapper's class it is a property, and says nothing
     modes = metadata.get("render_modes") or [] if isinstance(metadata, dict) else []
-    if isinstance(factory, type) and MODE not in modes:
+    if isinstance(factory, type) and isinstance(metadata, dict) and MODE not in modes:
         return f'its metadata["render_modes"] is {modes}; give it "{MODE}", and a render() that returns {PICTURE}'
     try:
         inspect.signature(factory).bind_partial(render_mode=MODE)
@@ -130,7 +133,7 @@ def _working_backend(env: EnvConfig, out: Path) -> str:
         status, words = _probed(backend, env)
         if status == 0:
             return backend
-        if status == ENVS_FAULT:
+        if status == ENVS_FAULT and ": render has not returned" not in words:  # a driver may hang in it
             raise ConfigError("--video", str(out), f"{env.id} cannot be filmed: {words}")
         failures[backend] = words
     reasons = "; ".join(f"{backend}: {reason}" for backend, reason in failures.items())
@@ -139,31 +142,46 @@ def _working_backend(env: EnvConfig, out: Path) -> str:
 
 def _probed(backend: str, env: EnvConfig) -> tuple[int, str]:
     """How a process ended that rendered a frame with a backend, and the last line that it said."""
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", PROBE, json.dumps(dataclasses.asdict(env))],
-            env={**os.environ, "MUJOCO_GL": backend, "PYTHONPATH": os.pathsep.join(sys.path)},
-            capture_output=True, text=True, timeout=PROBE_SECONDS, check=False,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:  # a driver that hangs
-        return 1, f"no frame in {PROBE_SECONDS} s"
-    return done.returncode, (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+    seconds = PROBE_SECONDS + 2 * env.env_timeout
+    words = [sys.executable, "-P", "-c", PROBE, json.dumps(dataclasses.asdict(env)), json.dumps(sys.path)]
+    with tempfile.TemporaryFile() as said:  # of a pipe a simulator of the environment's would keep the other end
+        process = subprocess.Popen(
+            words, env=os.environ | {"MUJOCO_GL": backend}, stdin=subprocess.DEVNULL, stdout=said, stderr=said
+        )
+        try:
+            process.wait(seconds)
+        except subprocess.TimeoutExpired:  # a driver that hangs
+            return 1, f"no frame in {seconds:g} s"
+        finally:
+            if process.poll() is None:
+                descendants.end(psutil.Process(process.pid))
+                process.wait()
+        said.seek(0)
+        lines = said.read().decode(errors="replace").strip().splitlines()
+    return process.returncode, (lines or ["no reason given"])[-1].removeprefix("rmc: ")
 
 
-def probe(env: str) -> None:
+def probe(env: str, import_path: str) -> None:
     """Render one frame of an environment, its config as JSON; ends the process where the environment is at fault.
 
-    Raises whatever else stands in the way: what draws for it does not work here.
+    ``import_path`` is JSON, too: where the asking process finds modules. Raises whatever else stands in the way: what
+    draws for it does not work here.
     """
+    sys.path += [folder for folder in json.loads(import_path) if folder not in sys.path]
+    descendants.adopt_orphans()
+    watchdog.start()
     try:
         environment = make_env(EnvConfig(**json.loads(env)), render=True)
         environment.reset(seed=0)
         _frame(environment)
+        environment.close()
     except EnvFault as fault:
         if fault.__cause__ is not None and _is_renderers(fault.__cause__):
             raise fault.__cause__ from None
         sys.stderr.write(f"{fault}\n")
         sys.exit(ENVS_FAULT)
+    finally:
+        descendants.end_children()
 
 
 def _is_renderers(error: BaseException) -> bool:

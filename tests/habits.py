@@ -1,5 +1,8 @@
 """Environments that are sound but for one habit, which their keyword names."""
 
+import subprocess
+import time
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -172,8 +175,15 @@ class Draws(Slide):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
-    def __init__(self, picture: str, render_mode: str | None = None) -> None:
-        self.picture, self.render_mode = picture, render_mode
+    def __init__(
+        self, picture: str, render_mode: str | None = None, late: float = 0.0, simulator: Sequence[str] = ()
+    ) -> None:
+        self.picture, self.render_mode, self.late = picture, render_mode, late
+        self.simulator = subprocess.Popen(simulator) if simulator else None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        time.sleep(self.late)
+        return super().reset(seed=seed, options=options)
 
     def render(self) -> Any:
         if self.picture == "noise":  # which no codec makes small
@@ -181,7 +191,18 @@ class Draws(Slide):
         return PICTURES[self.picture]
 
 
+class Masked(gym.ObservationWrapper[Any, Any, Any]):
+    """A wrapper's class as an entry point."""
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(Draws("sound", render_mode))
+
+    def observation(self, observation: Any) -> Any:
+        return observation
+
+
 for _kind in (
+    Masked,
     Slide,
     InPlace,
     Gives,

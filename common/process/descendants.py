@@ -25,7 +25,7 @@ def end_children(spared: Collection[int] = ()) -> None:
     deadline = time.monotonic() + END_SECONDS
     while strays := [child for child in psutil.Process().children() if child.pid not in spared]:
         for child in strays:
-            _kill(child)
+            end(child)
             with suppress(ChildProcessError):
                 os.waitpid(child.pid, os.WNOHANG)
         if time.monotonic() >= deadline:  # one that the kernel holds
@@ -33,7 +33,8 @@ def end_children(spared: Collection[int] = ()) -> None:
         time.sleep(LOOK_SECONDS)
 
 
-def _kill(child: psutil.Process) -> None:
+def end(child: psutil.Process) -> None:
+    """Kill a process and what lies below it."""
     with suppress(psutil.NoSuchProcess, psutil.AccessDenied):
         below = child.children(recursive=True)
         child.kill()

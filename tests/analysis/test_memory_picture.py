@@ -254,6 +254,29 @@ def test_a_probe_that_is_no_dict_of_the_same_numbers_is_named(probe: Any, tmp_pa
         player.play()
 
 
+class Reuses(MemoryEnv):
+    """Writes ``info["probe"]`` into one dict."""
+
+    def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        observation, _ = super().reset(**options)
+        self._probe = {"step": 0.0}
+        return observation, {"probe": self._probe}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self._probe["step"] += 1.0
+        return *super().step(action)[:4], {"probe": self._probe}
+
+
+gym.register("Reuses-v0", Reuses, kwargs={"delay": 3})
+
+
+def test_a_probe_is_read_at_its_step(tmp_path: Path) -> None:
+    config = dataclasses.replace(MEMORY, env=EnvConfig("tests.analysis.test_memory_picture:Reuses-v0"))
+    with closing(Player(run_of(tmp_path / "run", config), built(ASLEEP), config, "latest")) as player:
+        steps = player.play().probe["step"]
+    assert steps.tolist() == list(range(len(steps)))
+
+
 class Changing(MemoryEnv):
     """Its ``info["probe"]`` has other names in every episode."""
 

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -318,6 +319,13 @@ def test_a_file_is_played_and_exported_as_its_run_is(
     assert main.run(["export", str(file), "--out", str(out)]) == 0
     assert out.read_bytes() == file.read_bytes()
     assert "Joints-v0 after 70 environment steps, not evaluated" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_a_resume_with_more_time_for_the_environment_reaches_older_checkpoints(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+    config = folder.config()
+    folder.write_config(replace(config, env=replace(config.env, env_timeout=300.0)))
+    assert read_policy(folder.path).header.env.env_timeout == 300.0
 
 
 def test_a_run_keeps_no_other_environments_policy(tmp_path: Path) -> None:

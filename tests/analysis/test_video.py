@@ -3,9 +3,12 @@
 import json
 import os
 import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from imageio_ffmpeg import count_frames_and_secs, get_ffmpeg_exe
 
@@ -15,7 +18,7 @@ from rmc.analysis.video import _follow
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
-from rmc.common.errors import RmcError
+from rmc.common.errors import ConfigError, RmcError
 from rmc.common.whole_file import temporary_path
 from tests.analysis.test_policy import AGENTS, make_run
 from tests.command import rmc
@@ -128,9 +131,9 @@ def test_a_backend_that_hangs_is_passed_over_and_named(tmp_path: Path, capsys, m
     monkeypatch.setattr(video, "PROBE", "import time; time.sleep(60)")
     monkeypatch.setattr(video, "PROBE_SECONDS", 0.2)
     out = tmp_path / "episode.mp4"
-    assert main.run(["evaluate", folder, "--episodes", "1", "--video", str(out)]) == 2
+    assert main.run(["evaluate", folder, "--episodes", "1", "--video", str(out), "--env-timeout", "0.1"]) == 2
     errors = capsys.readouterr().err
-    assert f"--video={str(out)!r}: nothing here can render (egl: no frame in 0.2 s; osmesa: no frame in 0.2 s" in errors
+    assert f"--video={str(out)!r}: nothing here can render (egl: no frame in 0.4 s; osmesa: no frame in 0.4 s" in errors
     assert "libegl1 or libosmesa6" in errors
     assert len(errors.splitlines()) == 1
 
@@ -174,6 +177,41 @@ def test_an_environment_without_pictures_is_named_before_anything_is_played(
     assert "libegl1" not in captured.err
     assert (len(captured.err.splitlines()), captured.out) == (1, "")
     assert not (tmp_path / "episode.mp4").exists()
+
+
+def test_a_wrappers_class_is_judged_by_what_it_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    video.prepare(EnvConfig("tests.habits:Masked-v0"), tmp_path / "episode.mp4")
+
+
+def test_a_reset_that_hangs_is_named_within_the_environments_time(tmp_path: Path, capsys, monkeypatch) -> None:
+    """With the driver that is asked for, and no other is tried."""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    env = EnvConfig("tests.habits:Draws-v0", env_kwargs={"picture": "sound", "late": 60.0}, env_timeout=1.0)
+    begun = time.monotonic()
+    with pytest.raises(ConfigError, match=r"cannot be filmed: ENV=.*: reset has not returned for 1 s \(habits.py"):
+        video.prepare(env, tmp_path / "episode.mp4")
+    assert time.monotonic() - begun < 30.0
+
+
+def test_a_simulator_of_the_environments_ends_with_the_trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor is its standard error waited for."""
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    mark = f"{time.time():.6f}"  # seconds: told from other sleeps
+    words = ["sleep", f"1{mark}"]
+    env = EnvConfig("tests.habits:Draws-v0", env_kwargs={"picture": "sound", "simulator": words}, env_timeout=30.0)
+    begun = time.monotonic()
+    video.prepare(env, tmp_path / "episode.mp4")
+    assert time.monotonic() - begun < 30.0
+    assert not [one for one in psutil.process_iter(["cmdline"]) if one.info["cmdline"] == words]
+
+
+def test_a_file_of_rmcs_name_in_the_working_folder_is_not_taken(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "rmc.py").write_text("raise SystemExit('shadowed')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    video.prepare(EnvConfig("tests.habits:Draws-v0", env_kwargs={"picture": "sound"}), tmp_path / "episode.mp4")
 
 
 def test_an_environment_of_ones_own_is_filmed_without_a_screen(tmp_path: Path, monkeypatch) -> None:
