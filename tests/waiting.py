@@ -1,7 +1,9 @@
 """Waiting for what another process or thread is about to do."""
 
+import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 
 import psutil
 
@@ -14,6 +16,14 @@ def wait_until(
     while not condition():
         assert time.monotonic() < deadline, said()
         time.sleep(pause)
+
+
+def matching(pattern: str, among: Iterable[psutil.Process]) -> Iterator[psutil.Process]:
+    """Those whose command line the regular expression is found in; one that ends meanwhile is none."""
+    for process in among:
+        with suppress(psutil.Error):
+            if re.search(pattern, " ".join(process.cmdline())):
+                yield process
 
 
 def alive(processes: list[psutil.Process]) -> list[psutil.Process]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import tempfile
 import time
@@ -19,7 +20,7 @@ from tests.cluster import machines
 from tests.command import rmc
 from tests.deploy.test_tls import lacks_tls
 from tests.integration.running import ENVIRONMENT, Training, free_port
-from tests.waiting import wait_until
+from tests.waiting import matching, wait_until
 
 ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
 
@@ -32,23 +33,12 @@ def leaves_nothing_behind() -> Iterator[None]:
 
 
 def _left() -> list[str]:
-    results = []
-    for process in psutil.process_iter():
-        try:
-            words = " ".join(process.cmdline())
-        except psutil.Error:
-            continue
-        if (
-            "raylet/raylet" in words
-            or "gcs_server" in words
-            or ("rmc.cli.main" in words and tempfile.gettempdir() in words)
-        ):
-            results.append(f"{process.pid} {words[:150]}")
-    return results
+    ours = rf"raylet/raylet|gcs_server|rmc\.cli\.main.*{re.escape(tempfile.gettempdir())}"
+    return [str(one) for one in matching(ours, psutil.process_iter())]
 
 
 def _pids(words: str) -> list[int]:
-    return [one.pid for one in psutil.process_iter(["cmdline"]) if words in " ".join(one.info["cmdline"] or [])]
+    return [one.pid for one in matching(re.escape(words), psutil.process_iter())]
 
 
 def ring(folder: Path) -> Path:

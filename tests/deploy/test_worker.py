@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from rmc import deploy
-from tests.waiting import wait_until
+from tests.waiting import matching, wait_until
 
 SCRIPT = Path(deploy.__file__).parent / "cluster" / "worker.sh"
 RAY = """#!/bin/bash
@@ -58,12 +58,7 @@ class Worker:
 
     def processes(self, name: str) -> list[int]:
         """Those of this folder whose words have this in them."""
-        found = []
-        for process in psutil.process_iter(["cmdline"]):
-            words = " ".join(process.info["cmdline"] or [])
-            if name in words and str(self.folder) in words:
-                found.append(process.pid)
-        return found
+        return [one.pid for one in matching(rf"{self.folder}.*{name}|{name}.*{self.folder}", psutil.process_iter())]
 
     def calls(self, action: str) -> int:
         return sum(line.startswith(action) for line in (self.folder / "calls").read_text().splitlines())

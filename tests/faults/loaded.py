@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import time
 from collections.abc import Callable, Mapping
@@ -22,6 +21,7 @@ from rmc.deploy.run.folder import RunFolder
 from tests.faults.judge import Acks, Judgement, judge
 from tests.faults.witness import Witness
 from tests.integration.running import START_SECONDS, Training
+from tests.waiting import matching
 
 ACTORS = 2
 ENDLESS = ("--total-steps", "100000000", "--replay-ratio", "4", "--actors", str(ACTORS), "--checkpoint-steps", "20000")
@@ -99,7 +99,7 @@ class Loaded(Training):
         word, _, index = role.partition("-")
         others = {"redis": "unixsocket", "fork server": r"rmc\.cli\.fork_server"}
         pattern = others.get(role, rf"rmc\.cli\.main role {word} .*{f'--index {index}' if index else ''}")
-        return next((one for one in self.launcher.children(recursive=True) if _matches(one, pattern)), None)
+        return next(matching(pattern, self.launcher.children(recursive=True)), None)
 
     def kill(self, role: str, number: signal.Signals = signal.SIGKILL) -> float:
         """kill -9, or another signal; how long it takes until it is back in a new epoch."""
@@ -190,10 +190,3 @@ def _all_moved(before: Acks, now: Acks) -> bool:
 
 def _of(acks: Acks, actor: int) -> Acks:
     return {life: seq for life, seq in acks.items() if life[0] == actor}
-
-
-def _matches(process: psutil.Process, pattern: str) -> bool:
-    try:
-        return re.search(pattern, " ".join(process.cmdline())) is not None
-    except psutil.NoSuchProcess:
-        return False

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -16,7 +15,7 @@ from typing import Any, Self
 import psutil
 
 from tests.command import COMMAND
-from tests.waiting import wait_until
+from tests.waiting import matching, wait_until
 
 START_SECONDS = 120.0  # five processes import torch on two cores that other tests may use
 SMALL = (
@@ -127,13 +126,7 @@ class Training(Command):
     def role(self, name: str) -> psutil.Process | None:
         """A role's process; the role's name is ``actor``, ``replay``, ``learner``, ``evaluator`` or ``redis``."""
         pattern = "unixsocket" if name == "redis" else rf"rmc\.cli\.main role {name} "
-        for child in self.launcher.children(recursive=True):
-            try:
-                if re.search(pattern, " ".join(child.cmdline())):
-                    return child
-            except psutil.NoSuchProcess:
-                continue
-        return None
+        return next(matching(pattern, self.launcher.children(recursive=True)), None)
 
     def wait_for_updates(self, more: int = 1) -> None:
         """Wait until the learner has made so many more updates."""

@@ -11,21 +11,14 @@ import pytest
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.learner.config import MODEL_PROCESS
 from tests.integration.running import Training
-from tests.waiting import alive
+from tests.waiting import alive, matching
 
 pytestmark = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core: the update has one process")
 
 
 def halves(training: Training) -> list[psutil.Process]:
     """The processes of the model's half."""
-    metrics = []
-    for process in training.launcher.children(recursive=True):
-        try:
-            if MODEL_PROCESS in " ".join(process.cmdline()):
-                metrics.append(process)
-        except psutil.NoSuchProcess:
-            continue
-    return metrics
+    return list(matching(MODEL_PROCESS, training.launcher.children(recursive=True)))
 
 
 @pytest.mark.long  # tests/learner/test_pipelined_update.py has what a half does whose other one ends

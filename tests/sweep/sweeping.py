@@ -1,6 +1,7 @@
 """A real ``rmc sweep`` in a process of its own, of runs that are as short as can be."""
 
 import json
+import re
 import signal
 import time
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from typing import Any
 import psutil
 
 from tests.integration.running import Command, records_of
+from tests.waiting import matching
 
 PENDULUM = "InvertedPendulum-v5"
 TINY = {"preset": "debug", "launcher": "lockstep", "total_steps": 700, "warmup_steps": 200, "checkpoint_steps": 200}
@@ -44,14 +46,8 @@ class Sweeping(Command):
 
     def run_process(self, name: str) -> psutil.Process | None:
         """The process of one of its runs."""
-        for child in psutil.Process(self.process.pid).children(recursive=True):
-            try:
-                words = child.cmdline()
-            except psutil.Error:
-                continue
-            if "train" in words and str(self.folder / name) in words:
-                return child
-        return None
+        children = psutil.Process(self.process.pid).children(recursive=True)
+        return next(matching(rf" train .*{re.escape(str(self.folder / name))}( |$)", children), None)
 
     def wait_for_updates(self, *names: str) -> None:
         """Wait until these runs train."""
