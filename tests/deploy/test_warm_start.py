@@ -23,6 +23,7 @@ from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.starts import format_starts
 from tests.deploy.test_config import with_value
+from tests.integration.test_lockstep import trained
 
 ENV = EnvConfig("InvertedPendulum-v5")
 CONFIG = dataclasses.replace(
@@ -38,10 +39,7 @@ OTHER = dataclasses.replace(CONFIG, seed=7)
 def source(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """A run that has learnt something, in lockstep."""
     folder = open_run(CONFIG, tmp_path_factory.mktemp("source") / "run", "fail")
-    run = Lockstep(CONFIG, folder.path)
-    while not run.learner.finished:
-        run.step()
-    run.close()
+    trained(CONFIG, folder.path)
     folder.unlock()
     return folder
 

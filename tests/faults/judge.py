@@ -5,8 +5,7 @@ so a gap shows what was lost, and an origin (actor, epoch, seq, k) that stands t
 """
 
 import dataclasses
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -34,18 +33,13 @@ class Judgement:
         return not (self.lost or self.duplicated)
 
 
-@contextmanager
-def opened(folder: Path) -> Iterator[ReplayStore]:
+def opened(folder: Path) -> closing[ReplayStore]:
     """The ring of a run that nobody trains. Raises ConfigError."""
     run = RunFolder(folder)
     config = run.config()
-    store = open_store(
-        run.path / "replay", config.window_spec(), config.replay.capacity, config.replay.priority_exponent
+    return closing(
+        open_store(run.path / "replay", config.window_spec(), config.replay.capacity, config.replay.priority_exponent)
     )
-    try:
-        yield store
-    finally:
-        store.close()
 
 
 def judge(folder: Path, acks: Acks) -> Judgement:

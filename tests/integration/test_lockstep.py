@@ -31,7 +31,7 @@ CONFIG = dataclasses.replace(
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def run(config: RunConfig, folder: Path, stop_after_checkpoints: int = 0) -> Lockstep:
+def trained(config: RunConfig, folder: Path, stop_after_checkpoints: int = 0) -> Lockstep:
     lockstep = Lockstep(config, folder)
     checkpoints, seen = 0, lockstep.learner.last_checkpoint
     while not lockstep.learner.finished:
@@ -61,23 +61,23 @@ def assert_same(a: Lockstep, b: Lockstep) -> None:
 @pytest.fixture(scope="module")
 def straight(tmp_path_factory) -> Lockstep:
     torch.set_num_threads(1)
-    return run(CONFIG, tmp_path_factory.mktemp("straight"))
+    return trained(CONFIG, tmp_path_factory.mktemp("straight"))
 
 
 def test_another_seed_other_bits(straight, tmp_path):
-    other = run(dataclasses.replace(CONFIG, seed=6), tmp_path)
+    other = trained(dataclasses.replace(CONFIG, seed=6), tmp_path)
     assert not torch.equal(bits(straight)["policy.net.0.weight"], bits(other)["policy.net.0.weight"])
 
 
 def test_same_seed_same_bits_also_after_a_stop(straight, tmp_path):
     assert straight.learner.updates > 100
-    stopped = run(CONFIG, tmp_path, stop_after_checkpoints=2)
+    stopped = trained(CONFIG, tmp_path, stop_after_checkpoints=2)
     assert 0 < stopped.learner.updates < straight.learner.updates
-    assert_same(straight, run(CONFIG, tmp_path))
+    assert_same(straight, trained(CONFIG, tmp_path))
 
 
 def test_counters_stay_where_the_ring_is_lost(tmp_path: Path) -> None:
-    stopped = run(CONFIG, tmp_path, stop_after_checkpoints=1)
+    stopped = trained(CONFIG, tmp_path, stop_after_checkpoints=1)
     shutil.rmtree(tmp_path / "replay")
     again = Lockstep(CONFIG, tmp_path)
     counts = [one.server.stats()["env_steps"] for one in (stopped, again)]
@@ -89,9 +89,9 @@ def test_priorities_of_actors_are_the_same_across_a_stop_too(tmp_path):
     """They take random actions, whose generator begins anew with each epoch."""
     agent = dataclasses.replace(CONFIG.agent, initial_priority="actor")
     config = dataclasses.replace(CONFIG, agent=agent, total_steps=1_000)
-    straight = run(config, tmp_path / "straight")
-    run(config, tmp_path / "stopped", stop_after_checkpoints=1)
-    assert_same(straight, run(config, tmp_path / "stopped"))
+    straight = trained(config, tmp_path / "straight")
+    trained(config, tmp_path / "stopped", stop_after_checkpoints=1)
+    assert_same(straight, trained(config, tmp_path / "stopped"))
 
 
 def test_a_start_that_fails_leaves_no_lock(tmp_path, monkeypatch):
@@ -122,11 +122,11 @@ def test_batches_that_are_cut_give_the_same_bits_across_a_stop(tmp_path, monkeyp
     )
     actor = dataclasses.replace(CONFIG.actor, state_strategy="episode")
     config = dataclasses.replace(CONFIG, env=EnvConfig("InvertedPendulum-v5", time_limit=100), actor=actor)
-    straight = run(config, tmp_path / "straight")
-    stopped = run(config, tmp_path / "stopped", stop_after_checkpoints=1)
+    straight = trained(config, tmp_path / "straight")
+    stopped = trained(config, tmp_path / "stopped", stop_after_checkpoints=1)
     assert 1 < stopped.learner.updates < straight.learner.updates
     assert min(lengths) < config.window_spec().steps == max(lengths)
-    assert_same(straight, run(config, tmp_path / "stopped"))
+    assert_same(straight, trained(config, tmp_path / "stopped"))
 
 
 def test_an_evaluation_is_played_step_by_step_between_which_a_signal_is_heard(tmp_path):

@@ -20,8 +20,8 @@ from rmc.deploy.local.lockstep import Lockstep
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.opening import open_run
 from tests.deploy.test_warm_start import begin, state
-from tests.integration.test_lockstep import assert_same, run
-from tests.integration.test_variants import STEPS, config, train
+from tests.integration.test_lockstep import assert_same, trained
+from tests.integration.test_variants import STEPS, config
 
 ENV = "tests.partial_env:Partial-v0"
 AGENT = {"normalize_observations": True, "impute_missing": True, "missing_flag": True, "privileged_critic": True}
@@ -52,7 +52,7 @@ def rows_of(lockstep: Lockstep) -> tuple[Rows, np.ndarray]:
     ],
 )
 def test_it_trains_and_its_windows_say_what_was_seen(options: dict[str, Any], tmp_path: Path) -> None:
-    lockstep = train(partial(**options), tmp_path)
+    lockstep = trained(partial(**options), tmp_path)
     assert all(value.isfinite().all() for value in lockstep.learner.agent.state_dict().values())
     rows, real = rows_of(lockstep)
     missing, observation, privileged = (rows[name][real] for name in ("missing", "observation", "privileged"))
@@ -73,16 +73,16 @@ def test_a_run_that_goes_on_has_the_same_bits(tmp_path: Path) -> None:
     longer = dataclasses.replace(
         partial(scheme=3), learner=dataclasses.replace(partial().learner, checkpoint_steps=200)
     )
-    straight = run(longer, tmp_path / "straight")
-    run(longer, tmp_path / "stopped", stop_after_checkpoints=1)
-    assert_same(straight, run(longer, tmp_path / "stopped"))
+    straight = trained(longer, tmp_path / "straight")
+    trained(longer, tmp_path / "stopped", stop_after_checkpoints=1)
+    assert_same(straight, trained(longer, tmp_path / "stopped"))
 
 
 def test_its_policy_knows_what_is_missing_and_nothing_of_what_critics_see(tmp_path: Path) -> None:
     """Its file, an evaluation, a loop of one's own and ONNX; sent to actors are the networks that act alone."""
     settings = partial(checkpoint_steps=200)
     folder = open_run(settings, tmp_path / "run", "fail")
-    lockstep = train(settings, folder.path)
+    lockstep = trained(settings, folder.path)
     folder.unlock()
     sent = lockstep.bus.weights()
     assert sent is not None
@@ -135,7 +135,7 @@ def test_a_run_whose_critics_see_more_begins_with_another(tmp_path: Path) -> Non
     """All of it, its normaliser included; or, without what critics see, what remembers and predicts."""
     settings = partial(checkpoint_steps=200)
     source = open_run(settings, tmp_path / "source", "fail")
-    train(settings, source.path)
+    trained(settings, source.path)
     source.unlock()
     theirs, other = state(source)["agent"], dataclasses.replace(settings, seed=9)
     for parts, learnt in (("all", True), ("memory+world-model", False)):

@@ -9,10 +9,10 @@ import pytest
 
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.local.lockstep import Lockstep
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.validation import validate
+from tests.integration.test_lockstep import trained
 
 STEPS, WARMUP = 500, 200
 
@@ -29,14 +29,6 @@ def config(env: str = "InvertedPendulum-v5", **options: Any) -> RunConfig:
     assert not options, f"no such options: {options}"
     validate(run)
     return run
-
-
-def train(run: RunConfig, folder: Path) -> Lockstep:
-    lockstep = Lockstep(run, folder)
-    while not lockstep.learner.finished:
-        lockstep.step()
-    lockstep.close()
-    return lockstep
 
 
 VARIANTS: list[dict[str, Any]] = [
@@ -78,7 +70,7 @@ VARIANTS: list[dict[str, Any]] = [
 @pytest.mark.parametrize("options", VARIANTS, ids=lambda options: "-".join(f"{k}={v}" for k, v in options.items()))
 def test_a_variant_trains(options: dict[str, Any], tmp_path: Path) -> None:
     run = config(**options)
-    lockstep = train(run, tmp_path)
+    lockstep = trained(run, tmp_path)
     stats, learner = lockstep.server.stats(), lockstep.learner
     assert learner.updates > 0
     assert stats["env_steps"] == STEPS
@@ -90,14 +82,11 @@ def test_a_variant_trains(options: dict[str, Any], tmp_path: Path) -> None:
 
 
 def test_actors_rate_their_windows_once_there_is_something_to_rate_them_by(tmp_path: Path) -> None:
-    server = Lockstep(config(initial_priority="actor", capacity=1_000), tmp_path)
-    while not server.learner.finished:
-        server.step()
-    rows = server.server._store.ring.rows[: server.server.stats()["windows"]]
+    server = trained(config(initial_priority="actor", capacity=1_000), tmp_path).server
+    rows = server._store.ring.rows[: server.stats()["windows"]]
     by_actor, random = (
         rows["initial_priority"][mask] for mask in (rows["weights_update"] > 0, rows["weights_update"] == 0)
     )
-    server.close()
     assert len(by_actor) > 10
     assert (by_actor > 0).all()
     assert len(random) > 10
@@ -110,7 +99,7 @@ def test_actors_rate_their_windows_once_there_is_something_to_rate_them_by(tmp_p
 )
 def test_staleness_is_measured(strategy: str, stages: set[str], tmp_path: Path) -> None:
     run = config(env="Reacher-v5", state_strategy=strategy, batch_size=16, replay_ratio=64.0)
-    metrics = train(run, tmp_path).learner.metrics()
+    metrics = trained(run, tmp_path).learner.metrics()
     stale = {name: value for name, value in metrics.items() if name.startswith("stale_")}
     assert set(stale) == {f"stale_{what}_{stage}" for what in ("state", "q_first", "q_last") for stage in stages}
     assert all(0.0 <= value < 10.0 for value in stale.values())

@@ -4,8 +4,7 @@ import random
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +26,8 @@ CHUNK = 16
 KILLS = 10  # more under load: tests/faults/kill_replay.py
 
 
-@contextmanager
-def opened(folder: Path, capacity: int = CAPACITY) -> Iterator[ReplayStore]:
-    store = open_store(folder, SPEC, capacity, 0.6)
-    try:
-        yield store
-    finally:
-        store.close()
+def opened(folder: Path, capacity: int = CAPACITY) -> closing[ReplayStore]:
+    return closing(open_store(folder, SPEC, capacity, 0.6))
 
 
 def start(url: str, run: str, folder: Path) -> subprocess.Popen[bytes]:
