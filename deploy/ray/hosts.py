@@ -89,8 +89,9 @@ class Hosts:
         )  # fmt: skip
         environment = {URL_VARIABLE: f"file:{{scratch}}/redis-url-{name}", PATIENCE_VARIABLE: str(PATIENCE_SECONDS)}
         environment |= users_path()
+        run = self._folder
         return options.remote(
-            Task(self._folder.name, place.command, environment, self._secrets(name), working_folder())
+            Task(run.name, run.scratch_name(), place.command, environment, self._secrets(name), working_folder())
         )
 
     def _secrets(self, name: str) -> dict[str, bytes]:

@@ -39,6 +39,8 @@ class Task:
     """
 
     run: str
+    scratch: str
+    """By which its folder on the node is called."""
     command: RoleCommand
     environment: dict[str, str]
     secrets: dict[str, bytes] = field(repr=False)
@@ -66,12 +68,12 @@ class RoleReport:
     """What keeps it from bringing to the head what belongs there; empty where all is there."""
 
 
-def scratch_folder(run: str) -> Path:
+def scratch_folder(name: str) -> Path:
     """Where this node keeps what a run's roles need at hand. Raises RuntimeError where it is somebody else's.
 
     Short, for the sockets in it; the run's folder itself lies with its launcher, on the head.
     """
-    return private_folder(Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{run[-8:]}")
+    return private_folder(Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{name}")
 
 
 def is_full(error: str) -> bool:
@@ -91,7 +93,7 @@ class RoleActor:
         self._task, self._incarnation = task, uuid.uuid4().hex
         self._replaced = self._run_ends = False
         self.trouble = ""
-        self.scratch = scratch_folder(task.run)
+        self.scratch = scratch_folder(task.scratch)
         for name, content in task.secrets.items():
             _write_private(self.scratch / name, self._filled(content.decode()).encode())
         self._status: int | None = None

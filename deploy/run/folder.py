@@ -57,6 +57,17 @@ class RunFolder:
         """The run's name in Redis: the folder's, and what tells it from others of that name."""
         return f"{self.path.name}-{hashlib.sha256(self.secret()).hexdigest()[:8]}"
 
+    def scratch_name(self) -> str:
+        """By which nodes of a cluster know what they keep of the run: the same after a rename, another for a copy."""
+        note, own = self.path / "scratch", str(self.path.stat().st_ino)
+        with suppress(OSError, ValueError):  # there is none, or it is damaged
+            folder, name = note.read_text().split()
+            if folder == own:
+                return name
+        name = secrets.token_hex(4) if note.exists() else self.name[-8:]  # which runs of older versions have
+        write_whole(note, f"{own} {name}\n".encode())
+        return name
+
     def rings(self) -> list[Path]:
         """The folders of its replay servers' rings, as far as they are there."""
         return [path for path in self.path.glob("replay*") if RING.fullmatch(path.name)]

@@ -41,6 +41,20 @@ def test_a_secret_is_made_once(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["secret"]
 
 
+def test_nodes_know_a_run_that_is_renamed_but_take_a_copy_for_another(tmp_path: Path) -> None:
+    first = RunFolder(tmp_path / "run")
+    first.path.mkdir()
+    name = first.scratch_name()
+    assert name == first.name[-8:]
+    first.path.rename(tmp_path / "renamed")
+    assert RunFolder(tmp_path / "renamed").scratch_name() == name
+    shutil.copytree(tmp_path / "renamed", tmp_path / "copy")
+    copies = {RunFolder(tmp_path / "copy").scratch_name() for _ in range(2)}
+    assert len(copies | {name}) == 2
+    (tmp_path / "copy" / "scratch").write_text("damaged")
+    assert RunFolder(tmp_path / "copy").scratch_name() not in copies | {name}
+
+
 def test_all_who_make_it_at_once_have_the_same(tmp_path: Path) -> None:
     with ThreadPoolExecutor(8) as pool:
         for number in range(50):

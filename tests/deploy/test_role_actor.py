@@ -63,7 +63,7 @@ def host(program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
         return ended
 
     monkeypatch.setattr(supervisor.RoleProcess, "reap", slow_for_watchers)
-    actor = RoleActor(Task("test-run", RoleCommand("replay", ("replay",)), {}, {}, str(tmp_path)))
+    actor = RoleActor(Task("test-run", "test-run", RoleCommand("replay", ("replay",)), {}, {}, str(tmp_path)))
     yield actor
     actor.close()
     actor.clear()
@@ -119,7 +119,7 @@ def test_a_learner_that_saves_for_long_is_not_killed(
     log = tmp_path / "said"
     program.write_text(ENDS.replace("exit 0", f"sleep 1.5; echo saved >> {log}; exit 0"))
     monkeypatch.setattr(role_actor, "STOP_SECONDS", 0.5)
-    host = Learner(Task("test-run", RoleCommand("learner", ("learner",)), {}, {}, str(tmp_path)))
+    host = Learner(Task("test-run", "test-run", RoleCommand("learner", ("learner",)), {}, {}, str(tmp_path)))
     time.sleep(0.5)
     host.close()
     host.clear()
