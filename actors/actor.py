@@ -255,7 +255,8 @@ class Actor:
         action, state = self._runner.act(*now, noise)
         if self._version.update == UNTRAINED:
             action = self._rng.uniform(-1.0, 1.0, action.shape).astype(np.float32)
-            state[:, self._hidden :] = 0.0  # no frame was seen, as no statistics are there yet to normalise it by
+        if not self._runner.knows_statistics:
+            state[:, self._hidden :] = 0.0  # no frame was seen, as nothing normalises it yet
         given, faults = self._envs.step(action)
         for i in faults:
             self._builder.end_before(i)

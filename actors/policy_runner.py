@@ -111,6 +111,7 @@ class PolicyRunner:
         self._from_embedding = _Linear(embedding, 3 * config.hidden, envs)
         self._from_hidden = _Linear(config.hidden, 3 * config.hidden, envs)
         self._mean, self._std = torch.zeros(obs_dim, **PLAIN), torch.ones(obs_dim, **PLAIN)
+        self.knows_statistics = False  # whether what was loaded normalises observations by some
         self._gru = _GRU(self._from_embedding, self._from_hidden, envs, config.hidden)
         self._head = _head(config.feature_size(self._skip), config.heads, 2 * action_dim, envs)
         input_dim = config.hidden + obs_dim + action_dim
@@ -135,6 +136,7 @@ class PolicyRunner:
             raise MessageError("weights", f"not a policy of this run (it also has {', '.join(unread)})")
         for copy in copies:  # only now, so that what is refused changes nothing
             copy()
+        self.knows_statistics = bool(self._mean.any()) or bool((self._std != 1.0).any())
 
     def _copies(self, weights: dict[str, Tensor]) -> list[Callable[[], object]]:
         """What fills every part, once called; takes what it uses out of ``weights``."""

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import redis
+import torch
 from safetensors.torch import save
 
 from rmc.actors.actor import Actor, environment_seed
@@ -587,8 +588,9 @@ def test_a_reward_that_the_scale_makes_infinite_breaks_the_episode() -> None:
     actor.close()
 
 
-def test_a_frame_that_no_statistics_normalise_is_stored_as_none_seen() -> None:
-    """The learner, which knows them by then, would take raw numbers for normalised ones."""
+@pytest.mark.parametrize("known", [False, True])
+def test_a_frame_that_no_statistics_normalise_is_stored_as_none_seen(known: bool) -> None:
+    """The learner, which knows them by then, would take raw numbers for normalised ones. A warm start brings them."""
     agent = dataclasses.replace(AGENT, normalize_observations=True, impute_missing=True)
     spec = WindowSpec(OBS_DIM, ACTION_DIM, agent.state_size(OBS_DIM), burn_in=4, train=6)
     bus: Bus = MemoryBus()
@@ -596,12 +598,15 @@ def test_a_frame_that_no_statistics_normalise_is_stored_as_none_seen() -> None:
     actor = Actor(0, 1, lambda: make_env(COUNTING), spec, agent, CONFIG, bus, clock)
     reader = Reader(bus)
     for update in (0, 20):
-        bus.publish_weights(Version(1, update), save(Agent(OBS_DIM, ACTION_DIM, agent).policy_weights()))
+        made = Agent(OBS_DIM, ACTION_DIM, agent)
+        if known or update:
+            made.freeze_statistics(torch.tensor([10.0]), torch.full((OBS_DIM,), 5.0), torch.full((OBS_DIM,), 9.0))
+        bus.publish_weights(Version(1, update), save(made.policy_weights()))
         play(bus, actor, reader, 500 if update else 300, final=bool(update))
     rows = join_rows([decode_rows(entry.payload, spec) for entry in reader.entries], spec)
     later = rows["state"].any(1)  # at an episode's start nothing is remembered
     seen, trained = rows["state"][:, agent.hidden :].any(1), rows["weights_update"] > 0
-    assert (seen[later & trained].mean(), seen[~trained].any()) == (1.0, False)
+    assert (seen[later & trained].mean(), seen[later & ~trained].mean()) == (1.0, float(known))
     actor.close()
 
 
