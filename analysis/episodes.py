@@ -4,7 +4,6 @@ Shapes: T steps of an episode, O observation, A action, F numbers of the environ
 is missing, P privileged numbers, S state.
 """
 
-import copy
 import dataclasses
 from dataclasses import dataclass
 from math import isfinite
@@ -186,7 +185,8 @@ class Player:
 
 def _kept(info: dict[str, Any]) -> dict[str, Any]:
     """``info`` as it is at this step: an environment may write its probe into the same dict again."""
-    return {**info, "probe": copy.deepcopy(info.get("probe", {}))}
+    probe = info.get("probe", {})
+    return {**info, "probe": dict(probe) if isinstance(probe, dict) else probe}
 
 
 def _probes(values: list[Any], env_id: str) -> dict[str, NDArray[np.float64]]:

@@ -1,11 +1,7 @@
 """Waiting for what another process or thread is about to do."""
 
-import re
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
-
-import psutil
+from collections.abc import Callable
 
 
 def wait_until(
@@ -16,16 +12,3 @@ def wait_until(
     while not condition():
         assert time.monotonic() < deadline, said()
         time.sleep(pause)
-
-
-def matching(pattern: str, among: Iterable[psutil.Process]) -> Iterator[psutil.Process]:
-    """Those whose command line the regular expression is found in; one that ends meanwhile is none."""
-    for process in among:
-        with suppress(psutil.Error):
-            if re.search(pattern, " ".join(process.cmdline())):
-                yield process
-
-
-def alive(processes: list[psutil.Process]) -> list[psutil.Process]:
-    """Those that still run."""
-    return [process for process in processes if process.is_running() and process.status() != psutil.STATUS_ZOMBIE]

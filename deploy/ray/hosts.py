@@ -41,6 +41,7 @@ class Hosts:
         self._groups: dict[str, Any] = {}
         self._bundles: dict[str, int] = {}  # of the replay servers' group
         self._lost: dict[str, list[float]] = {}  # when hosts died for good, by role
+        self._full: dict[str, float] = {}  # when one last had no room on its node's disk
 
     def start(self, config: RunConfig) -> None:
         """Place every role, or find again those that an earlier launcher of the run has placed."""
@@ -114,12 +115,18 @@ class Hosts:
                 self._ring_locations.note(one.name, one.node)
 
     def _forget_dead(self, one: RoleHandle) -> None:
-        """Of a host that Ray does not start again: the next ``place`` makes another."""
-        log.warning("the host of %s is gone: %s", one.name, one.dead)
+        """Of a host that Ray does not start again: the next ``place`` makes another.
+
+        One without room on its node's disk is tried until it has some, and said once.
+        """
         del self._handles[one.name]
-        if is_full(one.dead):  # it begins once there is room, or elsewhere
-            return
         now = time.monotonic()
+        said = self._full.get(one.name, float("-inf")) > now - LOST_SECONDS
+        if not (is_full(one.dead) and said):
+            log.warning("the host of %s is gone: %s", one.name, one.dead)
+        if is_full(one.dead):
+            self._full[one.name] = now
+            return
         lost = [when for when in self._lost.get(one.name, []) if now - when < LOST_SECONDS]
         self._lost[one.name] = [*lost, now]
         if len(lost) + 1 >= QUICK_DEATHS:

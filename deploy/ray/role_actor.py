@@ -77,7 +77,7 @@ def scratch_folder(name: str) -> Path:
 
 
 def is_full(error: str) -> bool:
-    """Whether it is a disk without room, by an error's text: Ray keeps no more of one on another node."""
+    """Whether it is a disk without room, by an error's text, which is all that Ray brings from another node."""
     return any(words in error for words in FULL)
 
 

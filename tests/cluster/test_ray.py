@@ -20,7 +20,8 @@ from tests.cluster import machines
 from tests.command import rmc
 from tests.deploy.test_tls import lacks_tls
 from tests.integration.running import ENVIRONMENT, Training, free_port
-from tests.waiting import matching, wait_until
+from tests.processes import matching
+from tests.waiting import wait_until
 
 ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
 

@@ -74,7 +74,9 @@ def hosts(tmp_path: Path) -> Hosts:
 
 
 @pytest.mark.parametrize(("why", "ends"), [("OSError: [Errno 28] No space left on device", False), ("killed", True)])
-def test_a_host_on_a_full_disk_is_tried_again(hosts: Hosts, why: str, ends: bool) -> None:
+def test_a_host_on_a_full_disk_is_tried_again(
+    hosts: Hosts, why: str, ends: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     def lose() -> None:
         one: Any = Handle(name="actor-0", dead=why)
         hosts._handles["actor-0"] = one
@@ -88,6 +90,7 @@ def test_a_host_on_a_full_disk_is_tried_again(hosts: Hosts, why: str, ends: bool
     else:
         lose()
     assert not hosts._handles
+    assert len(caplog.messages) == (ray_hosts.QUICK_DEATHS if ends else 1)
 
 
 def test_a_launcher_may_lose_its_working_folder(hosts: Hosts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

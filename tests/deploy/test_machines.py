@@ -78,17 +78,21 @@ def test_a_login_shell_finds_the_programs(config: dict[str, Any], tmp_path: Path
     assert said.count("rmc-env") == 1
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only root starts a process of another user's")
+@pytest.mark.skipif(os.getuid() != 0, reason="only root becomes another user")
 def test_what_another_user_runs_is_not_counted() -> None:
-    count = machines.LEFT.replace("seq 20", "seq 1")
-    raylet = 'exec -a "/x/raylet/raylet" sleep 30'
-    with subprocess.Popen(["setpriv", "--reuid", "65534", "--clear-groups", "bash", "-c", raylet]) as other:
-        found = subprocess.run(["bash", "-c", count], capture_output=True, text=True).stdout.split()
-        other.kill()
-    with subprocess.Popen(["bash", "-c", raylet]) as own:
-        wait_until(lambda: "raylet" in " ".join(psutil.Process(own.pid).cmdline()), 10)
-        found += subprocess.run(["bash", "-c", count], capture_output=True, text=True).stdout.split()
-        own.kill()
+    """The one who counts is nobody, who has no Ray beside this test."""
+    nobody, raylet = (
+        ["setpriv", "--reuid", "65534", "--clear-groups"],
+        ["bash", "-c", "exec -a /x/raylet/raylet sleep 60"],
+    )
+    count = [*nobody, "bash", "-c", machines.LEFT.replace("seq 20", "seq 1")]
+    found = []
+    for words in (raylet, [*nobody, *raylet]):
+        with subprocess.Popen(words) as process:
+            running = psutil.Process(process.pid)
+            wait_until(lambda running=running: running.cmdline() == ["/x/raylet/raylet", "60"], 10)
+            found += subprocess.run(count, capture_output=True, text=True).stdout.split()
+            process.kill()
     assert found == ["0", "1"]
 
 

@@ -12,7 +12,8 @@ import redis
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.redis.server import MAX_VALUE, RedisServer
-from tests.waiting import alive, wait_until
+from tests.processes import alive
+from tests.waiting import wait_until
 
 HOLDER = """
 import sys, time

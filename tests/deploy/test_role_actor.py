@@ -145,3 +145,13 @@ def test_a_head_without_room_is_waited_for_unless_the_run_is_ended(monkeypatch: 
     learner._run_ends = True
     learner.flush_artifacts()
     assert len(tries) < 4
+
+
+def test_a_secret_without_room_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(role_actor.os, "replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        role_actor._write_private(tmp_path / "secret", b"x")
+    assert list(tmp_path.iterdir()) == []

@@ -27,7 +27,8 @@ from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.tracking import Tracking, keep_tracking
 from tests import wandb_file
-from tests.waiting import alive, wait_until
+from tests.processes import alive
+from tests.waiting import wait_until
 
 CLOSED = "http://127.0.0.1:9"  # no service of anyone's
 RESULT = {"state": "finished", "env_steps": 1500, "eval_return_mean": 11.5, "env": "InvertedPendulum-v5"}

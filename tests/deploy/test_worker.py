@@ -16,7 +16,8 @@ import psutil
 import pytest
 
 from rmc import deploy
-from tests.waiting import matching, wait_until
+from tests.processes import matching
+from tests.waiting import wait_until
 
 SCRIPT = Path(deploy.__file__).parent / "cluster" / "worker.sh"
 RAY = """#!/bin/bash

@@ -26,7 +26,7 @@ from tests.faults.row import Row
 from tests.faults.schedule import EACH_ACTOR, schedule
 from tests.faults.soak import RATIO_TOLERANCE, files_growth, memory_growth
 from tests.faults.witness import went_back
-from tests.waiting import alive
+from tests.processes import alive
 
 GAP_SECONDS = 3.5  # between the beginnings of faults, on average
 CALM_SHARE = 0.1  # steps without faults at the end, for one before

@@ -19,7 +19,7 @@ from rmc.deploy.local.role_environment import URL_VARIABLE
 from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.row import Row, at_length
 from tests.faults.witness import went_back
-from tests.waiting import alive
+from tests.processes import alive
 
 ENDS_S = 10.0
 PATIENT = ("--env-timeout", "1000")  # an actor that stood still does not take its environment for hung

@@ -21,7 +21,7 @@ from rmc.deploy.run.folder import RunFolder
 from tests.faults.judge import Acks, Judgement, judge
 from tests.faults.witness import Witness
 from tests.integration.running import START_SECONDS, Training
-from tests.waiting import matching
+from tests.processes import matching
 
 ACTORS = 2
 ENDLESS = ("--total-steps", "100000000", "--replay-ratio", "4", "--actors", str(ACTORS), "--checkpoint-steps", "20000")

@@ -15,7 +15,8 @@ from typing import Any, Self
 import psutil
 
 from tests.command import COMMAND
-from tests.waiting import matching, wait_until
+from tests.processes import matching
+from tests.waiting import wait_until
 
 START_SECONDS = 120.0  # five processes import torch on two cores that other tests may use
 SMALL = (

@@ -10,7 +10,7 @@ from rmc.deploy.run.folder import RunFolder
 from tests import wandb_file
 from tests.command import COMMAND, rmc
 from tests.integration.running import Training
-from tests.waiting import alive
+from tests.processes import alive
 
 
 @pytest.mark.long

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.integration.running import Training
-from tests.waiting import alive
+from tests.processes import alive
 
 ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
 

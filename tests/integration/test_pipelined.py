@@ -11,7 +11,7 @@ import pytest
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.learner.config import MODEL_PROCESS
 from tests.integration.running import Training
-from tests.waiting import alive, matching
+from tests.processes import alive, matching
 
 pytestmark = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core: the update has one process")
 

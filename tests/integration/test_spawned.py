@@ -17,7 +17,7 @@ from rmc.deploy.redis.socket_folder import sweep
 from rmc.deploy.run.state import STOPPED
 from tests.integration.running import Training
 from tests.integration.spawning_env import SPAWNED
-from tests.waiting import alive
+from tests.processes import alive
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere, those of its process group do")
 ENDLESS = ("--total-steps", "100000000", "--env-timeout", "3")

@@ -13,7 +13,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from tests.integration.running import Training
-from tests.waiting import alive
+from tests.processes import alive
 
 
 @pytest.mark.long

@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 
 from tests.integration.running import Command, records_of
-from tests.waiting import matching
+from tests.processes import matching
 
 PENDULUM = "InvertedPendulum-v5"
 TINY = {"preset": "debug", "launcher": "lockstep", "total_steps": 700, "warmup_steps": 200, "checkpoint_steps": 200}

@@ -28,8 +28,9 @@ from rmc.sweep.index import Index
 from rmc.sweep.job import Job
 from rmc.sweep.pool import drop_replay
 from rmc.sweep.table import result_table
+from tests.processes import alive
 from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
-from tests.waiting import alive, wait_until
+from tests.waiting import wait_until
 
 SEEDS = (1, 2)
 OTHERS = ("seed=1", "seed=2")
