@@ -1,6 +1,7 @@
 """What the commands ``rmc train``, ``rmc resume`` and ``rmc evaluate`` do, as functions for scripts and notebooks."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -20,6 +21,7 @@ from rmc.common.env.process_state import torch_as_imported
 from rmc.common.errors import ConfigError
 from rmc.common.process import watchdog
 from rmc.common.user_path import user_path
+from rmc.deploy.monitor.recorded import Callback
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig, checked
 from rmc.deploy.run.folder import RunFolder
@@ -47,12 +49,16 @@ def train(
     video_every: int | None = None,
     metrics_port: int | None = None,
     metrics_host: str = "127.0.0.1",
+    callback: Callback | None = None,
 ) -> dict[str, Any]:
     """Train a run to its ``total_steps``, or continue the one in ``run_dir``; its ``result.json`` and ``run_dir``.
 
     A new run begins with the networks and the normaliser of the run or ``RUN:CHECKPOINT`` in ``init_from``, or with
     those of ``init_parts``. Progress goes to standard output. Call it from the main thread: Ctrl-C ends the run
     cleanly. With the launcher ``local``, the roles are processes of their own, which import the environment by its id.
+
+    ``callback`` is called with each record of metrics.jsonl, in this thread. To end the run early, raise an error in
+    it: once the run is saved, ``train`` raises it.
 
     Raises ConfigError for options that cannot work, before anything starts; RoleDied where a role keeps dying;
     KeyboardInterrupt where the run was stopped, which ``resume`` continues.
@@ -77,7 +83,7 @@ def train(
         metrics_port=metrics_port,
         metrics_host=metrics_host,
     )
-    return _train(config, options)
+    return _train(config, options, callback)
 
 
 def resume(
@@ -91,6 +97,7 @@ def resume(
     device: str | None = None,
     redis_url: str | None = None,
     metrics_port: int | None = None,
+    callback: Callback | None = None,
 ) -> dict[str, Any]:
     """Continue the run in ``run_dir``; as ``train`` gives it. What is None stays as it was at the last start.
 
@@ -104,21 +111,43 @@ def resume(
         settings["replay"] = replace(config.replay, replay_ratio=replay_ratio)
     if learning_rate is not None:
         settings["update"] = replace(config.update, learning_rate=learning_rate)
-    return _train(replace(config, **_not_none(settings)), replace(options, **_not_none(how)))
+    return _train(replace(config, **_not_none(settings)), replace(options, **_not_none(how)), callback)
 
 
 def _not_none(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def _train(config: RunConfig, options: LaunchOptions) -> dict[str, Any]:
+class _Callback:
+    """The caller's. An error that it raises ends the run as Ctrl-C does, and is kept."""
+
+    def __init__(self, function: Callback) -> None:
+        self._function = function
+        self.error: BaseException | None = None
+
+    def __call__(self, record: dict[str, Any]) -> None:
+        if self.error is not None:
+            return
+        try:
+            self._function(dict(record))
+        except BaseException as error:  # also one that would end this process
+            self.error = error
+            signal.raise_signal(signal.SIGINT)
+
+
+def _train(config: RunConfig, options: LaunchOptions, callback: Callback | None) -> dict[str, Any]:
     config = checked(config)
     _check_call(options)
+    if callback is not None and not callable(callback):
+        raise ConfigError("callback", callback, "take a function of one record")
+    hears = None if callback is None else _Callback(callback)
     watchdog.warn()
     if options.launcher != "lockstep":
         _check_importable(config.env)
     with torch_as_imported():
-        folder, status = training.train(config, options, terminal())
+        folder, status = training.train(config, options, terminal(), hears)
+    if hears is not None and hears.error is not None:
+        raise hears.error
     if status == STOPPED:
         raise KeyboardInterrupt
     result = folder.result()

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError
-from rmc.deploy.monitor.recorded import catch_up, empty_status, take_start
+from rmc.deploy.monitor.recorded import Callback, catch_up, empty_status, take_start
 from rmc.deploy.monitor.view import View
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
@@ -24,8 +24,13 @@ AWAY_SECONDS = 30.0  # a launcher on Ray that was killed begins again within tha
 STOP_SECONDS = 60.0
 
 
-def watch(folder: RunFolder, console: Console, gone: Callable[[], bool]) -> int | None:
-    """Show a run until its launcher ends, and give its exit status; None where it is ``gone`` without one."""
+def watch(
+    folder: RunFolder, console: Console, gone: Callable[[], bool], callback: Callback | None = None
+) -> int | None:
+    """Show a run until its launcher ends, and give its exit status; None where it is ``gone`` without one.
+
+    ``callback`` hears each record from now on.
+    """
     config, tail = folder.config(), MetricsTail(folder.metrics)
     status = empty_status(folder, (*config.roles(), "launcher"))
     take_start(status, folder)
@@ -33,10 +38,10 @@ def watch(folder: RunFolder, console: Console, gone: Callable[[], bool]) -> int 
     view = View(status, console)
     try:
         while folder.ended() is None and not gone():
-            catch_up(status, tail)
+            catch_up(status, tail, callback)
             time.sleep(LOOK_SECONDS)
     finally:
-        catch_up(status, tail)
+        catch_up(status, tail, callback)
         view.close(run_state(folder))
     return folder.ended()
 

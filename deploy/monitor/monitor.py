@@ -15,7 +15,7 @@ from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.process.outage import OutageLog
 from rmc.deploy.monitor.main_metrics import evaluation_metrics, main_metrics
 from rmc.deploy.monitor.metrics_log import MetricsLog
-from rmc.deploy.monitor.recorded import empty_status
+from rmc.deploy.monitor.recorded import Callback, empty_status
 from rmc.deploy.monitor.tracker import Tracker
 from rmc.deploy.monitor.view import View
 from rmc.deploy.run.config import RunConfig, flat
@@ -31,7 +31,15 @@ log = logging.getLogger(__name__)
 class Monitor:
     """Reads every role's records and shows them. ``watch`` as often as you like; ``close`` at the end."""
 
-    def __init__(self, folder: RunFolder, config: RunConfig, console: Console, tracker: Tracker | None = None) -> None:
+    def __init__(
+        self,
+        folder: RunFolder,
+        config: RunConfig,
+        console: Console,
+        tracker: Tracker | None = None,
+        callback: Callback | None = None,
+    ) -> None:
+        """``callback`` hears each record until ``close``."""
         self.status = empty_status(folder, config.roles())
         for record in MetricsTail(folder.metrics, recent_bytes=0).take():  # evaluations of earlier starts
             self.status.take_evaluation(record)
@@ -45,7 +53,7 @@ class Monitor:
         self._started, self._wall_before = time.monotonic(), wall_seconds(folder.metrics)
         self._next_record, self._is_away = 0.0, False
         self._metrics_log, self._host = MetricsLog(folder, flat(config)), HostFigures(folder.path)
-        self._folder, self._writable, self._tracker = folder, True, tracker
+        self._folder, self._writable, self._tracker, self._callback = folder, True, tracker, callback
         self._unmarked: dict[int, float] = {}  # returns of checkpoints that may be the best
         self.view, self.outage = View(self.status, console), OutageLog("launcher")
 
@@ -116,6 +124,8 @@ class Monitor:
         main = main_metrics(self.status) if record["role"] == "launcher" else evaluation_metrics(record)
         self._metrics_log.write(record, self.status.env_steps if at is None else at, main)
         self._mark_best(record)
+        if self._callback is not None:
+            self._callback(record)
 
     def _mark_best(self, record: dict[str, Any]) -> None:
         update, score = record.get("eval_update"), record.get("eval_return_mean")
@@ -151,6 +161,7 @@ class Monitor:
 
     def close(self) -> None:
         """Show the last state and close the files."""
+        self._callback = None  # it could end a run that has just ended
         self._record_launcher()
         self.view.close()
         self._metrics_log.close()

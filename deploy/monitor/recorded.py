@@ -1,6 +1,7 @@
 """The state of a run out of its folder: of any version, also a baseline's, whether or not it is trained now."""
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any, TypeGuard
 
@@ -12,6 +13,8 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import RECENT_BYTES, MetricsTail
 from rmc.deploy.run.starts import starts
 from rmc.deploy.run.state import run_state
+
+Callback = Callable[[dict[str, Any]], object]  # hears a record, as a line of metrics.jsonl has it
 
 
 def recorded_status(folder: RunFolder, recent_bytes: int = RECENT_BYTES) -> RunStatus:
@@ -58,10 +61,12 @@ def status_json(folder: RunFolder, status: RunStatus) -> dict[str, Any]:
     return plain
 
 
-def catch_up(status: RunStatus, tail: MetricsTail) -> None:
-    """Take in what is new."""
+def catch_up(status: RunStatus, tail: MetricsTail, callback: Callback | None = None) -> None:
+    """Take in what is new; ``callback`` hears it."""
     for record in tail.take():
         status.take(record)
+        if callback is not None:
+            callback(record)
 
 
 def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus:

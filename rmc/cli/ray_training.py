@@ -13,6 +13,7 @@ from rmc.cli.ending import print_end
 from rmc.cli.signals import signals_caught
 from rmc.common.process.role import StopSignal
 from rmc.deploy.monitor import attach
+from rmc.deploy.monitor.recorded import Callback
 from rmc.deploy.ray import launcher, placement
 from rmc.deploy.redis.socket_folder import place_for_sockets
 from rmc.deploy.run.config import RunConfig
@@ -24,7 +25,9 @@ from rmc.deploy.run.preflight import check_machine, cores
 from rmc.deploy.run.validation import validate, validate_launch
 
 
-def train(config: RunConfig, options: LaunchOptions, console: Console) -> tuple[RunFolder, int]:
+def train(
+    config: RunConfig, options: LaunchOptions, console: Console, callback: Callback | None
+) -> tuple[RunFolder, int]:
     """Hand a run to a launcher on the cluster's head, and watch it; Ctrl-C ends the run, a closed terminal does not.
 
     The run's folder, and its exit status.
@@ -33,10 +36,12 @@ def train(config: RunConfig, options: LaunchOptions, console: Console) -> tuple[
     validate_launch(config, options)
     enough = max(cores(), ceil(placement.reserved_cpus(config)) + config.actors)  # of a cluster of our own
     with launcher.joined(options.ray_address, enough):
-        return _watched(config, options, console)
+        return _watched(config, options, console, callback)
 
 
-def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> tuple[RunFolder, int]:
+def _watched(
+    config: RunConfig, options: LaunchOptions, console: Console, callback: Callback | None
+) -> tuple[RunFolder, int]:
     launcher.check_on_head()
     if options.run_dir is not None and options.if_exists != "new" and (options.run_dir / "secret").exists():
         launcher.check_not_there(RunFolder(options.run_dir))
@@ -54,7 +59,7 @@ def _watched(config: RunConfig, options: LaunchOptions, console: Console) -> tup
     if note := reach_note(config):
         console.print(note, soft_wrap=True)
     with signals_caught(hangup=False) as stop:
-        attach.watch(folder, console, _passes_on(stop, folder))
+        attach.watch(folder, console, _passes_on(stop, folder), callback)
     return folder, print_end(folder, console)
 
 

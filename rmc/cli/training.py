@@ -17,7 +17,7 @@ from rmc.deploy.local import launcher
 from rmc.deploy.local.supervisor import EXIT_CONFIG
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.monitor.output import Output
-from rmc.deploy.monitor.recorded import empty_status
+from rmc.deploy.monitor.recorded import Callback, empty_status
 from rmc.deploy.monitor.tracker import start_tracker
 from rmc.deploy.redis.connect import connect
 from rmc.deploy.redis.socket_folder import place_for_sockets
@@ -32,17 +32,19 @@ from rmc.deploy.run.state import STOPPED
 from rmc.deploy.run.validation import validate, validate_launch
 
 
-def train(config: RunConfig, options: LaunchOptions, console: Console) -> tuple[RunFolder, int]:
+def train(
+    config: RunConfig, options: LaunchOptions, console: Console, callback: Callback | None = None
+) -> tuple[RunFolder, int]:
     """Train to the end, or to a stop signal; the run's folder, which may be a new one, and its exit status.
 
-    Raises ConfigError before anything is started.
+    ``callback`` hears the roles' records. Raises ConfigError before anything is started.
     """
     if options.launcher == "ray":
         from rmc.cli import ray_training  # Ray is an extra, and slow to import
 
-        return ray_training.train(config, options, console)
+        return ray_training.train(config, options, console, callback)
     folder = open_folder(config, options)
-    return folder, conduct(config, folder, options, console)
+    return folder, conduct(config, folder, options, console, callback)
 
 
 def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
@@ -57,19 +59,23 @@ def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
     return open_run(config, options.run_dir, options.if_exists, options)
 
 
-def conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
+def conduct(
+    config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console, callback: Callback | None = None
+) -> int:
     """Be the launcher of a run whose folder is locked, from its first evaluation to its last."""
     Output.log = folder.logs / "launcher.log"
     with signals_interrupt():
         try:
-            return _conduct(config, folder, options, console)
+            return _conduct(config, folder, options, console, callback)
         except Exception as error:  # whoever comes back to a closed terminal finds it there
             if options.launcher != "ray":  # on Ray all that is printed goes there
                 Output.keep(f"{error}\n" if isinstance(error, RmcError) else traceback.format_exc())
             raise
 
 
-def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console) -> int:
+def _conduct(
+    config: RunConfig, folder: RunFolder, options: LaunchOptions, console: Console, callback: Callback | None
+) -> int:
     status, tracker, monitor = 1, None, None
     end: dict[str, Any] = {"state": "failed"}
     try:
@@ -84,7 +90,7 @@ def _conduct(config: RunConfig, folder: RunFolder, options: LaunchOptions, conso
         before = _before(config, folder, seconds, console)
         console.print(f"before training: {format_evaluation(before)}")
         tracker = start_tracker(folder)
-        monitor = Monitor(folder, config, console, tracker)
+        monitor = Monitor(folder, config, console, tracker, callback)
         if not _trained(config, folder, options, monitor, console):
             raise KeyboardInterrupt
         result = _result(folder, seconds, monitor, before, console)

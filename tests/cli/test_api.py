@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+import json
 import os
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from rmc.deploy.run.config import checked, to_json
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import PATH_VARIABLE
 from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.state import STOPPED
 
 CONFIG = rmc.presets.debug("InvertedPendulum-v5")
 
@@ -188,3 +190,38 @@ def test_without_a_folder_the_result_names_the_one_that_was_made(
     result = rmc.train(dataclasses.replace(CONFIG, total_steps=600), launcher="lockstep")
     assert Path(result["run_dir"]).parent == tmp_path / "runs"
     assert rmc.resume(result["run_dir"])["env_steps"] == result["env_steps"] == 600
+
+
+class Enough(Exception):
+    """A caller's own."""
+
+
+@pytest.mark.parametrize("launcher", ["lockstep", "local"])
+def test_a_callback_hears_each_record_and_its_error_ends_a_run_that_goes_on(launcher: Any, tmp_path: Path) -> None:
+    heard: list[dict[str, Any]] = []
+
+    def until_updates(record: dict[str, Any]) -> None:
+        heard.append(record)
+        if record["role"] == "learner" and record["updates"] > 10:
+            record.clear()  # its own copy
+            raise Enough
+
+    config = dataclasses.replace(CONFIG, total_steps=1_000_000)
+    with pytest.raises(Enough):
+        rmc.train(config, tmp_path / "run", launcher=launcher, callback=until_updates)
+    folder = RunFolder(tmp_path / "run")
+    written = [json.loads(line) for line in folder.metrics.read_text().splitlines()]
+    assert heard.pop() == {}
+    assert [record for record in written if record in heard] == heard
+    assert folder.ended() == STOPPED
+    steps = written[len(heard)]["env_steps"]
+    heard.clear()
+    result = rmc.resume(tmp_path / "run", total_steps=steps + 300, callback=heard.append)
+    assert result["env_steps"] >= steps
+    assert {"learner", "actor-0", "replay", "launcher"} <= {record["role"] for record in heard}
+
+
+def test_a_callback_that_is_no_function_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(rmc.ConfigError, match=r"^callback='print': take a function of one record"):
+        rmc.train(CONFIG, tmp_path / "run", callback="print")  # type: ignore[arg-type]
+    assert not (tmp_path / "run").exists()

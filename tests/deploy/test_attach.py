@@ -106,6 +106,19 @@ def test_who_attaches_hears_who_is_silent(folder: RunFolder, monkeypatch: pytest
     assert re.search("silent: launcher for 40 s, learner for (9|10) s", printed.getvalue())
 
 
+def test_a_callback_hears_what_is_said_from_now_on(folder: RunFolder) -> None:
+    folder.metrics.write_text('{"role": "learner", "time": 1.0, "updates": 1}\n')
+    heard: list[object] = []
+
+    def gone() -> bool:
+        with folder.metrics.open("a") as lines:
+            lines.write('{"role": "learner", "time": 2.0, "updates": 2}\n')
+        return True
+
+    watch(folder, Console(quiet=True), gone, heard.append)
+    assert heard == [{"role": "learner", "time": 2.0, "updates": 2}]
+
+
 @pytest.mark.parametrize("words", [{}, {"learner": 900.0, "launcher": 901.0}, {"launcher": 40.0, "learner": 31.0}])
 def test_before_the_roles_and_after_them_nobody_is_silent(
     folder: RunFolder, monkeypatch: pytest.MonkeyPatch, words: dict[str, float]
