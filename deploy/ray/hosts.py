@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import cycle
 from typing import Any
 
 import ray
@@ -14,7 +15,7 @@ from rmc.common.errors import RoleDied
 from rmc.common.shard import WHOLE
 from rmc.deploy.local.role_environment import URL_VARIABLE, working_folder
 from rmc.deploy.local.supervisor import QUICK_DEATHS
-from rmc.deploy.ray.placement import SHARD_CPUS, RolePlacement, bundle, places
+from rmc.deploy.ray.placement import LEARNER, RolePlacement, groups, nodes_by_room, places
 from rmc.deploy.ray.ring_nodes import RingLocations
 from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, is_full
 from rmc.deploy.ray.role_handle import RoleHandle
@@ -39,27 +40,27 @@ class Hosts:
         self._ring_locations = RingLocations(folder)
         self._handles: dict[str, RoleHandle] = {}
         self._groups: dict[str, Any] = {}
-        self._bundles: dict[str, int] = {}  # of the replay servers' group
         self._lost: dict[str, list[float]] = {}  # when hosts died for good, by role
         self._full: dict[str, float] = {}  # when one last had no room on its node's disk
 
     def start(self, config: RunConfig) -> None:
         """Place every role, or find again those that an earlier launcher of the run has placed."""
-        near = self._ring_locations.node(WHOLE.role)
-        self._groups["learner"] = self._group("learner", [bundle(config, self._device)], "STRICT_PACK", near)
-        if config.replay.replay_shards > 1:  # a ring stays on its node: so does its server
-            roles = [shard.role for shard in config.shards()]
-            self._groups["replay"] = self._group("replay", [{"CPU": SHARD_CPUS}] * len(roles), "SPREAD")
-            self._bundles = self._ring_locations.bundles(self._groups["replay"], roles)
+        roomy = cycle(nodes_by_room())
+        for name, need in groups(config, self._device).items():
+            home = self._ring_locations.node(WHOLE.role if name == LEARNER else name)
+            if home is None and name != LEARNER:
+                home = next(roomy)
+            self._groups[name] = self._group(name, need, home)
         self.place(config)
 
-    def _group(self, name: str, bundles: list[dict[str, float]], strategy: str, near: str | None = None) -> Any:
+    def _group(self, name: str, need: dict[str, float], node: str | None) -> Any:
+        """On that node if it has room, else on any."""
         name = actor_name(self._folder.name, name)
         try:
             return ray.util.get_placement_group(name)
         except ValueError:
             return placement_group(
-                bundles, strategy=strategy, name=name, lifetime="detached", _soft_target_node_id=near
+                [need], strategy="STRICT_PACK", name=name, lifetime="detached", _soft_target_node_id=node
             )
 
     def _places(self, config: RunConfig) -> dict[str, RolePlacement]:
@@ -81,9 +82,7 @@ class Hosts:
     def _create(self, name: str, place: RolePlacement) -> Any:
         strategy: Any = "SPREAD"
         if place.group:
-            strategy = PlacementGroupSchedulingStrategy(
-                self._groups[place.group], placement_group_bundle_index=self._bundles.get(name, 0)
-            )
+            strategy = PlacementGroupSchedulingStrategy(self._groups[place.group], placement_group_bundle_index=0)
         options = ray.remote(place.kind).options(
             name=actor_name(self._folder.name, name), namespace=NAMESPACE, lifetime="detached", get_if_exists=True,
             max_restarts=-1, num_cpus=place.cpus, num_gpus=place.gpus, scheduling_strategy=strategy,

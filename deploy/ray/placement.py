@@ -23,6 +23,7 @@ from rmc.deploy.run.config import RunConfig
 
 REPLAY_CPUS = EVALUATOR_CPUS = 0.5  # beside the learner
 SHARD_CPUS = 1.0  # of a replay server among several, wherever it is: whole ones, so that what is left is whole, too
+LEARNER = "learner"  # the group of the learner and of who is beside it
 FREE_SECONDS = 10.0  # for what ran before to give back its CPUs
 
 
@@ -38,19 +39,21 @@ def learner_cpus(config: RunConfig) -> int:
 
 def reserved_cpus(config: RunConfig) -> float:
     """CPUs of everything but the actors."""
-    shards = config.replay.replay_shards
-    return bundle(config, "cpu")["CPU"] + (SHARD_CPUS * shards if shards > 1 else 0.0)
+    return sum(need["CPU"] for need in groups(config, "cpu").values())
 
 
-def bundle(config: RunConfig, device: str) -> dict[str, float]:
-    """What the node of the learner must hold."""
-    resources = {"CPU": float(ceil(learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS))}
-    return resources | {"GPU": 1.0} if device.startswith("cuda") else resources
+def groups(config: RunConfig, device: str) -> dict[str, dict[str, float]]:
+    """What a node must hold for the learner and who is beside it, and for each of several replay servers."""
+    learner = {"CPU": float(ceil(learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS))}
+    if device.startswith("cuda"):
+        learner["GPU"] = 1.0
+    shards = config.shards() if config.replay.replay_shards > 1 else ()
+    return {LEARNER: learner} | {shard.role: {"CPU": SHARD_CPUS} for shard in shards}
 
 
 def check_room(config: RunConfig, device: str) -> None:
     """Raises ConfigError where no node can hold the learner."""
-    need = bundle(config, device)
+    need = groups(config, device)[LEARNER]
     if not any(node["Alive"] and holds(node, need) for node in ray.nodes()):
         resources = ", ".join(f"{amount:g} {name}" for name, amount in need.items())
         fix = (
@@ -84,6 +87,12 @@ def free_resources() -> list[tuple[dict[str, Any], dict[str, float]]]:
     return [(node, free.get(node["NodeID"], {})) for node in ray.nodes() if node["Alive"]]
 
 
+def nodes_by_room() -> list[str]:
+    """Ray's ids of the nodes that are alive, those with the most free CPUs first."""
+    roomy = sorted(free_resources(), key=lambda one: one[1].get("CPU", 0.0), reverse=True)
+    return [node["NodeID"] for node, _ in roomy]
+
+
 def actors_in_the_way(
     need: dict[str, float], node: dict[str, Any], free: dict[str, float], actors: list[RoleHandle]
 ) -> list[RoleHandle] | None:
@@ -99,9 +108,9 @@ def whole_shares(actors: int, config: RunConfig) -> int:
     return actors - actors % config.replay.replay_shards
 
 
-def holds(node: dict[str, Any], bundle: dict[str, float]) -> bool:
+def holds(node: dict[str, Any], need: dict[str, float]) -> bool:
     """Whether a node is as large as that, were nothing else on it."""
-    return all(node["Resources"].get(name, 0.0) >= amount for name, amount in bundle.items())
+    return all(node["Resources"].get(name, 0.0) >= amount for name, amount in need.items())
 
 
 @dataclass(frozen=True)
@@ -112,7 +121,7 @@ class RolePlacement:
     command: RoleCommand
     cpus: float
     gpus: float = 0.0
-    group: str = ""  # of bundles that a node is found for: the learner's or the replay servers'
+    group: str = ""  # of ``groups``; an actor has none
 
 
 def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[str, RolePlacement]:
@@ -123,9 +132,9 @@ def places(config: RunConfig, run: str, device: str, encrypted: bool) -> dict[st
     learner, gpus = learner_command(run, "{scratch}/checkpoints", device, secrets), float(device.startswith("cuda"))
     placements = [
         *_replays(config, run, secrets),
-        RolePlacement(LearnerActor, learner, learner_cpus(config), gpus, "learner"),
+        RolePlacement(LearnerActor, learner, learner_cpus(config), gpus, LEARNER),
         *(
-            RolePlacement(RoleActor, command, EVALUATOR_CPUS, group="learner")
+            RolePlacement(RoleActor, command, EVALUATOR_CPUS, group=LEARNER)
             for command in evaluator_commands(config, run)
         ),
         *(RolePlacement(RoleActor, command, 1.0) for command in actor_commands(config, run)),
@@ -137,10 +146,13 @@ def _replays(config: RunConfig, run: str, secrets: list[str]) -> list[RolePlacem
     """One beside the learner on a unix socket, or several anywhere on the cluster's network."""
     alone = config.replay.replay_shards == 1
     listen = "unix:{scratch}/replay.sock" if alone else "tcp:{ip}:0"
-    cpus, group = (REPLAY_CPUS, "learner") if alone else (SHARD_CPUS, "replay")
+    cpus = REPLAY_CPUS if alone else SHARD_CPUS
     return [
         RolePlacement(
-            RoleActor, replay_command(shard, run, f"{{scratch}}/{shard.role}", listen, secrets), cpus, group=group
+            RoleActor,
+            replay_command(shard, run, f"{{scratch}}/{shard.role}", listen, secrets),
+            cpus,
+            group=LEARNER if alone else shard.role,
         )
         for shard in config.shards()
     ]

@@ -23,14 +23,15 @@ from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.ray.hosts import Hosts
 from rmc.deploy.ray.placement import (
     actors_in_the_way,
-    bundle,
     cpus,
     free_cpus,
     free_resources,
+    groups,
     reserved_cpus,
     whole_shares,
 )
-from rmc.deploy.ray.waiting_learners import WaitingLearners, learner_group
+from rmc.deploy.ray.role_actor import actor_name
+from rmc.deploy.ray.waiting_groups import WaitingGroups
 from rmc.deploy.redis.run_redis import RunRedis
 from rmc.deploy.redis.server import Port
 from rmc.deploy.run import tls
@@ -38,9 +39,9 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
 NODES_SECONDS = 2.0  # between looks for nodes that came
-LEARNER_PENDING_SECONDS = 8.0  # without a node for the learner, after which actors make room
+PENDING_SECONDS = 8.0  # without a node for the learner or a replay server, after which actors make room
 STARTING_SECONDS = 60.0  # of an actor without a CPU, where there is one for each: another run may have its own
-GIVE_WAY_SECONDS = 300.0  # without a node for another run's learner, after which actors are placed all the same
+GIVE_WAY_SECONDS = 300.0  # without a node for those of another run, after which actors are placed all the same
 STOP_SECONDS = 20.0  # for all roles to end cleanly and for the last checkpoint to reach the head
 FIRST_PORT, LAST_PORT = 6380, 6479  # for Redis; 6379 is Ray's
 log = logging.getLogger(__name__)
@@ -61,7 +62,7 @@ class ClusterRun:
         self.bus = self._redis.bus
         self.hosts = Hosts(folder, device, encrypted, self._url)
         self._look_at = 0.0
-        self._learners = WaitingLearners()
+        self._waiting = WaitingGroups()
 
     def _url(self, role: str) -> str:
         return self._redis.server.network_url(role, f"{{scratch_url}}/{tls.CERTIFICATE}")
@@ -81,8 +82,9 @@ class ClusterRun:
             self._look_at_nodes()
 
     def _look_at_nodes(self) -> None:
-        waiting, own = self._learners.look(), learner_group(self._folder.name)
-        first = [seconds for name, seconds in waiting.items() if name == own or seconds < GIVE_WAY_SECONDS]
+        needs = groups(self.config, self._device)
+        waiting, own = self._waiting.look(), {actor_name(self._folder.name, role): role for role in needs}
+        first = [seconds for name, seconds in waiting.items() if name in own or seconds < GIVE_WAY_SECONDS]
         if not first:
             self.hosts.place(self.config)
             if self._all_cpus and not self.hosts.waiting():
@@ -90,14 +92,15 @@ class ClusterRun:
             self._keep_low_actors()
         elif max(first) >= NODES_SECONDS:  # it has not only begun
             self._end_waiting_actors()
-            if waiting.get(own, 0.0) >= LEARNER_PENDING_SECONDS:
-                self._learners.count_anew(own)
-                self._make_room()
+            overdue = [name for name in own if waiting.get(name, 0.0) >= PENDING_SECONDS]
+            for name in overdue[:1]:  # of the next the cluster has another view
+                self._waiting.count_anew(name)
+                self._make_room(own[name], needs[own[name]])
 
     def _keep_low_actors(self) -> None:
         """Where CPUs are lost, it is the highest actors that wait: the run's last steps go to the lowest."""
         lost = cpus() < reserved_cpus(self.config) + self.config.actors
-        overdue = time.monotonic() - (LEARNER_PENDING_SECONDS if lost else STARTING_SECONDS)
+        overdue = time.monotonic() - (PENDING_SECONDS if lost else STARTING_SECONDS)
         actors = self.hosts.actors()
         waiting = [number for number, one in enumerate(actors) if not one.running and one.waits_since < overdue]
         higher = [one for one in actors[waiting[0] :] if one.running] if waiting else []
@@ -107,23 +110,24 @@ class ClusterRun:
             self.hosts.end(higher[-1])
 
     def _end_waiting_actors(self) -> None:
-        """They would take the CPUs that become free for a learner, of this run or another."""
+        """They would take the CPUs that become free for a learner or replay server, of this run or another."""
         waiting = [one for one in self.hosts.actors() if not one.running]
         for one in waiting:
             self.hosts.end(one)
         if waiting:
-            log.warning("a learner has no node; ended until it has: %s", ", ".join(one.name for one in waiting))
+            names = ", ".join(one.name for one in waiting)
+            log.warning("a learner or replay server has no node; ended until it has: %s", names)
 
-    def _make_room(self) -> None:
-        """End as few running actors as let the learner fit on a node; none where all of them are too few."""
-        actors, need = self.hosts.actors(), bundle(self.config, self._device)
+    def _make_room(self, role: str, need: dict[str, float]) -> None:
+        """End as few running actors as let the role fit on a node; none where all of them are too few."""
+        actors = self.hosts.actors()
         plans = [actors_in_the_way(need, node, free, actors) for node, free in free_resources()]
         going = min((plan for plan in plans if plan is not None), key=len, default=None)
         if going is None:
             fix = "start a node, or stop another run"
-            log.warning("no node has room for the learner, even without actors of this run; it needs %s; %s", need, fix)
+            log.warning("no node has room for %s, even without actors of this run; it needs %s; %s", role, need, fix)
         for one in going or []:
-            log.warning("no node has room for the learner; %s is ended for it", one.name)
+            log.warning("no node has room for %s; %s is ended for it", role, one.name)
             self.hosts.end(one)
 
     def _grow(self) -> None:

@@ -210,11 +210,48 @@ def test_freed_cpus_go_to_the_learner_that_lost_its_node(nodes: Cluster, tmp_pat
             other.wait_for_updates(50)
             logs = [(run.folder / "logs" / "launcher.log").read_text() for run in (one, other)]
             assert "actor-0 is ended for it" in logs[0]
-            assert "a learner has no node; ended until it has: actor-1, actor-2" in logs[1]
+            assert "a learner or replay server has no node; ended until it has: actor-1, actor-2" in logs[1]
 
             _check_list_and_stop(nodes.address, one, other)
             assert other.finish(60) == 130
         assert one.finish(60) == 130
+
+
+@pytest.mark.long
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize("nodes", [0], indirect=True)
+def test_actors_make_room_for_a_replay_server_and_a_run_goes_on_where_its_rings_are(
+    nodes: Cluster, tmp_path: Path
+) -> None:
+    sizes = {"127.0.0.2": 2, "127.0.0.3": 3, "127.0.0.4": 3}
+    at = {address: nodes.add_node(num_cpus=cpus, node_ip_address=address) for address, cpus in sizes.items()}
+    folder = tmp_path / "run"
+    on_ray = ("--launcher", "ray", "--ray-address", nodes.address)
+    with Training(folder, *ENDLESS, *on_ray, "--replay-shards", "2", "--actors", "4") as training:
+        training.wait_for_updates(50)
+        before = _rings(folder)
+        assert len(set(before.values())) == 2
+        (learner,) = _learner_node(training)
+        role, address = next((role, address) for role, address in before.items() if at[address].node_id != learner)
+        nodes.remove_node(at[address], allow_graceful=False)
+        training.wait_for(lambda: _rings(folder)[role] != address)
+        assert f"no node has room for {role}; actor-" in (folder / "logs" / "launcher.log").read_text()
+
+        nodes.add_node(num_cpus=3, node_ip_address="127.0.0.5")
+        training.wait_for_updates(50)
+        training.interrupt()
+    rings = _rings(folder)
+    nodes.add_node(num_cpus=6, node_ip_address="127.0.0.6")  # where there is the most room
+    with Training(folder, command=("resume", str(folder))) as training:
+        training.wait_for_updates(50)
+        assert _rings(folder) == rings
+        training.interrupt()
+
+
+def _rings(folder: Path) -> dict[str, str]:
+    """The addresses of the replay servers' nodes, by role."""
+    at: dict[str, str] = json.loads((folder / "rings-at").read_text())
+    return at
 
 
 def _learner_node(run: Training) -> list[str]:

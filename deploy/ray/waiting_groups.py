@@ -1,20 +1,15 @@
-"""Learners that wait for a node: those of all runs of the cluster, for no run's actors come before any learner."""
+"""Groups of roles that wait for a node: those of all runs of the cluster, for no run's actors come before any."""
 
+import re
 import time
 
 from ray.util.placement_group import placement_group_table
 
-from rmc.deploy.ray.role_actor import actor_name
-
 PLACED = {"CREATED", "REMOVED"}
+NAMES = re.compile(r".*:(learner|replay-\d+)")  # by ``actor_name``
 
 
-def learner_group(run: str) -> str:
-    """The name of the placement group of a run's learner."""
-    return actor_name(run, "learner")
-
-
-class WaitingLearners:
+class WaitingGroups:
     """For how long each has been seen without a node."""
 
     def __init__(self) -> None:
@@ -24,8 +19,8 @@ class WaitingLearners:
         """The seconds until now, by the group's name."""
         now = time.monotonic()
         groups = placement_group_table().values()
-        waiting = [one["name"] for one in groups if one["state"] not in PLACED]
-        self._since = {name: self._since.get(name, now) for name in waiting if name.endswith(learner_group(""))}
+        waiting = [one["name"] for one in groups if one["state"] not in PLACED and NAMES.fullmatch(one["name"])]
+        self._since = {name: self._since.get(name, now) for name in waiting}
         return {name: now - since for name, since in self._since.items()}
 
     def count_anew(self, name: str) -> None:
