@@ -25,6 +25,7 @@ from pathlib import Path
 
 from benchmarks import PEER_ENVIRONMENT
 from benchmarks.harness import HERE, Row, argument_parser, command, peer_python, save
+from rmc.deploy.run.metrics_tail import MetricsTail
 
 CURVES = HERE / "results" / "end-to-end.jsonl"
 EPISODES = 5
@@ -46,10 +47,12 @@ def ours(env: str, seed: int, every: int) -> Iterator[Point]:
         words = ["train", env, "--seed", str(seed), "--total-steps", "1000000", "--run-dir", str(run)]
         process = _started([sys.executable, "-m", "rmc.cli.main", *words, "--checkpoint-steps", str(every)])
         try:
-            for line in _lines(run / "metrics.jsonl", process):
-                record = json.loads(line)
-                if "eval_return_mean" in record:
-                    yield record["time"] - began, record["eval_return_mean"]
+            tail = MetricsTail(run / "metrics.jsonl")
+            while process.poll() is None:
+                for record in tail.take():
+                    if "eval_return_mean" in record:
+                        yield record["time"] - began, record["eval_return_mean"]
+                time.sleep(0.1)
             sys.exit(f"ours: rmc train has ended by itself, with status {process.wait()}")
         finally:
             _end(process)
@@ -79,21 +82,6 @@ def _end(process: subprocess.Popen[str]) -> None:
     with suppress(subprocess.TimeoutExpired):
         process.wait(60)
     process.kill()
-
-
-def _lines(path: Path, process: subprocess.Popen[str]) -> Iterator[str]:
-    """Whole lines of a file that grows while a process runs."""
-    while not path.exists() and process.poll() is None:
-        time.sleep(0.1)
-    with path.open() as file:
-        text = ""
-        while process.poll() is None:
-            text += file.readline()
-            if text.endswith("\n"):
-                yield text
-                text = ""
-            else:
-                time.sleep(0.1)
 
 
 def reached(points: list[Point], goal: float) -> float | None:

@@ -201,21 +201,6 @@ class Masked(gym.ObservationWrapper[Any, Any, Any]):
         return observation
 
 
-for _kind in (
-    Masked,
-    Slide,
-    InPlace,
-    Gives,
-    CannotClose,
-    Shaped,
-    Wants,
-    Stumbles,
-    Untyped,
-    TakesNoMode,
-    Draws,
-    LateSpaces,
-    NoRobot,
-    Mistyped,
-):
+for _kind in (Slide, *Slide.__subclasses__(), Masked, LateSpaces):
     gym.register(f"{_kind.__name__}-v0", entry_point=_kind)
 gym.register("NoModule-v0", entry_point="tests.nowhere:Env")

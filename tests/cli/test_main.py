@@ -194,7 +194,15 @@ def test_a_wrong_option_is_one_short_line(words: str, said: str, capsys: pytest.
         ([*DEBUG, "--dry-run", "--track-project", "mine"], "--track-project='mine': say which tracker"),
         ([*DEBUG, "--run-dir", "x" * 300], "File name too long; give another"),
         (["stats", "x" * 300], "File name too long"),
-        (["check-env", PENDULUM, "--env-timeout", "1e12"], "--env-timeout=1000000000000.0: take a number from 0.1"),
+        *(
+            (["check-env", PENDULUM, "--env-timeout", value], f"--env-timeout={float(value)}: take a number from 0.1")
+            for value in ("0", "nan", "1e12")
+        ),
+        ([*DEBUG, "--drop-sensors", "2"], "--drop-sensors=2.0: take a number from 0 to 1"),
+        ([*DEBUG, "--flicker-burst", "0"], "--flicker-burst=0.0: take a number from 1 to 1_000_000"),
+        ([*DEBUG, "--delay", "-2"], "--delay=-2: take a number from 0 to 1_000_000"),
+        ([*DEBUG, "--delay", "1000"], "--delay=1000: an episode ends after 1000 steps; take fewer"),
+        ([*DEBUG, "--privileged-critic"], '--privileged-critic=True: InvertedPendulum-v5 gives no info["privileged"]'),
         ([*DEBUG, "--track", "wandb", "--track-project", "a/b"], "--track-project='a/b'"),
         ([*DEBUG, "--track", "trackio", "--track-tags", "x" * 65], "--track-tags"),
         ([*DEBUG, "--metrics-port", "0"], "--metrics-port=0: take a port from 1 to 65535"),

@@ -103,14 +103,6 @@ def test_checkpoints_that_do_not_reach_the_head_are_said_and_brought_later(tmp_p
         training.interrupt()
 
 
-def test_more_than_the_cluster_holds_is_refused(tmp_path: Path) -> None:
-    words = ["train", "InvertedPendulum-v5", "--launcher", "ray", "--run-dir", str(tmp_path / "run")]
-    done = rmc(*words, env=ENVIRONMENT)
-    assert done.returncode == 2
-    assert done.stderr.startswith("rmc: --ray-address='auto': no Ray cluster answers")
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.fixture
 def nodes(request: pytest.FixtureRequest) -> Iterator[Cluster]:
     """A head with room for all but the actors, unless the test says other CPUs."""

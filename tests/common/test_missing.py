@@ -7,7 +7,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rmc.cli import main
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import env_layout, make_env
 from rmc.common.env.missing import DropSensors, Flicker
@@ -203,19 +202,3 @@ def test_a_bad_value_is_one_line(config: EnvConfig, says: str) -> None:
         make_env(config)
     assert str(caught.value).startswith(says)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["--drop-sensors", "2"], "--drop-sensors=2.0: take a number from 0 to 1"),
-        (["--flicker-burst", "0"], "--flicker-burst=0.0: take a number from 1 to 1_000_000"),
-        (["--delay", "-2"], "--delay=-2: take a number from 0 to 1_000_000"),
-        (["--delay", "1000"], "--delay=1000: an episode ends after 1000 steps; take fewer"),
-    ],
-)
-def test_a_run_refuses_it_before_it_begins(words: list[str], says: str, capsys: Any, tmp_path: Any) -> None:
-    run = ["train", "InvertedPendulum-v5", "--preset", "debug", "--run-dir", str(tmp_path / "run")]
-    assert main.run([*run, *words]) == 2
-    assert capsys.readouterr().err == f"rmc: {says}\n"
-    assert not (tmp_path / "run").exists()

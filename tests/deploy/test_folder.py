@@ -33,14 +33,6 @@ from rmc.deploy.run.presets import debug
 from rmc.deploy.run.state import run_state
 
 
-def test_a_secret_is_made_once(tmp_path: Path) -> None:
-    first = RunFolder(tmp_path).secret()
-    assert len(bytes.fromhex(first.decode())) == 32
-    assert RunFolder(tmp_path).secret() == first
-    assert stat.S_IMODE((tmp_path / "secret").stat().st_mode) == 0o600
-    assert [path.name for path in tmp_path.iterdir()] == ["secret"]
-
-
 def test_nodes_know_a_run_that_is_renamed_but_take_a_copy_for_another(tmp_path: Path) -> None:
     first = RunFolder(tmp_path / "run")
     first.path.mkdir()
@@ -93,11 +85,12 @@ def test_a_full_disk_leaves_none(tmp_path: Path) -> None:
     assert len(RunFolder(tmp_path).secret()) == 64
 
 
-@pytest.mark.parametrize("fault", [errno.EOPNOTSUPP, errno.EPERM])
-def test_a_disk_without_hard_links_has_a_secret_too(
-    fault: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("fault", [None, errno.EOPNOTSUPP, errno.EPERM])
+def test_a_secret_is_made_once_on_a_disk_without_hard_links_too(
+    fault: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(os, "link", raising(fault))
+    if fault is not None:
+        monkeypatch.setattr(os, "link", raising(fault))
     secret = RunFolder(tmp_path).secret()
     assert len(bytes.fromhex(secret.decode())) == 32
     assert RunFolder(tmp_path).secret() == secret
@@ -166,21 +159,17 @@ def test_one_that_others_could_read_is_closed_to_them(tmp_path: Path, mode: int)
     assert stat.S_IMODE((tmp_path / "secret").stat().st_mode) == 0o600
 
 
-def test_a_run_that_is_made_longer_has_no_result_until_it_ends(tmp_path: Path) -> None:
-    config = debug(EnvConfig("InvertedPendulum-v5"))
-    folder = open_run(config, tmp_path / "run", "fail")
+def test_a_run_that_is_made_longer_has_no_result_until_it_ends(folder: RunFolder) -> None:
+    config = folder.config()
     folder.write_result(dict.fromkeys(RESULT, config.total_steps))
-    folder.unlock()
     for more, there in ((0, True), (1, False)):
         open_run(dataclasses.replace(config, total_steps=config.total_steps + more), folder.path, "resume").unlock()
         assert (folder.result() is not None) == there
 
 
-def test_a_start_that_fails_takes_no_result_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = debug(EnvConfig("InvertedPendulum-v5"))
-    folder = open_run(config, tmp_path / "run", "fail")
+def test_a_start_that_fails_takes_no_result_along(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = folder.config()
     folder.write_result(dict.fromkeys(RESULT, config.total_steps))
-    folder.unlock()
 
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "no room")
@@ -269,9 +258,7 @@ def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_odd_lines_of_metrics_are_passed_over(tmp_path: Path) -> None:
-    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
-    folder.unlock()
+def test_odd_lines_of_metrics_are_passed_over(folder: RunFolder) -> None:
     evaluation = {"role": "evaluator", "eval_update": 50, "eval_return_mean": 7.0, "eval_return_std": 1.0}
     records = [{"role": "launcher", "time": 1.0, "wall_s": 3.0}, evaluation | {"time": 1.0}]
     odd = [b"5", b'{"a": 1}', b'{"role": 1}', b'{"role": "launcher", "wall_s": "abc"}', b"\xff", b'{"role": "launch']

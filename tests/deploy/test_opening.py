@@ -10,6 +10,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run import metrics_tail
 from rmc.deploy.run.config import RunConfig, flat
+from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import MAY_CHANGE, open_run
 from rmc.deploy.run.presets import debug
@@ -39,9 +40,7 @@ def another(path: str, value: Any) -> Any:
 
 
 @pytest.mark.parametrize("path", flat(CONFIG))
-def test_every_option_may_change_or_is_refused_with_the_reason(path: str, tmp_path: Path) -> None:
-    folder = open_run(CONFIG, tmp_path / "run", "fail")
-    folder.unlock()
+def test_every_option_may_change_or_is_refused_with_the_reason(path: str, folder: RunFolder) -> None:
     was = flat(CONFIG)[path]
     changed = with_value(CONFIG, path, another(path, was))
     if path in MAY_CHANGE:
@@ -57,10 +56,8 @@ def test_every_option_may_change_or_is_refused_with_the_reason(path: str, tmp_pa
         assert len(starts(folder)) == 1
 
 
-def test_the_history_is_a_line_a_start(tmp_path: Path) -> None:
-    folder = open_run(CONFIG, tmp_path / "run", "fail")
+def test_the_history_is_a_line_a_start(folder: RunFolder) -> None:
     assert format_starts(folder) == "1 start"
-    folder.unlock()
     folder.metrics.write_text('{"role": "learner", "env_steps": 1200}\n{"role": "replay", "env_steps": 1230}\n{"ro')
     folder.history_file.write_bytes(folder.history_file.read_bytes() + b'{"time": 1.0, "vers')  # torn by a crash
     replay = dataclasses.replace(CONFIG.replay, replay_ratio=8.0)
@@ -72,10 +69,10 @@ def test_the_history_is_a_line_a_start(tmp_path: Path) -> None:
     assert format_starts(folder) == "3 starts; from step 1,230 --total-steps 4000 to 9000, --replay-ratio 32 to 8"
 
 
-def test_of_a_run_of_weeks_a_start_parses_what_was_said_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_a_run_of_weeks_a_start_parses_what_was_said_last(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Else every start of its launcher holds more than the one before."""
-    folder = open_run(CONFIG, tmp_path / "run", "fail")
-    folder.unlock()
     line = '{"role": "replay", "env_steps": 7, "more": "%s"}\n' % ("x" * 400)
     folder.metrics.write_text(line * 20_000 + '{"role": "replay", "env_steps": 9000}\n')
     parsed, parse = [], metrics_tail.parse_record
@@ -85,9 +82,7 @@ def test_of_a_run_of_weeks_a_start_parses_what_was_said_last(tmp_path: Path, mon
     assert 0 < sum(parsed) < 1.1 * metrics_tail.LISTED_BYTES
 
 
-def test_an_older_run_has_no_history(tmp_path: Path) -> None:
-    folder = open_run(CONFIG, tmp_path / "run", "fail")
-    folder.unlock()
+def test_an_older_run_has_no_history(folder: RunFolder) -> None:
     folder.history_file.unlink()
     assert (starts(folder), format_starts(folder), last_launch(folder)) == ([], "", LaunchOptions(folder.path))
 

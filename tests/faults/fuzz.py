@@ -81,16 +81,11 @@ def odd(raw: bytes, rng: random.Random) -> bytes:
     return kind + msgpack.packb(meta)
 
 
-def window(payload: bytes) -> None:
-    """As the replay server's intake reads an entry."""
-    lawful_rows(payload)
-
-
 def honest_window(body: bytes) -> None:
-    """The same where header, length and checksum are right: what is within must be judged."""
+    """An entry whose header, length and checksum are right: what is within must be judged."""
     size = SPEC.dtype.itemsize
     rows = np.frombuffer(body[: len(body) // size * size].ljust(size, b"\0"), SPEC.dtype)
-    window(encode_windows(rows, SPEC))
+    lawful_rows(encode_windows(rows, SPEC))
 
 
 def frame(raw: bytes) -> None:
@@ -120,14 +115,6 @@ def request(raw: bytes) -> None:
     ASKED.say(kind, raw[1:], b"".join(PRIORITIES) if kind is Kind.PRIORITIES else b"")
 
 
-def config(raw: bytes) -> None:
-    from_json(raw)
-
-
-def registration(raw: bytes) -> None:
-    from_registration(raw)
-
-
 def published(raw: bytes) -> None:
     """Counters that a replay server begins with."""
     decode_published(raw, SPEC.obs_dim)
@@ -145,7 +132,7 @@ POLICY = save(Agent(SPEC.obs_dim, SPEC.action_dim, AGENT).policy_weights())
 BODY = make_rows(4).tobytes()
 PRIORITIES = (np.arange(8).tobytes(), np.ones(8, np.float32).tobytes())
 KINDS: dict[str, tuple[bytes, Reader]] = {
-    "window": (encode_windows(make_rows(4), SPEC), window),
+    "window": (encode_windows(make_rows(4), SPEC), lawful_rows),
     "window, checksum right": (BODY, honest_window),
     "batch": (encode_frame(Kind.BATCH, {"total_weight": 1.0, "env_steps": 9}, (BODY,)) + BODY, frame),
     "priorities": (encode_frame(Kind.PRIORITIES, {"count": 8}, PRIORITIES) + b"".join(PRIORITIES), frame),
@@ -156,8 +143,8 @@ KINDS: dict[str, tuple[bytes, Reader]] = {
     "episode": (_request(Kind.EPISODE, {"serial": 3}), request),
     "share": (_request(Kind.SHARE, {"batch_size": 4}), request),
     "record": (encode_record({"time": 1.5, "updates": 7, "waiting_for": "credit"}), decode_record),
-    "config": (to_json(robust(EnvConfig("HalfCheetah-v5"))).encode(), config),
-    "registration": (to_registration(robust(EnvConfig("HalfCheetah-v5"))), registration),
+    "config": (to_json(robust(EnvConfig("HalfCheetah-v5"))).encode(), from_json),
+    "registration": (to_registration(robust(EnvConfig("HalfCheetah-v5"))), from_registration),
     "counters": (Progress(SPEC.obs_dim).publish(), published),
 }
 

@@ -120,17 +120,6 @@ def test_its_policy_knows_what_is_missing_and_nothing_of_what_critics_see(tmp_pa
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "inspect.png")]) == 0
 
 
-def test_where_nothing_more_can_be_seen_the_start_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["train", "Pendulum-v1", "--preset", "debug", "--privileged-critic", "--run-dir", str(tmp_path / "run")]
-    assert main.run(words) == 2
-    line = capsys.readouterr().err
-    assert line.startswith('rmc: --privileged-critic=True: Pendulum-v1 gives no info["privileged"]')
-    assert line.count("\n") == 1
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_run_whose_critics_see_more_begins_with_another(tmp_path: Path) -> None:
     """All of it, its normaliser included; or, without what critics see, what remembers and predicts."""
     settings = partial(checkpoint_steps=200)

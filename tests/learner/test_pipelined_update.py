@@ -59,7 +59,7 @@ def test_it_is_the_same_update(agent, bf16, spec):
             results += copy.deepcopy(updated(raw, importance, 0.1 * step, number))
         if step % 15 == 0:  # as before weights are read
             actual += copy.deepcopy(apart.drain())
-            assert_same(update.agent.state_dict(), plain.agent.state_dict())
+            torch.testing.assert_close(update.agent.state_dict(), plain.agent.state_dict(), rtol=0, atol=0)
     actual += copy.deepcopy(apart.drain())
     apart.close()
     assert len(actual) == len(expected) == 40
@@ -68,26 +68,8 @@ def test_it_is_the_same_update(agent, bf16, spec):
         assert torch.equal(one.hidden, other.hidden)
         norm, of_both = one.metrics.pop("grad_norm"), other.metrics.pop("grad_norm")
         assert norm == pytest.approx(float(of_both), rel=1e-5)  # of the halves' norms
-        assert_same(one.metrics, other.metrics)
-    assert_same(update.state_dict(), plain.state_dict())
-
-
-def assert_same(actual: object, expected: object) -> None:
-    """Bit for bit, however they are nested."""
-    if isinstance(expected, torch.Tensor):
-        assert isinstance(actual, torch.Tensor)
-        assert torch.equal(actual, expected)
-    elif isinstance(expected, dict):
-        assert isinstance(actual, dict)
-        assert actual.keys() == expected.keys()
-        for name, value in expected.items():
-            assert_same(actual[name], value)
-    elif isinstance(expected, list):
-        assert isinstance(actual, list)
-        for one, other in zip(actual, expected, strict=True):
-            assert_same(one, other)
-    else:
-        assert actual == expected
+        torch.testing.assert_close(one.metrics, other.metrics, rtol=0, atol=0)
+    torch.testing.assert_close(update.state_dict(), plain.state_dict(), rtol=0, atol=0)
 
 
 def test_it_goes_on_from_a_checkpoint_of_the_other_kind():
@@ -103,7 +85,7 @@ def test_it_goes_on_from_a_checkpoint_of_the_other_kind():
         apart(*host_batch(step), 0.1, step)
     apart.drain()
     apart.close()
-    assert_same(update.state_dict(), plain.state_dict())
+    torch.testing.assert_close(update.state_dict(), plain.state_dict(), rtol=0, atol=0)
 
 
 def test_a_checkpoint_holds_what_the_plain_updates_does():

@@ -6,7 +6,6 @@ import io
 
 import pytest
 import torch
-from torch import Tensor
 
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
@@ -73,38 +72,6 @@ def test_a_schemes_gradients_reach_exactly(agent, scheme, order, loss, by, head,
     assert moved == part(moving, head, *["memory."] * trains)
 
 
-@pytest.mark.parametrize("scheme", [4, 5, 6])
-def test_the_policy_reaches_the_memory_by_its_own_input_alone_if_told_so(scheme):
-    """The two ways add up: what is left without Q's is the gradient by the policy's input."""
-
-    def memory_gradient(through_q: bool, stop_own: bool = False) -> Tensor:
-        update = make(PAPER, scheme=scheme, policy_through_q=through_q)
-        if stop_own:
-            act = update.agent.policy.forward
-            update.agent.policy.forward = lambda z: act(z.detach())
-        parts, *_ = update.forward(to_batch(random_rows(8)), BETA)
-        (gradient,) = torch.autograd.grad(parts["policy_loss"], [update.agent.memory.gru.weight_hh_l0])
-        return gradient
-
-    both, own, by_q = memory_gradient(True), memory_gradient(False), memory_gradient(True, stop_own=True)
-    torch.testing.assert_close(both, own + by_q)
-    assert by_q.abs().sum() > 0
-
-
-def test_each_stage_of_alternate_starts_from_what_the_one_before_left():
-    """With step sizes of 0 both orders have the same losses; with others, all but the first differ."""
-
-    def metrics(order: str, rate: float) -> dict[str, Tensor]:
-        update = make(PAPER, update_order=order, learning_rate=rate, alpha_learning_rate=rate)
-        update._noise_like = lambda x, cut: torch.full_like(x, 0.3)  # a forward more must not mean other noise
-        return update(to_batch(random_rows(8)), BETA).metrics
-
-    names = ("model_loss", "q_loss", "policy_loss")  # the temperature's is 0 at first, whatever the policy
-    still, moved = ([metrics(order, rate) for order in ("joint", "alternate")] for rate in (0.0, 0.1))
-    assert [name for name in names if still[0][name] != still[1][name]] == []
-    assert [name for name in names if moved[0][name] != moved[1][name]] == ["q_loss", "policy_loss"]
-
-
 def test_grounding_reaches_memory_and_world_model(monkeypatch):
     update = make(ROBUST)
     assert gradients(update, "grounding_loss", monkeypatch) == part(update, "memory.", "world_model.")
@@ -134,7 +101,7 @@ def test_garbage_in_padding_changes_nothing():
     assert torch.equal(clean.hidden[clean.observed], dirtied.hidden[dirtied.observed])
     for name, value in clean.metrics.items():
         assert torch.equal(value, dirtied.metrics[name]), name
-    assert_same(clean_update.agent.state_dict(), dirty_update.agent.state_dict())
+    torch.testing.assert_close(clean_update.agent.state_dict(), dirty_update.agent.state_dict(), rtol=0, atol=0)
 
 
 def test_padded_burn_in_starts_from_the_stored_state():
@@ -181,12 +148,6 @@ def test_error_by_observation_dimension():
     assert make(PAPER)(to_batch(rows), BETA).observation_unexplained.shape == (0,)
 
 
-def test_policy_maximises_the_critic_it_is_told_to():
-    first, smaller = make(PAPER, policy_q="first"), make(PAPER, policy_q="min")
-    a, b = (u(to_batch(random_rows(8)), BETA).metrics["policy_loss"].item() for u in (first, smaller))
-    assert b > a  # min Q <= Q_1, so the loss is larger
-
-
 def test_targets_follow_by_polyak_alone():
     update = make(PAPER, polyak=0.9, target_memory="ema")
     before = copy.deepcopy(update.target_critic.state_dict())
@@ -223,21 +184,6 @@ def test_the_policys_average_is_over_the_last_tenth_and_then_over_so_many():
             assert torch.equal(value, update.agent.state_dict()[name])
 
 
-@pytest.mark.parametrize(
-    ("option", "moved"), [("latent_target", {"model_loss"}), ("target_memory", {"q_loss"})], ids=["latent", "critics"]
-)
-def test_the_target_memory_is_read_where_the_options_say(option, moved):
-    def parts(memory: str) -> dict[str, Tensor]:
-        update = make(PAPER, **{option: memory})
-        with torch.no_grad():
-            for value in update.target_memory.parameters() if update.target_memory is not None else ():
-                value += 0.1
-        return update.forward(to_batch(random_rows(8)), torch.tensor(0.0))[0]
-
-    online, ema = parts("online"), parts("ema")
-    assert {name for name in online if not torch.equal(online[name], ema[name])} == moved
-
-
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 100.0])
 def test_curiosity_is_in_units_of_its_deviation_from_the_first_update_on(scale):
     update, i = make(ROBUST, curiosity_scale="std"), scale * torch.randn(32, 15)
@@ -259,12 +205,7 @@ def test_state_comes_back_bit_for_bit():
     for seed in range(3, 6):
         a, b = (u(to_batch(random_rows(8, seed)), BETA) for u in (straight, resumed))
         assert torch.equal(a.priorities, b.priorities)
-    assert_same(straight.agent.state_dict(), resumed.agent.state_dict())
-
-
-def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
-    for name in a:
-        assert torch.equal(a[name], b[name]), name
+    torch.testing.assert_close(straight.agent.state_dict(), resumed.agent.state_dict(), rtol=0, atol=0)
 
 
 def test_beta_decays_to_zero():

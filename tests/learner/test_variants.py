@@ -32,6 +32,7 @@ BETA = 0.5
 VARIANTS = [
     *({"scheme": scheme} for scheme in (1, 2, 3, 4, 5, 6)),
     {"scheme": 4, "policy_through_q": False},
+    {"scheme": 5, "policy_through_q": False},
     {"scheme": 6, "policy_through_q": False},
     {"update_order": "alternate"},
     {"update_order": "alternate", "scheme": 4, "curiosity_scale": "std"},

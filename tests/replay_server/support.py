@@ -85,6 +85,14 @@ def drain(server: ReplayServer) -> None:
         pass
 
 
+def filled(server: ReplayServer, bus: Bus, windows: int) -> tuple[ReplayServer, Sender]:
+    """It, and an actor that has sent it so many windows in an entry."""
+    sender = Sender(bus)
+    sender.send(windows)
+    drain(server)
+    return server, sender
+
+
 def stored(server: ReplayServer) -> np.ndarray:
     """All windows that may be sampled, by serial."""
     progress = server._store.ring.progress

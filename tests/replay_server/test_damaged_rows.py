@@ -10,8 +10,7 @@ from rmc.common.replay import SampleStatus
 from rmc.common.window import Rows
 from rmc.replay_server import row_check
 from rmc.replay_server.row_check import FAULTS, FLOATS, row_faults
-from rmc.replay_server.server import ReplayServer
-from tests.replay_server.support import SPEC, Make, Sender, close, drain, make_rows
+from tests.replay_server.support import SPEC, Make, close, filled, make_rows
 
 WORDS = {  # field, value, and why a row with it can be none
     "last": (2**30 + 6, "last is outside (burn_in, T]"),
@@ -26,20 +25,14 @@ DAMAGE = [(name, value) for name, (value, _) in WORDS.items()]
 THERE = [name for name in FLOATS if SPEC.dtype[name].itemsize]
 DAMAGE += [(name, value) for name in THERE for value in (np.nan, np.inf, -np.inf)]
 DAMAGE += [("serial", 2**40), ("serial", -1), ("serial", 4)]
-
-
-def filled(make: Make, bus: MemoryBus, windows: int = 20) -> ReplayServer:
-    server, sender = make(), Sender(bus)
-    sender.send(windows)
-    drain(server)
-    return server
+DAMAGE += [("reward", 5.0), ("terminated", 1), ("missing", 1)]  # of a row that could be one
 
 
 @pytest.mark.parametrize(("name", "value"), DAMAGE)
 def test_a_damaged_row_is_never_drawn(
     make: Make, bus: MemoryBus, name: str, value: float, caplog: pytest.LogCaptureFixture
 ) -> None:
-    server = filled(make, bus)
+    server, _ = filled(make(), bus, 20)
     field = server._store.ring.rows[name]
     (field if field.ndim == 1 else field.reshape(len(field), -1)[:, -1])[3] = value
     with caplog.at_level(logging.WARNING):
@@ -58,7 +51,7 @@ def test_a_damaged_row_is_never_drawn(
 
 
 def test_a_ring_of_damaged_rows_alone_makes_the_learner_wait(make: Make, bus: MemoryBus) -> None:
-    server = filled(make, bus)
+    server, _ = filled(make(), bus, 20)
     server._store.ring.rows["last"] = 10**9
     assert server.sample(8).status is SampleStatus.WAIT
     assert (server.stats()["drawn_steps"], server.stats()["draws"]) == (0, 0)
@@ -68,7 +61,7 @@ def test_a_ring_of_damaged_rows_alone_makes_the_learner_wait(make: Make, bus: Me
 
 
 def test_an_episode_with_a_damaged_row_is_none(make: Make, bus: MemoryBus) -> None:
-    server = filled(make, bus)
+    server, _ = filled(make(), bus, 20)
     assert server.episode(5) is not None
     server._store.ring.rows["reward"][5, 1] = np.nan
     assert server.episode(5) is None
@@ -77,14 +70,12 @@ def test_an_episode_with_a_damaged_row_is_none(make: Make, bus: MemoryBus) -> No
 
 def test_draws_of_sound_rows_are_as_they_were(make: Make, bus: MemoryBus) -> None:
     """What is damaged elsewhere changes no draw that does not meet it."""
-    server = filled(make, bus)
+    server, _ = filled(make(), bus, 20)
     first = server.sample(4).rows
     assert first is not None
     drawn, rest = first["serial"].tolist(), None
     close(server)
-    again = make(folder="other", on=(other := MemoryBus()))
-    Sender(other).send(20)
-    drain(again)
+    again, _ = filled(make(folder="other", on=(other := MemoryBus())), other, 20)
     rest = next(serial for serial in range(20) if serial not in drawn)
     again._store.ring.rows["last"][rest] = -1
     rows = again.sample(4).rows
@@ -135,7 +126,7 @@ def test_a_priority_beyond_the_largest_seen_is_not_believed_after_a_restart(
     make: Make, bus: MemoryBus, value: float
 ) -> None:
     """It would be all that is drawn."""
-    server = filled(make, bus)
+    server, _ = filled(make(), bus, 20)
     server.update_priorities(np.arange(20), np.linspace(1.0, 8.0, 20).astype(np.float32))
     server._store.priorities[3] = value
     close(server)

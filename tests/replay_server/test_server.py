@@ -18,7 +18,7 @@ from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.observation_sums import observation_sums
 from rmc.replay_server.server import ReplayServer
 from tests.learner.rows import observation_valid
-from tests.replay_server.support import SPEC, Make, Sender, close, drain, make_rows, stored
+from tests.replay_server.support import SPEC, Make, Sender, close, drain, filled, make_rows, stored
 
 
 def test_origin_and_serial_come_from_the_entry_id(make: Make, bus: MemoryBus) -> None:
@@ -63,9 +63,7 @@ def test_an_entry_larger_than_the_ring(make: Make, bus: MemoryBus) -> None:
 
 
 def test_new_windows_enter_with_their_own_or_the_largest_priority(make: Make, bus: MemoryBus) -> None:
-    server, sender = make(), Sender(bus)
-    sender.send(2)
-    drain(server)
+    server, sender = filled(make(), bus, 2)
     server.update_priorities(np.array([0, 1]), np.array([0.5, 6.0], np.float32))
     rows = make_rows(3)
     rows["initial_priority"] = [0, 2, 0]
@@ -76,9 +74,7 @@ def test_new_windows_enter_with_their_own_or_the_largest_priority(make: Make, bu
 
 def test_a_priority_that_was_corrected_is_no_new_windows(make: Make, bus: MemoryBus) -> None:
     """As a learner gives that diverges, and begins again at its last checkpoint."""
-    server, sender = make(), Sender(bus)
-    sender.send(4)
-    drain(server)
+    server, sender = filled(make(), bus, 4)
     server.update_priorities(np.arange(4), np.array([0.5, 1e20, 2.0, 0.1], np.float32))
     server.update_priorities(np.array([1]), np.array([0.25], np.float32))
     close(server)
@@ -90,9 +86,7 @@ def test_a_priority_that_was_corrected_is_no_new_windows(make: Make, bus: Memory
 
 
 def test_values_are_what_windows_are_drawn_by(make: Make, bus: MemoryBus) -> None:
-    server, sender = make(), Sender(bus)
-    sender.send(20)
-    drain(server)
+    server, _ = filled(make(), bus, 20)
     priorities = np.random.default_rng(0).exponential(size=20).astype(np.float32)
     server.update_priorities(np.arange(20), priorities)
     sample = server.sample(64)
@@ -105,9 +99,7 @@ def test_values_are_what_windows_are_drawn_by(make: Make, bus: MemoryBus) -> Non
 
 def test_exponent_zero_is_uniform(make: Make, bus: MemoryBus) -> None:
     config = ReplayConfig(capacity=100, replay_ratio=1e6, warmup_steps=0, priority_exponent=0.0)
-    server, sender = make(config), Sender(bus)
-    sender.send(50)
-    drain(server)
+    server, _ = filled(make(config), bus, 50)
     server.update_priorities(np.arange(50), np.linspace(1e-6, 1e6, 50).astype(np.float32))
     counts = np.zeros(50)
     for _ in range(40):
@@ -180,9 +172,7 @@ def test_one_huge_number_does_not_blind_the_statistics() -> None:
 
 
 def test_statistics_survive_a_restart_and_count_once(make: Make, bus: MemoryBus) -> None:
-    server, sender = make(), Sender(bus)
-    sender.send(8)
-    drain(server)
+    server, _ = filled(make(), bus, 8)
     expected = observation_sums(make_rows(8), SPEC, ObservationStatistics.none(SPEC))
     close(server)
     statistics = make().statistics()
@@ -226,9 +216,7 @@ def test_draws_follow_from_seed_number_and_ring_alone(make: Make, tmp_path: Path
 
 
 def test_rows_stay_until_the_next_draw_but_one(make: Make, bus: MemoryBus) -> None:
-    server, sender = make(), Sender(bus)
-    sender.send(50)
-    drain(server)
+    server, _ = filled(make(), bus, 50)
     samples, copies = [], []
     for _ in range(3):
         samples.append(server.sample(8).rows)
@@ -286,9 +274,7 @@ def test_small_credit_is_published_late_but_at_once_where_the_learner_waits(make
 
 def test_the_end_is_announced_and_reached(make: Make, bus: MemoryBus) -> None:
     config = ReplayConfig(capacity=1000, replay_ratio=2.0, warmup_steps=8)
-    server, sender = make(config, actors=1, total=400, slack=16), Sender(bus)
-    sender.send(2)
-    drain(server)
+    server, sender = filled(make(config, actors=1, total=400, slack=16), bus, 2)
     ack = bus.ack(0)
     assert ack is not None
     assert not ack.final
@@ -315,9 +301,7 @@ def test_an_empty_ring_makes_the_learner_wait(make: Make) -> None:
 
 
 def test_a_new_life_counts_from_zero(make: Make, bus: MemoryBus) -> None:
-    server, sender = make(ReplayConfig(capacity=100, replay_ratio=1.0, warmup_steps=100)), Sender(bus)
-    sender.send(5)
-    drain(server)
+    server, sender = filled(make(ReplayConfig(capacity=100, replay_ratio=1.0, warmup_steps=100)), bus, 5)
     assert sender.granted() == 20 + (116 - 20) // 2
     sender.hello()
     assert sender.epoch == 2
@@ -382,9 +366,7 @@ def assert_resent(sender: Sender, server: ReplayServer) -> None:
 @pytest.mark.parametrize("kind", ["memory", "redis"])
 def test_what_a_stream_lacks_is_sent_again(make: Make, kind: str, redis_url: str, run_name: str) -> None:
     bus: Bus = MemoryBus() if kind == "memory" else RedisBus(redis_url, run_name)
-    server, sender = make(on=bus), Sender(bus)
-    sender.send(2)
-    drain(server)
+    server, sender = filled(make(on=bus), bus, 2)
     sender.seq += 1  # entry 2 is what Redis lost
     sender.send_rows(make_rows(1, 3))
     drain(server)
@@ -423,9 +405,7 @@ def test_an_id_that_no_life_can_have_reached_is_refused_and_the_actor_goes_on(
     make: Make, redis_url: str, run_name: str, forged: tuple[int, int], counted: int
 ) -> None:
     bus = RedisBus(redis_url, run_name)
-    server, sender = make(on=bus), Sender(bus)
-    sender.send(2)
-    drain(server)
+    server, sender = filled(make(on=bus), bus, 2)
     sender.send(1)
     for _ in range(2):  # as often as somebody does it
         bus.redis.set(f"{bus.prefix}:epoch:actor-0", counted)
@@ -476,9 +456,7 @@ class Failing(MemoryBus):
 
 def test_what_a_stream_lacks_is_asked_for_again_where_redis_went_away_amid_asking(make: Make) -> None:
     bus = Failing("drop_stream")
-    server, sender = make(on=bus), Sender(bus)
-    sender.send(2)
-    drain(server)
+    server, sender = filled(make(on=bus), bus, 2)
     sender.seq += 1  # entry 2 is what Redis lost
     sender.send_rows(make_rows(1, 3))
     bus.failing = True
@@ -524,9 +502,7 @@ def test_an_id_past_all_others_closes_a_stream_to_nobody(
     make: Make, kind: str, bad: EntryId, redis_url: str, run_name: str
 ) -> None:
     bus: Bus = MemoryBus() if kind == "memory" else RedisBus(redis_url, run_name)
-    server, sender = make(on=bus), Sender(bus)
-    sender.send(2)
-    drain(server)
+    server, sender = filled(make(on=bus), bus, 2)
     bus.append(0, bad, b"anything")
     drain(server)
     assert server.stats()["dead_letters_id"] == 1
@@ -540,9 +516,7 @@ def test_an_id_past_all_others_closes_a_stream_to_nobody(
 
 
 def test_what_its_actor_lacks_too_is_given_up(make: Make, bus: MemoryBus) -> None:
-    server, sender = make(), Sender(bus)
-    sender.send(2)
-    drain(server)
+    server, sender = filled(make(), bus, 2)
     for _ in range(2):  # what it keeps starts at entry 6, also when it was asked to send again
         sender.greet()
         sender.seq = 5
@@ -595,9 +569,7 @@ def test_a_changed_ratio_counts_from_there(ratio: float, make: Make, bus: Memory
 
 
 def test_a_ratio_that_changes_in_the_warm_up_changes_nothing_else(make: Make, bus: MemoryBus) -> None:
-    server, sender = make(ReplayConfig(capacity=100, replay_ratio=8.0, warmup_steps=40)), Sender(bus)
-    sender.send(4)
-    drain(server)
+    server, sender = filled(make(ReplayConfig(capacity=100, replay_ratio=8.0, warmup_steps=40)), bus, 4)
     close(server)
     server = make(ReplayConfig(capacity=100, replay_ratio=2.0, warmup_steps=40))
     assert server.sample(4).status is SampleStatus.WAIT

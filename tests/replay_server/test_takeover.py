@@ -13,13 +13,11 @@ from rmc.common.errors import ConfigError, FencedError
 from rmc.common.replay import SampleStatus
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.recovery import valid_leaves
-from tests.replay_server.support import Make, Sender, close, drain, make_rows, stored
+from tests.replay_server.support import Make, Sender, close, drain, filled, make_rows, stored
 
 
 def test_an_empty_ring_goes_on_amid_a_life(make: Make, bus: MemoryBus) -> None:
-    server, sender = make(folder="lost"), Sender(bus)
-    sender.send(2)
-    drain(server)
+    server, sender = filled(make(folder="lost"), bus, 2)
     sender.send(3)
     bus._progress.clear()  # nobody knows how far the lost one was
     server = make(folder="empty")
@@ -32,9 +30,7 @@ def test_an_empty_ring_goes_on_amid_a_life(make: Make, bus: MemoryBus) -> None:
 def test_a_lost_ring_takes_no_counter_back(make: Make, kind: str, redis_url: str, run_name: str) -> None:
     bus: Bus = MemoryBus() if kind == "memory" else RedisBus(redis_url, run_name)
     config = ReplayConfig(capacity=100, replay_ratio=2.0, warmup_steps=20)
-    server, sender = make(config, folder="lost", actors=1, on=bus), Sender(bus)
-    sender.send(12)
-    drain(server)
+    server, sender = filled(make(config, folder="lost", actors=1, on=bus), bus, 12)
     for _ in range(4):
         assert server.sample(2).status is SampleStatus.BATCH
     server.update_priorities(np.array([3]), np.array([9.0], np.float32))
@@ -75,9 +71,7 @@ def test_a_lost_ring_takes_no_counter_back(make: Make, kind: str, redis_url: str
 
 
 def test_a_ring_that_is_ahead_of_what_was_published_stays(make: Make, bus: MemoryBus) -> None:
-    server, sender = make(), Sender(bus)
-    sender.send(4)
-    drain(server)
+    server, sender = filled(make(), bus, 4)
     published = bus.progress("replay")
     assert published is not None
     sender.send(2)
@@ -98,9 +92,7 @@ def test_published_counters_with_two_bits_flipped_are_passed_over(
     make: Make, bus: MemoryBus, place: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Whatever they count then: serials of terabytes, epochs that no later one passes."""
-    server, sender = make(folder="lost"), Sender(bus)
-    sender.send(4)
-    drain(server)
+    filled(make(folder="lost"), bus, 4)
     published = bytearray(bus.progress("replay") or b"")
     published[place] ^= 0x40
     published[place + 4] ^= 0x01
@@ -111,9 +103,7 @@ def test_published_counters_with_two_bits_flipped_are_passed_over(
 
 
 def test_lost_redis_data_neither_doubles_nor_goes_back(make: Make, bus: MemoryBus) -> None:
-    server, sender = make(), Sender(bus)
-    sender.send(4)
-    drain(server)
+    server, sender = filled(make(), bus, 4)
     close(server)
     empty = MemoryBus()
     server = make(on=empty)
@@ -208,9 +198,7 @@ def test_what_another_redis_held_is_read_once_the_older_server_is_fenced(
 
 
 def test_a_power_cut_loses_the_end_of_a_ring_alone(make: Make, bus: MemoryBus, tmp_path: Path) -> None:
-    server, sender = make(actors=1), Sender(bus)
-    sender.send(50)
-    drain(server)
+    server, sender = filled(make(actors=1), bus, 50)
     server.sample(4)
     shutil.copytree(tmp_path / "replay", tmp_path / "on disk")
     sender.send(3)
@@ -233,9 +221,7 @@ def test_a_power_cut_loses_the_end_of_a_ring_alone(make: Make, bus: MemoryBus, t
 
 def test_a_ring_of_which_nothing_is_left_begins_empty(make: Make, bus: MemoryBus) -> None:
     config = ReplayConfig(capacity=100, replay_ratio=2.0, warmup_steps=20)
-    server, sender = make(config, actors=1), Sender(bus)
-    sender.send(12)
-    drain(server)
+    server, sender = filled(make(config, actors=1), bus, 12)
     server._store.ring.rows["serial"] = -1
     close(server)
     server = make(config, actors=1)
