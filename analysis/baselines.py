@@ -29,7 +29,7 @@ from rmc.common.whole_file import write_whole
 from rmc.deploy.run.config import changes, layout_sizes, option
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.metrics_tail import wall_seconds
+from rmc.deploy.run.metrics_tail import MetricsTail, wall_seconds
 from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.opening import default_name, forget_start, has_more_than_a_start, make, new_folder
 from rmc.deploy.run.starts import note_start, resume_command
@@ -38,18 +38,21 @@ from rmc.deploy.run.state import STOPPED
 MAY_CHANGE = {"total_steps", "threads", "checkpoint_steps", "episodes", "env.env_timeout"}
 SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
 RECORD_SECONDS = 5.0
+Changes = dict[str, list[Any]]  # by the option's path, what it was and is
 
 
 def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: StopSignal) -> int:
     """Train to the end, or to a stop signal; the exit status. Raises ConfigError before anything is written."""
     validate(config)
     sizes = _sizes(config)
-    folder = _open_folder(config, run_dir, sizes)
+    folder, changed = _open_folder(config, run_dir, sizes)
     status = 1
     try:
         _set_torch(config)
-        console.print(f"run folder {folder.path}", soft_wrap=True)
-        status = _conduct(config, folder, console, stop)
+        with closing(BaselineModel(config, next(iter(saved_states(folder)[-1:]), None))) as model:
+            _write_start(config, folder, sizes, changed)
+            console.print(f"run folder {folder.path}", soft_wrap=True)
+            status = _conduct(config, folder, model, console, stop)
     finally:
         folder.unlock(status)
     return status
@@ -61,9 +64,11 @@ def _set_torch(config: BaselineConfig) -> None:
     torch.set_flush_denormal(True)  # as our learner does
 
 
-def _conduct(config: BaselineConfig, folder: RunFolder, console: Console, stop: StopSignal) -> int:
+def _conduct(
+    config: BaselineConfig, folder: RunFolder, model: BaselineModel, console: Console, stop: StopSignal
+) -> int:
     result, steps = None, 0
-    with suppress(_Stopped), closing(_Run(config, folder, console, stop)) as run:
+    with suppress(_Stopped), closing(_Run(config, folder, model, console, stop)) as run:
         run.train()
         steps = run.steps
         result = None if stop.requested else run.result()
@@ -82,8 +87,8 @@ def _sizes(config: BaselineConfig) -> dict[str, Any]:
     return layout_sizes(env_layout(config.env))
 
 
-def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, Any]) -> RunFolder:
-    """Make or take up a run's folder, locked, as ``open_run``. Raises ConfigError."""
+def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, Any]) -> tuple[RunFolder, Changes]:
+    """Make or take up a run's folder, locked, as ``open_run``; what is other than before. Raises ConfigError."""
     name = default_name(config.env.id, f"{config.algorithm}-{config.settings}", config.seed)
     folder = RunFolder(run_dir) if run_dir is not None else new_folder(Path("runs").resolve() / name)
     there = (folder.path / "config.json").exists() and folder.is_baseline()
@@ -95,12 +100,18 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
         raise ConfigError("ENV" if refused == "env.id" else option(refused), now, fix)
     if there:
         folder.check_sizes(config.env.id, sizes)
+        _initial_return(folder)
     elif has_more_than_a_start(folder):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no baseline's; give another one")
     make(folder)
     folder.lock()
     if not there:
         forget_start(folder)
+    return folder, changed
+
+
+def _write_start(config: BaselineConfig, folder: RunFolder, sizes: dict[str, Any], changed: Changes) -> None:
+    """That it begins, or goes on; a start that fails before takes no result along."""
     folder.reopen(config.total_steps)
     note_start(folder, changed, LaunchOptions(folder.path), None)
     written = json.dumps({"format": FORMAT} | asdict(config), indent=2)
@@ -108,7 +119,6 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
     folder.write_sizes(sizes)
     for leftover in set(folder.checkpoints.glob("[0-9]*")) - set(saved_states(folder)):  # by a crash amid a save
         shutil.rmtree(leftover)
-    return folder
 
 
 class _Stopped(Exception):
@@ -118,13 +128,15 @@ class _Stopped(Exception):
 class _Run(BaseCallback):
     """A model between its environment and its folder: evaluates, records, saves, stops. Raises _Stopped."""
 
-    def __init__(self, config: BaselineConfig, folder: RunFolder, console: Console, stop: StopSignal) -> None:
+    def __init__(
+        self, config: BaselineConfig, folder: RunFolder, model: BaselineModel, console: Console, stop: StopSignal
+    ) -> None:
         super().__init__()
         self.config, self.folder, self._console, self._stop = config, folder, console, stop
-        self._model = BaselineModel(config, next(iter(saved_states(folder)[-1:]), None))
+        self._model = model
         self._began, self._wall_before = time.monotonic(), wall_seconds(folder.metrics)
         self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, 0.0
-        self._next_evaluation = self._after(self.steps)
+        self._next_evaluation = self._after(min(self.steps, _evaluated_steps(folder)))  # one that was cut is made up
         self._initial = self._first_evaluation()
         self._metrics = folder.metrics.open("a", buffering=1)
 
@@ -146,7 +158,6 @@ class _Run(BaseCallback):
 
     def close(self) -> None:
         self._metrics.close()
-        self._model.close()
 
     def _on_step(self) -> bool:
         now = time.monotonic()
@@ -182,10 +193,11 @@ class _Run(BaseCallback):
 
     def _first_evaluation(self) -> float:
         """Of what it was before any training, once for the folder."""
-        initial = self.folder.path / "initial.json"
-        if not initial.exists():
-            write_whole(initial, json.dumps(self._play(FINAL_EPISODES, final=True)).encode())
-        return float(read_object(initial, "eval_return_mean")["eval_return_mean"])
+        if (kept := _initial_return(self.folder)) is not None:
+            return kept
+        played = self._play(FINAL_EPISODES, final=True)
+        self.folder.write_initial(played)
+        return float(played["eval_return_mean"])
 
     def _evaluate(self) -> None:
         result = self._play(self.config.episodes, final=False)
@@ -221,6 +233,18 @@ class _Run(BaseCallback):
         }
 
 
+def _initial_return(folder: RunFolder) -> float | None:
+    """Of what it was before any training, if that was played. Raises ConfigError where the file is damaged."""
+    file = folder.initial_file
+    return float(read_object(file, "eval_return_mean")["eval_return_mean"]) if file.exists() else None
+
+
+def _evaluated_steps(folder: RunFolder) -> int:
+    """Environment steps at the last evaluation; 0 before the first."""
+    said = (record.get("eval_env_steps") for record in MetricsTail(folder.metrics).take())
+    return max((steps for steps in said if isinstance(steps, int)), default=0)
+
+
 def evaluate(
     folder: RunFolder,
     episodes: int,
@@ -233,11 +257,11 @@ def evaluate(
     config, states = read(folder), saved_states(folder)
     if not states:
         raise ConfigError("RUN", str(folder.path), "it has no checkpoint yet; train it for longer")
-    folder.check_sizes(config.env.id, _sizes(config))
-    _set_torch(config)
-    progress = read_object(states[-1] / PROGRESS, "env_steps", "updates")
     env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
     env = env if env_timeout is None else dataclasses.replace(env, env_timeout=env_timeout)
+    folder.check_sizes(env.id, layout_sizes(env_layout(env)))
+    _set_torch(config)
+    progress = read_object(states[-1] / PROGRESS, "env_steps", "updates")
     player = saved_player(config, states[-1], env)
     seed = first_start(config.seed, final=True)
     rollout = play_episodes(player, lambda: make_env(env), episodes, seed, seconds, watch)

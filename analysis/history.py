@@ -184,7 +184,7 @@ def _env_label(env: EnvConfig) -> str:
     names = [item.name for item in dataclasses.fields(env) if item.name not in separate]
     odd = [name for name in names if getattr(env, name) != getattr(plain, name)]
     options = (f"{name.replace('_', ' ')} {getattr(env, name)}" for name in odd)
-    return ", ".join([env.id, *write_kwargs(env.env_kwargs), *options])
+    return ", ".join([env.id, *write_kwargs(dict(sorted(env.env_kwargs.items()))), *options])
 
 
 def _evaluations(records: Iterable[dict[str, Any]]) -> list[Evaluation]:

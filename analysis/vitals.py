@@ -122,8 +122,8 @@ def _newest(records: Iterable[Record], span: float) -> list[Record]:
             if seconds < trained:
                 kept, end = [], 0.0
             trained, began = seconds, record["time"] - seconds - LAUNCHER_SECONDS
-        if kept and record["time"] - end > NEW_START_SECONDS:
-            kept.clear()
+        if kept and abs(record["time"] - end) > NEW_START_SECONDS:  # a pause, or a clock that was set
+            kept, end = [], 0.0
         kept.append(record)
         end = max(end, record["time"])
     return [record for record in kept if record["time"] >= max(began, end - span)]

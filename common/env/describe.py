@@ -13,8 +13,11 @@ from rmc.common.env.wrappers import Env
 
 def structure(env: gym.Env[Any, Any]) -> dict[str, int]:
     """Names and sizes of the observation's parts in order, where the environment tells them (MuJoCo's bodies)."""
-    named = getattr(env.unwrapped, "observation_structure", None) or {}
-    return {name: size for name, size in named.items() if not name.startswith("skipped")}
+    told = getattr(env.unwrapped, "observation_structure", None)
+    named = told if isinstance(told, dict) else {}
+    if not all(isinstance(name, str) and isinstance(size, int | np.integer) for name, size in named.items()):
+        return {}  # of that name, but something else
+    return {name: int(size) for name, size in named.items() if not name.startswith("skipped")}
 
 
 def shown(env: gym.Env[Any, Any], hide: str) -> slice | None:

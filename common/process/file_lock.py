@@ -11,7 +11,7 @@ from rmc.common.errors import ConfigError
 
 LOCK_SECONDS = 5.0  # that a lock is waited for: who held it may be about to end
 LOOK_SECONDS = 0.1
-WITHOUT_LOCKS = {errno.ENOSYS, errno.EOPNOTSUPP}  # of a disk that has none
+WITHOUT_LOCKS = {errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK}  # of a disk that has none
 log = logging.getLogger(__name__)
 
 

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -92,8 +91,8 @@ def _owner(process: int) -> str:
 def stop(folder: RunFolder) -> int:
     """Ask the launcher to end the run cleanly, and wait until it has; its exit status. Raises ConfigError."""
     trainer = launcher_pid(folder)
-    if (host := folder.trainer_host()) not in ("", socket.gethostname()):
-        raise ConfigError("RUN", str(folder.path), f"is trained on {host}; stop it there")
+    if elsewhere := folder.trained_elsewhere():
+        raise ConfigError("RUN", str(folder.path), f"is trained on {elsewhere}; stop it there")
     _ask(folder, trainer)
     seconds = STOP_SECONDS + CheckpointFolder(folder.checkpoints).patience(0.0)
     deadline = time.monotonic() + seconds

@@ -53,19 +53,27 @@ class RunStatus:
         self._counted, self._moved_at, self._spoke_at = (0, 0), 0.0, 0.0  # steps and updates, when they last grew
 
     @property
+    def _began(self) -> float:
+        """The newest start; one that lies ahead is not known, as the clock was set back."""
+        return self.began if self.began <= time.time() else 0.0
+
+    @property
     def is_over(self) -> bool:
         """Then nobody is expected to speak."""
         return self.state != "training"
 
     def take(self, record: dict[str, Any]) -> None:
-        """Take in a record; what it does not name stays as it was, and of a role there are ``MOST_NAMES`` at most."""
+        """Take in a record; what it does not name stays as it was.
+
+        Of a role there are ``MOST_NAMES`` at most, but for the launcher, which names each role.
+        """
         role = record["role"]
         current = self.roles.get(role, {})
         if role == "launcher" and _number(record.get("start_s")) < _number(current.get("start_s")):
             self._pace.forget()  # of another start
             self._is_trained = False
-        room = MOST_NAMES - len(current)
-        new = record if len(record) <= room else {name: record[name] for name in record if name in current}
+        fits = role == "launcher" or len(record) <= MOST_NAMES - len(current)
+        new = record if fits else {name: record[name] for name in record if name in current}
         if role in self.roles:
             self.roles[role] = current | new
         else:  # afresh: another thread may be going through the old one
@@ -79,7 +87,7 @@ class RunStatus:
 
     def _note_word(self, record: dict[str, Any]) -> None:
         spoke = _number(record.get("time"))
-        if self._spoke_last < self.began <= spoke:  # the first of this start, before which all may take its time
+        if self._spoke_last < self._began <= spoke:  # the first of this start, before which all may take its time
             self._since = dict.fromkeys(self._since, time.time())
         self._spoke_last = spoke
         if record["role"] == "learner":
@@ -140,7 +148,7 @@ class RunStatus:
     @property
     def _is_training(self) -> bool:
         """Whether roles are to speak: not before the first word of this start, nor once the learner is at its end."""
-        return not (self.is_over or self._is_trained) and self._spoke_last >= self.began
+        return not (self.is_over or self._is_trained) and self._spoke_last >= self._began
 
     @property
     def stalled_s(self) -> float:
@@ -168,8 +176,8 @@ class RunStatus:
         """Environment steps committed to the ring."""
         if self.final_steps is not None:
             return self.final_steps
-        steps = self.replay("env_steps", sum) or self.get("learner", "env_steps") or self.steps_before
-        return _steps(steps) or 0
+        steps = self.replay("env_steps", sum) or self.get("learner", "env_steps")
+        return max(_steps(steps) or 0, self.steps_before)  # one of several replay servers may speak first
 
     @property
     def share_done(self) -> float:
@@ -182,7 +190,7 @@ class RunStatus:
         wall_s, spoke = self.get("launcher", "wall_s"), self.get("launcher", "time")
         if not is_finite(wall_s):
             return None
-        trains = not self.is_over and is_finite(spoke) and spoke >= self.began  # between two starts none does
+        trains = not self.is_over and is_finite(spoke) and spoke >= self._began  # between two starts none does
         return float(wall_s) + (max(0.0, time.time() - spoke) if trains else 0.0)
 
     @property

@@ -91,7 +91,7 @@ class Hosts:
         environment |= users_path()
         run = self._folder
         return options.remote(
-            Task(run.name, run.scratch_name(), place.command, environment, self._secrets(name), working_folder())
+            Task(run.name, run.identity(), place.command, environment, self._secrets(name), working_folder())
         )
 
     def _secrets(self, name: str) -> dict[str, bytes]:

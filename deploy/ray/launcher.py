@@ -75,7 +75,7 @@ def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None
         name=actor_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
         max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
     )  # fmt: skip
-    task = Task(folder.name, folder.scratch_name(), command, users_path(), {}, working_folder())
+    task = Task(folder.name, folder.identity(), command, users_path(), {}, working_folder())
     host = actor.remote(task, str(folder.path), config.learner.keep_checkpoints)
     try:
         ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)

@@ -55,16 +55,17 @@ class RunFolder:
     @property
     def name(self) -> str:
         """The run's name in Redis: the folder's, and what tells it from others of that name."""
-        return f"{self.path.name}-{hashlib.sha256(self.secret()).hexdigest()[:8]}"
+        return f"{self.path.name}-{self.identity()}"
 
-    def scratch_name(self) -> str:
-        """By which nodes of a cluster know what they keep of the run: the same after a rename, another for a copy."""
+    def identity(self) -> str:
+        """Eight letters: the same after a rename, others for a copy. By them nodes know what they keep of the run."""
         note, own = self.path / "scratch", str(self.path.stat().st_ino)
         with suppress(OSError, ValueError):  # there is none, or it is damaged
             folder, name = note.read_text().split()
             if folder == own:
                 return name
-        name = secrets.token_hex(4) if note.exists() else self.name[-8:]  # which runs of older versions have
+        older = hashlib.sha256(self.secret()).hexdigest()[:8]  # which runs of older versions have
+        name = secrets.token_hex(4) if note.exists() else older
         write_whole(note, f"{own} {name}\n".encode())
         return name
 
@@ -188,9 +189,17 @@ class RunFolder:
         """Be the one launcher of this run. Raises ConfigError where another one is."""
         self._lock = take_lock(self.path / ".lock", LOCK_SECONDS)
         if self._lock is None:
-            raise ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first")
+            raise self._is_trained()
         self._was = self.path.stat()
-        self._note(f"training {os.getpid()} {socket.gethostname()}")
+        self._note(" ".join(["training", str(os.getpid()), *_process_space()]))
+
+    def check_untrained(self) -> None:
+        """Raises ConfigError where a launcher trains it."""
+        if self.trainer() is not None:
+            raise self._is_trained()
+
+    def _is_trained(self) -> ConfigError:
+        return ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first")
 
     def check_there(self) -> None:
         """Raises ConfigError where it is not the folder any more that was locked, or has lost what it goes on from."""
@@ -219,7 +228,7 @@ class RunFolder:
         os.pwrite(self._lock, text.encode(), 0)
 
     def trainer(self) -> int | None:
-        """The process of the launcher that trains this run now, if one does; on ``trainer_host``."""
+        """The process of the launcher that trains this run now, if one does, wherever that is."""
         try:
             with (self.path / ".lock").open("rb") as file:
                 word, *rest = file.read().decode().split()
@@ -232,9 +241,12 @@ class RunFolder:
                 raise
             return None  # a copy: no launcher trains where it cannot lock
 
-    def trainer_host(self) -> str:
-        """The machine whose launcher trains this run; empty where none does."""
-        return " ".join((self.path / ".lock").read_text().split()[2:])
+    def trained_elsewhere(self) -> str:
+        """The machine or container whose launcher trains this run; empty where that is here, or none does."""
+        (host, *container), space = _process_space(), (self.path / ".lock").read_text().split()[2:]
+        if space == [host, *container][: len(space)]:  # versions before noted the machine alone
+            return ""
+        return f"another container of {host}" if space[0] == host else space[0]
 
     def ended(self) -> int | None:
         """The exit status of the launcher that trained it last, if that came to an end of its own.
@@ -248,6 +260,14 @@ class RunFolder:
             return None
         except ValueError as error:
             raise ConfigError("RUN", str(self.path), f".lock is damaged ({error}); remove that file") from None
+
+
+def _process_space() -> list[str]:
+    """Where this process has its number: the machine, and the container on it."""
+    space = [socket.gethostname()]
+    with suppress(OSError):  # not on Linux
+        space.append(os.readlink("/proc/self/ns/pid"))
+    return space
 
 
 def _link(temporary: str, path: Path) -> None:

@@ -14,6 +14,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, flat, option, option_words
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.preflight import check_machine
+from rmc.deploy.run.tracking import choose_tracking
 from rmc.deploy.run.validation import validate, validate_launch, validate_windows
 from rmc.sweep.job import Job
 from rmc.sweep.spec import Range, Spec, check_name
@@ -79,6 +80,7 @@ def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:
         if alike is None:
             alike = by_values[repr(job.values)] = _checked(job, on_this_machine)
         config = dataclasses.replace(alike.config, seed=job.seed)
+        config.__dict__["layout"] = alike.config.layout  # the environment is made once
         validate(config)
         checked.append(Checked(with_length(job, config), config, alike.options))
     return checked
@@ -106,6 +108,7 @@ def _checked(job: Job, on_this_machine: bool) -> Checked:
     validate_launch(config, options)
     if on_this_machine:
         check_machine(config, options)
+        choose_tracking(options)
     else:
         if options.device not in ("cpu", "cuda", "cuda:0"):
             raise ConfigError("--device", options.device, "a run on a node sees one GPU; take cuda")

@@ -51,7 +51,12 @@ def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
     """The run's folder, locked, once all is checked that needs no process. Raises ConfigError."""
     validate(config)
     validate_launch(config, options)
-    check_machine(config, options)
+    try:
+        check_machine(config, options)
+    except ConfigError:
+        if options.goes_on and options.run_dir is not None:
+            RunFolder(options.run_dir).check_untrained()  # by whom its port and memory would be taken
+        raise
     if options.launcher == "local":
         place_for_sockets()
     if options.redis_url is not None:

@@ -14,10 +14,11 @@ def result_table(jobs: Sequence[Job], index: Index) -> Table:
     points: dict[str, list[Job]] = {}
     for job in jobs:
         points.setdefault(job.name if job.name.startswith(TRIAL) else repr(job.values), []).append(job)
-    rows = sorted((_row(runs, index) for runs in points.values()), key=lambda row: -row[0])
+    names = list(jobs[0].values)
+    rows = sorted((_row(runs, index, names) for runs in points.values()), key=lambda row: -row[0])
     table = Table(box=None, pad_edge=False)
     whole = all(not cells[-1] for _, cells in rows)
-    columns = ["trial" if jobs[0].name.startswith(TRIAL) else "", *jobs[0].values, "seeds", "return", "not finished"]
+    columns = ["trial" if jobs[0].name.startswith(TRIAL) else "", *names, "seeds", "return", "not finished"]
     shown_at = [at for at, name in enumerate(columns) if name and not (whole and name == "not finished")]
     for at in shown_at:
         table.add_column(columns[at], justify="right", no_wrap=True)
@@ -26,7 +27,7 @@ def result_table(jobs: Sequence[Job], index: Index) -> Table:
     return table
 
 
-def _row(runs: list[Job], index: Index) -> tuple[float, list[str]]:
+def _row(runs: list[Job], index: Index, names: list[str]) -> tuple[float, list[str]]:
     """Its mean return, by which it is sorted, and its cells."""
     finished = [index.lines[job.name] for job in runs if index.state(job) == "finished"]
     returns = [line["return"] for line in finished if line["return"] is not None]
@@ -35,7 +36,8 @@ def _row(runs: list[Job], index: Index) -> tuple[float, list[str]]:
     others = [index.state(job) for job in runs if index.state(job) != "finished"]
     counts = ", ".join(f"{others.count(state)} {state}" for state in dict.fromkeys(others))
     is_trial = runs[0].name.startswith(TRIAL)  # whose values were drawn, with all their digits
-    values = (f"{one:.4g}" if is_trial and isinstance(one, float) else shown(one) for one in runs[0].values.values())
+    drawn = (runs[0].values[name] for name in names)  # trials of another command may have another order
+    values = (f"{one:.4g}" if is_trial and isinstance(one, float) else shown(one) for one in drawn)
     text = f"{mean:,.1f}{deviation}" if returns else "-"
     return mean, [runs[0].name.removeprefix(TRIAL), *values, str(len(returns)), text, counts]
 

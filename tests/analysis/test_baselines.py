@@ -219,11 +219,35 @@ def test_files_that_are_cut_are_named(tmp_path):
             if path.name in ("progress.json", "model.zip", "config.json"):
                 with pytest.raises(ConfigError, match=rf"{folder}.*{fault}"):
                     evaluate(RunFolder(folder), 1, None, 0.0, lambda _: None)
+            assert RunFolder(folder).result() is not None
         path.write_bytes(whole)
 
 
+def test_an_evaluation_that_was_stopped_is_made_up(tmp_path, monkeypatch):
+    folder, stop = RunFolder(tmp_path / "run"), StopSignal()
+
+    def stopped(*_):
+        stop.request()
+        raise baselines._Stopped
+
+    with monkeypatch.context() as patch:
+        patch.setattr(baselines._Run, "_evaluate", stopped)
+        assert run(config(), folder.path, stop) == 130
+    assert "eval_env_steps" not in folder.metrics.read_text()
+    assert run(config(), folder.path) == 0
+    assert [one.env_steps for one in of_run(folder).evaluations] == [101, 200, 300]
+
+
+def test_it_is_played_with_the_time_limit_that_is_given(tmp_path, monkeypatch):
+    run(config("ppo", total_steps=100), tmp_path / "run")
+    seconds, made = [], baselines.env_layout
+    monkeypatch.setattr(baselines, "env_layout", lambda env: seconds.append(env.env_timeout) or made(env))
+    evaluate(RunFolder(tmp_path / "run"), 1, env_timeout=7.0)
+    assert seconds == [7.0]
+
+
 def test_the_environments_keywords_and_sizes_are_kept(tmp_path, monkeypatch, capsys):
-    env = EnvConfig("tests.habits:Wants-v0", time_limit=20, env_kwargs={"goal": 1.5, "size": 4})
+    env = EnvConfig("tests.habits:Wants-v0", time_limit=20, env_kwargs={"size": 4, "goal": 1.5})
     assert run(config(env=env, total_steps=150), tmp_path / "run") == 0
     assert read(RunFolder(tmp_path / "run")).env == env
     assert of_run(RunFolder(tmp_path / "run")).env == "tests.habits:Wants-v0, goal=1.5, size=4, time limit 20"

@@ -126,6 +126,12 @@ def test_a_resume_within_the_minute_is_another_start(seconds: int) -> None:
     assert run_faults.stalled(newest, CONFIG) is not None
 
 
+def test_after_the_clock_was_set_back_the_newest_is_judged() -> None:
+    said = records(2_000)
+    said = [one | {"time": one["time"] - 900.0 * (one["time"] > 2_000.0)} for one in said]
+    assert Vitals(said).last("learner", "updates") == 19_990
+
+
 def test_a_deadlock_is_named_with_its_waits() -> None:
     still = records(
         120,

@@ -44,7 +44,7 @@ def _pids(words: str) -> list[int]:
 
 def ring(folder: Path) -> Path:
     """Where the replay server's node keeps it."""
-    return Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{RunFolder(folder).scratch_name()}" / "replay" / "ring"
+    return Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{RunFolder(folder).identity()}" / "replay" / "ring"
 
 
 def test_a_run_on_a_ray_of_its_own(tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
 """Environments: what comes out, what is refused in one line, and that MuJoCo keeps quiet."""
 
+import json
 import math
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +56,25 @@ def odd(name: str, observation: gym.Space[Any], action: gym.Space[Any]) -> EnvCo
     gym.registry.pop(name, None)
     gym.register(name, entry_point=OddSpaces, kwargs={"observation": observation, "action": action})
     return EnvConfig(name)
+
+
+@pytest.mark.parametrize(
+    ("told", "names"),
+    [
+        (["pos", "vel"], [""]),
+        ("pos", [""]),
+        ({"pos": (3,)}, [""]),
+        ({"pos": np.int64(1), "vel": 2}, ["pos", "vel"]),
+    ],
+    ids=str,
+)
+def test_what_an_environment_calls_the_parts_of_its_observation(
+    told: Any, names: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or something else of that name."""
+    monkeypatch.setattr(OddSpaces, "observation_structure", told, raising=False)
+    layout = env_layout(odd("OddParts-v0", VECTOR, Box(-1.0, 1.0, (2,))))
+    assert [part["name"] for part in json.loads(json.dumps(asdict(layout)))["observations"]] == names
 
 
 def test_mujoco_environment() -> None:

@@ -5,6 +5,7 @@ import itertools
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
 import time
@@ -71,6 +72,39 @@ def test_a_trainer_on_another_machine_is_not_ours_to_stop(folder: RunFolder, mon
     with pytest.raises(ConfigError, match=r"is trained on .*; stop it there"):
         stop(folder)
     folder.unlock()
+
+
+def test_nor_is_one_in_another_container_of_this_machine(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There, another process has its number."""
+    folder.lock()
+    assert folder.trained_elsewhere() == ""
+    monkeypatch.setattr("os.readlink", lambda path: f"{path} of another")
+    with pytest.raises(ConfigError, match=rf"is trained on another container of {socket.gethostname()}; stop it there"):
+        stop(folder)
+    folder.unlock()
+
+
+def test_of_several_replay_servers_none_takes_the_steps_back(folder: RunFolder) -> None:
+    status = empty_status(folder)
+    status.steps_before = 800
+    for role, steps in (("replay-0", 400), ("replay-1", 500)):
+        status.take({"role": role, "time": time.time(), "env_steps": steps})
+        assert status.env_steps == max(800, 900 * (role == "replay-1"))
+
+
+def test_the_launcher_of_a_thousand_roles_is_heard(folder: RunFolder) -> None:
+    status = empty_status(folder)
+    restarts = {f"restarts_actor-{number}": 0 for number in range(run_status.MOST_NAMES)}
+    status.take({"role": "launcher", "time": time.time(), "redis_away_s": 40.0, **restarts})
+    assert list(status.silent()) == ["Redis"]
+
+
+def test_after_the_clock_was_set_back_silence_is_shown(folder: RunFolder) -> None:
+    status = empty_status(folder)
+    status.began = time.time() + 3600.0
+    for role in ("launcher", "learner"):
+        status.take({"role": role, "time": time.time() - 100.0, "start_s": 50.0})
+    assert set(status.silent()) == {"launcher", "learner"}
 
 
 def test_nobody_to_stop_is_said(folder: RunFolder, tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from rmc.cli.role_options import LauncherRole
 from rmc.deploy.local.role_command import launcher_command
 from rmc.deploy.monitor import exporter
 from rmc.deploy.monitor.run_status import RunStatus
+from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from tests.integration.running import free_port
 
@@ -144,6 +145,18 @@ def test_a_port_that_is_taken_is_one_line(tmp_path: Path, capsys: pytest.Capture
         assert main.run([*words, "--metrics-port", str(port)]) == 2
     assert capsys.readouterr().err == f"rmc: --metrics-port={port}: Address already in use on {HERE}; take another\n"
     assert not list(tmp_path.iterdir())
+
+
+def test_a_second_start_is_not_told_of_the_port_that_the_first_one_has(
+    folder: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_server((HERE, 0)) as taken:
+        port = taken.getsockname()[1]
+        folder.lock()
+        words = ["resume", str(folder.path), "--metrics-port", str(port)]
+        assert main.run(words) == 2
+        folder.unlock()
+    assert capsys.readouterr().err == f"rmc: --run-dir='{folder.path}': this run is being trained; stop it first\n"
 
 
 @pytest.mark.parametrize("options", [{}, {"metrics_port": 9464, "metrics_host": "0.0.0.0", "tls": True}])

@@ -33,18 +33,20 @@ from rmc.deploy.run.presets import debug
 from rmc.deploy.run.state import run_state
 
 
-def test_nodes_know_a_run_that_is_renamed_but_take_a_copy_for_another(tmp_path: Path) -> None:
+def test_a_run_that_is_renamed_is_known_but_a_copy_is_another(tmp_path: Path) -> None:
+    """To the nodes of a cluster, and in a Redis of the user's own though its folder has the same name."""
     first = RunFolder(tmp_path / "run")
     first.path.mkdir()
-    name = first.scratch_name()
-    assert name == first.name[-8:]
+    name = first.identity()
+    shutil.copytree(first.path, tmp_path / "other" / "run")
+    assert len({first.name, first.name, RunFolder(tmp_path / "other" / "run").name}) == 2
     first.path.rename(tmp_path / "renamed")
-    assert RunFolder(tmp_path / "renamed").scratch_name() == name
+    assert RunFolder(tmp_path / "renamed").identity() == name
     shutil.copytree(tmp_path / "renamed", tmp_path / "copy")
-    copies = {RunFolder(tmp_path / "copy").scratch_name() for _ in range(2)}
+    copies = {RunFolder(tmp_path / "copy").identity() for _ in range(2)}
     assert len(copies | {name}) == 2
     (tmp_path / "copy" / "scratch").write_text("damaged")
-    assert RunFolder(tmp_path / "copy").scratch_name() not in copies | {name}
+    assert RunFolder(tmp_path / "copy").identity() not in copies | {name}
 
 
 def test_all_who_make_it_at_once_have_the_same(tmp_path: Path) -> None:
@@ -108,11 +110,14 @@ def test_a_disk_without_locks_is_one_line_before_there_is_a_run(
     assert not (tmp_path / "run" / "config.json").exists()
 
 
-def test_a_copy_on_a_disk_without_locks_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("fault", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
+def test_a_copy_on_a_disk_without_locks_can_be_read(
+    fault: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
     shutil.copytree(folder.path, tmp_path / "copy")
     folder.unlock()
-    monkeypatch.setattr("fcntl.flock", raising(errno.ENOSYS))
+    monkeypatch.setattr("fcntl.flock", raising(fault))
     assert run_state(RunFolder(tmp_path / "copy")) == "lost"
 
 

@@ -190,6 +190,7 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(
         ([PENDULUM, "--config", "f.toml"], "--config='f.toml': cannot be read"),
         ([PENDULUM, "--config", "me@f.toml"], "--config='me@f.toml': cannot be read"),
         ([PENDULUM, "--trials", "3"], "--trials=3: is for a search"),
+        ([PENDULUM, "--preset", "debug", "--track-tags", "x"], "--track-tags=('x',): say which tracker"),
         (["spec.toml", "--seeds", "1"], "--seeds='1': belongs into spec.toml"),
         ([PENDULUM, "--search", "scheme=9..1"], "search.scheme={'low': 9"),
         ([PENDULUM, "--preset", "debug", "--total-steps", "9"], "--total-steps=9: take more than --warmup-steps"),

@@ -16,10 +16,11 @@ import pytest
 from rich.console import Console
 
 from rmc.cli.main import run
-from rmc.cli.sweep_check import Checked, read
+from rmc.cli.sweep_check import Checked, check_jobs, read
 from rmc.cli.sweep_command import grid_work
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
+from rmc.deploy.run import config as run_config
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import open_run
 from rmc.sweep import local_runs, pool, room
@@ -207,6 +208,28 @@ def test_a_killed_sweeps_runs_are_not_told_as_running_and_tables_are_not_cut(tmp
     assert "0.99992" in text
 
 
+def test_a_trials_values_stand_under_their_names(tmp_path: Path) -> None:
+    """In whatever order its command gave them."""
+    jobs = [
+        Job(tmp_path / f"trial-{number}", (), 0, values)
+        for number, values in enumerate([{"gamma": 0.99, "polyak": 0.995}, {"polyak": 0.98, "gamma": 0.95}])
+    ]
+    with closing(Index(tmp_path)) as index:
+        columns = result_table(jobs, index).columns
+    cells = {column.header: list(column.cells) for column in columns}
+    assert (cells["gamma"], cells["polyak"]) == (["0.99", "0.95"], ["0.995", "0.98"])
+
+
+def test_the_environment_is_made_once_for_all_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, env_layout = [], run_config.env_layout
+    monkeypatch.setattr(run_config, "env_layout", lambda *words: made.append(words) or env_layout(*words))
+    words = ("train", "InvertedPendulum-v5", "--preset", "debug")
+    jobs = [Job(tmp_path / str(seed), words, seed) for seed in range(3)]
+    checked = check_jobs(jobs, on_this_machine=True)
+    assert [one.config.seed for one in checked] == [0, 1, 2]
+    assert len({one.config.window_spec() for one in checked}) == len(made) == 1
+
+
 def made(folder: Path, gamma: float = 0.99) -> Job:
     """A run that is over."""
     words = ("train", "InvertedPendulum-v5", "--preset", "debug", "--gamma", str(gamma), "--seed", "0")
@@ -247,6 +270,12 @@ def test_the_rings_of_all_replay_servers_are_dropped(tmp_path: Path) -> None:
     job = Job(tmp_path, (), 0)
     for name in ("replay", "replay-0", "replay-11", "replay-counters", "checkpoints"):
         (tmp_path / name).mkdir()
+    lock = RunFolder(tmp_path)
+    lock.lock()
+    drop_replay(job)
+    assert (tmp_path / "replay").is_dir()  # somebody trains it longer
+    lock.unlock()
+    (tmp_path / ".lock").unlink()
     drop_replay(job)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoints", "replay-counters"]
 
