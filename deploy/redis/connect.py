@@ -11,6 +11,7 @@ from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.bus.redis_url import shown
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError
 from rmc.common.process.role import RECONNECT_SLEEP, StopSignal
+from rmc.common.user_path import user_path
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -44,7 +45,7 @@ class Deadline:
 def connect(url: str, run: str, waits: Deadline | None = None) -> RedisBus:
     """A bus whose Redis answers, at once or within that patience; ``file:PATH`` holds the URL. Raises ConfigError."""
     if url.startswith("file:"):
-        url = _in_file(Path(url.removeprefix("file:")))
+        url = _in_file(user_path(url.removeprefix("file:")))
     bus = RedisBus(url, run)
     while True:
         try:

@@ -1,4 +1,4 @@
-"""``rmc``: every command's entry, and how errors reach the user: one line, exit status 2."""
+"""``rmc``: every command's entry, and how errors reach the user: one line, exit status 2 for what they gave, else 1."""
 
 import contextlib
 import errno

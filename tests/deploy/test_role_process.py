@@ -72,12 +72,13 @@ def test_who_is_told_to_stop_waits_no_longer(short: Path) -> None:
             waiting.result(10.0)
 
 
-def test_a_url_is_read_from_a_file(short: Path) -> None:
+def test_a_url_is_read_from_a_file(short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the login that the server asks for, and the end of line that every editor writes."""
     users = RedisUsers("run", b"of the run", ("actor-0",))
     with RedisServer(short, users=users) as server:
         (short / "redis-url").write_text(f"{server.url('actor-0')}\n")
-        connect(f"file:{short}/redis-url", "run").ping()
+        monkeypatch.setenv("HOME", str(short))
+        connect("file:~/redis-url", "run").ping()
         (short / "redis-url").write_text(f"unix://{server.socket}\n")
         with pytest.raises(ConfigError, match=r"--redis-url='unix:///.*no Redis answers there .*authenticat"):
             connect(f"file:{short}/redis-url", "run")
