@@ -1,9 +1,12 @@
 """Files that are there whole or not at all. The temporary one beside each has a dot in front."""
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT}  # what a full disk raises
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -58,6 +58,12 @@ class _Pipeline(Pipeline):
         with _naming(args):
             return super().immediate_execute_command(*args, **options)  # type: ignore[no-untyped-call]
 
+    def reset(self) -> None:  # type: ignore[override]  # a command of Redis has that name, too
+        """Give the connection back, also where Redis hangs: redis-py would wait for UNWATCH, and then keep it."""
+        if self.connection is not None and not self.connection.is_connected:
+            self.watching = False  # a new connection watches nothing
+        super().reset()
+
     def annotate_exception(self, exception: Any, _: int, command: Any) -> None:
         _name(exception, tuple(command))
 

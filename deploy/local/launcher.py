@@ -1,5 +1,6 @@
 """A run as processes of this machine: embedded Redis if none is given, roles under the supervisor, the monitor."""
 
+import json
 import logging
 import signal
 import time
@@ -7,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rmc.common.bus.redis_bus import RedisBus
-from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RmcError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local.role_command import (
@@ -29,6 +30,7 @@ from rmc.deploy.run.folder import RunFolder
 TICK_SECONDS = 0.2  # between looks at the roles and their metrics: a look costs 3 ms
 UNREACHABLE_SECONDS = 1.0  # without its socket, until a replay server is started again
 OUTAGE_SECONDS = 86_400.0  # of a Redis that answered once, until a role that is started amid it gives up
+HELD_SECONDS = 20.0  # that a learner may be held by a replay server or Redis that hangs, before it hears and saves
 KEPT_SECONDS = 3600  # in a user's Redis, after the end
 log = logging.getLogger(__name__)
 
@@ -58,7 +60,7 @@ class LocalRun:
             commands(config, folder, self._redis.sockets, device),
             lambda role: {URL_VARIABLE: self._redis.url(role), PATIENCE_VARIABLE: str(OUTAGE_SECONDS)},
             folder.logs,
-            lambda role: CheckpointFolder(folder.checkpoints).patience(0.0) if role == "learner" else 0.0,
+            lambda role: CheckpointFolder(folder.checkpoints).patience(HELD_SECONDS) if role == "learner" else 0.0,
             lambda: stop.requested,
         )
 
@@ -115,7 +117,7 @@ def train(
 ) -> bool:
     """Train until the total is reached or ``stop`` is set; whether it was reached. Raises RoleDied, ConfigError."""
     run = LocalRun(config, folder, redis_url, device, stop)
-    monitor.restarts = run.supervisor.restarts
+    monitor.restarts, total = run.supervisor.restarts, config.total_steps
     try:
         tried_again(lambda: monitor.skip_old(run.bus), stop)
         run.supervisor.start()
@@ -124,10 +126,16 @@ def train(
             monitor.watch(run.bus)
             time.sleep(TICK_SECONDS)
         run.supervisor.stop()
-        monitor.watch(run.bus)  # what the roles said last
-        return monitor.learner_finished()
+        monitor.watch(run.bus)  # what the roles said last; a Redis that is away has lost it
+        return monitor.learner_finished() or (run.finished() and not stop.requested and _saved_steps(folder) >= total)
     finally:
         run.close()
+
+
+def _saved_steps(folder: RunFolder) -> int:
+    """Environment steps of the newest checkpoint; 0 where there is none."""
+    newest = CheckpointFolder(folder.checkpoints).latest()
+    return int(json.loads(newest[1][PROGRESS])["env_steps"]) if newest else 0
 
 
 def _asked_to_stop(bus: RedisBus, reason: str) -> bool:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from rmc.common.bus.protocol import Bus
+from rmc.common.bus.protocol import Bus, ReplayOwner
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import run_role
 from rmc.common.shard import Shard
@@ -20,6 +20,13 @@ def make_server(config: RunConfig, folder: Path, bus: Bus, shard: Shard) -> Repl
     return ReplayServer(spec, config.replay, folder, config.seed, config.total_steps, config.actors, slack, bus, shard)
 
 
+def drop_unread(bus: Bus, shard: Shard) -> None:
+    """Remove what no replay server has taken: where that fills Redis, none could begin. Actors send it again."""
+    owner = ReplayOwner(shard.role, bus.current_epoch(shard.role))
+    for actor in filter(shard.owns, bus.actors()):
+        bus.drop_stream(owner, actor)
+
+
 def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> int:
     """A replay server's process; its ring lies in ``folder``, its socket at ``listen``."""
     secret, process = place.secret(), Process(place)
@@ -28,7 +35,7 @@ def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> i
     if not 0 <= index < shard.count:
         raise ConfigError("--shard", index, f"the run has replay servers 0 to {shard.count - 1}")
     context = tls.server_context(place.tls_folder) if place.tls_folder is not None else None
-    with process.starting(shard.role):
+    with process.starting(shard.role, lambda: drop_unread(process.bus, shard)):
         server = make_server(config, folder, process.bus, shard)
         sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size, context)
         process.bus.announce_replay(server.owner, sockets.address)

@@ -72,9 +72,12 @@ class Process:
                 raise ConfigError("--run", run, "no run of this name is registered in that Redis; start it first")
 
     @contextmanager
-    def starting(self, role: str) -> Iterator[None]:
-        """Within it the role is made, once Redis takes what it writes. Outages are waited out, as when it runs."""
-        with self.bus.repeated(lambda call: until_taken(call, role, self.stop)):
+    def starting(self, role: str, make_room: Callable[[], None] = lambda: None) -> Iterator[None]:
+        """Within it the role is made, once Redis takes what it writes. Outages are waited out, as when it runs.
+
+        ``make_room`` is called before each new try where Redis has no memory left.
+        """
+        with self.bus.repeated(lambda call: until_taken(call, role, self.stop, make_room)):
             self.bus.check_room(role)
             yield
 
@@ -85,7 +88,7 @@ class Process:
         return env
 
 
-def until_taken(call: Callable[[], T], role: str, stop: StopSignal) -> T:
+def until_taken(call: Callable[[], T], role: str, stop: StopSignal, make_room: Callable[[], None] = lambda: None) -> T:
     """Make a call of Redis until it is taken. Raises BusUnavailable, BusFull once the role is to stop."""
     outage = OutageLog(role)
     while True:
@@ -96,6 +99,8 @@ def until_taken(call: Callable[[], T], role: str, stop: StopSignal) -> T:
                 raise
             outage.begin(error)
             time.sleep(RECONNECT_SLEEP)
+            if str(error).startswith("OOM"):
+                make_room()
         else:
             outage.end()
             return answer

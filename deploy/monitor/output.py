@@ -7,8 +7,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
+from rmc.common.whole_file import NO_ROOM
+
 PLAIN = str.maketrans({"±": "+-", "·": "-", "→": "->", "…": "...", "–": "-"})  # for a terminal that has ASCII alone
-PASSING = (errno.ENOSPC, errno.EDQUOT, errno.EAGAIN)  # there may be room again
+PASSING = {*NO_ROOM, errno.EAGAIN}  # there may be room again
 
 
 class Output:

@@ -1,6 +1,5 @@
 """Ray actors that hold a role each: its process, its files and its end. Ray starts them again where they die."""
 
-import errno
 import os
 import shutil
 import tempfile
@@ -15,6 +14,7 @@ from urllib.parse import quote
 import ray
 
 from rmc.common.errors import CheckpointError
+from rmc.common.whole_file import NO_ROOM
 from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.local.supervisor import EXIT_CONFIG, RoleProcess
 from rmc.deploy.ray.node import leave_rays_worker, private_folder
@@ -27,7 +27,7 @@ ENDED_IN_ORDER = 0
 STOP_SECONDS = 5.0
 SETTLE_SECONDS = 60.0  # for the last checkpoint to reach the head
 CLAIM_SECONDS = 60.0  # for a launcher that is being started again
-FULL = tuple(map(os.strerror, (errno.ENOSPC, errno.EDQUOT)))
+FULL = tuple(map(os.strerror, NO_ROOM))
 AWAY = (ray.exceptions.RayError, ValueError, CheckpointError, OSError)  # of who keeps the checkpoints
 
 

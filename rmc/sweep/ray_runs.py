@@ -1,6 +1,5 @@
 """Whole runs spread over a Ray cluster, each on the cores of one node; what they leave comes to this machine."""
 
-import errno
 import os
 import time
 from contextlib import suppress
@@ -9,6 +8,7 @@ from typing import Any
 import ray
 
 from rmc.common.errors import ConfigError, last_line
+from rmc.common.whole_file import NO_ROOM
 from rmc.sweep.job import Job
 from rmc.sweep.local_runs import last_log_line
 from rmc.sweep.node_run import NodeRun
@@ -17,7 +17,6 @@ from rmc.sweep.parcel import Parcel, Stamps, pack, unpack
 LOOK_SECONDS = 2.0
 BYTES_PER_SECOND = 1e6  # that copies of a run's files take at most, but for the last
 LOST = 1
-FULL = errno.ENOSPC, errno.EDQUOT  # what a full disk raises
 
 
 class RayRuns:
@@ -94,7 +93,7 @@ class RayRun:
             try:
                 self._take(parcel, log)
             except OSError as error:
-                if error.errno not in FULL:
+                if error.errno not in NO_ROOM:
                     raise
                 return None  # the next look takes the same answer, once there is room
             self._copy_at = now + len(parcel.tar) / BYTES_PER_SECOND

@@ -8,12 +8,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
+import psutil
 import pytest
 import redis
 
 from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner, Version
 from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.bus.redis_connection import TIMEOUT_SECONDS
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from rmc.deploy.redis.server import RedisServer, server_binary
 
@@ -101,6 +104,27 @@ def _is_busy(client: redis.Redis) -> bool:
     except redis.exceptions.RedisError:
         return True
     return False
+
+
+def test_one_that_hangs_amid_a_transaction_costs_one_wait_and_no_connection(tmp_path: Path) -> None:
+    with RedisServer(tmp_path) as server:
+        bus = RedisBus(server.url(), "run")
+        assert server.process is not None
+        process = psutil.Process(server.process.pid)
+
+        def freeze(pipe: Any) -> None:
+            process.suspend()
+            pipe.multi()
+            pipe.set("other", 1)
+
+        began = time.monotonic()
+        with pytest.raises(BusUnavailable):
+            bus.call(lambda: bus.redis.transaction(freeze, "watched"))
+        assert time.monotonic() - began < TIMEOUT_SECONDS + 0.5
+        process.resume()
+        assert not bus.redis.connection_pool._in_use_connections
+        time.sleep(TIMEOUT_SECONDS)
+        bus.ping()
 
 
 @contextmanager

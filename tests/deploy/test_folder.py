@@ -24,6 +24,7 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.monitor import Monitor
+from rmc.deploy.run import folder as run_folder
 from rmc.deploy.run.config import to_json
 from rmc.deploy.run.folder import RESULT, RunFolder
 from rmc.deploy.run.launch_options import IfExists
@@ -261,6 +262,25 @@ def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"--run-dir='.*\\udcff/run': is no UTF-8; give another"):
         open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / os.fsdecode(b"\xff") / "run", "fail")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_result_waits_for_room(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    faults, write = iter((errno.ENOSPC, errno.EDQUOT)), run_folder.write_whole
+
+    def full_at_first(path: Path, content: bytes) -> None:
+        for fault in faults:
+            raise OSError(fault, os.strerror(fault))
+        write(path, content)
+
+    monkeypatch.setattr(run_folder, "write_whole", full_at_first)
+    monkeypatch.setattr(run_folder, "LOCK_SECONDS", 0.01)
+    folder.write_result(dict.fromkeys(RESULT, 1))
+    assert folder.result() == dict.fromkeys(RESULT, 1)
+    assert [one.getMessage() for one in caplog.records] == [
+        f"{folder.result_file} cannot be written now; waiting until it can"
+    ]
 
 
 def test_odd_lines_of_metrics_are_passed_over(folder: RunFolder) -> None:

@@ -11,7 +11,7 @@ import pytest
 import redis
 
 from rmc.common.errors import ConfigError
-from rmc.deploy.redis.server import MAX_VALUE, RedisServer
+from rmc.deploy.redis.server import MAX_VALUE, RedisServer, server_binary
 from tests.processes import alive
 from tests.waiting import wait_until
 
@@ -54,6 +54,19 @@ def test_takes_no_larger_value_than_a_role_may_need(tmp_path: Path) -> None:
         with pytest.raises(redis.exceptions.RedisError), redis.Redis.from_url(server.url(), retry=None) as liar:
             liar.set("larger", bytes(MAX_VALUE + 1))
         assert client.keys() == [b"large"]
+
+
+@pytest.mark.parametrize(
+    ("told", "is_taken"), [("Redis server v=6.0.16 sha=0", False), ("Valkey server v=8.1.0", True)]
+)
+def test_one_on_the_path_is_taken_unless_it_is_too_old(
+    told: str, is_taken: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = tmp_path / "redis-server"
+    script.write_text(f"#!/bin/sh\necho '{told}'\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert (server_binary() == str(script)) == is_taken
 
 
 def test_long_path_is_refused(tmp_path: Path) -> None:

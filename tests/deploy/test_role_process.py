@@ -11,10 +11,13 @@ from pathlib import Path
 import pytest
 import redis
 
+from rmc.common.bus.protocol import EntryId
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusFull, ConfigError
 from rmc.common.process.role import StopSignal
+from rmc.common.shard import Shard
+from rmc.deploy.local.replay_process import drop_unread
 from rmc.deploy.local.role_process import Process, RunConnection, until_taken
 from rmc.deploy.redis.connect import Deadline, connect
 from rmc.deploy.redis.registration import Registration
@@ -127,6 +130,24 @@ def test_without_room_it_waits(short: Path, caplog: pytest.LogCaptureFixture) ->
         assert time.monotonic() - began > 0.9
         assert bus.current_epoch("learner") == 0  # nothing was taken meanwhile
     assert [record.getMessage().split(":")[0] for record in caplog.records] == ["learner"] * 2
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_replay_server_begins_though_its_actors_windows_fill_redis(
+    short: Path, run_name: str, tmp_path: Path
+) -> None:
+    """Nobody else would remove them."""
+    config = debug(EnvConfig("Pendulum-v1"))
+    with RedisServer(short) as server, redis.Redis.from_url(server.url()) as client:
+        bus = RedisBus(server.url(), run_name)
+        Registration(config, RunFolder(tmp_path), bus)
+        for seq in range(9):
+            bus.append(0, EntryId(bus.take_epoch("actor-0") if seq == 0 else 1, seq), bytes(1 << 20))
+        client.config_set("maxmemory", client.info()["used_memory"] - 1)
+        process, shard = Process(RunConnection(run_name, server.url())), Shard()
+        with process.starting("replay", lambda: drop_unread(process.bus, shard)):
+            assert process.bus.take_epoch("replay") == 1
+        assert list(bus.read({0: EntryId(1, -1)}, 9)) == []
 
 
 def test_one_that_answers_that_it_is_full_is_there(short: Path) -> None:

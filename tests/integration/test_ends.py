@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.run.folder import RunFolder
 from tests import wandb_file
 from tests.command import COMMAND, rmc
@@ -32,6 +33,20 @@ def test_a_role_that_dies_at_once_ends_the_run_with_its_traceback(tmp_path: Path
             assert training.finish(150) == 1
     assert "RuntimeError: the wheel came off" in training.text().splitlines()[-1]
     assert "3 times in a row" in training.text()
+
+
+def test_a_learner_that_a_replay_server_holds_is_given_the_time_to_save(tmp_path: Path) -> None:
+    """It hears of the end only after 10 s, and has no checkpoint yet."""
+    options = ("--total-steps", "10000000", "--checkpoint-steps", "10000000")
+    with Training(tmp_path / "run", *options) as training:
+        training.wait_for_updates(20)
+        replay = training.role("replay")
+        assert replay is not None
+        replay.suspend()
+        time.sleep(1.0)  # until it draws
+        updates = training.newest("learner", "updates")
+        training.interrupt()
+    assert CheckpointFolder(tmp_path / "run" / "checkpoints").numbers()[-1] >= updates
 
 
 @pytest.mark.parametrize("when", ["before", pytest.param("after", marks=pytest.mark.long)])
