@@ -17,6 +17,8 @@ class UpdateConfig:
     """The memory's step size, as a multiple of the others'."""
     alpha_learning_rate: float = 3e-4
     """Adam's step size for the temperature."""
+    target_entropy: float = -1.0
+    """What the temperature holds the policy's entropy at, in nats for each dimension of the action."""
     gamma: float = 0.99
     """Discount per step of the agent."""
     polyak: float = 0.995

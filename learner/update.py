@@ -162,7 +162,7 @@ class JointUpdate:
         log_pi, td_error = log_pi[:, :-1], (q.detach() - y).abs().mean(0)
         loss_values = {
             "q_loss": losses.q_loss(q, y, batch.importance, m),
-            "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, -float(a.shape[-1]), m),
+            "temperature_loss": losses.temperature_loss(agent.log_alpha, log_pi, c.target_entropy * a.shape[-1], m),
         }
         if batch.plan.trains_policy:
             loss_values["policy_loss"] = losses.policy_loss(log_pi, self._frozen_q(*proposed), alpha, m)

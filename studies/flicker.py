@@ -11,6 +11,7 @@ STUDY = Study(
     {
         "RMC": "train ENV --flicker 0.5",
         "RMC, an update a step": "train ENV --flicker 0.5 --replay-ratio 240",
+        "RMC, target entropy -A/2": "train ENV --flicker 0.5 --target-entropy -0.5",
         "RMC, 1e-3": "train ENV --flicker 0.5 --learning-rate 1e-3 --alpha-learning-rate 1e-3 "
         "--memory-learning-scale 0.3",
         "RMC, policy at every update": "train ENV --flicker 0.5 --head-input hidden --policy-delay 1",

@@ -6,6 +6,7 @@ ENVS = ("Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Walker2d-v5", "HumanoidStand
 OURS = {
     "RMC": "train ENV",
     "RMC, an update a step": "train ENV --replay-ratio 240",
+    "RMC, target entropy -A/2": "train ENV --target-entropy -0.5",
     "RMC, 1e-3": "train ENV --learning-rate 1e-3 --alpha-learning-rate 1e-3 --memory-learning-scale 0.3",
     "CrossQ's form": "train ENV --head-input observation --hidden 8 --embedding 0 --no-impute-missing --no-grounding "
     "--scheme 2 --burn-in 0 --trained-steps 1 --capacity 110000 --batch-size 256 --replay-ratio 256 --policy-delay 3 "

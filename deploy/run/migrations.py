@@ -38,7 +38,11 @@ def _to_6(raw: Raw) -> None:
     _remove(raw, "agent", layer_norm=False)
 
 
-MIGRATIONS: list[Callable[[Raw], None]] = [_to_2, _to_3, _to_4, _to_5, _to_6]  # the first is from format 1 to 2
+def _to_7(raw: Raw) -> None:
+    _add(raw, "update", target_entropy=-1.0)
+
+
+MIGRATIONS: list[Callable[[Raw], None]] = [_to_2, _to_3, _to_4, _to_5, _to_6, _to_7]  # the first is from format 1 to 2
 FORMAT = 1 + len(MIGRATIONS)
 
 

@@ -39,6 +39,7 @@ MAY_CHANGE = SAME_AGENT | {  # that, and what is read afresh at every start: no 
     "update.learning_rate",
     "update.memory_learning_scale",
     "update.alpha_learning_rate",
+    "update.target_entropy",
     "update.gamma",
     "update.polyak",
     "update.clip_norm",

@@ -30,6 +30,7 @@ RANGES: dict[str, tuple[float, float]] = {  # both ends included
     "update.learning_rate": (1e-12, 1),
     "update.memory_learning_scale": (0, 1_000),
     "update.alpha_learning_rate": (0, 1),
+    "update.target_entropy": (-100, 0.69),  # log 2 is that of a uniform action
     "update.gamma": (0, 1),
     "update.polyak": (0, 1),
     "update.clip_norm": (0, 1e12),

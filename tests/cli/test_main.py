@@ -44,7 +44,8 @@ TRAIN_FLAGS = """
     --envs-per-actor --reward-scale --stride --refresh-steps --chunk-windows --chunk-seconds --unacked-bytes
     --capacity --replay-shards --replay-ratio --warmup-steps --priority-exponent --importance-exponent
     --learning-rate --memory-learning-scale
-    --alpha-learning-rate --gamma --polyak --clip-norm --policy-ema-updates --latent-target --target-memory --policy-q
+    --alpha-learning-rate --target-entropy --gamma --polyak --clip-norm --policy-ema-updates
+    --latent-target --target-memory --policy-q
     --scheme --policy-through-q --update-order --model-norm --policy-delay --n-step --state-strategy
     --curiosity --curiosity-scale --curiosity-steps --eta
     --batch-size --publish-updates --checkpoint-steps --keep-checkpoints --precision --threads

@@ -3,7 +3,8 @@
 ``runs/format-1-a`` was made before keywords of environments, sizes.json and initial.json; ``format-1-b`` by the last
 version that wrote config.json without a format; ``format-2`` before rows had checksums and sensors dropped out;
 ``format-4``, with batch norm in its critics, before the policy could wait for its turn; ``format-5`` by the
-last version with a LayerNorm behind the embedding. All ended at step 1500.
+last version with a LayerNorm behind the embedding; ``format-6`` before the target entropy was an option. All ended at
+step 1500.
 """
 
 import json
@@ -29,7 +30,7 @@ from rmc.replay_server.recovery import open_store
 
 RUNS = Path(__file__).parent / "runs"
 # Whoever changes this list raises FORMAT by a migration, and keeps a run of the version before in runs/.
-FORMAT_6 = """
+FORMAT_7 = """
     env.id env.flicker env.drop_sensors env.flicker_burst env.delay env.hide env.noise env.frame_stack
     env.action_repeat env.time_limit env.env_timeout env.env_kwargs preset seed total_steps actors
     window.burn_in window.trained_steps
@@ -39,16 +40,16 @@ FORMAT_6 = """
     actor.envs_per_actor actor.stride actor.state_strategy actor.reward_scale actor.refresh_steps actor.chunk_windows
     actor.chunk_seconds actor.unacked_bytes
     replay.capacity replay.replay_ratio replay.warmup_steps replay.priority_exponent replay.replay_shards
-    update.learning_rate update.memory_learning_scale update.alpha_learning_rate update.gamma update.polyak
-    update.clip_norm update.latent_target update.target_memory update.policy_q update.curiosity update.curiosity_scale
-    update.curiosity_steps update.scheme update.policy_through_q update.update_order update.model_norm
-    update.policy_delay update.n_step update.eta update.policy_ema_updates
+    update.learning_rate update.memory_learning_scale update.alpha_learning_rate update.target_entropy
+    update.gamma update.polyak update.clip_norm update.latent_target update.target_memory update.policy_q
+    update.curiosity update.curiosity_scale update.curiosity_steps update.scheme update.policy_through_q
+    update.update_order update.model_norm update.policy_delay update.n_step update.eta update.policy_ema_updates
     learner.batch_size learner.importance_exponent learner.publish_updates learner.checkpoint_steps
     learner.keep_checkpoints learner.precision learner.threads evaluator.episodes evaluator.evaluation_seconds
 """.split()  # noqa: SIM905
 
 
-FORMATS = ("format-1-a", "format-1-b", "format-2", "format-3", "format-4", "format-5")
+FORMATS = ("format-1-a", "format-1-b", "format-2", "format-3", "format-4", "format-5", "format-6")
 BETWEEN = FORMATS[1:4]  # what brings the first up to date does so with these
 the_rest_at_length = pytest.mark.parametrize(
     "old", [pytest.param(one, marks=[pytest.mark.long] * (one in BETWEEN)) for one in FORMATS], indirect=True
@@ -63,8 +64,8 @@ def old(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
 
 
 def test_an_option_comes_with_a_format() -> None:
-    assert sorted(flat(robust(EnvConfig("")))) == sorted(FORMAT_6)
-    assert FORMAT == 6
+    assert sorted(flat(robust(EnvConfig("")))) == sorted(FORMAT_7)
+    assert FORMAT == 7
 
 
 def test_its_options_are_read_in_the_words_of_this_version(old: RunFolder) -> None:

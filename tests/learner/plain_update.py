@@ -174,7 +174,7 @@ class PlainUpdate:
                 judged = self.reaching("P", z) if c.policy_through_q else z.detach()
                 q_pi = twin_q(agent.critic, self.critics_z(row, t, judged), pi, frozen=True)
                 sums["P"].append(alpha * log_pi - (q_pi[0] if c.policy_q == "first" else q_pi.min()))
-                sums["T"].append(-agent.log_alpha * (log_pi.detach() - agent.action_dim))
+                sums["T"].append(-agent.log_alpha * (log_pi.detach() + self.c.target_entropy * agent.action_dim))
             errors.append(window)
         i, variance = self.scaled(errors)
         priorities = []

@@ -41,6 +41,7 @@ VARIANTS = [
     {"target_memory": "ema"},
     {"latent_target": "ema", "target_memory": "ema", "scheme": 4},
     {"policy_q": "first"},
+    {"target_entropy": -0.5},
     {"curiosity_scale": "std"},
     {"n_step": 2},
     {"n_step": 9},
