@@ -120,9 +120,9 @@ class RunFolder:
         """Write ``result.json``, whole or not at all; in a read-only folder or on a full disk, once it can be."""
         said = False
         while not self._wrote(self.result_file, f"{json.dumps(result, indent=2)}\n".encode()):
-            if not said:
-                log.warning("%s cannot be written now; waiting until it can", self.result_file)
-            said = True
+            if self.writable() and not said:  # that it is not, others say
+                log.warning("%s finds no room; waiting until there is some", self.result_file)
+                said = True
             self.check_there()
             time.sleep(LOCK_SECONDS)
 

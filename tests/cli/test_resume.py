@@ -144,12 +144,20 @@ def test_help_of_no_run_is_the_presets(tmp_path: Path, capsys: pytest.CaptureFix
         assert "(default: 1000000)" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_baseline_takes_its_own_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def begun(config: BaselineConfig, path: Path) -> RunFolder:
+    """A baseline's run that has trained nothing."""
     from rmc.analysis import baselines
 
-    config = BaselineConfig("td3", EnvConfig(PENDULUM, flicker=0.5), "default", 2, 700, 300, 4)
-    folder = baselines._open_folder(config, tmp_path / "run", baselines._sizes(config))
+    sizes = baselines._sizes(config)
+    folder, changed = baselines._open_folder(config, path, sizes)
+    baselines._write_start(config, folder, sizes, changed)
     folder.unlock()
+    return folder
+
+
+def test_a_baseline_takes_its_own_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = BaselineConfig("td3", EnvConfig(PENDULUM, flicker=0.5), "default", 2, 700, 300, 4)
+    folder = begun(config, tmp_path / "run")
     for words, expected in (([], config), (["--total-steps", "900"], dataclasses.replace(config, total_steps=900))):
         command = parser.parse(["resume", str(folder.path), *words])
         assert isinstance(command, run_options.ResumeBaseline)
@@ -189,11 +197,8 @@ def test_the_warning_reaches_the_terminal(capsys: pytest.CaptureFixture[str], tm
 
 
 def test_a_baseline_that_is_named_again_is_as_it_was(tmp_path: Path) -> None:
-    from rmc.analysis import baselines
-
     config = BaselineConfig("sac", EnvConfig(PENDULUM, flicker=0.5), total_steps=2_000, episodes=20, threads=4)
-    folder = baselines._open_folder(config, tmp_path / "run", baselines._sizes(config))
-    folder.unlock()
+    folder = begun(config, tmp_path / "run")
     command = parser.parse(["baseline", "sac", PENDULUM, "--threads", "2", "--run-dir", str(folder.path)])
     assert isinstance(command, run_options.Baseline)
     assert command.config() == dataclasses.replace(config, threads=2)

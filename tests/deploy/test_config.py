@@ -109,7 +109,7 @@ def with_value(config: RunConfig, path: str, value: Any) -> RunConfig:
     return dataclasses.replace(config, **{parent: part})
 
 
-@pytest.mark.parametrize("value", [-1, math.nan, math.inf])
+@pytest.mark.parametrize("value", [-1_000, math.nan, math.inf])
 @pytest.mark.parametrize("path", numeric_paths())
 def test_every_number_is_judged(path: str, value: float) -> None:
     with pytest.raises(ConfigError) as caught:

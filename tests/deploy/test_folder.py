@@ -279,7 +279,7 @@ def test_a_result_waits_for_room(
     folder.write_result(dict.fromkeys(RESULT, 1))
     assert folder.result() == dict.fromkeys(RESULT, 1)
     assert [one.getMessage() for one in caplog.records] == [
-        f"{folder.result_file} cannot be written now; waiting until it can"
+        f"{folder.result_file} finds no room; waiting until there is some"
     ]
 
 
