@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from rmc.analysis import baseline_settings
 from rmc.common.bus.metrics_record import is_finite, is_whole
 from rmc.common.env.config import EnvConfig, write_kwargs
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig, changes, option
+from rmc.deploy.run.config import RunConfig, changes, flat, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import SAME_AGENT
 from rmc.deploy.run.presets import preset_config
@@ -148,14 +149,28 @@ def describe(path: Path) -> About:
         return About(" ".join([baseline.name, *_stack(baseline.env)]), _env_label(baseline.env), baseline.seed)
     config = folder.config()
     name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
-    agent = " ".join([name, *_changes(config), *_stack(config.env), *_warm_start(folder)])
+    agent = " ".join([name, *_changes(config, folder), *_stack(config.env), *_warm_start(folder)])
     return About(agent, _env_label(config.env), config.seed)
 
 
-def _changes(config: RunConfig) -> list[str]:
-    """Options that differ from the preset's, as they are typed."""
+def _changes(config: RunConfig, folder: RunFolder) -> list[str]:
+    """Options that differ from the preset's, as they are typed, and those that a resume has changed."""
     changed = changes(preset_config(config.preset, config.env), config)
-    return [_typed(path, now) for path, (_, now) in changed.items() if path not in OMITTED]
+    words = {path: _typed(path, now) for path, (_, now) in changed.items()}
+    words |= {path: f"{option(path)} {' then '.join(map(str, had))}" for path, had in _resumed(config, folder).items()}
+    return [text for path, text in words.items() if path not in OMITTED]
+
+
+def _resumed(config: RunConfig, folder: RunFolder) -> dict[str, list[Any]]:
+    """By the path of an option that a resume has changed, the values that it had, one after the other."""
+    past: dict[str, list[Any]] = {}
+    for start in starts(folder):
+        if start.env_steps:  # before the first step nothing was trained with it
+            for path, (before, _) in start.changes.items():
+                past.setdefault(path, []).append(before)
+    now = flat(config)
+    had = {path: [value for value, _ in groupby([*values, now[path]])] for path, values in past.items() if path in now}
+    return {path: values for path, values in had.items() if len(values) > 1}
 
 
 def _warm_start(folder: RunFolder) -> list[str]:

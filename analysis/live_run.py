@@ -71,18 +71,30 @@ class LiveRun:
 
     def __init__(self, name: str, path: Path) -> None:
         self.media: dict[str, Path] = {}
-        self._folder = RunFolder(path)
-        self._status = empty_status(self._folder)
+        self._name, self._folder = name, RunFolder(path)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Know nothing of it yet. Raises ConfigError."""
+        self._status, self._began = empty_status(self._folder), self._first_start()
         self._tail = MetricsTail(self._folder.metrics, recent_bytes=sys.maxsize)
         self._curves: dict[str, Curve] = {}
         self._events: list[Event] = []
-        self._state: dict[str, Any] = {"name": name}
+        self._state: dict[str, Any] = {"name": self._name}
+
+    def _first_start(self) -> float:
+        """When it began; 0 where that is not known."""
+        return next((start.time for start in starts(self._folder)), 0.0)
 
     def look(self) -> dict[str, Any] | None:
-        """What is new since the last look; None where nothing is."""
-        changed = {name: value for name, value in self._look().items() if self._state.get(name) != value}
+        """What is new since the last look; None where nothing is. ``whole`` where nothing before holds any more."""
+        began = self._began
+        found = self._look().items()
+        changed = {name: value for name, value in found if name not in self._state or self._state[name] != value}
         curves = {name: news for name, curve in self._curves.items() if (news := curve.news()) is not None}
         self._state |= changed
+        if began != self._began:
+            return {**self.everything(), "whole": True}
         return {**changed, "curves": curves} if changed or curves else None
 
     def everything(self) -> dict[str, Any]:
@@ -93,6 +105,8 @@ class LiveRun:
         """The state, or why it cannot be read now."""
         self._status.final_steps = None  # what is read now may be of before the end
         try:
+            if self._first_start() not in (0.0, self._began):
+                self._begin()  # it was made anew in its folder
             for record in self._tail.take(LOOK_BYTES):
                 self._take(record)
             take_state(self._status, self._folder)

@@ -138,11 +138,11 @@ def diverging(vitals: Vitals, config: RunConfig) -> Finding | None:
 
 def oversized_ring(vitals: Vitals, config: RunConfig) -> Finding | None:
     """A ring that the whole run cannot fill."""
-    steps = sum(vitals.last(role, "env_steps") for role in vitals.of("replay"))
-    fills = vitals.values("replay", "ring_fill")
+    steps, windows = (sum(vitals.last(role, name) for role in vitals.of("replay")) for name in ("env_steps", "windows"))
+    fills, capacity = vitals.values("replay", "ring_fill"), config.replay.capacity
     if not steps or not fills or max(fills) >= HALF_FULL:
         return None
-    capacity, end = config.replay.capacity, max(fills) * config.total_steps / steps
+    end = max(*fills, windows / capacity) * config.total_steps / steps  # a ring that was lost holds fewer than came
     if end >= HALF_FULL or capacity * (1.0 - end) < WORTH_WINDOWS:
         return None
     needed = typed_number(1.1 * end * capacity)

@@ -56,8 +56,12 @@ class Row:
         """Each run's, nearest to those steps."""
         return [min(run.evaluations, key=lambda one: abs(one.env_steps - self.steps)) for run, _ in self.runs]
 
+    def seeds(self) -> int:
+        """How many there are, one that ran twice counted once."""
+        return len({run.seed for run, _ in self.runs})
+
     def mean(self) -> float:
-        """Over seeds."""
+        """Over runs."""
         return statistics.mean(one.return_mean for one in self.evaluations())
 
 
@@ -109,11 +113,11 @@ def _readme() -> Iterator[str]:
 
 
 def _return(row: Row) -> str:
-    """Its mean, and deviation over seeds; bold where the first row of an agent is ahead of others' first."""
+    """Its mean, and deviation over runs; bold where the first row of an agent is ahead of others' first."""
     if len(row.runs) == 1:
         return _number(row.mean())
     deviation = statistics.stdev(one.return_mean for one in row.evaluations())
-    beside = [one for one in rows("returns") if (one.env, one.steps) == (row.env, row.steps) and len(one.runs) > 1]
+    beside = [one for one in rows("returns") if (one.env, one.steps) == (row.env, row.steps) and one.seeds() > 1]
     first = {one.agent.split(",")[0].rstrip("ⁿ"): one for one in reversed(beside)}
     text = f"{_number(row.mean())} ± {_number(deviation)}"
     return f"**{text}**" if len(first) > 1 and row is max(first.values(), key=Row.mean) else text

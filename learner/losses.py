@@ -97,9 +97,9 @@ def temperature_loss(log_alpha: Tensor, log_pi: Tensor, target_entropy: float, m
 def grounding_loss(
     predicted: Tensor, observation: Tensor, predicted_reward: Tensor, r: Tensor, seen: Tensor, m: Tensor
 ) -> Tensor:
-    """L1 of o_{t+1} (mean over O) where ``seen`` (B, T, M): not missing, nor o_t unless that was filled; and of r_t.
+    """L1 of o_{t+1}, over the numbers that ``seen`` (B, T, M) marks, plus L1 of r_t.
 
-    The reward is real in a missing frame, too, so ``m`` alone masks it.
+    A missing o_{t+1} is not seen, nor is what follows a missing o_t that was not imputed. A reward is real there, too.
     """
     return observation_loss(predicted, observation, seen, m) + masked_mean((predicted_reward - r).abs(), m)
 

@@ -202,7 +202,7 @@ class JointUpdate:
     def plan(self, raw: Tensor, spec: WindowSpec, number: int) -> Plan:
         """Of update ``number``, from its (B, row bytes) on the host.
 
-        What imputes is trained at every ``IMPUTER_UPDATES``-th until a frame was missing.
+        The imputer trains at every ``IMPUTER_UPDATES``-th until a frame was missing, then at every one.
         """
         steps, trains_policy = update_steps(raw, spec, number), number % self.config.policy_delay == 0
         if self.agent.next_frame is None:
@@ -212,7 +212,7 @@ class JointUpdate:
         return Plan(steps, fills, bool(self.was_missing) or number % IMPUTER_UPDATES == 1, trains_policy)
 
     def _imputer_losses(self, o: Tensor, memory: MemoryOutput, batch: Batch, m: Tensor) -> Losses:
-        """The loss of what imputes, where it is configured and its turn."""
+        """The imputer's, where it is configured and its turn."""
         imputer, steps = self.agent.next_frame, batch.trained
         if imputer is None or not batch.plan.trains_imputer:
             return {}

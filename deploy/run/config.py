@@ -56,7 +56,7 @@ class RunConfig:
     seed: int = 0
     """Seed of networks, environments, noise and sampling."""
     total_steps: int = 1_000_000
-    """Environment steps of the run, over all actors."""
+    """Steps of the agent in the run, over all actors; with action_repeat K each is K of the environment's."""
     actors: int = 1
     """Actor processes."""
     window: WindowConfig = field(default_factory=WindowConfig)

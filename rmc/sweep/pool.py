@@ -86,7 +86,7 @@ class _AtWork:
         seconds = time.monotonic() - self.began
         if status == 0:
             return Ending("finished", seconds)
-        if self.hopeless and status == STOPPED:
+        if self.hopeless and self.deadline is not None:  # killed, too: it may have been asked before it could hear it
             return Ending("pruned", seconds)
         if status == STOPPED or self.deadline is not None:
             return Ending("stopped", seconds)

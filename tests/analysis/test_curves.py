@@ -95,6 +95,21 @@ def test_a_warm_start_is_another_agent(tmp_path: Path) -> None:
     assert warm.split()[-2:] == ["3.00", "1.00"]
 
 
+def test_what_a_resume_changed_is_another_agent(tmp_path: Path) -> None:
+    """Not so what never trained, and what makes no other agent."""
+    changed = [
+        (0, {"update.gamma": [0.5, 0.99]}),
+        (100_032, {"replay.replay_ratio": [96.0, 16.0], "total_steps": [100_000, 300_000]}),
+    ]
+    starts = [{"time": 1.0, "version": "0", "env_steps": step, "changes": said} for step, said in changed]
+    (tmp_path / "history.jsonl").write_text("".join(json.dumps(start) + "\n" for start in starts))
+    for ratio, agent in ((16.0, "RMC --replay-ratio 96.0 then 16.0"), (96.0, "RMC")):
+        config = robust("Hopper-v5")
+        config = dataclasses.replace(config, replay=dataclasses.replace(config.replay, replay_ratio=ratio))
+        (tmp_path / "config.json").write_text(to_json(config))
+        assert history.describe(tmp_path).agent == agent
+
+
 def test_what_a_long_run_has_said_is_not_kept(tmp_path):
     (tmp_path / "config.json").write_text(to_json(robust(EnvConfig("Hopper-v5"))))
     said = {"role": "actor-0", "time": 1.0, **{f"metric_{i}": float(i) for i in range(20)}}

@@ -243,6 +243,8 @@ def test_a_ring_that_never_fills() -> None:
         "--capacity 7800 in a new run holds all of it"
     )
     assert run_faults.oversized_ring(little, CONFIG) is None  # a million steps fill it
+    lost_a_ring = vitals(replay={"env_steps": 50_000, "windows": 20_000, "ring_fill": 0.01})
+    assert run_faults.oversized_ring(lost_a_ring, short) is None
 
 
 def test_threads_that_fight() -> None:

@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import selectors
+import shutil
 import signal
 import socket
 import subprocess
@@ -47,8 +48,8 @@ def serve() -> Iterator[Serve]:
     """Starts rmc watch and gives its URL and process. Ctrl-C ends it, with status 0 and without a word."""
     servers = []
 
-    def start(*words: str) -> tuple[str, psutil.Process]:
-        command = [sys.executable, "-m", "rmc.cli.main", "watch", *words, "--port", "0"]
+    def start(*words: str, port: int = 0) -> tuple[str, psutil.Process]:
+        command = [sys.executable, "-m", "rmc.cli.main", "watch", *words, "--port", str(port)]
         server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         servers.append(server)
         assert server.stdout is not None
@@ -132,6 +133,42 @@ def test_a_page_whose_connection_dies_without_a_word_says_so_and_finds_it_again(
         page.seconds_until("document.getElementById('lost').hidden")
         page.js("quietSeconds = 40")
         page.seconds_until("document.body.innerText.includes('77.25 /s')")
+
+
+def test_a_page_of_other_runs_than_before_shows_nothing_of_those(
+    serve: Serve, folder: RunFolder, tmp_path: Path
+) -> None:
+    """Another rmc watch at the same port."""
+    other = open_run(CONFIG, tmp_path / "other", "fail")
+    say(folder, "learner", env_steps=700, updates_per_s=77.25, model_loss=0.5)
+    url, server = serve(str(folder.path), str(other.path))
+    with opened(url, tmp_path) as page:
+        page.seconds_until("document.body.innerText.includes('77.25 /s')")
+        server.send_signal(signal.SIGINT)
+        server.wait(10)
+        say(other, "learner", env_steps=30, updates_per_s=9.25)
+        serve(str(other.path), port=urlsplit(url).port or 0)
+        page.seconds_until("document.body.innerText.includes('9.25 /s')")
+        assert "model loss" not in page.js("document.body.innerText")
+        assert page.js("document.querySelectorAll('section').length") == 1
+    other.unlock()
+
+
+def test_a_run_made_anew_in_its_folder_shows_nothing_of_the_old_one(folder: RunFolder) -> None:
+    live = LiveRun("run", folder.path)
+    say(folder, "learner", env_steps=1700, updates_per_s=5.0, model_loss=1.0)
+    say(folder, "evaluator", eval_return_mean=999.0, eval_return_std=0.0, eval_update=9, eval_env_steps=1700)
+    assert (live.look() or {})["best_evaluation"] is not None
+    folder.unlock()
+    shutil.rmtree(folder.path)
+    anew = open_run(dataclasses.replace(CONFIG, seed=7), folder.path, "fail")
+    say(anew, "learner", env_steps=10, updates_per_s=9.0)
+    found = live.look() or {}
+    anew.unlock()
+    assert (found["whole"], found["seed"], found["best_evaluation"]) == (True, 7, None)
+    assert found["curves"] == {"updates_per_s": (0, [(10, 9.0)])}
+    say(anew, "learner", env_steps=20, updates_per_s=9.0)
+    assert "whole" not in (live.look() or {})
 
 
 def test_a_page_without_news_is_told_that_its_server_is_there(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -186,6 +186,15 @@ def test_a_full_disk_ends_a_sweep_but_its_runs_save_first(tmp_path: Path, monkey
     assert at_work[1].done == []
 
 
+@pytest.mark.parametrize("status", [pool.STOPPED, -signal.SIGTERM, 1])
+def test_what_is_stopped_as_hopeless_is_over_however_early_that_was(tmp_path: Path, status: int) -> None:
+    """Asked while it still imports, a run cannot save, and would be started and stopped for ever."""
+    one = pool._AtWork(Job(tmp_path / "trial-0", (), 0), cast(Any, Saving()), 0.0, hopeless=True)
+    one.stop()
+    assert one.ending(status).state == "pruned"
+    assert "pruned" in pool.OVER
+
+
 def test_runs_that_began_with_nothing_are_no_results_of_a_warm_start(tmp_path: Path, capsys) -> None:
     job = made(tmp_path / "sweep" / "seed=0")
     config, options = read(job)
