@@ -62,7 +62,10 @@ def reserve_memory(size: int) -> int | None:
     """A descriptor of memory that nobody can cut short under the other; None where there is none to be had."""
     if not hasattr(os, "memfd_create"):  # macOS
         return None
-    descriptor = os.memfd_create("rmc-batches", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    try:
+        descriptor = os.memfd_create("rmc-batches", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    except OSError:  # a sandbox refuses it
+        return None
     try:
         os.posix_fallocate(descriptor, 0, size)  # a page that is missing later would be a SIGBUS
         fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)

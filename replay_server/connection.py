@@ -1,5 +1,6 @@
 """One client's connection: bytes in, frames out, never blocking."""
 
+import selectors
 import socket
 import ssl
 import time
@@ -40,8 +41,14 @@ class ClientConnection:
 
     @property
     def sending(self) -> bool:
-        """Whether something is still to be sent; until then nothing more is read from this client."""
+        """Whether something is still to be sent; until then no frame of this client is handled."""
         return bool(self._unsent)
+
+    def events(self, ahead: int) -> int:
+        """What to wait for. A client may send ``ahead`` bytes before it reads: else each may wait for the other."""
+        if not self._unsent:
+            return selectors.EVENT_READ
+        return selectors.EVENT_WRITE | (selectors.EVENT_READ if len(self._inbox) < ahead else 0)
 
     def encrypt(self) -> bool:
         """Go on with the handshake of a socket that needs one; whether it is over."""

@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 MAX_CONNECTIONS = 32
 AUTHENTICATION_SECONDS = 5.0
 SEND_BUFFER = 8 << 20  # bytes: a batch should leave in one call
+AHEAD_BYTES = 64  # that a client may send before it reads, for each window of a batch: the priorities of five batches
 READ, WRITE = selectors.EVENT_READ, selectors.EVENT_WRITE
 
 
@@ -134,7 +135,7 @@ class SocketServer:
             if events & READ:
                 connection.receive()
             self._handle_frames(connection)
-            self._await(connection, WRITE if connection.sending else READ)
+            self._await(connection, connection.events(AHEAD_BYTES * self._max_batch if connection.authenticated else 0))
         except FencedError as error:
             self._refuse(connection, "fenced", str(error), fenced=True)
         except (MessageError, AuthenticationError) as error:

@@ -19,7 +19,7 @@ from rmc.deploy.local.role_command import (
     replay_command,
 )
 from rmc.deploy.local.role_environment import URL_VARIABLE
-from rmc.deploy.local.supervisor import STOP_SECONDS, Supervisor
+from rmc.deploy.local.supervisor import HELD_SECONDS, STOP_SECONDS, Supervisor
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.redis.connect import PATIENCE_VARIABLE, connect, tried_again
 from rmc.deploy.redis.registration import Registration
@@ -30,7 +30,6 @@ from rmc.deploy.run.folder import RunFolder
 TICK_SECONDS = 0.2  # between looks at the roles and their metrics: a look costs 3 ms
 UNREACHABLE_SECONDS = 1.0  # without its socket, until a replay server is started again
 OUTAGE_SECONDS = 86_400.0  # of a Redis that answered once, until a role that is started amid it gives up
-HELD_SECONDS = 20.0  # that a learner may be held by a replay server or Redis that hangs, before it hears and saves
 KEPT_SECONDS = 3600  # in a user's Redis, after the end
 log = logging.getLogger(__name__)
 
@@ -127,18 +126,18 @@ def train(
             time.sleep(TICK_SECONDS)
         run.supervisor.stop()
         monitor.watch(run.bus)  # what the roles said last; a Redis that is away has lost it
-        return monitor.learner_finished() or (run.finished() and not stop.requested and _saved_steps(folder) >= total)
+        return monitor.learner_finished() or (run.finished() and not stop.requested and saved_steps(folder) >= total)
     finally:
         run.close()
 
 
-def _saved_steps(folder: RunFolder) -> int:
+def saved_steps(folder: RunFolder) -> int:
     """Environment steps of the newest checkpoint; 0 where there is none."""
     newest = CheckpointFolder(folder.checkpoints).latest()
     return int(json.loads(newest[1][PROGRESS])["env_steps"]) if newest else 0
 
 
-def _asked_to_stop(bus: RedisBus, reason: str) -> bool:
+def asked_to_stop(bus: RedisBus, reason: str) -> bool:
     """Whether Redis took it."""
     try:
         bus.request_stop(reason)
@@ -159,7 +158,7 @@ def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monito
     reason, asked = "stopped by its launcher" if stop.requested else "finished", False
     deadline = time.monotonic() + CheckpointFolder(folder.checkpoints).patience(STOP_SECONDS)
     while (stop.requested or not asked) and time.monotonic() < deadline:
-        asked = asked or _asked_to_stop(bus, reason)
+        asked = asked or asked_to_stop(bus, reason)
         monitor.watch(bus)  # the learner saves; what it says then is still recorded
         time.sleep(TICK_SECONDS)
     if not asked:

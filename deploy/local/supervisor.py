@@ -24,6 +24,7 @@ from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inher
 QUICK_DEATHS, QUICK_SECONDS = 3, 60.0
 FIRST_BACKOFF, LONGEST_BACKOFF = 0.25, 10.0  # seconds before a role is started again, doubled at each quick death
 STOP_SECONDS = 3.5  # for the roles to end cleanly; then they are killed
+HELD_SECONDS = 20.0  # that a learner may be held by a replay server or Redis that hangs, before it hears and saves
 EXIT_CONFIG = 2  # the exit status of an error that starting again cannot fix
 TRACEBACK_BYTES = 8192
 NO_PROCESS = errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE  # for now

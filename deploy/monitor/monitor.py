@@ -93,10 +93,13 @@ class Monitor:
                 self._tracker.look()
 
     def _find_ends(self, bus: Bus) -> None:
-        """A Redis that came back empty after the clock was set back gives its records lower ids."""
+        """A Redis that came back from a snapshot, or empty after the clock was set back, has lower ids than were read.
+
+        What is in a snapshot was read before.
+        """
         for role, end in bus.records_end(self.roles()).items():
             if _in_order(end) < _in_order(self._cursors.get(role, "0")):
-                self._cursors[role] = "0"
+                self._cursors[role] = end
 
     def _look_at_folder(self) -> None:
         self._folder.check_there()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import ray
-from ray.util.placement_group import remove_placement_group
+from ray.util.placement_group import placement_group_table, remove_placement_group
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.whole_file import write_whole
@@ -77,7 +77,8 @@ class LauncherActor(RoleActor):
             ):
                 with suppress(ValueError):
                     ray.kill(ray.get_actor(actor["name"], NAMESPACE), no_restart=True)
-        for name in (f"{run}learner", f"{run}replay"):
+        groups = [group["name"] for group in placement_group_table().values() if group["state"] != "REMOVED"]
+        for name in filter(lambda name: name.startswith(run), groups):
             with suppress(ValueError):
                 remove_placement_group(ray.util.get_placement_group(name))
         ray.kill(own, no_restart=True)

@@ -7,8 +7,8 @@ from typing import Any
 import ray
 
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.errors import last_line
-from rmc.deploy.ray import role_actor
+from rmc.common.errors import CheckpointError, last_line
+from rmc.deploy.local.supervisor import HELD_SECONDS
 from rmc.deploy.ray.role_actor import (
     AWAY,
     CLAIM_SECONDS,
@@ -69,14 +69,18 @@ class LearnerActor(RoleActor):
         newest, took = max(self._archived, default=-1), self._folder.last_save()
         for number in self._folder.numbers():
             if number > newest and number not in self._archived:
-                ray.get(self._launcher().archive.remote(self._incarnation, number, self._folder.load(number), took))
+                try:
+                    files = self._folder.load(number)
+                except CheckpointError:  # damaged, or dropped since
+                    continue
+                ray.get(self._launcher().archive.remote(self._incarnation, number, files, took))
                 self._archived.add(number)
         epoch = self._folder.last_epoch()
         if epoch > self._epoch:
             self._epoch = ray.get(self._launcher().note_epoch.remote(self._incarnation, epoch))
 
     def patience(self) -> float:
-        return self._folder.patience(role_actor.STOP_SECONDS)
+        return self._folder.patience(HELD_SECONDS)
 
     def flush_artifacts(self) -> None:
         deadline = time.monotonic() + SETTLE_SECONDS

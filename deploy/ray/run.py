@@ -18,7 +18,8 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.common.whole_file import write_whole
-from rmc.deploy.local.launcher import TICK_SECONDS
+from rmc.deploy.local.launcher import TICK_SECONDS, asked_to_stop, saved_steps
+from rmc.deploy.local.supervisor import HELD_SECONDS
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.ray.hosts import Hosts
 from rmc.deploy.ray.placement import (
@@ -149,21 +150,20 @@ class ClusterRun:
     def stop(self, reason: str) -> None:
         """Ask every role to end, and wait until the learner's last checkpoint is on the head."""
         self.hosts.tell_stop()
-        with suppress(BusUnavailable, BusFull):
-            self.bus.request_stop(reason)
-        deadline = time.monotonic() + STOP_SECONDS + self._saving()
+        deadline, asked = time.monotonic() + STOP_SECONDS + self._patience(0.0), False
         while time.monotonic() < deadline and not self.hosts.all_ended():
+            asked = asked or asked_to_stop(self.bus, reason)  # a Redis that is away is asked again
             time.sleep(TICK_SECONDS)
         self._redis.keep()
 
-    def _saving(self) -> float:
+    def _patience(self, least: float) -> float:
         """The seconds that the learner has to save, which are none of those in which a small state is on the head."""
-        return CheckpointFolder(self._folder.checkpoints).patience(0.0)
+        return CheckpointFolder(self._folder.checkpoints).patience(least)
 
     def close(self, over: bool) -> None:
         """End everything; nothing is left but the run's folder and, on its node, the ring of a run that may go on."""
         try:
-            self.hosts.close(over, self._saving())
+            self.hosts.close(over, self._patience(HELD_SECONDS))
         finally:
             self._redis.close()
 
@@ -190,7 +190,8 @@ def train(
             time.sleep(TICK_SECONDS)
         run.stop("stopped by its launcher" if stop.requested else "finished")
         monitor.watch(run.bus)  # what the roles said last
-        over = monitor.learner_finished()  # one that was stopped has ended cleanly, too
+        trained = run.hosts.finished() and not stop.requested and saved_steps(folder) >= run.config.total_steps
+        over = monitor.learner_finished() or trained  # one that was stopped has ended cleanly, too
         return over
     finally:
         run.close(over)
@@ -212,6 +213,7 @@ def _port(folder: RunFolder, ip: str) -> tuple[int, bool]:
                 probe.bind((ip, port))
             except OSError:
                 continue
-            write_whole(note, f"{port}\n".encode())
+            if port != had:  # on a full disk it may stay as it is
+                write_whole(note, f"{port}\n".encode())
             return port, had not in (None, port)
     raise ConfigError("--launcher", "ray", f"no port from {FIRST_PORT} to {LAST_PORT} is free on {ip} for Redis")

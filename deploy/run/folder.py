@@ -14,7 +14,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,7 @@ class RunFolder:
         self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
         self.initial_file, self.sizes_file = self.path / "initial.json", self.path / "sizes.json"
         self.history_file = self.path / "history.jsonl"
+        self._identity = ""  # before it is asked for
         self._lock: int | None = None
         self._was: os.stat_result | None = None  # when it was locked
 
@@ -61,14 +62,27 @@ class RunFolder:
 
     def identity(self) -> str:
         """Eight letters: the same after a rename, others for a copy. By them nodes know what they keep of the run."""
-        note, own = self.path / "scratch", str(self.path.stat().st_ino)
+        if not self._identity:
+            self._identity = self._known_identity()
+        return self._identity
+
+    def _known_identity(self) -> str:
+        """A rename keeps the folder's inode and when its secret last changed, a remount the latter, a copy neither."""
+        if not self.secret_file.exists():
+            self.secret()
+        note = self.path / "scratch"
+        own = [str(self.path.stat().st_ino), str(self.secret_file.stat().st_ctime_ns)]
+        words: list[str] = []
         with suppress(OSError, ValueError):  # there is none, or it is damaged
-            folder, name = note.read_text().split()
-            if folder == own:
-                return name
-        older = hashlib.sha256(self.secret()).hexdigest()[:8]  # which runs of older versions have
-        name = secrets.token_hex(4) if note.exists() else older
-        write_whole(note, f"{own} {name}\n".encode())
+            words = note.read_text().split()
+        known = set(words[:-1]) & set(own)
+        if known:
+            name = words[-1]
+        else:  # runs of versions without such a note have the second
+            name = secrets.token_hex(4) if note.exists() else hashlib.sha256(self.secret()).hexdigest()[:8]
+        if words != [*own, name]:
+            with suppress(OSError) if known else nullcontext():  # it may be read-only, or the disk full
+                write_whole(note, f"{' '.join([*own, name])}\n".encode())
         return name
 
     def rings(self) -> list[Path]:
@@ -234,14 +248,17 @@ class RunFolder:
     def unlock(self, status: int | None = None) -> None:
         """Let another launcher in; ``status`` is how this one ended, if it trained."""
         if self._lock is not None:
-            self._note("" if status is None else f"ended {status}")
+            with suppress(OSError):  # no room
+                self._note("" if status is None else f"ended {status}")
             os.close(self._lock)
             self._lock = None
 
     def _note(self, text: str) -> None:
+        """Over what is there: on a full disk that needs no new block."""
         assert self._lock is not None
-        os.ftruncate(self._lock, 0)
-        os.pwrite(self._lock, text.encode(), 0)
+        content = text.encode()
+        os.pwrite(self._lock, content.ljust(os.fstat(self._lock).st_size), 0)
+        os.ftruncate(self._lock, len(content))
 
     def trainer(self) -> int | None:
         """The process of the launcher that trains this run now, if one does, wherever that is."""

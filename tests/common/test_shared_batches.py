@@ -23,6 +23,14 @@ def descriptor():
     os.close(memory)
 
 
+def test_a_sandbox_that_refuses_such_memory_gets_none(monkeypatch):
+    def refuse(*_):
+        raise PermissionError(1, os.strerror(1))
+
+    monkeypatch.setattr(os, "memfd_create", refuse)
+    assert reserve_memory(4096) is None
+
+
 def test_batches_take_turns_and_are_seen_by_the_other_side(descriptor):
     server, learner = SharedBatches(descriptor, SPEC, BATCH), SharedBatches(descriptor, SPEC, BATCH)
     replies = []

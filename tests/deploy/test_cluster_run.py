@@ -1,5 +1,7 @@
 """What a launcher on Ray decides, without a cluster."""
 
+import json
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -7,18 +9,24 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 pytest.importorskip("ray")
 
+from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.env.config import EnvConfig
-from rmc.common.errors import RoleDied
+from rmc.common.errors import BusUnavailable, RoleDied
+from rmc.common.process.role import StopSignal
 from rmc.deploy.local.role_command import RoleCommand
+from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.ray import hosts as ray_hosts
 from rmc.deploy.ray import run as ray_run
 from rmc.deploy.ray.hosts import Hosts
 from rmc.deploy.ray.placement import RolePlacement
 from rmc.deploy.ray.role_actor import RoleActor
 from rmc.deploy.ray.run import ClusterRun
+from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
@@ -63,6 +71,56 @@ def test_the_lowest_actors_run(monkeypatch: pytest.MonkeyPatch, running: str, cl
     look = exchanges(monkeypatch, running, cluster)
     assert look() == ended
     assert look() == ended  # one at a time
+
+
+class Ended(SimpleNamespace):
+    """A run whose roles have all ended cleanly; Redis was away, and has lost what the learner said last."""
+
+    def __init__(self, config: RunConfig) -> None:
+        hosts = SimpleNamespace(restarts=dict, waiting=dict, finished=lambda: True)
+        super().__init__(config=config, hosts=hosts, bus=MemoryBus())
+        self.start, self.stop, self.close = lambda: None, lambda _: None, lambda _: None
+
+
+@pytest.mark.parametrize(("missing", "is_over"), [(0, True), (1, False)])
+def test_a_run_whose_last_word_redis_has_lost_is_over_if_its_checkpoint_is(
+    missing: int, is_over: bool, folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = folder.config()
+    monkeypatch.setattr(ray_run, "ClusterRun", lambda *_: Ended(config))
+    progress = json.dumps({"env_steps": config.total_steps - missing}).encode()
+    CheckpointFolder(folder.checkpoints).save(7, {PROGRESS: progress})
+    monitor = Monitor(folder, config, Console(quiet=True))
+    assert ray_run.train(config, folder, "cpu", False, False, monitor, StopSignal()) == is_over
+    monitor.close()
+
+
+def test_a_redis_that_is_away_is_asked_again_to_stop(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_run, "TICK_SECONDS", 0.01)
+    run, asked = ClusterRun.__new__(ClusterRun), list[str]()
+
+    def request_stop(reason: str) -> None:
+        asked.append(reason)
+        if len(asked) < 3:
+            raise BusUnavailable("away")
+
+    run._folder, run.bus = folder, SimpleNamespace(request_stop=request_stop)  # type: ignore[assignment]
+    ended = iter([False] * 5 + [True])
+    run.hosts = SimpleNamespace(tell_stop=lambda: None, all_ended=lambda: next(ended))  # type: ignore[assignment]
+    run._redis = SimpleNamespace(keep=lambda: None)  # type: ignore[assignment]
+    run.stop("stopped")
+    assert asked == ["stopped"] * 3
+
+
+def test_a_port_that_a_run_has_is_not_written_again(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk would end a launcher that Ray has started again."""
+    port, _ = ray_run._port(folder, "127.0.0.1")
+
+    def full(*_: object) -> None:
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(ray_run, "write_whole", full)
+    assert ray_run._port(folder, "127.0.0.1") == (port, False)
 
 
 @pytest.fixture

@@ -50,6 +50,41 @@ def test_a_run_that_is_renamed_is_known_but_a_copy_is_another(tmp_path: Path) ->
     assert RunFolder(tmp_path / "copy").identity() not in copies | {name}
 
 
+@pytest.mark.parametrize("changed", [0, 1])
+def test_a_run_is_known_by_its_folder_or_its_secret(tmp_path: Path, changed: int) -> None:
+    """A remount may give the folder another number, ``chown`` changes when the secret changed."""
+    name = RunFolder(tmp_path).identity()
+    note = tmp_path / "scratch"
+    words = note.read_text().split()
+    note.write_text(" ".join("1" if at == changed else word for at, word in enumerate(words)))
+    assert RunFolder(tmp_path).identity() == name
+    assert note.read_text().split() == words
+    note.write_text(f"{words[0]} {name}\n")  # as versions before wrote it
+    assert RunFolder(tmp_path).identity() == name
+    folder = RunFolder(tmp_path)
+    name = folder.name
+    shutil.rmtree(tmp_path)
+    assert folder.name == name  # also where the folder was deleted or moved
+
+
+def test_a_full_disk_keeps_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = RunFolder(tmp_path)
+    folder.lock()
+    folder.unlock(130)
+    folder.lock()
+    text = (tmp_path / ".lock").read_text()
+    assert text.startswith("training ")
+    assert str(os.getpid()) in text
+
+    def full(*_: object) -> None:
+        raise OSError(28, os.strerror(28))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", full)
+        folder.unlock(130)
+    RunFolder(tmp_path).lock()
+
+
 def test_all_who_make_it_at_once_have_the_same(tmp_path: Path) -> None:
     with ThreadPoolExecutor(8) as pool:
         for number in range(50):

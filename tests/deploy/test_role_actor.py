@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,7 +16,7 @@ pytest.importorskip("ray")
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.local import supervisor
 from rmc.deploy.local.role_command import RoleCommand
-from rmc.deploy.ray import learner_actor, role_actor
+from rmc.deploy.ray import launcher_actor, learner_actor, role_actor
 from rmc.deploy.ray.launcher_actor import LauncherActor
 from rmc.deploy.ray.learner_actor import LearnerActor
 from rmc.deploy.ray.role_actor import RoleActor, Task
@@ -118,12 +119,42 @@ def test_a_learner_that_saves_for_long_is_not_killed(
 ) -> None:
     log = tmp_path / "said"
     program.write_text(ENDS.replace("exit 0", f"sleep 1.5; echo saved >> {log}; exit 0"))
-    monkeypatch.setattr(role_actor, "STOP_SECONDS", 0.5)
+    monkeypatch.setattr(learner_actor, "HELD_SECONDS", 0.5)
     host = Learner(Task("test-run", "test-run", RoleCommand("learner", ("learner",)), {}, {}, str(tmp_path)))
     time.sleep(0.5)
     host.close()
     host.clear()
     assert log.read_text() == "saved\n"
+
+
+def test_a_damaged_checkpoint_holds_no_newer_one_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    learner, brought = LearnerActor.__new__(LearnerActor), list[int]()
+    learner._folder, learner._archived, learner._epoch, learner._incarnation = CheckpointFolder(tmp_path), set(), 0, ""
+    for number in (1, 2):
+        learner._folder.save(number, {"state": b"whole"})
+    (learner._folder.path(1) / "state").write_bytes(b"whale")
+    archive = SimpleNamespace(remote=lambda _, number, *rest: brought.append(number))
+    monkeypatch.setattr(learner, "_launcher", lambda: SimpleNamespace(archive=archive))
+    monkeypatch.setattr(learner_actor.ray, "get", lambda reply: reply)
+    learner._bring()
+    assert brought == [2]
+
+
+def test_what_a_launcher_leaves_is_ended_but_no_other_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ["r:learner", "r:replay-0", "r:replay-1", "other:replay-0"]
+    monkeypatch.setattr(launcher_actor, "actor_name", lambda run, role: f"{run}:{role}")
+    table = {name: {"name": name, "state": "CREATED"} for name in names} | {"": {"name": "r:x", "state": "REMOVED"}}
+    removed, ray = list[str](), launcher_actor.ray
+    monkeypatch.setattr(launcher_actor, "placement_group_table", lambda: table)
+    monkeypatch.setattr(launcher_actor, "remove_placement_group", removed.append)
+    monkeypatch.setattr(ray.util, "get_placement_group", lambda name: name)
+    monkeypatch.setattr(ray.util, "list_named_actors", lambda all_namespaces: [])
+    monkeypatch.setattr(ray, "get_runtime_context", lambda: SimpleNamespace(current_actor=None))
+    monkeypatch.setattr(ray, "kill", lambda *_, **__: None)
+    launcher = LauncherActor.__new__(LauncherActor)
+    launcher._task = Task("r", "r", RoleCommand("launcher", ()), {}, {}, "")
+    launcher.flush_artifacts()
+    assert removed == names[:3]
 
 
 def test_a_head_without_room_is_waited_for_unless_the_run_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:

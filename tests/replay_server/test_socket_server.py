@@ -25,6 +25,7 @@ from rmc.learner.replay_connection import ReplayConnection
 from rmc.replay_server import socket_server
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.socket_server import SocketServer
+from tests.replay_server import served as served_module
 from tests.replay_server.served import BIG, MAX_BATCH, SECRET, Served
 from tests.replay_server.support import SPEC, make_rows
 
@@ -385,6 +386,21 @@ def test_a_client_that_does_not_read_keeps_nobody_waiting_and_gets_its_own_batch
         assert (rows["reward"][:, 0] == rows["serial"]).all()
     silent.close()
     busy.close()
+
+
+def test_priorities_of_large_batches_never_wait_for_the_batches(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both ends send more than the kernel's buffers take."""
+    monkeypatch.setattr(served_module, "MAX_BATCH", 40_000)
+    served = serve()
+    client = ReplayClient(lambda: served.address, SECRET, SPEC, 40_000)
+    client._may_share = False
+    started = time.monotonic()
+    for _ in range(4):
+        sample = client.sample(40_000)
+        assert sample.rows is not None
+        client.update_priorities(sample.rows["serial"], np.ones(40_000, np.float32))
+    assert time.monotonic() - started < 8.0  # a socket gives up after 10 s
+    client.close()
 
 
 def test_strangers_are_sent_away_and_cannot_fill_the_server(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
