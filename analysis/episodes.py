@@ -10,7 +10,6 @@ from math import isfinite
 from numbers import Real
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.describe import layout_of, shown
 from rmc.common.env.layout import Part
 from rmc.common.env.make import make_env
-from rmc.common.env.wrappers import CorruptObservation, Delay, Env, Floats, FrameStack, ObservationSlice
+from rmc.common.env.wrappers import CorruptObservation, Delay, Env, Floats, FrameStack, ObservationSlice, SeenWrapper
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
@@ -67,20 +66,14 @@ class HiddenPart:
     flags: slice  # its own, where each number of what is seen has one
 
 
-class Record(gym.Wrapper[Floats, Floats, Floats, Floats]):
+class Record(SeenWrapper):
     """Keeps the newest observation of the environment that it wraps."""
 
     newest: Floats  # (F,), NaN where the environment itself calls it missing
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        observation, info = self.env.reset(seed=seed, options=options)
+    def seen(self, observation: Floats, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
         self.newest = np.where(info.get("missing", False), np.float32(np.nan), observation)
         return observation, info
-
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self.newest = np.where(info.get("missing", False), np.float32(np.nan), observation)
-        return observation, float(reward), terminated, truncated, info
 
 
 def recorded(env: Env) -> tuple[Env, Record]:

@@ -10,6 +10,7 @@ from rmc.analysis.policy import load_policy
 from rmc.analysis.report_figures import data_uri
 from rmc.analysis.report_run import ReportRun
 from rmc.common.errors import ConfigError, RmcError
+from rmc.deploy.run.checkpoint_choice import checkpoint_number
 
 LONGEST_FILM = 1_000  # steps: the page holds it
 
@@ -23,8 +24,16 @@ class Medium:
     note: str = ""
 
 
-def film(run: ReportRun) -> Medium:
-    """One deterministic episode of the newest policy, its first 1 000 steps."""
+def newest_checkpoint(run: ReportRun) -> str:
+    """Its number, as a run in training goes on to others; "latest" where there is none."""
+    try:
+        return str(checkpoint_number(run.folder, "latest"))
+    except ConfigError:
+        return "latest"
+
+
+def film(run: ReportRun, checkpoint: str) -> Medium:
+    """One deterministic episode, its first 1 000 steps."""
     if run.folder.is_baseline():
         return Medium(run.name, note="Of a baseline there is no video.")
     try:
@@ -32,20 +41,20 @@ def film(run: ReportRun) -> Medium:
         with tempfile.TemporaryDirectory() as place:
             out = Path(place) / "episode.mp4"
             video.prepare(config.env, out)
-            policy = load_policy(run.folder.path)
+            policy = load_policy(run.folder.path, checkpoint)
             total = video.record(policy, config.env, config.seed, out, LONGEST_FILM)
             return Medium(run.name, data_uri(out.read_bytes(), "video/mp4"), f"return {total:,.1f}")
     except RmcError as error:
         return Medium(run.name, note=f"No video: {_why(error)}.")
 
 
-def rollouts(run: ReportRun) -> Medium:
-    """The world model's predictions along an episode of the newest policy."""
+def rollouts(run: ReportRun, checkpoint: str) -> Medium:
+    """The world model's predictions along an episode."""
     if run.folder.is_baseline():
         return Medium(run.name, note="A baseline has no world model.")
     picture = io.BytesIO()
     try:
-        insight = world_model_picture.inspect_to(run.folder, picture)
+        insight = world_model_picture.inspect_to(run.folder, checkpoint, picture)
     except RmcError as error:
         return Medium(run.name, note=f"No world-model rollouts: {_why(error)}.")
     ahead = ", ".join(f"{share:.0%} at {horizon}" for horizon, share in insight.open_loop.items())

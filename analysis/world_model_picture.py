@@ -25,7 +25,7 @@ from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError, first_line
 from rmc.common.extra import check_installed
-from rmc.deploy.run.checkpoint_choice import choose_checkpoint
+from rmc.deploy.run.checkpoint_choice import checkpoint_number, choose_checkpoint
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.validation import validate
@@ -126,8 +126,8 @@ def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, Remembered,
     check_installed("plot", ("matplotlib",), "--out", str(out))
     check_writable("--out", out, PICTURES)
     folder = RunFolder(run)
-    config, agent = _grounded(folder, checkpoint)
-    with closing(Player(folder, agent, config, checkpoint)) as player:
+    config, agent, number = _grounded(folder, checkpoint)
+    with closing(Player(folder, agent, config, number)) as player:
         episodes, hidden = player.several(), player.hidden_parts()
     insight = look(agent, episodes[0], config.update.model_norm)
     memory = remember(agent, episodes, hidden)
@@ -135,21 +135,23 @@ def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, Remembered,
     return insight, memory, value_bias(agent, episodes, config.update.gamma)
 
 
-def inspect_to(folder: RunFolder, out: BinaryIO) -> Insight:
-    """Play the latest, look, and write the picture of one episode as PNG to what is like a file. Raises ConfigError."""
-    config, agent = _grounded(folder, "latest")
-    with closing(Player(folder, agent, config, "latest")) as player:
+def inspect_to(folder: RunFolder, checkpoint: str, out: BinaryIO) -> Insight:
+    """Play one episode, look, and write the picture as PNG to what is like a file. Raises ConfigError."""
+    config, agent, number = _grounded(folder, checkpoint)
+    with closing(Player(folder, agent, config, number)) as player:
         insight = look(agent, player.play(), config.update.model_norm)
     draw(insight, _title(config), out)
     return insight
 
 
-def _grounded(folder: RunFolder, checkpoint: str) -> tuple[RunConfig, Agent]:
+def _grounded(folder: RunFolder, checkpoint: str) -> tuple[RunConfig, Agent, str]:
+    """And the checkpoint's number: a run in training goes on to others."""
     config = folder.config()
     if not config.agent.grounding:
         fix = "its world model predicts no observations; train with --grounding"
         raise ConfigError("RUN", str(folder.path), fix)
-    return config, load_agent(folder, config, checkpoint)
+    number = str(checkpoint_number(folder, checkpoint))
+    return config, load_agent(folder, config, number), number
 
 
 def _title(config: RunConfig) -> str:

@@ -23,6 +23,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.harness import HERE
+from benchmarks.update_time import updates_per_s
 from rmc.analysis import history
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
@@ -75,17 +76,8 @@ def trained(task: str, seed: int, code: str) -> Line:
         raise ConfigError(task, shlex.join(words), f"it ended with {ended.returncode}; {folder}/logs say why")
     run = RunFolder(folder)
     returns = [one.return_mean for one in history.of_run(run).evaluations]
-    return Line(task, seed, code, statistics.fmean(returns[-EVALUATIONS:]), updates_per_s(run), (before + gflops()) / 2)
-
-
-def updates_per_s(run: RunFolder) -> float:
-    """The median of the learner's records, once it is warm."""
-    speeds = [
-        record["updates_per_s"]
-        for record in run.records()
-        if record["role"] == "learner" and record.get("updates", 0) > WARM and "updates_per_s" in record
-    ]
-    return statistics.median(speeds)
+    speed = updates_per_s(folder, lambda one: one.get("updates", 0) > WARM)
+    return Line(task, seed, code, statistics.fmean(returns[-EVALUATIONS:]), speed, (before + gflops()) / 2)
 
 
 def gflops(least_seconds: float = PRODUCT_SECONDS) -> float:

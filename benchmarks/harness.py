@@ -244,5 +244,7 @@ def replay_process(spec: WindowSpec, config: ReplayConfig) -> Iterator[RedisBus]
             try:
                 yield bus
             finally:
+                for process in psutil.Process().children(recursive=True):  # a stopped one cannot end
+                    process.resume()
                 bus.request_stop("done")
                 server.join()

@@ -18,23 +18,18 @@ from benchmarks.harness import (
     ENDLESS,
     Measure,
     Row,
-    argument_parser,
     compare,
     random_rows,
     replay_process,
     running,
-    save,
     speed,
     started_peer,
 )
+from benchmarks.replay import WINDOWS, measure_each, spec_of
 from benchmarks.sender import CHUNK, Sender
-from rmc.common.env.config import EnvConfig
-from rmc.common.env.make import env_layout
 from rmc.common.window import WindowSpec
 from rmc.replay_server.config import ReplayConfig
 
-WINDOWS = {"HalfCheetah-v5": 20_000, "Humanoid-v5": 4_000}  # in the ring
-HIDDEN = 256
 BEHIND = 256  # entries sent ahead of what is acknowledged
 LAYOUTS = {"Reverb": "fields", "Reverb, packed windows": "packed"}
 
@@ -59,11 +54,7 @@ def ours(spec: WindowSpec, windows: int, seconds: float) -> Iterator[Measure]:
                 sender.wait()
                 return (sender.seq - first) * CHUNK / (time.perf_counter() - start)
 
-        try:
-            yield measure
-        finally:
-            for process in processes:  # a stopped one cannot end
-                process.resume()
+        yield measure
 
 
 def copy(spec: WindowSpec, seconds: float) -> Measure:
@@ -79,10 +70,8 @@ def copy(spec: WindowSpec, seconds: float) -> Measure:
 
 def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
     """Windows of one environment."""
-    layout = env_layout(EnvConfig(env_id))
-    obs_dim, action_dim = layout.obs_dim, layout.action_dim
-    spec, cores = WindowSpec(obs_dim, action_dim, HIDDEN), sorted(os.sched_getaffinity(0))
-    words = cores[0], cores[-1], obs_dim, action_dim, HIDDEN, WINDOWS[env_id], CHUNK
+    spec, cores = spec_of(env_id), sorted(os.sched_getaffinity(0))
+    words = cores[0], cores[-1], spec.obs_dim, spec.action_dim, spec.state, WINDOWS[env_id], CHUNK
     with ExitStack() as stack:
         own = stack.enter_context(ours(spec, WINDOWS[env_id], seconds))
         peers = {
@@ -93,13 +82,5 @@ def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
         return compare(f"ingest, {CHUNK} windows an entry, {env_id}", "windows/s", own, peers, limit, rounds)
 
 
-def main() -> None:
-    parser = argument_parser(__doc__)
-    parser.add_argument("--env", nargs="+", choices=list(WINDOWS), default=list(WINDOWS))
-    options = parser.parse_args()
-    for env_id in options.env:
-        save(measure(env_id, options.rounds, options.seconds))
-
-
 if __name__ == "__main__":
-    main()
+    measure_each(__doc__, measure)

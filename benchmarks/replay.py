@@ -9,7 +9,7 @@ the last one, and each side has it to itself in its turn. Ours is the product wi
 import multiprocessing
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 
@@ -122,8 +122,6 @@ def ours(spec: WindowSpec, windows: int, seconds: float) -> Iterator[Measure]:
         try:
             yield measure
         finally:
-            for process in processes:  # a stopped one cannot end
-                process.resume()
             learner.client.close()
             sender.kill()
 
@@ -142,11 +140,8 @@ def gather(spec: WindowSpec, windows: int, seconds: float) -> Measure:
 
 def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
     """Windows of one environment."""
-    layout = env_layout(EnvConfig(env_id))
-    obs_dim, action_dim = layout.obs_dim, layout.action_dim
-    spec, windows = WindowSpec(obs_dim, action_dim, HIDDEN), WINDOWS[env_id]
-    core = max(os.sched_getaffinity(0))
-    sizes = core, obs_dim, action_dim, HIDDEN, windows, BATCH, RATE, CHUNK
+    spec, windows, core = spec_of(env_id), WINDOWS[env_id], max(os.sched_getaffinity(0))
+    sizes = core, spec.obs_dim, spec.action_dim, spec.state, windows, BATCH, RATE, CHUNK
     with ExitStack() as stack:
         own = stack.enter_context(ours(spec, windows, seconds))
         peers: dict[str, Measure | None] = {}
@@ -159,15 +154,22 @@ def measure(env_id: str, rounds: int, seconds: float) -> list[Row]:
         return compare(f"replay, mixed load, batch {BATCH}, {env_id}", "batches/s", own, peers, limit, rounds)
 
 
-def main() -> None:
-    parser = argument_parser(__doc__)
+def spec_of(env_id: str) -> WindowSpec:
+    """Its windows; making it tells their sizes."""
+    layout = env_layout(EnvConfig(env_id))
+    return WindowSpec(layout.obs_dim, layout.action_dim, HIDDEN)
+
+
+def measure_each(doc: str | None, measure: Callable[[str, int, float], list[Row]]) -> None:
+    """The command line: each of the environments."""
+    parser = argument_parser(doc)
     parser.add_argument("--env", nargs="+", choices=list(WINDOWS), default=list(WINDOWS))
     options = parser.parse_args()
-    torch.set_num_threads(1)
-    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     for env_id in options.env:
         save(measure(env_id, options.rounds, options.seconds))
 
 
 if __name__ == "__main__":
-    main()
+    torch.set_num_threads(1)
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    measure_each(__doc__, measure)

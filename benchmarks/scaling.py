@@ -22,18 +22,17 @@ from pathlib import Path
 import psutil
 
 from benchmarks.harness import ENDLESS, RUN, random_rows
-from rmc.common.bus.protocol import EntryId
+from benchmarks.sender import CHUNK, Sender
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.shard import Shard
 from rmc.common.window import WindowSpec
-from rmc.common.wire import encode_hello, encode_windows
+from rmc.common.wire import encode_windows
 from rmc.deploy.redis.server import RedisServer
 from rmc.deploy.run.presets import robust
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.server import ReplayServer
 
-CHUNK = 16  # windows an entry
 BEHIND = 256  # entries that a simulated actor sends ahead of what is acknowledged: of 32 actors they fit into Redis
 KEPT_UP = 0.95  # of what is offered
 
@@ -69,19 +68,13 @@ def _serve(url: str, folder: str, spec: WindowSpec, actors: int, shard: Shard) -
 
 def _simulate(url: str, actor: int, spec: WindowSpec, rate: float) -> None:
     """Send ``rate`` windows a second, as far as the acknowledged ones let it."""
-    bus, payload = RedisBus(url, RUN), encode_windows(random_rows(spec, CHUNK), spec)
-    epoch, seq, acknowledged = bus.take_epoch(f"actor-{actor}"), 0, 0
-    bus.append(actor, EntryId(epoch, 0), encode_hello(spec))
+    sender, payload = Sender(RedisBus(url, RUN), spec, actor), encode_windows(random_rows(spec, CHUNK), spec)
     period, due = CHUNK / rate, time.monotonic()
     while True:
-        while seq - acknowledged >= BEHIND:
-            ack = bus.ack(actor)
-            acknowledged = ack.id.seq if ack is not None and ack.id.epoch == epoch else 0
-            time.sleep(0.001)
+        sender.wait(BEHIND - 1)
         due = max(due + period, time.monotonic() - 10 * period)
         time.sleep(max(0.0, due - time.monotonic()))
-        seq += 1
-        bus.append(actor, EntryId(epoch, seq), payload)
+        sender.send(payload)
 
 
 @contextmanager

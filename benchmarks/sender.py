@@ -11,23 +11,24 @@ CHUNK = 16  # windows an entry, fewer of large ones
 
 
 class Sender:
-    """Actor 0; each entry is encoded anew, as an actor does."""
+    """An actor; each entry is encoded anew, as by a real one, unless a recorded one is given."""
 
-    def __init__(self, bus: Bus, spec: WindowSpec) -> None:
+    def __init__(self, bus: Bus, spec: WindowSpec, actor: int = 0) -> None:
         self.bus, self.spec, self.chunk = bus, spec, min(CHUNK, max(1, MAX_ENTRY_BYTES // spec.dtype.itemsize))
-        self._rows = random_rows(spec, self.chunk)
-        self._epoch, self.seq, self._acknowledged = bus.take_epoch("actor-0"), 0, 0
-        self.bus.append(0, EntryId(self._epoch, 0), encode_hello(spec))
+        self._rows, self._actor = random_rows(spec, self.chunk), actor
+        self._epoch, self.seq, self._acknowledged = bus.take_epoch(f"actor-{actor}"), 0, 0
+        self.bus.append(actor, EntryId(self._epoch, 0), encode_hello(spec))
 
-    def send(self) -> None:
+    def send(self, payload: bytes | None = None) -> None:
         """One entry."""
         self.seq += 1
-        self.bus.append(0, EntryId(self._epoch, self.seq), encode_windows(self._rows, self.spec))
+        payload = encode_windows(self._rows, self.spec) if payload is None else payload
+        self.bus.append(self._actor, EntryId(self._epoch, self.seq), payload)
 
     def wait(self, behind: int = 0) -> None:
         """Until all but so many entries are committed."""
         while self._acknowledged < self.seq - behind:
-            ack = self.bus.ack(0)
+            ack = self.bus.ack(self._actor)
             if ack is not None and ack.id.epoch == self._epoch:
                 self._acknowledged = ack.id.seq
             if self._acknowledged < self.seq - behind:

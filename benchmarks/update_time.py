@@ -16,9 +16,10 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -56,15 +57,15 @@ def sampled(run: Path, pids: dict[str, int], seconds: float) -> dict[str, dict[s
     spies = [_spy(pid, stacks[name], seconds) for name, pid in pids.items()]
     if failed := [spy.args for spy in spies if spy.wait()]:
         raise ConfigError("py-spy", failed[0], "it failed; the lines above say why")
-    an_update = 1000.0 / updates_per_s(run, began)
+    an_update = 1000.0 / updates_per_s(run, lambda one: one["time"] >= began)
     print(f"{1000.0 / an_update:.1f} updates/s")
     return {name: _shares(path, RATE * seconds, an_update) for name, path in stacks.items()}
 
 
-def updates_per_s(run: Path, began: float) -> float:
-    """The median of what a run's learner has said since then."""
-    records = [record for record in RunFolder(run).records() if record["role"] == "learner"]
-    return statistics.median(one["updates_per_s"] for one in records if one["time"] >= began and "updates_per_s" in one)
+def updates_per_s(run: Path, counts: Callable[[dict[str, Any]], bool]) -> float:
+    """The median of what a run's learner has said, in the records that count."""
+    records = [record for record in RunFolder(run).records() if record["role"] == "learner" and counts(record)]
+    return statistics.median(one["updates_per_s"] for one in records if "updates_per_s" in one)
 
 
 def _spy(pid: int, out: Path, seconds: float) -> subprocess.Popen[bytes]:

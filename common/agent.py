@@ -17,7 +17,7 @@ from rmc.common.critic import TwinQ
 
 
 class Normalizer(nn.Module):
-    """(o - mean) / std by the last statistics that it was given, or o itself where that is off; what is missing stays zero."""
+    """(o - mean) / std by the statistics it was given last, or o itself where that is off; what is missing is zero."""
 
     mean: Tensor
     std: Tensor

@@ -80,14 +80,8 @@ def page(path: Path) -> str:
     """The page with its table as it should be."""
     before, _, rest = path.read_text().partition(BEGIN)
     body = {RESULTS: _results, README: _readme}[path]()
-    return (
-        before
-        + BEGIN
-        + "\n".join([HEAD[path], "|---" * (HEAD[path].count("|") - 1) + "|", *body])
-        + "\n"
-        + END
-        + rest.partition(END)[2]
-    )
+    table = "\n".join([HEAD[path], "|---" * (HEAD[path].count("|") - 1) + "|", *body])
+    return f"{before}{BEGIN}{table}\n{END}{rest.partition(END)[2]}"
 
 
 def _results() -> Iterator[str]:

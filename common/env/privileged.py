@@ -5,15 +5,14 @@ Shapes: O observation, A action, P privileged numbers.
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from rmc.common.env.spaces import array
-from rmc.common.env.wrappers import Env, Floats
+from rmc.common.env.wrappers import Env, Floats, SeenWrapper
 from rmc.common.errors import EnvFault
 
 
-class Privileged(gym.Wrapper[Floats, Floats, Floats, Floats]):
+class Privileged(SeenWrapper):
     """``info["privileged"]`` as (P,) finite float32, of one shape from the first reset on.
 
     Where the environment gives none, that is the observation (O,), if ``take_observation``; else there is none.
@@ -26,15 +25,7 @@ class Privileged(gym.Wrapper[Floats, Floats, Floats, Floats]):
         self._shape: tuple[int, ...] | None = None  # as the environment gives it; None where it gives none
         self._begun = False
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        observation, info = self.env.reset(seed=seed, options=options)
-        return observation, self._with_privileged(observation, info)
-
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, float(reward), terminated, truncated, self._with_privileged(observation, info)
-
-    def _with_privileged(self, observation: Floats, info: dict[str, Any]) -> dict[str, Any]:
+    def seen(self, observation: Floats, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
         given = None
         if "privileged" in info:
             given = array('info["privileged"]', info["privileged"], "an array of numbers")
@@ -45,9 +36,9 @@ class Privileged(gym.Wrapper[Floats, Floats, Floats, Floats]):
             fix = "return it in one shape, at each reset and step"
             raise EnvFault(f'the environment\'s info["privileged"] has shape {shape}, at first {self._shape}; {fix}')
         if given is None and not self._take_observation:
-            return info
+            return observation, info
         numbers = np.array(observation if given is None else given, np.float32).ravel()
         if not np.isfinite(numbers).all():
             name = "observation" if given is None else 'info["privileged"]'
             raise EnvFault(f"the environment's {name} is not finite")
-        return info | {"privileged": numbers}
+        return observation, info | {"privileged": numbers}

@@ -137,7 +137,23 @@ def _warn_once(text: str) -> None:
     log.warning("%s", text)
 
 
-class ObservationSlice(gym.Wrapper[Floats, Floats, Floats, Floats]):
+class SeenWrapper(gym.Wrapper[Floats, Floats, Floats, Floats]):
+    """Changes what is seen of an environment, and nothing else of it."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+        return self.seen(*self.env.reset(seed=seed, options=options))
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, info = self.seen(observation, info)
+        return observation, float(reward), terminated, truncated, info
+
+    def seen(self, observation: Floats, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
+        """An observation and its ``info`` as they are -> as they are seen."""
+        raise NotImplementedError
+
+
+class ObservationSlice(SeenWrapper):
     """Only some of the observation's dimensions."""
 
     def __init__(self, env: Env, shown: slice) -> None:
@@ -146,20 +162,13 @@ class ObservationSlice(gym.Wrapper[Floats, Floats, Floats, Floats]):
         size = range(*shown.indices(env.observation_space.shape[0] if env.observation_space.shape else 0))
         self.observation_space = _box(len(size))
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        observation, info = self.env.reset(seed=seed, options=options)
-        return observation[self._shown], self._cut(info)
-
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation[self._shown], float(reward), terminated, truncated, self._cut(info)
-
-    def _cut(self, info: dict[str, Any]) -> dict[str, Any]:
+    def seen(self, observation: Floats, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
         flags = info.get("missing")
-        return info | {"missing": flags[self._shown]} if isinstance(flags, np.ndarray) else info
+        own = {"missing": flags[self._shown]} if isinstance(flags, np.ndarray) else {}
+        return observation[self._shown], info | own
 
 
-class CorruptObservation(gym.Wrapper[Floats, Floats, Floats, Floats]):
+class CorruptObservation(SeenWrapper):
     """Observations that chance changes; its random numbers are the episode's seed's, apart from the environment's."""
 
     stream: int  # keeps the random numbers of different disturbances apart
@@ -171,12 +180,10 @@ class CorruptObservation(gym.Wrapper[Floats, Floats, Floats, Floats]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         if seed is not None:
             self._rng = np.random.default_rng([seed, self.stream])
-        observation, info = self.env.reset(seed=seed, options=options)
-        return self.disturb(observation, info), info
+        return super().reset(seed=seed, options=options)
 
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return self.disturb(observation, info), float(reward), terminated, truncated, info
+    def seen(self, observation: Floats, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
+        return self.disturb(observation, info), info
 
     def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
         """(O,) as it is -> (O,) as it is seen; may say so in ``info``."""
@@ -197,7 +204,7 @@ class Noise(CorruptObservation):
         return np.where(info.get("missing", False), observation, noisy)
 
 
-class Delay(gym.Wrapper[Floats, Floats, Floats, Floats]):
+class Delay(SeenWrapper):
     """The observation of some steps ago, and whether it was missing; until then the episode's first one.
 
     Rewards, ends and what else ``info`` says are of now.
@@ -208,22 +215,16 @@ class Delay(gym.Wrapper[Floats, Floats, Floats, Floats]):
         self._past: deque[tuple[Floats, Any]] = deque(maxlen=steps + 1)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._past.extend([(observation, info.get("missing", False))] * (self._past.maxlen or 1))
-        return self._oldest(info)
+        self._past.clear()
+        return super().reset(seed=seed, options=options)
 
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._past.append((observation, info.get("missing", False)))
-        observation, info = self._oldest(info)
-        return observation, float(reward), terminated, truncated, info
-
-    def _oldest(self, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
+    def seen(self, observation: Floats, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
+        self._past.extend([(observation, info.get("missing", False))] * (1 if self._past else self._past.maxlen or 1))
         observation, missing = self._past[0]
         return observation, info | {"missing": missing}
 
 
-class FrameStack(gym.Wrapper[Floats, Floats, Floats, Floats]):
+class FrameStack(SeenWrapper):
     """The newest observations side by side, oldest first; the first one of an episode stands for those before it."""
 
     def __init__(self, env: Env, frames: int) -> None:
@@ -233,14 +234,12 @@ class FrameStack(gym.Wrapper[Floats, Floats, Floats, Floats]):
         self.observation_space = _box(frames * env.observation_space.shape[0])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._frames.extend([observation] * (self._frames.maxlen or 1))
-        return np.concatenate(self._frames), info | {"missing": False}
+        self._frames.clear()
+        return super().reset(seed=seed, options=options)
 
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._frames.append(observation)
-        return np.concatenate(self._frames), float(reward), terminated, truncated, info | {"missing": False}
+    def seen(self, observation: Floats, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
+        self._frames.extend([observation] * (1 if self._frames else self._frames.maxlen or 1))
+        return np.concatenate(self._frames), info | {"missing": False}
 
 
 def _box(size: int) -> gym.Space[Floats]:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from mlflow import MlflowClient
-from mlflow.entities import Metric, Param
+from mlflow.entities import Metric, Param, RunData
 
 from rmc.deploy.run.config import flat
 from rmc.deploy.run.folder import RunFolder
@@ -27,12 +27,21 @@ class MlflowRun:
         if before:
             self._run = before[0].info.run_id
             self._client.update_run(self._run, status="RUNNING")
+            self._tag_changes(before[0].data, flat(folder.config()))
+            for tag in tracking.tags:
+                self._client.set_tag(self._run, tag, "")
             return
         tags = {ID: tracking.id, **dict.fromkeys(tracking.tags, "")}
         self._run = self._client.create_run(experiment, run_name=folder.path.name, tags=tags).info.run_id
         params = [Param(name, str(value)) for name, value in flat(folder.config()).items()]
         for first in range(0, len(params), MOST_PARAMS):
             self._client.log_batch(self._run, params=params[first : first + MOST_PARAMS])
+
+    def _tag_changes(self, told: RunData, options: dict[str, Any]) -> None:
+        """What a resume has changed; a param of MLflow's is for good."""
+        for name, value in options.items():
+            if str(value) != told.tags.get(tag := f"resumed.{name}", told.params.get(name)):
+                self._client.set_tag(self._run, tag, str(value))
 
     def log(self, values: dict[str, Any], env_steps: int) -> None:
         now = int(1e3 * time.time())

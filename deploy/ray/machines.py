@@ -1,7 +1,6 @@
 """``rmc cluster up`` and ``down``: ``ray up`` and ``ray down`` with what these leave undone (docs/cluster.md)."""
 
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -12,7 +11,6 @@ import yaml
 from rich.console import Console
 
 from rmc.common.errors import ConfigError, RmcError
-from rmc.common.extra import how_to_install
 
 UP_SECONDS = 900.0  # for all nodes to have joined once the head is up: new machines install everything first
 LOOK_SECONDS = 2.0
@@ -98,20 +96,13 @@ def secure_token() -> None:
     path.chmod(0o600)
 
 
-def _ray_program() -> str:
-    beside = Path(sys.executable).with_name("ray")
-    program = str(beside) if beside.exists() else shutil.which("ray")
-    if program is None:
-        raise ConfigError("cluster", "ray", f"Ray is not installed; {how_to_install('ray')}")
-    return program
-
-
 def _ray(*words: str, quiet: bool = False) -> str:
     """Run Ray's own command line, its words seen unless ``quiet``. Raises RmcError."""
     environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_UP_enable_autoscaler_v2": "0"}
     captured = subprocess.PIPE if quiet else None
+    program = [sys.executable, "-P", "-m", "ray.scripts.scripts"]
     done = subprocess.run(
-        [_ray_program(), *words], env=environment, stdin=subprocess.DEVNULL, stdout=captured, stderr=captured, text=True
+        [*program, *words], env=environment, stdin=subprocess.DEVNULL, stdout=captured, stderr=captured, text=True
     )
     if done.returncode and not quiet:
         raise RmcError(f"ray {' '.join(words)} ended with status {done.returncode}")

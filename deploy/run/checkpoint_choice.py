@@ -7,17 +7,18 @@ from rmc.deploy.run.folder import RunFolder
 
 def choose_checkpoint(folder: RunFolder, which: str) -> tuple[int, dict[str, bytes]]:
     """Its number and files, verified. Raises ConfigError where there is none or it is damaged."""
-    checkpoints, which = CheckpointFolder(folder.checkpoints), str(which)
-    number = _number(checkpoints, which)
+    checkpoints, number = CheckpointFolder(folder.checkpoints), checkpoint_number(folder, which)
     try:
         return number, checkpoints.load(number)
     except CheckpointError as error:
         others = [other for other in checkpoints.numbers() if other != number]
         fix = f"use one of {others}" if others else "there is no other"
-        raise ConfigError("--checkpoint", which, f"{error}; {fix}") from None
+        raise ConfigError("--checkpoint", str(which), f"{error}; {fix}") from None
 
 
-def _number(checkpoints: CheckpointFolder, which: str) -> int:
+def checkpoint_number(folder: RunFolder, which: str) -> int:
+    """Its number, which stays the same while a run goes on to others. Raises ConfigError where there is none."""
+    checkpoints, which = CheckpointFolder(folder.checkpoints), str(which)
     numbers = checkpoints.numbers()
     if not numbers:
         raise ConfigError("RUN", str(checkpoints.folder.parent), "it has no checkpoint yet; train it for longer")

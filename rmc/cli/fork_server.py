@@ -55,7 +55,7 @@ def _forked(requests: socket.socket, request: dict[str, Any], log: int) -> int:
     if pid == 0:
         requests.close()
         _be(request["words"], {**request["environment"], parent_death.PARENT_VARIABLE: str(fork_server)}, log)
-    _lead_group(pid)  # here, too: who hears of it may signal its group at once
+    os.setpgid(pid, 0)  # said here, too: who hears of it may signal its group at once
     return pid
 
 
@@ -86,7 +86,7 @@ def _status(pid: int, roles: set[int]) -> int | str:
 def _be(words: list[str], environment: dict[str, str], log: int) -> None:
     """In the new process: become the role; never returns."""
     try:
-        _lead_group(0)
+        os.setpgid(0, 0)
         for stream in (1, 2):
             os.dup2(log, stream)
         os.close(log)
@@ -105,10 +105,6 @@ def _be(words: list[str], environment: dict[str, str], log: int) -> None:
     finally:
         sys.stderr.flush()
         os._exit(1)
-
-
-def _lead_group(pid: int) -> None:
-    os.setpgid(pid, 0)
 
 
 if __name__ == "__main__":

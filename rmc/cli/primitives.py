@@ -1,39 +1,15 @@
 """Words as people write them: 1000000, 1_000_000 and 1e6 are the same whole number, ``~`` in a path is their home."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from rmc.common.user_path import user_path
 
 PRIMITIVES = ConstructorRegistry()
-
-
-@PRIMITIVES.primitive_rule
-def _whole_numbers(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
-    if kind.type is not int:
-        return None
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="INT",
-        instance_from_str=lambda words: read_whole(words[0]),
-        is_instance=lambda value: type(value) is int,
-        str_from_instance=lambda value: [str(value)],
-    )
-
-
-@PRIMITIVES.primitive_rule
-def _paths(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
-    if kind.type is not Path:
-        return None
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="PATH",
-        instance_from_str=lambda words: user_path(words[0]),
-        is_instance=lambda value: isinstance(value, Path),
-        str_from_instance=lambda value: [str(value)],
-    )
 
 
 def read_whole(word: str) -> int:
@@ -43,3 +19,17 @@ def read_whole(word: str) -> int:
             if (number := read(word)) == int(number):
                 return int(number)
     raise ValueError(f"{word!r} is no whole number")
+
+
+@PRIMITIVES.primitive_rule
+def _read(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    if kind.type is not int and kind.type is not Path:
+        return None
+    read: Callable[[str], Any] = read_whole if kind.type is int else user_path
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.type.__name__.upper(),
+        instance_from_str=lambda words: read(words[0]),
+        is_instance=lambda value: isinstance(value, kind.type) and not isinstance(value, bool),
+        str_from_instance=lambda value: [str(value)],
+    )

@@ -5,12 +5,12 @@ import dataclasses
 import itertools
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import redis
 import torch
 from safetensors.torch import save
 
@@ -81,6 +81,12 @@ class Reader:
         return join_rows([decode_rows(entry.payload, SPEC) for entry in self.entries], SPEC)
 
 
+def begun(bus: Bus, **how: Any) -> tuple[Actor, Reader]:
+    """An actor that has untrained weights, and who reads what it sends."""
+    publish(bus, 0)
+    return make_actor(bus, **how), Reader(bus)
+
+
 def step_until_blocked(actor: Actor, limit: int = 10_000) -> int:
     for steps in range(limit):
         if not actor.step():
@@ -88,7 +94,7 @@ def step_until_blocked(actor: Actor, limit: int = 10_000) -> int:
     raise AssertionError("never blocked")
 
 
-def play(bus: Bus, actor: Actor, reader: Reader, steps: int, final: bool = True) -> None:
+def play(actor: Actor, reader: Reader, steps: int, final: bool = True) -> None:
     """So many steps, in several grants; with ``final`` everything open is sent at the end."""
     for granted in range(100, steps + 1, 100):
         reader.read(granted)
@@ -116,7 +122,7 @@ def test_each_step_once_in_order(bus: Bus) -> None:
     publish(bus, 0)
     actors, reader = [make_actor(bus, index) for index in range(2)], Reader(bus)
     for actor in actors:
-        play(bus, actor, reader, 1000)
+        play(actor, reader, 1000)
     assert_each_step_once(reader.rows(), 2000)
     rows = reader.rows()
     origins = [tuple(int(row[name]) for name in ("actor", "epoch", "seq", "k")) for row in rows]
@@ -126,7 +132,6 @@ def test_each_step_once_in_order(bus: Bus) -> None:
         assert ids == [EntryId(1, seq) for seq in range(len(ids))]
         assert not actor.step()
         assert actor.metrics()["unacked_entries"] == 0
-        actor.close()
 
 
 def test_waits_for_weights_then_credit_then_stops_at_its_credit(bus: Bus) -> None:
@@ -139,7 +144,6 @@ def test_waits_for_weights_then_credit_then_stops_at_its_credit(bus: Bus) -> Non
         step_until_blocked(actor)
         assert (actor.step(), actor.waiting_for()) == (False, "credit")
         assert actor.metrics()["env_steps"] == -(-granted // 4) * 4  # past its grant by less than one vector step
-    actor.close()
 
 
 def test_credit_of_an_earlier_epoch_is_none(bus: Bus) -> None:
@@ -149,12 +153,10 @@ def test_credit_of_an_earlier_epoch_is_none(bus: Bus) -> None:
     reader.read(1000)
     actor = make_actor(bus)
     assert (actor.step(), actor.waiting_for()) == (False, "credit")
-    actor.close()
 
 
 def test_final_credit_flushes_open_windows_and_more_credit_goes_on(bus: Bus) -> None:
-    publish(bus, 0)
-    actor, reader = make_actor(bus), Reader(bus)
+    actor, reader = begun(bus)
     reader.read(20)
     step_until_blocked(actor)
     reader.read(20)
@@ -170,7 +172,6 @@ def test_final_credit_flushes_open_windows_and_more_credit_goes_on(bus: Bus) -> 
     step_until_blocked(actor)
     reader.read(100, final=True)
     assert_each_step_once_with_cuts(reader.rows(), 100)
-    actor.close()
 
 
 def assert_each_step_once_with_cuts(rows: Rows, steps: int) -> None:
@@ -181,9 +182,8 @@ def assert_each_step_once_with_cuts(rows: Rows, steps: int) -> None:
 
 
 def test_a_full_resend_buffer_makes_it_wait(bus: Bus) -> None:
-    publish(bus, 0)
     config = ActorConfig(envs_per_actor=2, stride=6, chunk_windows=1, unacked_bytes=3 * SPEC.dtype.itemsize)
-    actor, reader = make_actor(bus, config=config), Reader(bus)
+    actor, reader = begun(bus, config=config)
     reader.read(100_000)
     step_until_blocked(actor)
     assert actor.waiting_for() == "acknowledgements"
@@ -192,25 +192,22 @@ def test_a_full_resend_buffer_makes_it_wait(bus: Bus) -> None:
     reader.read(100_000)
     step_until_blocked(actor)
     assert actor.metrics()["env_steps"] > steps
-    actor.close()
 
 
 def test_random_phase_and_newer_weights(bus: Bus) -> None:
-    publish(bus, 0)
-    actor, reader = make_actor(bus), Reader(bus)
-    play(bus, actor, reader, 400, final=False)
+    actor, reader = begun(bus)
+    play(actor, reader, 400, final=False)
     actions = reader.rows()
     assert set(actions["weights_update"].tolist()) == {0}
     valid = actions["action"][step_valid(actions, SPEC)]
     assert abs(valid.mean()) < 0.1
     assert valid.std() == pytest.approx(1 / np.sqrt(3), abs=0.05)
     publish(bus, 7)
-    play(bus, actor, reader, 800)
+    play(actor, reader, 800)
     versions = reader.rows()["weights_update"]
     assert set(versions.tolist()) == {0, 7}
     assert actor.metrics()["weights_update"] == 7
     assert (reader.rows()["new_steps"][versions == 0].sum()) <= 400 + CONFIG.refresh_steps + 4 * SPEC.steps
-    actor.close()
 
 
 def test_a_policy_that_cannot_be_read_is_refused_and_the_one_before_goes_on(bus: Bus) -> None:
@@ -228,7 +225,6 @@ def test_a_policy_that_cannot_be_read_is_refused_and_the_one_before_goes_on(bus:
     assert record["env_steps"] == 800
     assert record["weights_update"] == 3
     assert record["refused_weights"] >= 2
-    actor.close()
 
 
 def test_metrics() -> None:
@@ -246,7 +242,6 @@ def test_metrics() -> None:
     assert 1 <= record["episode_length_mean"] <= 40
     assert record["episode_return_mean"] > record["episode_length_mean"]  # a step's reward is its number
     assert "episode_return_mean" not in actor.metrics()
-    actor.close()
 
 
 def test_seeds() -> None:
@@ -256,13 +251,10 @@ def test_seeds() -> None:
     assert all(0 <= environment_seed(*name) < 2**31 for name in names)
 
     def first_steps(seed: int, restarts: int) -> set[Step]:
-        bus = MemoryBus()
-        publish(bus, 0)
-        actor, reader = make_actor(bus, seed=seed), Reader(bus)
+        actor, reader = begun(MemoryBus(), seed=seed)
         for _ in range(restarts):
             actor.restart()
-        play(bus, actor, reader, 200)
-        actor.close()
+        play(actor, reader, 200)
         return set(audit(reader.rows(), SPEC).trained)
 
     assert first_steps(1, 0) == first_steps(1, 0)
@@ -275,10 +267,9 @@ def test_same_seed_same_bits() -> None:
         bus = MemoryBus()
         bus.publish_weights(Version(1, 5), blob)
         actor, reader = make_actor(bus), Reader(bus)
-        play(bus, actor, reader, 500)
+        play(actor, reader, 500)
         actor.restart()
-        play(bus, actor, reader, 500)
-        actor.close()
+        play(actor, reader, 500)
         return reader.rows().tobytes()
 
     blob = publish(MemoryBus(), 5)
@@ -286,20 +277,17 @@ def test_same_seed_same_bits() -> None:
 
 
 def test_restart_begins_a_new_epoch_without_what_was_open() -> None:
-    bus = MemoryBus()
-    publish(bus, 0)
-    actor, reader = make_actor(bus), Reader(bus)
-    play(bus, actor, reader, 300, final=False)
+    actor, reader = begun(MemoryBus())
+    play(actor, reader, 300, final=False)
     actor.restart()
     assert actor.metrics()["env_steps"] == 0
     assert (actor.step(), actor.waiting_for()) == (False, "credit")  # it has the weights again, its credit is old
-    play(bus, actor, reader, 300)
+    play(actor, reader, 300)
     rows = reader.rows()
     assert set(rows["epoch"].tolist()) == {1, 2}
     later = rows["epoch"] == 2
     assert_each_step_once(rows[later], 300)
     assert audit(rows, SPEC).trained.total() <= 600
-    actor.close()
 
 
 class Unsteady(MemoryBus):
@@ -323,8 +311,7 @@ def test_a_failed_append_loses_and_repeats_nothing() -> None:
     kinds = [None, (BusUnavailable, False), (BusUnavailable, True), (BusFull, False)]
     rng = np.random.default_rng(0)
     bus = Unsteady([kinds[i] for i in rng.integers(0, 4, 400)])
-    publish(bus, 0)
-    actor, reader = make_actor(bus), Reader(bus)
+    actor, reader = begun(bus)
     reader.read(1000)
     for attempt in range(5000):
         try:
@@ -337,20 +324,18 @@ def test_a_failed_append_loses_and_repeats_nothing() -> None:
     assert actor.metrics()["env_steps"] == 1000
     assert actor.metrics()["resends"] > 0
     assert_each_step_once_with_cuts(reader.rows(), 1000)
-    actor.close()
 
 
 @pytest.mark.parametrize("then_steps", [True, False], ids=["while stepping", "while waiting"])
 def test_a_redis_that_forgot_everything_gets_it_again(redis_url: str, run_name: str, then_steps: bool) -> None:
     bus = RedisBus(redis_url, run_name)
-    publish(bus, 0)
-    actor, reader = make_actor(bus), Reader(bus)
-    play(bus, actor, reader, 200, final=False)
+    actor, reader = begun(bus)
+    play(actor, reader, 200, final=False)
     unread = 600 if then_steps else 300
     reader.read(unread)
     for _ in range(30 if then_steps else 200):
         actor.step()
-    _forget(redis_url, run_name)
+    _forget(bus)
     with contextlib.suppress(BusUnavailable):  # run_role waits here, and goes on
         for _ in range(100):
             actor.step()
@@ -362,7 +347,6 @@ def test_a_redis_that_forgot_everything_gets_it_again(redis_url: str, run_name: 
     reader.read(unread, final=True)
     assert_each_step_once_with_cuts(reader.rows(), unread)
     assert actor.metrics()["resends"] > 0
-    actor.close()
 
 
 def test_a_hello_that_redis_forgot_is_said_again(redis_url: str, run_name: str) -> None:
@@ -370,34 +354,29 @@ def test_a_hello_that_redis_forgot_is_said_again(redis_url: str, run_name: str) 
     publish(bus, 0)
     actor = make_actor(bus)
     assert bus.actors() == [0]
-    _forget(redis_url, run_name)  # before any replay server has read it
+    _forget(bus)  # before any replay server has read it
     for _ in range(100):
         actor.step()
     assert bus.actors() == [0]
-    actor.close()
 
 
-def _forget(redis_url: str, run_name: str) -> None:
+def _forget(bus: RedisBus) -> None:
     """All but the replay's epoch, which a restarted replay server would take anew."""
-    server = redis.Redis.from_url(redis_url)
-    for key in server.scan_iter(f"rmc:{run_name}:*"):
-        if not key.endswith(b":epoch:replay"):
-            server.delete(key)
-    server.close()
+    for key in bus.redis.scan_iter():  # by no pattern: the name of a test has brackets
+        if key.startswith(f"{bus.prefix}:".encode()) and not key.endswith(b":epoch:replay"):
+            bus.redis.delete(key)
 
 
 def test_a_replaced_actor_ends(bus: Bus) -> None:
-    publish(bus, 0)
-    old, reader = make_actor(bus), Reader(bus)
+    old, reader = begun(bus)
     reader.read(1000)
     old.step()
     new = make_actor(bus)
     with pytest.raises(FencedError):
         step_until_blocked(old)
     old.close()  # quietly
-    play(bus, new, reader, 200)
+    play(new, reader, 200)
     assert {int(epoch) for epoch in reader.rows()["epoch"]} == {2}
-    new.close()
 
 
 def test_epochs_that_redis_forgot_do_not_strand_the_actor(bus: Bus) -> None:
@@ -410,28 +389,24 @@ def test_epochs_that_redis_forgot_do_not_strand_the_actor(bus: Bus) -> None:
     assert bus.current_epoch("actor-0") == 2
     bus.commit(replay, {0: Ack(EntryId(2, 0), 40)})
     assert step_until_blocked(actor) == 10
-    actor.close()
 
 
 def test_a_life_that_the_ring_forgot_is_begun_anew(bus: Bus) -> None:
     """A replay server with an empty ring grants less than it had acknowledged: waiting would never end."""
-    publish(bus, 0)
-    actor, reader = make_actor(bus), Reader(bus)
-    play(bus, actor, reader, 400, final=False)
+    actor, reader = begun(bus)
+    play(actor, reader, 400, final=False)
     reader.read(60)
     assert not actor.step()
     assert bus.current_epoch("actor-0") == 2
-    play(bus, actor, reader, 300)
+    play(actor, reader, 300)
     later = reader.rows()[reader.rows()["epoch"] == 2]
     assert_each_step_once(later, 300)
-    actor.close()
 
 
 def test_a_redis_that_is_back_as_it_was_ends_no_life(bus: Bus) -> None:
     """It has an older ack; the replay server, which forgot nothing, repeats its own soon."""
-    publish(bus, 0)
-    actor, reader = make_actor(bus), Reader(bus)
-    play(bus, actor, reader, 200, final=False)
+    actor, reader = begun(bus)
+    play(actor, reader, 200, final=False)
     old = bus.ack(0)
     assert old is not None
     for granted in (300, 400):
@@ -448,20 +423,13 @@ def test_a_redis_that_is_back_as_it_was_ends_no_life(bus: Bus) -> None:
     for _ in range(60):  # it stays: the ring has forgotten the newest
         actor.step()
     assert bus.current_epoch("actor-0") == 2
-    actor.close()
-
-
-def make_broken(bus: Bus, env: str) -> Actor:
-    return make_actor(bus, make=lambda: make_env(EnvConfig(f"tests.broken_env:{env}")))
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_broken_episode_ends_with_the_step_before_and_training_goes_on(fault: str) -> None:
     """What was seen of it before is sound; nothing of the step that broke is, and it costs no credit."""
-    bus = MemoryBus()
-    publish(bus, 0)
-    actor, reader = make_broken(bus, f"Broken-{fault}-v0"), Reader(bus)
-    play(bus, actor, reader, 2000)
+    actor, reader = begun(MemoryBus(), make=lambda: make_env(EnvConfig(f"tests.broken_env:Broken-{fault}-v0")))
+    play(actor, reader, 2000)
     rows = reader.rows()
     counts = audit(rows, SPEC)
     assert set(counts.trained.values()) == {1}
@@ -471,24 +439,20 @@ def test_a_broken_episode_ends_with_the_step_before_and_training_goes_on(fault: 
     assert actor.metrics()["broken_episodes"] > 10
     sent = {step.step for step in counts.trained if step.episode % 3 == 2}
     assert sent == set(range(BREAKS_AT - 1))  # those before the one that broke
-    actor.close()
 
 
 def test_an_environment_that_always_breaks_early_is_learnt_from_up_to_there() -> None:
     """Whatever its strategy, what was sound reaches the replay, as of an episode that was cut off."""
     for strategy in ("burn-in", "episode"):
-        bus = MemoryBus()
-        publish(bus, 0)
         config = dataclasses.replace(CONFIG, state_strategy=strategy)  # type: ignore[arg-type]
-        actor = make_actor(bus, config=config, make=lambda: make_env(EnvConfig("tests.broken_env:Early-v0")))
-        reader = Reader(bus)
-        play(bus, actor, reader, 300)
+        env = EnvConfig("tests.broken_env:Early-v0")
+        actor, reader = begun(MemoryBus(), config=config, make=partial(make_env, env))
+        play(actor, reader, 300)
         rows = reader.rows()
         counts = audit(rows, SPEC)
         assert counts.new_steps >= 300
         assert {step.step for step in counts.trained} == {0, 1}
         assert not rows["terminated"].any()
-        actor.close()
 
 
 def test_what_critics_are_not_asked_to_read_is_the_environments_own_affair() -> None:
@@ -496,20 +460,13 @@ def test_what_critics_are_not_asked_to_read_is_the_environments_own_affair() -> 
         def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
             return self.env.reset(**options)[0], {"privileged": [[1.0], [1.0, 2.0]]}
 
-    bus = MemoryBus()
-    publish(bus, 0)
-    actor = make_actor(bus, make=lambda: Gives(make_env(COUNTING)))
-    play(bus, actor, Reader(bus), 60)
+    actor, reader = begun(MemoryBus(), make=lambda: Gives(make_env(COUNTING)))
+    play(actor, reader, 60)
     assert actor.metrics()["broken_episodes"] == 0
-    actor.close()
 
 
 def test_a_fault_is_logged_with_its_place_in_the_users_file(caplog: pytest.LogCaptureFixture) -> None:
-    bus = MemoryBus()
-    publish(bus, 0)
-    actor = make_broken(bus, "Broken-raise-v0")
-    play(bus, actor, Reader(bus), 500)
-    actor.close()
+    play(*begun(MemoryBus(), make=lambda: make_env(EnvConfig("tests.broken_env:Broken-raise-v0"))), 500)
     messages = [record.getMessage() for record in caplog.records if "broke in step" in record.getMessage()]
     assert messages
     fault = r"the environment's step raises RuntimeError: the simulation is unstable \(broken_env.py, line \d+\)$"
@@ -530,15 +487,11 @@ gym.register("Scaling-v0", entry_point=Scaling)
 
 
 def test_a_window_holds_the_agents_own_actions() -> None:
-    bus = MemoryBus()
-    publish(bus, 0)
-    actor = make_actor(bus, make=lambda: make_env(EnvConfig("Scaling-v0")))
-    reader = Reader(bus)
-    play(bus, actor, reader, 500)
+    actor, reader = begun(MemoryBus(), make=lambda: make_env(EnvConfig("Scaling-v0")))
+    play(actor, reader, 500)
     rows = reader.rows()
     assert 0.9 < np.abs(rows["action"]).max() <= 1.0
     assert 0.9 < np.abs(rows["prev_action"]).max() <= 1.0
-    actor.close()
 
 
 def test_an_environment_that_always_breaks_at_once_ends_the_actor() -> None:
@@ -546,17 +499,13 @@ def test_an_environment_that_always_breaks_at_once_ends_the_actor() -> None:
         def step(self, action: Any) -> Any:
             raise RuntimeError("it is dead")
 
-    bus = MemoryBus()
-    publish(bus, 0)
-    actor = make_actor(bus, make=lambda: Dead(make_env(COUNTING)))
+    actor, reader = begun(MemoryBus(), make=lambda: Dead(make_env(COUNTING)))
     with pytest.raises(RuntimeError, match="it is dead"):
-        play(bus, actor, Reader(bus), 2000)
+        play(actor, reader, 2000)
 
 
 def test_a_reset_that_breaks_is_tried_once_more_on_a_new_environment() -> None:
-    bus = MemoryBus()
-    publish(bus, 0)
-    actor, reader = make_actor(bus), Reader(bus)
+    actor, reader = begun(MemoryBus())
 
     class BreaksAtReset(gym.Wrapper[Any, Any, Any, Any]):
         def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
@@ -564,10 +513,9 @@ def test_a_reset_that_breaks_is_tried_once_more_on_a_new_environment() -> None:
             return np.full_like(observation, np.nan), info
 
     actor._envs._envs[2] = BreaksAtReset(actor._envs._envs[2])
-    play(bus, actor, reader, 1000)
+    play(actor, reader, 1000)
     assert actor.metrics()["broken_episodes"] == 1
     assert audit(reader.rows(), SPEC).trained.total() == 1000
-    actor.close()
 
 
 def test_a_reward_that_the_scale_makes_infinite_breaks_the_episode() -> None:
@@ -578,14 +526,11 @@ def test_a_reward_that_the_scale_makes_infinite_breaks_the_episode() -> None:
             observation, _, *rest = self.env.step(action)
             return observation, 1e33 if observation[3] == 5.0 else 1.0, *rest
 
-    bus = MemoryBus()
-    publish(bus, 0)
     config = dataclasses.replace(CONFIG, reward_scale=1e6)
-    actor, reader = make_actor(bus, config=config, make=lambda: Explodes(make_env(COUNTING))), Reader(bus)
-    play(bus, actor, reader, 1000)
+    actor, reader = begun(MemoryBus(), config=config, make=lambda: Explodes(make_env(COUNTING)))
+    play(actor, reader, 1000)
     assert actor.metrics()["broken_episodes"] > 0
     assert np.isfinite(reader.rows()["reward"]).all()
-    actor.close()
 
 
 @pytest.mark.parametrize("known", [False, True])
@@ -602,21 +547,20 @@ def test_a_frame_that_no_statistics_normalise_is_stored_as_none_seen(known: bool
         if known or update:
             made.freeze_statistics(torch.tensor([10.0]), torch.full((OBS_DIM,), 5.0), torch.full((OBS_DIM,), 9.0))
         bus.publish_weights(Version(1, update), save(made.policy_weights()))
-        play(bus, actor, reader, 500 if update else 300, final=bool(update))
+        play(actor, reader, 500 if update else 300, final=bool(update))
     rows = join_rows([decode_rows(entry.payload, spec) for entry in reader.entries], spec)
     later = rows["state"].any(1)  # at an episode's start nothing is remembered
     seen, trained = rows["state"][:, agent.hidden :].any(1), rows["weights_update"] > 0
     assert (seen[later & trained].mean(), seen[later & ~trained].mean()) == (1.0, float(known))
-    actor.close()
 
 
 def test_an_environment_that_breaks_now_and_then_at_once_goes_on() -> None:
     """Five times in a row is too often; sound episodes in between end the row."""
-    begun = itertools.count()
+    episodes = itertools.count()
 
     class BreaksAtTimes(gym.Wrapper[Any, Any, Any, Any]):
         def reset(self, **options: Any) -> Any:
-            self._breaks = next(begun) % 3 == 0
+            self._breaks = next(episodes) % 3 == 0
             return self.env.reset(**options)
 
         def step(self, action: Any) -> Any:
@@ -624,9 +568,6 @@ def test_an_environment_that_breaks_now_and_then_at_once_goes_on() -> None:
                 raise RuntimeError("it breaks")
             return self.env.step(action)
 
-    bus = MemoryBus()
-    publish(bus, 0)
-    actor = make_actor(bus, make=lambda: BreaksAtTimes(make_env(COUNTING)))
-    play(bus, actor, Reader(bus), 2000)
+    actor, reader = begun(MemoryBus(), make=lambda: BreaksAtTimes(make_env(COUNTING)))
+    play(actor, reader, 2000)
     assert actor.metrics()["broken_episodes"] > 20
-    actor.close()

@@ -31,6 +31,7 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
+from tests.cli.test_main import complaint
 
 AGENTS = {
     "robust": AgentConfig(
@@ -248,20 +249,15 @@ def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureF
 def test_export_says_what_is_wrong_in_one_line(
     run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert main.run(["export", str(run.path), "--out", str(tmp_path / "no" / "policy.onnx")]) == 2
-    assert "its folder is not there" in capsys.readouterr().err
-    assert main.run(["export", str(run.path), "--out", str(tmp_path)]) == 2
-    assert "is a folder" in capsys.readouterr().err
-    assert main.run(["export", str(run.path), "--checkpoint", "best"]) == 2
-    assert "none was evaluated whole yet" in capsys.readouterr().err
-    assert main.run(["export", str(run.path), "--checkpoint", "²"]) == 2
-    assert "use latest, best or one of [7]" in capsys.readouterr().err
-    assert main.run(["export", str(run.path), "--out", "/proc/policy.onnx"]) == 2
-    assert "cannot be written" in capsys.readouterr().err
+    words = ["export", str(run.path)]
+    assert "its folder is not there" in complaint([*words, "--out", str(tmp_path / "no" / "policy.onnx")], capsys)
+    assert "is a folder" in complaint([*words, "--out", str(tmp_path)], capsys)
+    assert "none was evaluated whole yet" in complaint([*words, "--checkpoint", "best"], capsys)
+    assert "use latest, best or one of [7]" in complaint([*words, "--checkpoint", "²"], capsys)
+    assert "cannot be written" in complaint([*words, "--out", "/proc/policy.onnx"], capsys)
     there = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "onnxscript" else there(name))
-    assert main.run(["export", str(run.path)]) == 2
-    assert "pip install -e '.[onnx]' in /" in capsys.readouterr().err
+    assert "pip install -e '.[onnx]' in /" in complaint(words, capsys)
 
 
 def test_another_environments_policy_is_refused(run: RunFolder, tmp_path: Path, capsys) -> None:
@@ -273,6 +269,5 @@ def test_another_environments_policy_is_refused(run: RunFolder, tmp_path: Path, 
     for blob in (theirs["policy.safetensors"], save(fewer)):
         CheckpointFolder(run.checkpoints).save(8, theirs | {"policy.safetensors": blob})
         for words in (["export", str(run.path), "--out", str(file)], ["evaluate", str(run.path), "--episodes", "1"]):
-            assert main.run(words) == 2
-            assert "--checkpoint='latest': weights: not a policy of this run" in capsys.readouterr().err
+            assert "--checkpoint='latest': weights: not a policy of this run" in complaint(words, capsys)
     assert not file.exists()

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rmc.analysis import report
+from rmc.analysis import report, video
 from rmc.analysis.doctor import examine
 from rmc.analysis.history import Evaluation, History
 from rmc.analysis.report_run import DRAWN, ReportRun
 from rmc.cli.main import run
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.local import trial
 from rmc.deploy.run.folder import RunFolder
 from tests.analysis import browser
@@ -225,6 +226,28 @@ def test_where_nothing_renders_the_video_is_a_note(
     assert "No video: nothing here can render" in text
     assert "<video" not in text
     assert "data:image/png" in text  # the world model's picture needs no renderer
+
+
+def test_film_and_rollouts_are_of_one_checkpoint(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though the run goes on meanwhile."""
+    path, read, load = tmp_path / "run", list[int](), CheckpointFolder.load
+    shutil.copytree(trained, path)
+
+    def newer(checkpoints: CheckpointFolder, number: int) -> dict[str, bytes]:
+        read.append(number)
+        files = load(checkpoints, number)
+        checkpoints.save(checkpoints.numbers()[-1] + 1, files)
+        return files
+
+    monkeypatch.setattr(CheckpointFolder, "load", newer)
+    monkeypatch.setattr(CheckpointFolder, "_prune", lambda *_: None)
+    monkeypatch.setattr(video, "prepare", lambda *_: None)
+    monkeypatch.setattr(video, "record", lambda policy, env, seed, out, longest: out.write_bytes(b"film"))
+    written(tmp_path / "report.html", str(path))
+    assert len(read) >= 3  # the film's, the world model's and what it plays
+    assert len(set(read)) == 1
 
 
 def test_a_baseline_stands_beside_a_run(trained: Path, tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from tests.analysis.browser import opened
+from tests.cli.test_main import complaint
 
 SHOWN_SECONDS, PAGES, STREAM_SECONDS = 2.0, 100, 4.0
 CONFIG = dataclasses.replace(debug(EnvConfig("InvertedPendulum-v5")), total_steps=2000)
@@ -364,18 +365,13 @@ def test_what_it_cannot_do_is_one_line(
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         values = {"RUN": str(folder.path), "TAKEN": str(taken.getsockname()[1])}
-        assert run(["watch", *(values.get(word, word) for word in words)]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert message in err
-    assert err.count("\n") == 1
+        assert message in complaint(["watch", *(values.get(word, word) for word in words)], capsys)
 
 
 def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     there = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "uvicorn" else there(name))
-    assert run(["watch", "nowhere"]) == 2
-    assert "uvicorn is missing; pip install -e '.[watch]'" in capsys.readouterr().err
+    assert "uvicorn is missing; pip install -e '.[watch]'" in complaint(["watch", "nowhere"], capsys)
 
 
 def test_a_run_that_cannot_be_read_is_told_and_the_others_are_shown(

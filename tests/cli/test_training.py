@@ -45,24 +45,31 @@ class Endless(CountingEnv):
 
 
 gym.register("NeverEnding-v0", entry_point=Endless)
+QUIET = Console(quiet=True)
 
 
-def test_the_last_evaluation_judges_and_does_not_choose(tmp_path, monkeypatch):
-    """The best is of those that were evaluated from other starts."""
-    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A run's, whose roles have trained it before they start."""
     monkeypatch.setattr(training, "_launch", lambda *_: True)
-    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
+    return make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+
+
+def conducted(folder, console=QUIET, launcher="local"):
+    """Its launcher's exit status."""
     folder.lock()
-    assert conduct(folder.config(), folder, placement, Console(quiet=True)) == 0
+    return conduct(folder.config(), folder, LaunchOptions(folder.path, launcher=launcher), console)
+
+
+def test_the_last_evaluation_judges_and_does_not_choose(folder):
+    """The best is of those that were evaluated from other starts."""
+    assert conducted(folder) == 0
     assert json.loads(folder.result_file.read_bytes())["updates"] == 7
     assert CheckpointFolder(folder.checkpoints).best() is None
 
 
-def test_the_untrained_policy_is_played_once(tmp_path, monkeypatch):
+def test_the_untrained_policy_is_played_once(folder, monkeypatch):
     """Its result is read at a resume; where that is damaged, it is played again."""
-    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
-    monkeypatch.setattr(training, "_launch", lambda *_: True)
-    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
     played, play = [], evaluation.evaluate_blob
 
     def counted(config, blob, *others):
@@ -74,8 +81,7 @@ def test_the_untrained_policy_is_played_once(tmp_path, monkeypatch):
     def train() -> float:
         """How often a policy was played, with the last's; what the result says of the untrained one."""
         played.clear()
-        folder.lock()
-        assert conduct(folder.config(), folder, placement, Console(quiet=True)) == 0
+        assert conducted(folder) == 0
         return json.loads(folder.result_file.read_bytes())["initial_return_mean"]
 
     first = train()
@@ -114,9 +120,7 @@ def test_an_evaluation_without_end_shows_that_it_goes_on_and_is_cut(tmp_path, mo
     assert "--seconds=nan: take 0 or more" in capsys.readouterr().err
 
 
-def test_in_lockstep_no_clock_cuts_an_evaluation_and_none_counts_as_training(tmp_path, monkeypatch):
-    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
-    monkeypatch.setattr(training, "_launch", lambda *_: True)
+def test_in_lockstep_no_clock_cuts_an_evaluation_and_none_counts_as_training(folder, monkeypatch):
     limits, play = [], evaluation.evaluate_blob
 
     def noted(header, blob, episodes, flicker, seconds, *others):
@@ -127,9 +131,7 @@ def test_in_lockstep_no_clock_cuts_an_evaluation_and_none_counts_as_training(tmp
     monkeypatch.setattr(evaluation, "evaluate_blob", noted)
     for launcher in ("lockstep", "local"):
         folder.initial_file.unlink(missing_ok=True)
-        folder.lock()
-        options = LaunchOptions(folder.path, "resume", launcher, "cpu", None)
-        assert conduct(folder.config(), folder, options, Console(quiet=True)) == 0
+        assert conducted(folder, launcher=launcher) == 0
     assert limits == [0.0, 0.0, 300.0, 300.0]
     trained = [record["wall_s"] for record in folder.records() if record["role"] == "launcher"]
     assert json.loads(folder.result_file.read_bytes())["wall_s"] < trained[-1] + 0.5
@@ -142,48 +144,35 @@ def test_it_imports_torch_without_its_compiler(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_a_stop_signal_amid_the_evaluations_stops_the_run(tmp_path, monkeypatch):
+def test_a_stop_signal_amid_the_evaluations_stops_the_run(folder, monkeypatch):
     """There is no role yet, or no more."""
-    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
-    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
-    monkeypatch.setattr(training, "_launch", lambda *_: True)
     before = signal.getsignal(signal.SIGTERM)
     for amid in ("_before", "_result"):
         with monkeypatch.context() as patch:
             patch.setattr(training, amid, lambda *_: signal.raise_signal(signal.SIGTERM))
-            folder.lock()
-            assert conduct(folder.config(), folder, placement, Console(quiet=True)) == STOPPED
+            assert conducted(folder) == STOPPED
         assert folder.ended() == STOPPED
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_a_run_that_goes_on_knows_its_steps_before_a_role_speaks(tmp_path, monkeypatch):
-    folder, output = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5"), io.StringIO()
+def test_a_run_that_goes_on_knows_its_steps_before_a_role_speaks(folder, monkeypatch):
+    output = io.StringIO()
     folder.history_file.write_text(json.dumps({"time": 1.0, "version": "0", "env_steps": 1_400}) + "\n")
-    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
-    monkeypatch.setattr(training, "_launch", lambda *_: True)
     for amid in ("_before", "_result"):
         with monkeypatch.context() as patch:
             patch.setattr(training, amid, lambda *_: signal.raise_signal(signal.SIGTERM))
-            folder.lock()
-            assert conduct(folder.config(), folder, placement, Console(file=output, width=200)) == STOPPED
+            assert conducted(folder, Console(file=output, width=200)) == STOPPED
     assert output.getvalue().count("stopped at environment step 1,400; to go on:") == 2
 
 
-def test_a_finished_run_that_is_resumed_says_that_no_step_is_missing(tmp_path, monkeypatch):
-    folder, output = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5"), io.StringIO()
-    monkeypatch.setattr(training, "_launch", lambda *_: True)
-    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
+def test_a_finished_run_that_is_resumed_says_that_no_step_is_missing(folder):
+    output = io.StringIO()
     for times in (0, 1):
-        folder.lock()
-        assert conduct(folder.config(), folder, placement, Console(file=output, width=200)) == 0
+        assert conducted(folder, Console(file=output, width=200)) == 0
         assert output.getvalue().count(f"steps are trained; rmc resume {folder.path} --total-steps N goes on") == times
 
 
-def test_a_second_ctrl_c_amid_the_upload_leaves_no_lock(tmp_path, monkeypatch):
-    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
-    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
-
+def test_a_second_ctrl_c_amid_the_upload_leaves_no_lock(folder, monkeypatch):
     class Uploads:
         def close(self, _):
             raise KeyboardInterrupt
@@ -193,39 +182,31 @@ def test_a_second_ctrl_c_amid_the_upload_leaves_no_lock(tmp_path, monkeypatch):
 
     monkeypatch.setattr(training, "start_tracker", lambda *_: Uploads())
     monkeypatch.setattr(training, "_launch", lambda *_: False)
-    folder.lock()
     with pytest.raises(KeyboardInterrupt):
-        conduct(folder.config(), folder, placement, Console(quiet=True))
+        conducted(folder)
     assert folder.ended() == STOPPED
     RunFolder(folder.path).lock()
 
 
-def test_why_a_run_has_failed_stays_in_its_folder(tmp_path, monkeypatch):
-    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
-    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
-
+def test_why_a_run_has_failed_stays_in_its_folder(folder, monkeypatch):
     def fail(*_):
         raise RoleDied("the learner ended 3 times")
 
     monkeypatch.setattr(training, "_launch", fail)
-    folder.lock()
     with pytest.raises(RoleDied):
-        conduct(folder.config(), folder, placement, Console(quiet=True))
+        conducted(folder)
     assert (folder.logs / "launcher.log").read_text() == "the learner ended 3 times\n"
 
 
-def test_what_nobody_expected_stays_there_too(tmp_path, monkeypatch):
-    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+def test_what_nobody_expected_stays_there_too(folder, monkeypatch):
     monkeypatch.setattr(training, "_launch", lambda *_: 1 // 0)
-    folder.lock()
     with pytest.raises(ZeroDivisionError):
-        conduct(folder.config(), folder, LaunchOptions(folder.path), Console(quiet=True))
+        conducted(folder)
     text = (folder.logs / "launcher.log").read_text()
     assert text.startswith("Traceback")
     assert text.endswith("ZeroDivisionError: integer division or modulo by zero\n")
 
 
-def test_a_run_whose_launcher_was_killed_says_how_to_go_on(tmp_path):
-    folder = make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5")
+def test_a_run_whose_launcher_was_killed_says_how_to_go_on(folder):
     with pytest.raises(RoleDied, match=rf"the launcher of \S+ was killed; to go on: rmc resume {folder.path}"):
-        print_end(folder, Console(quiet=True))
+        print_end(folder, QUIET)

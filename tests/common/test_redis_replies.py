@@ -18,6 +18,8 @@ from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner, Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.bus.redis_connection import TIMEOUT_SECONDS
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
+from rmc.common.process.role import StopSignal
+from rmc.deploy.redis.connect import Deadline, connect
 from rmc.deploy.redis.server import RedisServer, server_binary
 
 Call = Callable[[RedisBus], object]
@@ -211,18 +213,8 @@ def test_a_cluster_is_waited_for_while_it_is_down_and_refused_where_keys_are_els
         words = ["--port", "0", "--unixsocket", f"{folder}/r", "--cluster-enabled", "yes", "--dir", folder]
         with subprocess.Popen([server_binary(), *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as node:
             try:
-                bus = RedisBus(f"unix://{folder}/r", "run")
-                _until_it_answers(bus)
+                bus = connect(f"unix://{folder}/r", "run", Deadline(10.0, StopSignal()))
                 with pytest.raises(BusUnavailable, match="CLUSTERDOWN"):
                     bus.set_config(b"{}")
             finally:
                 node.kill()
-
-
-def _until_it_answers(bus: RedisBus) -> None:
-    deadline = time.monotonic() + 10.0
-    while time.monotonic() < deadline:
-        with suppress(BusUnavailable):
-            bus.ping()
-            return
-        time.sleep(0.02)

@@ -32,6 +32,7 @@ from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.opening import make, open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.state import run_state
+from tests.cli.test_main import complaint
 
 
 def test_a_run_that_is_renamed_is_known_but_a_copy_is_another(tmp_path: Path) -> None:
@@ -356,17 +357,15 @@ def test_odd_files_are_named_in_one_line(
     for name, text in (files | {"metrics.jsonl": json.dumps(record)}).items():
         (tmp_path / name).write_text(text)
     for command in commands:
-        assert run([*command, str(tmp_path)]) == 2
-        captured = capsys.readouterr()
-        assert (captured.out, captured.err.count("\n")) == ("", 1)
-        assert fault in captured.err
-        assert str(tmp_path) in captured.err
+        line = complaint([*command, str(tmp_path)], capsys)
+        assert fault in line
+        assert str(tmp_path) in line
 
 
 def test_a_baseline_is_not_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "config.json").write_text(BASELINE)
-    assert run(["evaluate", str(tmp_path), "--video", "x.mp4"]) == 2
-    assert "--video='x.mp4': only runs of rmc train are filmed" in capsys.readouterr().err
+    line = complaint(["evaluate", str(tmp_path), "--video", "x.mp4"], capsys)
+    assert "--video='x.mp4': only runs of rmc train are filmed" in line
 
 
 def test_a_newer_damaged_checkpoint_is_told_where_the_run_goes_on(

@@ -3,7 +3,6 @@
 import errno
 import os
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +29,7 @@ def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def tend_until(role: RoleProcess, seconds: float = 5.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not role.finished and time.monotonic() < deadline:
-        role.tend()
-        time.sleep(0.01)
+    wait_until(lambda: role.tend() or role.finished, seconds, pause=0.01)
 
 
 def test_the_learner_may_end(quick: Path) -> None:
@@ -109,11 +105,7 @@ def test_a_role_that_others_kill_is_started_again_however_often(quick: Path, end
     Path(supervisor.sys.executable).write_text(f"#!/bin/sh\n{end}\n")
     role = RoleProcess(RoleCommand("role", ("role",), ends=ends), {}, quick)
     role.start()
-    deadline = time.monotonic() + 20.0
-    while role.restarts < 10:
-        assert time.monotonic() < deadline
-        role.tend()
-        time.sleep(0.001)
+    wait_until(lambda: role.tend() or role.restarts >= 10, 20.0, pause=0.001)
     assert not role.finished
     role.signal(9)
     role.reap(5.0)

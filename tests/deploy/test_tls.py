@@ -4,7 +4,6 @@ import socket
 import stat
 import subprocess
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from rmc.replay_server.config import ReplayConfig
 from tests.integration.running import free_port
 from tests.replay_server.served import Served
 from tests.replay_server.support import SPEC
+from tests.waiting import wait_until
 
 SECRET = b"encrypted"
 USERS = RedisUsers("encrypted", SECRET, ("learner", "actor-0"))
@@ -51,14 +51,9 @@ def served(folder: Path) -> Iterator[Served]:
 
 
 def draw(client: ReplayClient, batch: int) -> np.ndarray:
-    deadline = time.monotonic() + 20.0
-    while time.monotonic() < deadline:
-        sample = client.sample(batch)
-        if sample.status is SampleStatus.BATCH:
-            assert sample.rows is not None
-            return sample.rows
-        time.sleep(0.05)
-    raise AssertionError("no batch came")
+    rows: list[np.ndarray | None] = []
+    wait_until(lambda: rows.append(client.sample(batch).rows) or rows[-1] is not None, 20.0, pause=0.05)
+    return rows[-1]
 
 
 def test_batches_and_priorities_travel_encrypted(served: Served, folder: Path) -> None:

@@ -1,5 +1,6 @@
 """A run in real trackers: what arrives, that a resume continues it, and that no tracker's trouble is the run's."""
 
+import dataclasses
 import json
 import logging
 import os
@@ -151,6 +152,9 @@ def test_mlflow_has_the_run_over_its_starts(
     monkeypatch.setenv("MLFLOW_TRACKING_URI", store)
     monkeypatch.chdir(tmp_path)  # where videos go
     train_twice(folder, "mlflow")
+    config = folder.config()
+    folder.write_config(dataclasses.replace(config, update=dataclasses.replace(config.update, gamma=0.5)))
+    started(folder, "mlflow").close(RESULT)
     assert not caplog.messages
     client = MlflowClient(store)
     experiment = client.get_experiment_by_name("my-project")
@@ -159,6 +163,8 @@ def test_mlflow_has_the_run_over_its_starts(
     assert (run.info.run_name, run.info.status) == ("first", "FINISHED")
     assert run.data.tags.keys() >= {"a", "b"}
     assert run.data.params["env.id"] == "InvertedPendulum-v5"
+    assert (run.data.params["update.gamma"], run.data.tags["resumed.update.gamma"]) == ("0.99", "0.5")
+    assert sum(tag.startswith("resumed.") for tag in run.data.tags) == 1
     returns = client.get_metric_history(run.info.run_id, "Main/evaluation_return")
     assert [(one.step, one.value) for one in returns] == [(700, 7.0), (1500, 15.0)]
     assert run.data.metrics["Main/q_loss"] == 0.5

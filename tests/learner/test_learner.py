@@ -59,6 +59,11 @@ class Setting:
         while self.server.step():
             pass
 
+    def update(self) -> None:
+        """One, after more experience has come."""
+        self.feed(60)
+        self.learner.step()
+
 
 @pytest.fixture
 def setting(tmp_path):
@@ -147,8 +152,7 @@ def test_updates_publish_and_give_priorities_back(setting):
 
 
 def test_statistics_are_frozen_into_what_is_published(setting):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     setting.learner.publish()
     weights = safetensors.torch.load(setting.bus.weights()[1])
     statistics = setting.server.statistics()
@@ -158,8 +162,7 @@ def test_statistics_are_frozen_into_what_is_published(setting):
 
 
 def test_statistics_stay_while_the_replay_server_is_away(setting, monkeypatch):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     before = setting.learner.agent.normalizer.mean.clone()
     assert before.any()
     monkeypatch.setattr(setting.learner.replay, "statistics", lambda: None)
@@ -208,8 +211,7 @@ def test_what_is_evaluated_and_saved_is_the_average_where_asked_and_actors_have_
 
 
 def test_no_valid_checkpoint_is_an_error(setting):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     setting.learner.close()
     for path in setting.folder.glob("checkpoints/0*/learner.pt"):
         path.write_bytes(b"damaged")
@@ -218,8 +220,7 @@ def test_no_valid_checkpoint_is_an_error(setting):
 
 
 def test_a_newer_checkpoint_that_is_damaged_is_passed_over_and_told(setting):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     assert setting.learner.metrics()["damaged_checkpoints"] == 0
     setting.learner.close()
     checkpoints = setting.learner.checkpoints
@@ -230,8 +231,7 @@ def test_a_newer_checkpoint_that_is_damaged_is_passed_over_and_told(setting):
 
 
 def test_a_checkpoint_never_executes_code(setting):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     setting.learner.close()
     mark = setting.folder / "owned"
     number, files = setting.learner.checkpoints.latest()
@@ -243,8 +243,7 @@ def test_a_checkpoint_never_executes_code(setting):
 
 @pytest.mark.parametrize("state", [None, [], {}, {"agent": None}, {"agent": {}}, {"generator": 3}], ids=str)
 def test_a_checkpoint_of_something_else_is_said_to_be_so(setting, state):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     setting.learner.close()
     file = io.BytesIO()
     number, files = setting.learner.checkpoints.latest()
@@ -259,8 +258,7 @@ def test_a_checkpoint_of_something_else_is_said_to_be_so(setting, state):
 
 @pytest.mark.parametrize("progress", ["", "[]", "{}", '{"updates": "x"}'])
 def test_progress_that_makes_no_sense_is_said_to_be_so(setting, progress):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     setting.learner.close()
     number, files = setting.learner.checkpoints.latest()
     setting.learner.checkpoints.save(number + 1, {**files, "progress.json": progress.encode()})
@@ -280,8 +278,7 @@ def test_ends_with_a_checkpoint_once_the_ratio_is_spent(tmp_path):
 
 
 def test_a_replaced_learner_is_fenced(setting):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     setting.learner.step()
     saved = setting.learner.checkpoints.numbers()
     setting.bus.take_epoch("learner")
@@ -314,8 +311,7 @@ def test_the_next_epoch_is_above_the_one_in_the_folder(setting):
 
 
 def test_a_checkpoint_without_room_is_tried_again_and_training_goes_on(setting, monkeypatch):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     blocked = setting.learner.checkpoints.folder
     blocked.rename(blocked.with_name("away"))
     blocked.write_bytes(b"")  # no folder, so nothing can be made in it
@@ -355,8 +351,7 @@ def test_the_end_waits_for_room(tmp_path, monkeypatch):
 
 
 def test_divergence_ends_it_and_keeps_the_last_good_checkpoint(setting):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     saved = setting.learner.checkpoints.numbers()
     with torch.no_grad():
         setting.learner.agent.policy.net[0].weight.fill_(float("nan"))
@@ -388,8 +383,7 @@ SPOILT = {
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("part", SPOILT)
 def test_nothing_that_is_not_finite_is_saved(setting, part, value):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     assert setting.learner.checkpoint()
     saved = setting.learner.checkpoints.numbers()
     setting.learner.step()
@@ -406,8 +400,7 @@ def test_nothing_that_is_not_finite_is_saved(setting, part, value):
 
 
 def test_critics_spoilt_by_one_gradient_are_not_saved_though_the_policy_is_sound(setting):
-    setting.feed(60)
-    setting.learner.step()
+    setting.update()
     weight = next(setting.learner.agent.critic.parameters())
     hook = weight.register_hook(lambda gradient: torch.full_like(gradient, float("inf")))
     setting.learner.step()
@@ -420,8 +413,7 @@ def test_critics_spoilt_by_one_gradient_are_not_saved_though_the_policy_is_sound
 
 def step_for_long(setting: Setting) -> None:
     for _ in range(100):
-        setting.feed(60)
-        setting.learner.step()
+        setting.update()
 
 
 @pytest.mark.parametrize(
