@@ -46,7 +46,7 @@ def write_report(runs: Sequence[ReportRun], out: Path, with_video: bool) -> None
 
     from rmc.analysis import report_media  # imports torch
 
-    shown = [(run, report_media.newest_checkpoint(run)) for run in newest(runs)]
+    shown = [report_media.media(run, with_video) for run in newest(runs)]
     page = {
         "title": f"Report of {runs[0].name}" if len(runs) == 1 else f"Report of {len(runs)} runs",
         "date": time.strftime("%Y-%m-%d %H:%M"),
@@ -55,8 +55,8 @@ def write_report(runs: Sequence[ReportRun], out: Path, with_video: bool) -> None
         "returns": _returns([run.history for run in runs if run.history is not None]),
         "final_columns": COLUMNS,
         "unevaluated": [run.name for run in runs if run.history is None],
-        "films": [report_media.film(*one) for one in shown] if with_video else [],
-        "rollouts": [report_media.rollouts(*one) for one in shown],
+        "films": [film for film, _ in shown if film is not None],
+        "rollouts": [rollouts for _, rollouts in shown],
         "courses": [_course(run) for run in runs],
         "differences": differences(runs),
     }

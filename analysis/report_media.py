@@ -24,10 +24,17 @@ class Medium:
     note: str = ""
 
 
-def newest_checkpoint(run: ReportRun) -> str:
-    """Its number, as a run in training goes on to others; "latest" where there is none."""
+def media(run: ReportRun, with_video: bool) -> tuple[Medium | None, Medium]:
+    """Film and rollouts of one checkpoint; of a run in training, unless that is dropped meanwhile."""
+    checkpoint = _there(run, "latest")
+    seen = rollouts(run, checkpoint)
+    return film(run, _there(run, checkpoint)) if with_video else None, seen
+
+
+def _there(run: ReportRun, checkpoint: str) -> str:
+    """Its number, as a run goes on to others; "latest" where it is not there."""
     try:
-        return str(checkpoint_number(run.folder, "latest"))
+        return str(checkpoint_number(run.folder, checkpoint))
     except ConfigError:
         return "latest"
 
@@ -39,9 +46,8 @@ def film(run: ReportRun, checkpoint: str) -> Medium:
     try:
         config = run.folder.config()
         with tempfile.TemporaryDirectory() as place:
-            out = Path(place) / "episode.mp4"
+            out, policy = Path(place) / "episode.mp4", load_policy(run.folder.path, checkpoint)
             video.prepare(config.env, out)
-            policy = load_policy(run.folder.path, checkpoint)
             total = video.record(policy, config.env, config.seed, out, LONGEST_FILM)
             return Medium(run.name, data_uri(out.read_bytes(), "video/mp4"), f"return {total:,.1f}")
     except RmcError as error:

@@ -86,7 +86,7 @@ class Broadcast:
         return False
 
     def _everything(self) -> bytes:
-        return b"".join(_event(i, run.everything()) for i, run in enumerate(self._runs))
+        return b"".join(_event(i, {**run.everything(), "whole": True}) for i, run in enumerate(self._runs))
 
 
 def _event(run: int, message: dict[str, Any]) -> bytes:

@@ -40,7 +40,7 @@ class MlflowRun:
     def _tag_changes(self, told: RunData, options: dict[str, Any]) -> None:
         """What a resume has changed; a param of MLflow's is for good."""
         for name, value in options.items():
-            if str(value) != told.tags.get(tag := f"resumed.{name}", told.params.get(name)):
+            if str(value) != told.tags.get(tag := f"resumed.{name}", told.params.get(name, str(value))):
                 self._client.set_tag(self._run, tag, str(value))
 
     def log(self, values: dict[str, Any], env_steps: int) -> None:

@@ -67,11 +67,14 @@ class LearnerActor(RoleActor):
 
     def _bring(self) -> None:
         newest, took = max(self._archived, default=-1), self._folder.last_save()
-        for number in self._folder.numbers():
+        numbers = self._folder.numbers()
+        for number in numbers:
             if number > newest and number not in self._archived:
                 try:
                     files = self._folder.load(number)
                 except CheckpointError:  # damaged, or dropped since
+                    if number == numbers[-1]:
+                        raise
                     continue
                 ray.get(self._launcher().archive.remote(self._incarnation, number, files, took))
                 self._archived.add(number)

@@ -170,6 +170,7 @@ def test_a_run_made_anew_in_its_folder_shows_nothing_of_the_old_one(folder: RunF
     assert found["curves"] == {"updates_per_s": (0, [(10, 9.0)])}
     say(anew, "learner", env_steps=20, updates_per_s=9.0)
     assert "whole" not in (live.look() or {})
+    assert b'"whole":true' in watch_server.Broadcast([live])._everything()  # a page may have missed it
 
 
 def test_a_page_without_news_is_told_that_its_server_is_there(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,10 +40,12 @@ def test_a_run_that_is_renamed_is_known_but_a_copy_is_another(tmp_path: Path) ->
     first = RunFolder(tmp_path / "run")
     first.path.mkdir()
     name = first.identity()
+    time.sleep(0.02)  # a copy within a tick of the clock that files are stamped with would be the same
     shutil.copytree(first.path, tmp_path / "other" / "run")
     assert len({first.name, first.name, RunFolder(tmp_path / "other" / "run").name}) == 2
     first.path.rename(tmp_path / "renamed")
     assert RunFolder(tmp_path / "renamed").identity() == name
+    time.sleep(0.02)
     shutil.copytree(tmp_path / "renamed", tmp_path / "copy")
     copies = {RunFolder(tmp_path / "copy").identity() for _ in range(2)}
     assert len(copies | {name}) == 2

@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("ray")
 
 from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import CheckpointError
 from rmc.deploy.local import supervisor
 from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.ray import launcher_actor, learner_actor, role_actor
@@ -138,6 +139,10 @@ def test_a_damaged_checkpoint_holds_no_newer_one_back(tmp_path: Path, monkeypatc
     monkeypatch.setattr(learner_actor.ray, "get", lambda reply: reply)
     learner._bring()
     assert brought == [2]
+    learner._folder.save(3, {"state": b"whole"})
+    (learner._folder.path(3) / "state").write_bytes(b"whale")
+    with pytest.raises(CheckpointError):  # the newest is tried again, and what is left is told
+        learner._bring()
 
 
 def test_what_a_launcher_leaves_is_ended_but_no_other_runs(monkeypatch: pytest.MonkeyPatch) -> None:
