@@ -105,7 +105,7 @@ WHEN = {
     "learning_rate": "down when the losses jump or training diverges",
     "memory_learning_scale": "down to keep stored states fresh, at the price of a slower memory",
     "alpha_learning_rate": "up where exploration stays high for too long",
-    "target_entropy": "up, to -0.5, where a policy gets stuck in what it found first; down for a calmer one",
+    "target_entropy": "up where a policy gets stuck in what it found first; down, to SAC's -1, for a calmer one",
     "gamma": "up for goals further away than 100 steps, down for nearer ones",
     "polyak": "up for slower, steadier targets; of use with `--no-critic-batch-norm`, or an `ema` memory",
     "clip_norm": "where single batches throw training off (`grad_norm` in the metrics); "

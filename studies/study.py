@@ -36,13 +36,18 @@ TINY = "--checkpoint-steps 300 --episodes 1"  # at the scale smoke
 TINY_OURS = f"{TINY} --hidden 16 --embedding 16 --heads 16 16 --warmup-steps 200 --batch-size 6 --replay-ratio 4"
 
 
+def earlier(words: str = "") -> str:
+    """Words of ``robust`` as it was with a target entropy of -A, and these."""
+    return f"train ENV --target-entropy -1 {words}".rstrip()
+
+
 def before(words: str = "") -> str:
     """Words of ``robust`` as it was before batch norm, and these: target critics, 8 windows, a replay ratio of 48, the
-    policy at every update, heads that read h alone.
+    policy at every update, heads that read h alone, a target entropy of -A.
     """
     sizes = {"--batch-size": "8", "--replay-ratio": "48", "--policy-delay": "1", "--head-input": "hidden"}
     unsaid = [f"{option} {value}" for option, value in sizes.items() if option not in words]
-    return " ".join(["train ENV --no-critic-batch-norm", *unsaid, words])
+    return earlier(" ".join(["--no-critic-batch-norm", *unsaid, words]))
 
 
 @dataclasses.dataclass(frozen=True)

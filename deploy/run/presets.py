@@ -29,7 +29,7 @@ def robust(env: EnvConfig | str) -> RunConfig:
         ),
         actor=ActorConfig(envs_per_actor=8),
         replay=ReplayConfig(replay_ratio=96.0, priority_exponent=0.0),
-        update=UpdateConfig(scheme=3, policy_ema_updates=2_000, policy_delay=2),
+        update=UpdateConfig(target_entropy=-0.5, scheme=3, policy_ema_updates=2_000, policy_delay=2),
         learner=LearnerConfig(batch_size=16, publish_updates=80),
     )
 
@@ -43,7 +43,7 @@ def memory(env: EnvConfig | str) -> RunConfig:
         agent=replace(base.agent, gate_init="chrono", head_input="hidden", critic_batch_norm=False),
         actor=replace(base.actor, state_strategy="episode"),
         replay=replace(base.replay, capacity=10_000, replay_ratio=48.0),
-        update=replace(base.update, scheme=1, policy_delay=1),
+        update=replace(base.update, target_entropy=-1.0, scheme=1, policy_delay=1),
         learner=replace(base.learner, batch_size=8, publish_updates=10),  # one of long windows is worth many steps
     )
 
