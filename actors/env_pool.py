@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rmc.actors.window_builder import Transition
-from rmc.common.env.make import checked_reset, further_env, recreate_env
+from rmc.common.env.make import further_env, recreate_env
 from rmc.common.env.wrappers import Env, Floats
 from rmc.common.errors import EnvFault
 from rmc.common.window import BoolArray, WindowSpec
@@ -68,7 +68,7 @@ class EnvPool:
                 self._step_one(i, action[i])
             except Exception as error:
                 faults[i] = error
-        self._mark_non_finite(faults)
+        self._mark_broken(faults)
         return self._given, faults
 
     def _step_one(self, i: int, action: Floats) -> None:
@@ -79,14 +79,12 @@ class EnvPool:
         if self._spec.privileged:
             given.privileged[i] = info["privileged"]
 
-    def _mark_non_finite(self, faults: dict[int, Exception]) -> None:
-        """Whose observation or scaled reward is not finite. What a broken one left behind must not end an episode."""
+    def _mark_broken(self, faults: dict[int, Exception]) -> None:
+        """Whose scaled reward is not finite, too. What a broken one left behind must not end an episode."""
         given = self._given
         rewarded = np.abs(given.reward) <= self._largest_reward
-        if not (np.isfinite(given.observation).all() and rewarded.all()):
-            sound = np.isfinite(given.observation).all(1) & rewarded
-            for i in np.flatnonzero(~sound).tolist():
-                faults.setdefault(i, EnvFault("the environment's observation or scaled reward is not finite"))
+        for i in np.flatnonzero(~rewarded).tolist():
+            faults.setdefault(i, EnvFault("the environment's scaled reward is not finite"))
         for i in faults:
             given.observation[i] = given.reward[i] = 0.0
             given.terminated[i] = given.truncated[i] = False
@@ -100,11 +98,11 @@ class EnvPool:
         if number is None:  # the episode before has ended as it should
             self._broken_starts[i] = 0
         try:
-            observation, info = checked_reset(self._envs[i], None if number is None else self._seed_of(number))
+            observation, info = self._envs[i].reset(seed=None if number is None else self._seed_of(number))
         except Exception as error:
             log.warning("%s: environment %d broke in a reset: %s", self._name, i, error)
             self._make_anew(i)
-            observation, info = checked_reset(self._envs[i], self._seed_of(self._seeds_due.pop(i)))
+            observation, info = self._envs[i].reset(seed=self._seed_of(self._seeds_due.pop(i)))
         self._check_sizes(info)
         return observation, info.get("missing", False), info["privileged"] if self._spec.privileged else None
 

@@ -4,6 +4,7 @@ Imported only where the extra ``baselines`` is installed. Shapes: N environments
 """
 
 import json
+import math
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -57,8 +58,11 @@ class BaselineModel:
 
     @property
     def updates(self) -> int:
-        """Gradient steps so far."""
-        return int(self.sb3._n_updates)
+        """Gradient steps so far. On-policy ones count their epochs, each of several minibatches."""
+        steps = 1
+        if self._config.algorithm not in OFF_POLICY:
+            steps = math.ceil(self.sb3.n_steps * self.sb3.n_envs / self.sb3.batch_size)
+        return int(self.sb3._n_updates) * steps
 
     def _load(self, saved: Path, vec: VecEnv, choice: Choice) -> tuple[VecEnv, Any]:
         with reading(saved):

@@ -1,6 +1,7 @@
 """What a baseline is trained with: as the paper sizes its networks, or as rl-baselines3-zoo tuned it.
 
-The zoo's numbers are those of hyperparams/*.yml at its commit 00128b5, for MuJoCo's v3 environments.
+The zoo's numbers are those of hyperparams/*.yml at its commit 00128b5, for MuJoCo's v3 environments (Reacher-v2), and
+CrossQ's at 208b6fd, for v4.
 """
 
 from dataclasses import dataclass, field, fields
@@ -33,8 +34,10 @@ _PPO_ROWS: dict[str, tuple[float, ...]] = {
     "Humanoid": (256, 512, 0.95, 3.56987e-05, 0.00238306, 0.3, 5, 0.9, 2.0, 0.431892),
     "HumanoidStandup": (32, 512, 0.99, 2.55673e-05, 3.62109e-06, 0.3, 20, 0.9, 0.7, 0.430793),
     "InvertedPendulum": (64, 32, 0.999, 0.000222425, 1.37976e-07, 0.4, 5, 0.9, 0.3, 0.19816),
+    "Reacher": (32, 512, 0.9, 0.000104019, 7.52585e-08, 0.3, 5, 1.0, 0.9, 0.950368),
     "InvertedDoublePendulum": (512, 128, 0.98, 0.000155454, 1.05057e-06, 0.4, 10, 0.8, 0.5, 0.695929),
 }
+_SWIMMER_GAMMA = {"sac": 0.9999, "crossq": 0.999, "ppo": 0.9999, "recurrent-ppo": 0.9999}
 _PPO_WIDE = {"HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup"}
 
 
@@ -103,16 +106,17 @@ def choose(algorithm: Algorithm, settings: Settings, env_id: str) -> Choice:
         return Choice(noise=noise)
     if settings == "paper":
         return Choice(network={"net_arch": PAPER_NET}, noise=noise)
+    body = env_id.rpartition("/")[2].partition("-")[0]
+    far = {"gamma": _SWIMMER_GAMMA[algorithm]} if body == "Swimmer" and algorithm in _SWIMMER_GAMMA else {}
     if algorithm == "sac":
-        return Choice(dict(_LEARNING_STARTS))
+        return Choice(_LEARNING_STARTS | far)
     if algorithm == "crossq":
-        return Choice({"learning_starts": 5_000}, {"net_arch": dict(_CROSSQ_NET)})
+        return Choice({"learning_starts": 5_000} | far, {"net_arch": dict(_CROSSQ_NET)})
     if algorithm in OFF_POLICY:
         return Choice(dict(_WITH_NOISE), {"net_arch": PAPER_NET}, noise=noise)
-    body = env_id.rpartition("/")[2].partition("-")[0]
     row = _PPO_ROWS.get(body)
     if row is None:
-        return Choice(normalize=True)
+        return Choice(far, normalize=True)
     arguments = {name: type(value)(value) for name, value in zip(_PPO_COLUMNS, row, strict=True)}
     wide = body in _PPO_WIDE
     return Choice(arguments, dict(_WIDE) if wide else {}, relu=wide, normalize=True)

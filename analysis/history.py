@@ -22,7 +22,7 @@ from rmc.deploy.run.config import RunConfig, changes, flat, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import SAME_AGENT
 from rmc.deploy.run.presets import preset_config
-from rmc.deploy.run.starts import starts
+from rmc.deploy.run.starts import begun_with, starts
 
 OMITTED = SAME_AGENT | {"seed", "preset", "env.id"}  # makes no other agent
 
@@ -175,10 +175,10 @@ def _resumed(config: RunConfig, folder: RunFolder) -> dict[str, list[Any]]:
 
 def _warm_start(folder: RunFolder) -> list[str]:
     """The run that it began with, where it did not begin anew."""
-    begun = [start.init_from for start in starts(folder) if start.init_from is not None]
+    begun = begun_with(folder)
     if not begun:
         return []
-    run, number, parts = (begun[0][name] for name in ("run", "checkpoint", "parts"))
+    run, number, parts = (begun[name] for name in ("run", "checkpoint", "parts"))
     return [f"--init-from {Path(run).name}:{number}", *([f"--init-parts {parts}"] if parts != "all" else [])]
 
 

@@ -11,6 +11,7 @@ from rmc.analysis.doctor import examine
 from rmc.analysis.history import About, History
 from rmc.analysis.vitals import Record
 from rmc.common.bus.metrics_record import is_finite
+from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import changes, flat
 from rmc.deploy.run.folder import RunFolder
@@ -73,7 +74,7 @@ class ReportRun:
         if self.folder.is_baseline():
             return {}
         config = self.folder.config()
-        return changes(preset_config(config.preset, config.env), config)
+        return changes(preset_config(config.preset, EnvConfig(config.env.id)), config)
 
     def series(self, kind: str, name: str) -> Series:
         """A metric over wall time (s), of the roles of a kind as each speaks; empty where nobody does.

@@ -5,7 +5,6 @@ Observations are normalised ones.
 """
 
 import io
-import pickle
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +29,7 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.validation import validate
 from rmc.learner.diagnostics import relative_l1_error
+from rmc.learner.learner_checkpoint import NOT_OURS
 from rmc.learner.losses import model_error
 
 HORIZONS = (1, 5, 15)  # steps ahead
@@ -60,7 +60,7 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     raw = choose_checkpoint(folder, checkpoint)[1][STATE]
     try:
         agent.load_state_dict(torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)["agent"])
-    except (pickle.UnpicklingError, EOFError, RuntimeError, KeyError, TypeError) as error:
+    except NOT_OURS as error:
         fix = f"its {STATE} is not this run's ({first_line(error)}); use another"
         raise ConfigError("--checkpoint", checkpoint, fix) from None
     return agent.eval()
@@ -132,7 +132,8 @@ def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, Remembered,
     insight = look(agent, episodes[0], config.update.model_norm)
     memory = remember(agent, episodes, hidden)
     draw(insight, _title(config), out, memory)
-    return insight, memory, value_bias(agent, episodes, config.update.gamma)
+    value = value_bias(agent, episodes, config.update.gamma) if config.update.n_step == 1 else None
+    return insight, memory, value
 
 
 def inspect_to(folder: RunFolder, checkpoint: str, out: BinaryIO) -> Insight:

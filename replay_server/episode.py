@@ -34,7 +34,11 @@ def find_episode(ring: Ring, serial: int, most: int) -> Slots | None:
 
 
 def _adjoins(ring: Ring, earlier: int, later: int) -> bool:
-    """Whether no step is missing between the windows in two slots."""
-    begins = ring.rows["episode_step"]
-    end = begins[earlier] + ring.rows["last"][earlier] - ring.spec.burn_in
-    return bool(begins[earlier] < begins[later] <= end)
+    """Whether no step is missing between the windows in two slots, and both hold what was seen at the former's end.
+
+    Where an episode's own first windows are gone, those of the one before may end at just that step.
+    """
+    begins, seen, last = ring.rows["episode_step"], ring.rows["observation"], ring.rows["last"][earlier]
+    offset = int(begins[later]) - int(begins[earlier])
+    within = 0 < offset <= last - ring.spec.burn_in
+    return bool(within and np.array_equal(seen[earlier, last], seen[later, last - offset]))

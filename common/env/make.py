@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from rmc.common.env.config import EnvConfig, check_env_config
@@ -30,7 +29,7 @@ from rmc.common.env.privileged import Privileged
 from rmc.common.env.process_state import ApartCall
 from rmc.common.env.spaces import space_fault
 from rmc.common.env.watched_env import WatchedEnv
-from rmc.common.env.wrappers import Delay, Env, Floats, FrameStack, Noise, ObservationSlice, RescaledEnv
+from rmc.common.env.wrappers import Delay, Env, FrameStack, Noise, ObservationSlice, RescaledEnv
 from rmc.common.errors import ConfigError, EnvFault, RmcError
 from rmc.common.extra import how_to_install
 
@@ -127,14 +126,6 @@ def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None, privi
     if config.flicker:
         wrapped = Flicker(wrapped, config.flicker, config.flicker_burst)
     return FrameStack(wrapped, config.frame_stack) if config.frame_stack > 1 else wrapped
-
-
-def checked_reset(env: Env, seed: int | None) -> tuple[Floats, dict[str, Any]]:
-    """Reset. Raises EnvFault, also where the observation is not finite."""
-    observation, info = env.reset(seed=seed)
-    if not np.isfinite(observation).all():
-        raise EnvFault("the environment's first observation is not finite")
-    return observation, info
 
 
 def recreate_env(env: Env, make_env: Callable[[], Env]) -> Env:

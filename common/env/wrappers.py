@@ -47,13 +47,13 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         result = call_env("reset", partial(self.env.reset, seed=seed, options=options))
         observation, info = _values("reset", result, RESET)
-        return vector(self.raw_observation_space, observation), self._own(info)
+        return self._vector(observation), self._own(info)
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         result = call_env("step", self.env.step, self._stretched(action))
         observation, reward, terminated, truncated, info = _values("step", result, STEP)
         ends = _bool("terminated", terminated), _bool("truncated", truncated)
-        return vector(self.raw_observation_space, observation), _number("reward", reward), *ends, self._own(info)
+        return self._vector(observation), _number("reward", reward), *ends, self._own(info)
 
     def render(self) -> Any:
         return call_env("render", self.env.render)
@@ -64,6 +64,13 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
             call_env("close", self.env.close)
         except EnvFault as fault:
             _warn_once(f"{fault}; it is left as it is")
+
+    def _vector(self, observation: Any) -> Floats:
+        """Judged before any wrapper hides, delays or blanks it: a broken simulator is broken now."""
+        numbers = vector(self.raw_observation_space, observation)
+        if not np.isfinite(numbers).all():
+            raise EnvFault("the environment's observation is not finite")
+        return numbers
 
     def _own(self, info: Any) -> dict[str, Any]:
         own = _own(info, math.prod(self.observation_space.shape or ()))

@@ -15,7 +15,7 @@ def main_metrics(status: RunStatus) -> dict[str, float]:
     waits = {
         "waiting_share_learner": learner.get("waiting_share"),
         "waiting_share_replay": status.replay("waiting_share", mean),
-        "waiting_share_actors": _actors_waiting(status),
+        "waiting_share_actors": status.over("actor-", "waiting_share", mean),
     }
     losses = {name: value for name, value in learner.items() if name.endswith("_loss")}
     metrics: dict[str, Any] = {
@@ -34,12 +34,3 @@ def evaluation_metrics(record: dict[str, Any]) -> dict[str, float]:
     if record["role"] != "evaluator":
         return {}
     return {MAIN + name: float(record[key]) for name, key in names.items() if is_finite(record.get(key))}
-
-
-def _actors_waiting(status: RunStatus) -> float | None:
-    shares = [
-        record["waiting_share"]
-        for role, record in status.roles.items()
-        if role.startswith("actor-") and "waiting_share" in record
-    ]
-    return mean(shares) if shares else None

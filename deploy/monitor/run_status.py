@@ -207,8 +207,12 @@ class RunStatus:
 
     def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:
         """The sum or mean ``over`` all replay servers, or None."""
-        values = [record[name] for role, record in self.roles.items() if role.startswith("replay") and name in record]
-        return over(values) if values else None
+        return self.over("replay", name, over)
+
+    def over(self, kind: str, name: str, how: Callable[[list[float]], float]) -> float | None:
+        """The sum or mean over all roles whose name begins with ``kind``, or None."""
+        values = [record[name] for role, record in self.roles.items() if role.startswith(kind) and name in record]
+        return how(values) if values else None
 
     @property
     def episode_return(self) -> float | None:

@@ -13,7 +13,7 @@ from rmc.common.errors import CheckpointError, ConfigError
 from rmc.deploy.run.config import RunConfig, changes, option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import IfExists, LaunchOptions
-from rmc.deploy.run.starts import note_start, starts
+from rmc.deploy.run.starts import begun_with, note_start
 from rmc.deploy.run.tracking import choose_tracking, keep_tracking
 from rmc.deploy.run.validation import validate_windows
 
@@ -206,8 +206,7 @@ def _check_changes(folder: RunFolder, before: RunConfig, config: RunConfig) -> N
 
 def _check_begun(folder: RunFolder, options: LaunchOptions) -> None:
     """Raises ConfigError where it is to begin with other weights than it did."""
-    began = next((start.init_from for start in starts(folder) if start.init_from is not None), {})
-    if options.init_from is not None and began.get("asked") != [options.init_from, options.init_parts]:
+    if options.init_from is not None and begun_with(folder).get("asked") != [options.init_from, options.init_parts]:
         fix = f"the run in {folder.path} has begun, and not with that; leave it, or take another --run-dir"
         raise ConfigError("--init-from", options.init_from, fix)
 

@@ -80,6 +80,11 @@ def starts(folder: RunFolder) -> list[Start]:
     return all_starts
 
 
+def begun_with(folder: RunFolder) -> dict[str, Any]:
+    """The run whose networks it began with, as ``InitialCheckpoint`` tells it; empty where it began anew."""
+    return next((start.init_from for start in starts(folder) if start.init_from is not None), {})
+
+
 def resume_command(folder: RunFolder) -> str:
     """What to type in a shell to continue a run."""
     return f"rmc resume {shlex.quote(str(folder.path))}"

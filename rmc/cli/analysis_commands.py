@@ -120,8 +120,11 @@ def inspect(command: run_options.Inspect) -> int:
     worst = ", ".join(f"{i} ({insight.unexplained[i]:.0%})" for i in hardest)
     console.print(f"unexplained of the observation's change: {ahead} (100% is a guess of no change)", soft_wrap=True)
     console.print(f"worst dimensions one step ahead: {worst}")
-    if value is not None:
-        counted = f"with the entropy's bonus, over {value.steps:,} steps"
+    if value is None:
+        which = "compared where --n-step is 1 and episodes end by themselves, or outlast 3 / (1 - gamma) steps"
+        console.print(f"what the critics expect and what came: {which}", soft_wrap=True)
+    else:
+        counted = f"with the entropy's bonus, without curiosity, over {value.steps:,} steps"
         console.print(
             f"critics expect {value.expected:,.1f} on average; {value.came:,.1f} came, {counted}", soft_wrap=True
         )

@@ -1,13 +1,12 @@
 """What a user is told at the end of a run."""
 
-import json
 from typing import Any
 
 from rich.console import Console
 
 from rmc.analysis.doctor import examine
-from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.errors import RoleDied
+from rmc.deploy.local.launcher import saved_steps
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
 from rmc.deploy.run.starts import resume_command
@@ -20,9 +19,7 @@ def print_end(folder: RunFolder, console: Console) -> int:
     if status == 0:
         return print_result(folder, console)
     if status == STOPPED:
-        newest = CheckpointFolder(folder.checkpoints).latest()
-        steps = json.loads(newest[1][PROGRESS])["env_steps"] if newest else 0
-        return print_stopped(folder, steps, console)
+        return print_stopped(folder, saved_steps(folder), console)
     if status is None:
         raise RoleDied(f"the launcher of {folder.path} was killed; to go on: {resume_command(folder)}")
     log_file = folder.logs / "launcher.log"

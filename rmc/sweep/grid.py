@@ -10,7 +10,7 @@ from rmc.deploy.run.config import RunConfig, flat, option, option_words
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import SAME_AGENT
-from rmc.deploy.run.starts import starts
+from rmc.deploy.run.starts import begun_with
 from rmc.sweep.job import Job, run_name
 from rmc.sweep.pool import Ending
 from rmc.sweep.spec import Spec
@@ -39,7 +39,7 @@ def is_finished(job: Job, config: RunConfig, options: LaunchOptions) -> bool:
         if path not in SAME_AGENT and was.get(path) != now[path]:
             fix = f"the run in {job.folder} has {was.get(path)!r}; use that, or another --sweep-dir"
             raise ConfigError(option(path), now[path], fix)
-    began = next((start.init_from for start in starts(folder) if start.init_from is not None), {})
+    began = begun_with(folder)
     asked = None if options.init_from is None else [options.init_from, options.init_parts]
     if began.get("asked") != asked:
         fix = f"the run in {job.folder} began {_with(began)}; use that, or another --sweep-dir"

@@ -23,7 +23,7 @@ from rmc.common.bus.protocol import Ack, Bus, Entry, EntryId, ReplayOwner, Versi
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
-from rmc.common.errors import BusFull, BusUnavailable, FencedError
+from rmc.common.errors import BusFull, BusUnavailable, EnvFault, FencedError
 from rmc.common.window import Rows, WindowSpec
 from rmc.common.wire import decode_rows
 from tests.actors.support import join_rows
@@ -509,8 +509,7 @@ def test_a_reset_that_breaks_is_tried_once_more_on_a_new_environment() -> None:
 
     class BreaksAtReset(gym.Wrapper[Any, Any, Any, Any]):
         def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-            observation, info = self.env.reset(**options)
-            return np.full_like(observation, np.nan), info
+            raise EnvFault("it is broken")
 
     actor._envs._envs[2] = BreaksAtReset(actor._envs._envs[2])
     play(actor, reader, 1000)

@@ -17,6 +17,7 @@ from rich.console import Console
 
 from rmc import api
 from rmc.analysis import baselines
+from rmc.analysis.baseline_model import BaselineModel
 from rmc.analysis.baseline_settings import Algorithm, BaselineConfig, Settings, choose, read
 from rmc.analysis.baselines import evaluate, train
 from rmc.analysis.history import of_run
@@ -173,6 +174,23 @@ def test_the_zoos_numbers_are_of_the_right_kind(algorithm, body):
     choice = choose(algorithm, "zoo", body)
     assert all(type(choice.arguments[name]) is int for name in ("batch_size", "n_steps") if name in choice.arguments)
     assert choice.normalize == (algorithm in ("ppo", "recurrent-ppo"))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "env", "gamma"),
+    [
+        ("sac", "Swimmer-v5", 0.9999), ("crossq", "Swimmer-v5", 0.999), ("ppo", "Swimmer-v5", 0.9999),
+        ("recurrent-ppo", "Reacher-v5", 0.9),
+    ],
+)  # fmt: skip
+def test_the_zoos_discounts(algorithm, env, gamma):
+    assert choose(algorithm, "zoo", env).arguments["gamma"] == gamma
+
+
+def test_updates_are_gradient_steps():
+    model = BaselineModel(config("ppo"), None)
+    model.sb3.learn(1)
+    assert model.updates == 10 * 2048 // 64
 
 
 def test_the_zoos_ppo_trains_and_keeps_its_scales(tmp_path):

@@ -173,7 +173,7 @@ def test_rewards_of_an_ordinary_size_need_no_scale(capsys):
             "raise",
             "fault: the environment's step raises RuntimeError: the simulation is unstable (broken_env.py, line ",
         ),
-        ("nan", "fault: observations are not finite"),
+        ("nan", "fault: the environment's observation is not finite"),
         ("reward", "fault: rewards are not finite"),
         ("shape", "fault: the environment's observation has shape (3,), its space says (4,)"),
     ],

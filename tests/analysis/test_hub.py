@@ -96,6 +96,7 @@ WRONG = [
     (["push", "run", "me/x"], "", "HF_TOKEN=None: no token; set it to one that may write, or run hf auth login"),
     (["push", "run", "me/x"], "hf_reads", "REPO='me/x': the hub refuses it (HTTP 401); use a token that may"),
     (["push", "run", "others/x"], TOKEN, "REPO='others/x': the hub refuses it (HTTP 403); use a token that may"),
+    (["push", "run", "swings"], TOKEN, "REPO='swings': no repository's name; give owner/name"),
     (["push", "run", "a/b/c"], TOKEN, "REPO='a/b/c': no repository's name; give owner/name"),
     (
         ["push", "run", "me/x", "--license", "foo"],
@@ -121,7 +122,7 @@ for words, token in json.loads(sys.argv[1]):
 def test_what_goes_wrong_is_one_line(hub: Hub, call: Call, tmp_path: Path) -> None:
     make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
     hub.repos |= {"me/empty": {}, "me/other": {"policy.safetensors": save({})}}
-    cases = json.dumps([[words, token] for words, token, _ in WRONG])
+    before, cases = set(hub.repos), json.dumps([[words, token] for words, token, _ in WRONG])
     done = call("-c", MANY, cases, folder=tmp_path)
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
     errors = done.stderr.splitlines()
@@ -131,6 +132,7 @@ def test_what_goes_wrong_is_one_line(hub: Hub, call: Call, tmp_path: Path) -> No
         assert expected in line
         assert status == "2"
     assert not (tmp_path / "policy.safetensors").exists()
+    assert not any("swings" in name for name in set(hub.repos) - before)
 
 
 @pytest.mark.parametrize(

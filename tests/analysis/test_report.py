@@ -175,6 +175,13 @@ def test_wall_time_goes_over_all_starts(trained: Path, tmp_path: Path) -> None:
     assert values == [2.0] * 4
 
 
+def test_the_environments_options_are_not_the_presets(trained: Path, tmp_path: Path) -> None:
+    config = json.loads((trained / "config.json").read_text())
+    config["env"]["flicker"] = 0.5
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    assert ReportRun.read(tmp_path).changed()["env.flicker"] == [0.0, 0.5]
+
+
 def test_a_run_that_trains_and_was_never_evaluated(trained: Path, tmp_path: Path) -> None:
     path = tmp_path / "begun"
     shutil.copytree(trained, path, ignore=shutil.ignore_patterns("result.json", "checkpoints", "replay"))

@@ -131,7 +131,7 @@ def test_networks_of_an_impossible_size_are_not_made(config: RunConfig, tmp_path
         load_agent(folder, huge, "latest")
 
 
-@pytest.mark.parametrize("state", [[], {}, {"agent": None}, {"agent": {}}], ids=str)
+@pytest.mark.parametrize("state", [[], {}, {"agent": None}, {"agent": {}}, {"agent": {1: 2}}], ids=str)
 def test_another_runs_state_is_said_to_be_so(config: RunConfig, tmp_path: Path, state: object) -> None:
     folder, file = run_of(tmp_path / "run", config), io.BytesIO()
     checkpoints = CheckpointFolder(folder.checkpoints)

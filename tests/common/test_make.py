@@ -285,16 +285,6 @@ def test_flicker_hides_the_whole_observation_and_nothing_else() -> None:
     assert 0 < sum(blanks) < 50
 
 
-def test_flicker_is_seeded() -> None:
-    def blanks(seed: int) -> list[bool]:
-        env = make_env(EnvConfig("tests.memory_env:Memory40-v0", flicker=0.5))
-        first = env.reset(seed=seed)[1]["missing"]
-        return [first] + [env.step(np.zeros(1, np.float32))[4]["missing"] for _ in range(40)]
-
-    assert blanks(1) == blanks(1)
-    assert blanks(1) != blanks(2)
-
-
 @pytest.mark.parametrize("delay", [12, 40])
 def test_memory_task_needs_a_memory(delay: int) -> None:
     """Remembering reaches the best return; without, half of the episodes cost what the others gain."""

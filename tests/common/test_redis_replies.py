@@ -17,7 +17,7 @@ import redis
 from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner, Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.bus.redis_connection import TIMEOUT_SECONDS
-from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.redis.connect import Deadline, connect
 from rmc.deploy.redis.server import RedisServer, server_binary
@@ -200,12 +200,6 @@ def test_an_epoch_that_none_can_be_is_mended(bus: RedisBus, value: str | int) ->
     bus.redis.set(bus.key("epoch", "replay"), "many")
     bus.commit(ReplayOwner("replay", 1), ACK)
     assert bus.current_epoch("replay") == 1
-
-
-def test_an_older_life_is_still_fenced(bus: RedisBus) -> None:
-    bus.append(0, EntryId(2, 0), b"hello")
-    with pytest.raises(FencedError):
-        bus.append(0, EntryId(1, 1), b"x")
 
 
 def test_a_cluster_is_waited_for_while_it_is_down_and_refused_where_keys_are_elsewhere() -> None:

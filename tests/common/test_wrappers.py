@@ -1,5 +1,7 @@
 """What is done to an environment before the agent sees it."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -10,9 +12,16 @@ from rmc.common.env import wrappers
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.layout import Part
 from rmc.common.env.make import env_layout, make_env
-from rmc.common.env.wrappers import RescaledEnv
+from rmc.common.env.missing import DropSensors, Flicker
+from rmc.common.env.wrappers import Delay, ObservationSlice, RescaledEnv
+from rmc.common.errors import EnvFault
+from tests.broken_env import BREAKS_AT, BrokenEnv
 
 CHEETAH, ACTION = "HalfCheetah-v5", np.linspace(-1, 1, 6, dtype=np.float32)
+
+
+def first_number(env: Any) -> ObservationSlice:
+    return ObservationSlice(env, slice(0, 1))
 
 
 def played(config: EnvConfig, steps: int = 30, seed: int = 1) -> tuple[np.ndarray, np.ndarray, list[dict[str, Any]]]:
@@ -67,6 +76,22 @@ def test_what_the_environment_calls_missing_has_no_noise() -> None:
     flags = np.array([info["missing"] for info in infos])
     assert 0.1 < flags.mean() < 0.5
     np.testing.assert_array_equal(np.stack(seen) != 0.0, ~flags)
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [partial(Delay, steps=20), partial(Flicker, probability=1.0), partial(DropSensors, probability=1.0), first_number],
+    ids=["delay", "flicker", "drop", "hide"],
+)
+def test_what_is_not_finite_is_a_fault_at_once_whatever_hides_it(wrap: Callable[[Any], Any]) -> None:
+    env = wrap(RescaledEnv(BrokenEnv("nan")))
+    for seed in (1, None, None):  # it breaks in the third, which is long enough
+        env.reset(seed=seed)
+    action = np.zeros(env.action_space.shape, np.float32)
+    for _ in range(1, BREAKS_AT):
+        env.step(action)
+    with pytest.raises(EnvFault, match="the environment's observation is not finite"):
+        env.step(action)
 
 
 def test_stacked_frames_are_the_newest_oldest_first() -> None:

@@ -1,5 +1,6 @@
 """An episode's windows are found again among those of other environments, or not at all."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,10 +26,17 @@ def played(lengths: list[tuple[int, int]], stride: int) -> tuple[Rows, list[list
     for row, (env, _, window) in zip(rows, turns, strict=True):
         row["actor"], row["epoch"], row["env"] = ENVS[env]
         row["episode_step"] = stride * window
+    write_observations(rows, [episode for _, episode, _ in turns])
     chains = [
         [earlier for earlier, (_, e, w) in enumerate(turns) if e == chain and w <= window] for _, chain, window in turns
     ]
     return rows, chains
+
+
+def write_observations(rows: Rows, episodes: Sequence[int]) -> None:
+    """Each its episode and its step there, so that windows of one episode see the same at the same step."""
+    steps = rows["episode_step"][:, None] + np.arange(SPEC.observations) - SPEC.burn_in
+    rows["observation"] = (1000.0 * np.array(episodes)[:, None] + steps)[..., None]
 
 
 def _round(lengths: list[tuple[int, int]], turn: tuple[int, int, int]) -> int:
@@ -60,8 +68,10 @@ def test_every_episode_is_found_whole_or_not_at_all(
 
 
 def ring_of(folder: Path, episode_steps: list[int]) -> Ring:
+    """An episode begins at each step 0."""
     ring, rows = Ring(folder / "ring", SPEC, 100), make_rows(len(episode_steps))
     rows["episode_step"] = episode_steps
+    write_observations(rows, np.cumsum(np.array(episode_steps) == 0).tolist())
     ring.write(rows)
     ring.commit()
     return ring
@@ -79,6 +89,13 @@ def ring_of(folder: Path, episode_steps: list[int]) -> Ring:
 def test_what_is_not_whole_is_not_found(tmp_path: Path, steps: list[int], why: str) -> None:
     ring = ring_of(tmp_path, steps)
     assert find_episode(ring, len(steps) - 1, most=5) is None, why
+
+
+def test_the_episode_before_is_not_taken_for_the_start_that_is_gone(tmp_path: Path) -> None:
+    """It ended at the very step at which the windows of the later one that are left begin."""
+    ring = ring_of(tmp_path, [0, 0, 4])
+    ring.forget(np.array([1]))
+    assert find_episode(ring, 2, most=5) is None
 
 
 def test_who_is_not_there_has_no_episode(tmp_path: Path) -> None:
