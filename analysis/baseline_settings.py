@@ -1,7 +1,7 @@
 """What a baseline is trained with: as the paper sizes its networks, or as rl-baselines3-zoo tuned it.
 
-The zoo's numbers are those of hyperparams/*.yml at its commit 00128b5, for MuJoCo's v3 environments (Reacher-v2), and
-CrossQ's at 208b6fd, for v4.
+The zoo's numbers are those of hyperparams/*.yml at its commit 00128b5, for MuJoCo's v3 environments (Reacher-v2);
+CrossQ's, TD3's and DDPG's at 208b6fd, for v4.
 """
 
 from dataclasses import dataclass, field, fields
@@ -37,7 +37,7 @@ _PPO_ROWS: dict[str, tuple[float, ...]] = {
     "Reacher": (32, 512, 0.9, 0.000104019, 7.52585e-08, 0.3, 5, 1.0, 0.9, 0.950368),
     "InvertedDoublePendulum": (512, 128, 0.98, 0.000155454, 1.05057e-06, 0.4, 10, 0.8, 0.5, 0.695929),
 }
-_SWIMMER_GAMMA = {"sac": 0.9999, "crossq": 0.999, "ppo": 0.9999, "recurrent-ppo": 0.9999}
+_SWIMMER_GAMMA = {"sac": 0.9999, "crossq": 0.999, "td3": 0.9999, "ddpg": 0.9999, "ppo": 0.9999, "recurrent-ppo": 0.9999}
 _PPO_WIDE = {"HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup"}
 
 
@@ -113,7 +113,7 @@ def choose(algorithm: Algorithm, settings: Settings, env_id: str) -> Choice:
     if algorithm == "crossq":
         return Choice({"learning_starts": 5_000} | far, {"net_arch": dict(_CROSSQ_NET)})
     if algorithm in OFF_POLICY:
-        return Choice(dict(_WITH_NOISE), {"net_arch": PAPER_NET}, noise=noise)
+        return Choice(_WITH_NOISE | far, {"net_arch": PAPER_NET}, noise=noise)
     row = _PPO_ROWS.get(body)
     if row is None:
         return Choice(far, normalize=True)

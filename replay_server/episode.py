@@ -34,11 +34,17 @@ def find_episode(ring: Ring, serial: int, most: int) -> Slots | None:
 
 
 def _adjoins(ring: Ring, earlier: int, later: int) -> bool:
-    """Whether no step is missing between the windows in two slots, and both hold what was seen at the former's end.
+    """Whether no step is missing between the windows in two slots, and what both hold is the same.
 
     Where an episode's own first windows are gone, those of the one before may end at just that step.
     """
-    begins, seen, last = ring.rows["episode_step"], ring.rows["observation"], ring.rows["last"][earlier]
-    offset = int(begins[later]) - int(begins[earlier])
-    within = 0 < offset <= last - ring.spec.burn_in
-    return bool(within and np.array_equal(seen[earlier, last], seen[later, last - offset]))
+    begins, first, last = (ring.rows[name] for name in ("episode_step", "first", "last"))
+    offset, end = int(begins[later]) - int(begins[earlier]), int(last[earlier])
+    if not 0 < offset <= end - ring.spec.burn_in:
+        return False
+    begin = max(int(first[earlier]), int(first[later]) + offset)
+    for name, to in (("observation", end + 1), ("action", end)):  # actions differ where all frames are missing
+        values = ring.rows[name]
+        if not np.array_equal(values[earlier, begin:to], values[later, begin - offset : to - offset]):
+            return False
+    return True

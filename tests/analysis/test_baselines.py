@@ -180,6 +180,7 @@ def test_the_zoos_numbers_are_of_the_right_kind(algorithm, body):
     ("algorithm", "env", "gamma"),
     [
         ("sac", "Swimmer-v5", 0.9999), ("crossq", "Swimmer-v5", 0.999), ("ppo", "Swimmer-v5", 0.9999),
+        ("td3", "Swimmer-v5", 0.9999), ("ddpg", "Swimmer-v5", 0.9999),
         ("recurrent-ppo", "Reacher-v5", 0.9),
     ],
 )  # fmt: skip

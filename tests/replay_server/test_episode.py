@@ -26,17 +26,19 @@ def played(lengths: list[tuple[int, int]], stride: int) -> tuple[Rows, list[list
     for row, (env, _, window) in zip(rows, turns, strict=True):
         row["actor"], row["epoch"], row["env"] = ENVS[env]
         row["episode_step"] = stride * window
-    write_observations(rows, [episode for _, episode, _ in turns])
+    write_steps(rows, [episode for _, episode, _ in turns])
     chains = [
         [earlier for earlier, (_, e, w) in enumerate(turns) if e == chain and w <= window] for _, chain, window in turns
     ]
     return rows, chains
 
 
-def write_observations(rows: Rows, episodes: Sequence[int]) -> None:
-    """Each its episode and its step there, so that windows of one episode see the same at the same step."""
+def write_steps(rows: Rows, episodes: Sequence[int]) -> None:
+    """Observations and actions name episode and step, so that windows of one episode hold the same at the same step."""
     steps = rows["episode_step"][:, None] + np.arange(SPEC.observations) - SPEC.burn_in
-    rows["observation"] = (1000.0 * np.array(episodes)[:, None] + steps)[..., None]
+    names = (1000.0 * np.array(episodes)[:, None] + steps)[..., None]
+    rows["observation"], rows["action"] = names, np.cos(names[:, :-1])
+    rows["first"] = np.where(rows["episode_step"] >= SPEC.burn_in, 0, SPEC.burn_in)
 
 
 def _round(lengths: list[tuple[int, int]], turn: tuple[int, int, int]) -> int:
@@ -67,11 +69,12 @@ def test_every_episode_is_found_whole_or_not_at_all(
             assert (None if slots is None else ring.rows["serial"][slots].tolist()) == (chain if whole else None)
 
 
-def ring_of(folder: Path, episode_steps: list[int]) -> Ring:
-    """An episode begins at each step 0."""
+def ring_of(folder: Path, episode_steps: list[int], seen: float = 1.0) -> Ring:
+    """An episode begins at each step 0; ``seen`` 0 leaves no frame."""
     ring, rows = Ring(folder / "ring", SPEC, 100), make_rows(len(episode_steps))
     rows["episode_step"] = episode_steps
-    write_observations(rows, np.cumsum(np.array(episode_steps) == 0).tolist())
+    write_steps(rows, np.cumsum(np.array(episode_steps) == 0).tolist())
+    rows["observation"] *= seen
     ring.write(rows)
     ring.commit()
     return ring
@@ -91,9 +94,10 @@ def test_what_is_not_whole_is_not_found(tmp_path: Path, steps: list[int], why: s
     assert find_episode(ring, len(steps) - 1, most=5) is None, why
 
 
-def test_the_episode_before_is_not_taken_for_the_start_that_is_gone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("seen", [1.0, 0.0])
+def test_the_episode_before_is_not_taken_for_the_start_that_is_gone(tmp_path: Path, seen: float) -> None:
     """It ended at the very step at which the windows of the later one that are left begin."""
-    ring = ring_of(tmp_path, [0, 0, 4])
+    ring = ring_of(tmp_path, [0, 0, 4], seen)
     ring.forget(np.array([1]))
     assert find_episode(ring, 2, most=5) is None
 
