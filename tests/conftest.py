@@ -6,6 +6,7 @@ module by module, those with trainings of their own first.
 
 import os
 import shutil
+import signal
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
@@ -28,6 +29,8 @@ WORKER = "PYTEST_XDIST_WORKER" in os.environ
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch starts its threads: small products only, few cores
 TEMPORARY = tempfile.mkdtemp(prefix="rmct-")  # so that what other runs on this machine leave is not taken for ours
 os.environ["TMPDIR"] = tempfile.tempdir = TEMPORARY
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # begun in the background: what is tested must hear a Ctrl-C
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from rmc.common.env.process_state import ApartCall  # noqa: E402
 from rmc.deploy.redis.server import RedisServer  # noqa: E402

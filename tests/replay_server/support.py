@@ -1,6 +1,6 @@
 """What the replay server's tests share: a small window, lawful rows, an actor's end of the bus, a server's state."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -27,6 +27,14 @@ def make_rows(count: int, first_mark: int = 0, spec: WindowSpec = SPEC) -> Rows:
     rows["observation"] = np.sin(marks[:, None, None] + phase)
     rows["reward"][:, 0] = marks
     return rows
+
+
+def write_steps(rows: Rows, episodes: Sequence[int]) -> None:
+    """Observations and actions name episode and step, so that windows of one episode hold the same at the same step."""
+    steps = rows["episode_step"][:, None] + np.arange(SPEC.observations) - SPEC.burn_in
+    names = (1000.0 * np.array(episodes)[:, None] + steps)[..., None]
+    rows["observation"], rows["action"] = names, np.cos(names[:, :-1])
+    rows["first"] = np.where(rows["episode_step"] >= SPEC.burn_in, 0, SPEC.burn_in)
 
 
 def lawful_rows(payload: bytes, spec: WindowSpec = SPEC) -> Rows:

@@ -1,6 +1,5 @@
 """An episode's windows are found again among those of other environments, or not at all."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,7 +12,7 @@ from rmc.common.window import Rows
 from rmc.replay_server import episode
 from rmc.replay_server.episode import find_episode
 from rmc.replay_server.ring import Ring
-from tests.replay_server.support import SPEC, make_rows
+from tests.replay_server.support import SPEC, make_rows, write_steps
 
 ENVS = [(0, 1, 0), (0, 1, 1), (1, 1, 0), (0, 2, 0)]  # actor, epoch, env
 
@@ -31,14 +30,6 @@ def played(lengths: list[tuple[int, int]], stride: int) -> tuple[Rows, list[list
         [earlier for earlier, (_, e, w) in enumerate(turns) if e == chain and w <= window] for _, chain, window in turns
     ]
     return rows, chains
-
-
-def write_steps(rows: Rows, episodes: Sequence[int]) -> None:
-    """Observations and actions name episode and step, so that windows of one episode hold the same at the same step."""
-    steps = rows["episode_step"][:, None] + np.arange(SPEC.observations) - SPEC.burn_in
-    names = (1000.0 * np.array(episodes)[:, None] + steps)[..., None]
-    rows["observation"], rows["action"] = names, np.cos(names[:, :-1])
-    rows["first"] = np.where(rows["episode_step"] >= SPEC.burn_in, 0, SPEC.burn_in)
 
 
 def _round(lengths: list[tuple[int, int]], turn: tuple[int, int, int]) -> int:

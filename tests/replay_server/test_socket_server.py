@@ -27,7 +27,7 @@ from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.socket_server import SocketServer
 from tests.replay_server import served as served_module
 from tests.replay_server.served import BIG, MAX_BATCH, SECRET, Served
-from tests.replay_server.support import SPEC, make_rows
+from tests.replay_server.support import SPEC, make_rows, write_steps
 
 Serve = Callable[..., Served]
 Frame = Callable[[bytes], tuple[Kind, dict[str, Any]]]  # of a client's nonce
@@ -139,6 +139,7 @@ def test_an_episode_over_the_socket(serve: Serve) -> None:
     served = serve()
     rows = make_rows(3)
     rows["episode_step"] = np.arange(3) * SPEC.train
+    write_steps(rows, [0, 0, 0])
     served.sender.send_rows(rows)
     while served.replay.step():
         pass
