@@ -88,6 +88,15 @@ def test_the_command_writes_a_picture_and_says_it_in_numbers(
     assert "ends in .png" in complaint([*words, str(tmp_path / "seen.xyz")], capsys)
 
 
+def test_critics_of_longer_targets_are_not_compared(
+    config: RunConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    longer = dataclasses.replace(config, update=dataclasses.replace(config.update, n_step=5))
+    folder = run_of(tmp_path / "run", longer)
+    assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 0
+    assert "what came: compared where --n-step is 1 and episodes end by themselves" in capsys.readouterr().out
+
+
 def test_an_episode_that_never_ends_is_looked_at_for_a_while(
     config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
