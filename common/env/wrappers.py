@@ -66,7 +66,7 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
             _warn_once(f"{fault}; it is left as it is")
 
     def _vector(self, observation: Any) -> Floats:
-        """Judged before any wrapper hides, delays or blanks it: a broken simulator is broken now."""
+        """(O,). Raises EnvFault here, before a wrapper hides, delays or blanks it: a broken simulator is broken now."""
         numbers = vector(self.raw_observation_space, observation)
         if not np.isfinite(numbers).all():
             raise EnvFault("the environment's observation is not finite")
