@@ -42,7 +42,6 @@ class Insight:
     """What the world model says of an episode."""
 
     real: Floats  # (T, O), the next observations, NaN where they are missing
-    predicted: Floats  # (T, O), one step ahead
     curiosity: Floats  # (T,), the world model's error of the online memory's change
     reward: Floats  # (T,)
     predicted_reward: Floats  # (T,)
@@ -79,7 +78,6 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     ahead = _open_loop(agent, memory, seen[0, :-1], episode.action[0])
     return Insight(
         real=real.numpy(),
-        predicted=ahead[1].numpy(),
         curiosity=model_error(prediction.hidden_change[0], latent_change, norm).numpy(),
         reward=episode.reward.numpy(),
         predicted_reward=prediction.reward[0].numpy(),

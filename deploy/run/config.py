@@ -52,11 +52,11 @@ class RunConfig:
     env: EnvConfig
     """The environment."""
     preset: Preset = "robust"
-    """The preset that the other values started from."""
+    """Where the other options' defaults come from."""
     seed: int = 0
     """Seed of networks, environments, noise and sampling."""
     total_steps: int = 1_000_000
-    """Steps of the agent in the run, over all actors; with action_repeat K each is K of the environment's."""
+    """Agent steps, of all actors together. With action_repeat K each is K environment steps."""
     actors: int = 1
     """Actor processes."""
     window: WindowConfig = field(default_factory=WindowConfig)

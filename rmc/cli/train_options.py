@@ -8,13 +8,9 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from rmc.actors.config import ActorConfig, EvaluatorConfig
-from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig, read_kwargs, write_kwargs
-from rmc.deploy.run.config import Preset, RunConfig, WindowConfig
+from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions, Tracker
-from rmc.learner.config import LearnerConfig, UpdateConfig
-from rmc.replay_server.config import ReplayConfig
 
 KEYWORDS = PrimitiveConstructorSpec(
     nargs="*",
@@ -55,27 +51,12 @@ def known_run(env: EnvConfig) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Train:
+class Train(RunConfig):
     """Train an agent, or continue a run. --help shows the basic options, --help-all all of them."""
 
     env: EnvOptions
-    window: WindowConfig
-    agent: AgentConfig
-    actor: ActorConfig
-    replay: ReplayConfig
-    update: UpdateConfig
-    learner: LearnerConfig
-    evaluator: EvaluatorConfig
     config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
     """A TOML file of options, like env = "HalfCheetah-v5" and learning_rate = 3e-4; those given beside it win."""
-    preset: Preset = "robust"
-    """Where the other options' defaults come from."""
-    seed: int = 0
-    """Seed of networks, environments, noise and sampling."""
-    total_steps: int = 1_000_000
-    """Environment steps of the run, over all actors."""
-    actors: int = 1
-    """Actor processes."""
     run_dir: Path | None = None
     """The run's folder; by default runs/<env>__<preset>__<seed>__<time>."""
     if_exists: IfExists = "resume"

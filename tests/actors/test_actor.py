@@ -24,9 +24,8 @@ from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
 from rmc.common.errors import BusFull, BusUnavailable, EnvFault, FencedError
-from rmc.common.window import Rows, WindowSpec
+from rmc.common.window import Rows, WindowSpec, joined
 from rmc.common.wire import decode_rows
-from tests.actors.support import join_rows
 from tests.broken_env import BREAKS_AT, FAULTS
 from tests.counting_env import ACTION_DIM, OBS_DIM, CountingEnv, Step, audit
 from tests.learner.rows import step_valid
@@ -78,7 +77,7 @@ class Reader:
         self._bus.commit(self.owner, acks)
 
     def rows(self) -> Rows:
-        return join_rows([decode_rows(entry.payload, SPEC) for entry in self.entries], SPEC)
+        return joined([decode_rows(entry.payload, SPEC) for entry in self.entries], SPEC)
 
 
 def begun(bus: Bus, **how: Any) -> tuple[Actor, Reader]:
@@ -547,7 +546,7 @@ def test_a_frame_that_no_statistics_normalise_is_stored_as_none_seen(known: bool
             made.freeze_statistics(torch.tensor([10.0]), torch.full((OBS_DIM,), 5.0), torch.full((OBS_DIM,), 9.0))
         bus.publish_weights(Version(1, update), save(made.policy_weights()))
         play(actor, reader, 500 if update else 300, final=bool(update))
-    rows = join_rows([decode_rows(entry.payload, spec) for entry in reader.entries], spec)
+    rows = joined([decode_rows(entry.payload, spec) for entry in reader.entries], spec)
     later = rows["state"].any(1)  # at an episode's start nothing is remembered
     seen, trained = rows["state"][:, agent.hidden :].any(1), rows["weights_update"] > 0
     assert (seen[later & trained].mean(), seen[later & ~trained].mean()) == (1.0, float(known))

@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 
 from rmc.actors.window_builder import Transition, WindowBuilder
 from rmc.common.agent_config import AgentConfig
-from rmc.common.window import Rows, WindowSpec
+from rmc.common.window import Rows, WindowSpec, joined
 from rmc.learner.batch import Batch, view_batch
 from rmc.learner.unroll import impute_and_unroll
-from tests.actors.support import join_rows
 from tests.actors.test_policy_runner import ACTION_DIM, OBS_DIM, make_agent, make_runner
 
 HIDDEN = 16
@@ -64,7 +63,7 @@ def play(
         for env in np.flatnonzero(ended).tolist():
             builder.begin(env, observe(time)[env], missing=False)
         rows.append(builder.take().copy())
-    return join_rows(rows, spec), states
+    return joined(rows, spec), states
 
 
 @torch.no_grad()

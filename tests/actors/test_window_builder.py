@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmc.actors.window_builder import Transition, WindowBuilder
-from rmc.common.window import Rows, WindowSpec
+from rmc.common.window import Rows, WindowSpec, joined
 from rmc.replay_server.row_check import row_faults
-from tests.actors.support import join_rows
 
 OBS_DIM, ACTION_DIM, HIDDEN = 3, 3, 3
 
@@ -77,7 +76,7 @@ def run(play: Play, steps: int, cut: bool = True, store_states: bool = True) -> 
         builder.cut()
         taken.append(builder.take().copy())
         assert not builder.open
-    return join_rows(taken, play.spec), episode.tolist()
+    return joined(taken, play.spec), episode.tolist()
 
 
 def _missing(k: int, spec: WindowSpec) -> np.ndarray:

@@ -66,7 +66,7 @@ def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -
     missing = np.broadcast_to(episode.missing[0, 1:].numpy(), insight.real.shape)
     np.testing.assert_array_equal(np.isnan(insight.real), missing)  # a gap in the picture, no zero
     before = np.concatenate([episode.observation[0, :1].numpy(), insight.real[:-1]])
-    error, change = (np.abs(x - insight.real)[seen].sum(0) for x in (insight.predicted, before))
+    error, change = (np.abs(x - insight.real)[seen].sum(0) for x in (insight.ahead[1], before))
     np.testing.assert_allclose(insight.unexplained, error / change, rtol=1e-4)
 
 
