@@ -54,6 +54,12 @@ class PolicyLike(Protocol):
         """(N, O), (N, A), (N, M), (N, S), and noise or None for the mean -> (N, A) in [-1, 1], (N, S)."""
 
 
+def longest_episode(env: Env) -> int:
+    """Steps after which an episode that has not ended is given up: none, where the environment has a limit."""
+    limited = env.spec is not None and env.spec.max_episode_steps is not None
+    return sys.maxsize if limited else LONGEST_EPISODE
+
+
 class Rollout:
     """Deterministic episodes of one environment, one after the other: how many there are changes none of them.
 
@@ -75,8 +81,7 @@ class Rollout:
         self._runner, self.env, self._make_env, self._clock = runner, env, make_env, clock
         self._seed, self.episodes = seed, episodes
         self._deadline = clock() + seconds if seconds else math.inf
-        limited = env.spec is not None and env.spec.max_episode_steps is not None
-        self._longest = sys.maxsize if limited else LONGEST_EPISODE
+        self._longest = longest_episode(env)
         self.returns: list[float] = []  # of the episodes that are over
         self.broken = self.steps = 0
         self.fault: Exception | None = None  # what an environment broke in last
@@ -210,7 +215,7 @@ class Evaluator:
             return None
         self._next_look = self._clock() + POLL_SECONDS
         newest = self._bus.latest_version(evaluate=True)
-        weights = self._bus.weights(evaluate=True) if newest not in (None, self._version) else None
+        weights = self._bus.weights(evaluate=True) if newest is not None and newest > self._version else None
         if weights is None:
             return None
         self._version, blob = weights

@@ -11,7 +11,7 @@ import time
 from contextlib import closing, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import torch
 from rich.console import Console
@@ -137,6 +137,7 @@ class _Run(BaseCallback):
         self._began, self._wall_before = time.monotonic(), wall_seconds(folder.metrics)
         self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, 0.0
         self._next_evaluation = self._after(min(self.steps, _evaluated_steps(folder)))  # one that was cut is made up
+        self._metrics: TextIO | None = None  # it has no first word before that
         self._initial = self._first_evaluation()
         self._metrics = folder.metrics.open("a", buffering=1)
 
@@ -157,13 +158,12 @@ class _Run(BaseCallback):
         self._write_progress()
 
     def close(self) -> None:
+        assert self._metrics is not None
         self._metrics.close()
 
     def _on_step(self) -> bool:
         now = time.monotonic()
-        if now >= self._record_at:
-            self._record_at = now + RECORD_SECONDS
-            self._write_progress()
+        self._speak()
         if self.num_timesteps >= self._next_evaluation:
             self._next_evaluation = self._after(self.num_timesteps)
             self._evaluate()
@@ -183,6 +183,7 @@ class _Run(BaseCallback):
 
         def watch(rollout: Rollout) -> None:
             progress(rollout)
+            self._speak()
             if self._stop.requested:
                 raise _Stopped
 
@@ -207,11 +208,19 @@ class _Run(BaseCallback):
         line = f"environment step {self.steps:,}: return {mean:,.1f} ± {deviation:,.1f}, {self._wall():,.0f} s"
         self._console.print(line)
 
+    def _speak(self) -> None:
+        """Say now and then how far it is: who says nothing for long is taken for hanging."""
+        now = time.monotonic()
+        if self._metrics is not None and now >= self._record_at:
+            self._record_at = now + RECORD_SECONDS
+            self._write_progress()
+
     def _write_progress(self) -> None:
         self._write("launcher", {"wall_s": self._wall()})
         self._write("learner", {"env_steps": self.steps, "updates": self._model.updates})
 
     def _write(self, role: str, record: dict[str, Any]) -> None:
+        assert self._metrics is not None
         self._metrics.write(json.dumps({"role": role, "time": time.time(), **record}) + "\n")
 
     def _wall(self) -> float:

@@ -77,6 +77,7 @@ class LiveRun:
     def _begin(self) -> None:
         """Know nothing of it yet. Raises ConfigError."""
         self._status, self._began = empty_status(self._folder), self._first_start()
+        self._status.steps_before = 0  # all its starts are read
         self._tail = MetricsTail(self._folder.metrics, recent_bytes=sys.maxsize)
         self._curves: dict[str, Curve] = {}
         self._events: list[Event] = []
@@ -109,6 +110,7 @@ class LiveRun:
                 self._begin()  # it was made anew in its folder
             for record in self._tail.take(LOOK_BYTES):
                 self._take(record)
+            self._status.is_past = not self._tail.at_end
             take_state(self._status, self._folder)
             self._status.total_steps = empty_status(self._folder).total_steps  # a resume may change it
             self.media = newest_media(self._folder.path)

@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from rmc.actors.evaluator import LONGEST_EPISODE, first_start
+from rmc.actors.evaluator import first_start, longest_episode
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.common.env.config import EnvConfig
@@ -66,7 +66,7 @@ def _mode_fault(env: EnvConfig) -> str | None:
     return None
 
 
-def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest: int = LONGEST_EPISODE) -> float:
+def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest: int = sys.maxsize) -> float:
     """Play one deterministic episode, ``longest`` steps of it at most, and write it to ``out``; its return.
 
     ``prepare`` must have been called. Raises EnvFault; RmcError where the file cannot be written.
@@ -82,7 +82,7 @@ def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest:
     with written_whole(out) as path, _told(out):
         video = write_frames(str(path), (frame.shape[1], frame.shape[0]), fps=rate, macro_block_size=1)
         video.send(None)  # the generator's start
-        for _ in range(longest):
+        for _ in range(min(longest, longest_episode(env))):
             video.send(_frame(env, frame.shape).tobytes())
             action = policy.act(observation, info.get("missing", False))
             observation, reward, terminated, truncated, info = env.step(action)

@@ -35,7 +35,7 @@ from rmc.learner.update_order import make_update
 log = logging.getLogger(__name__)
 LARGE_REWARD = 1e4  # a step's, from which it is the likely cause of a divergence
 SAVE_AGAIN_SECONDS = 10.0  # after a checkpoint that could not be written
-LOOK_SECONDS = 5.0  # between looks, while waiting, whether Redis still has the weights
+LOOK_SECONDS = 5.0  # between looks whether Redis still has what is to be evaluated and, while waiting, what acts
 
 
 class Learner:
@@ -78,6 +78,8 @@ class Learner:
         self._largest_reward = 0.0  # that was learnt from, as it was scaled
         self._look_at = 0.0  # when to ask next whether Redis still has the weights
         self._published: Version | None = None  # last
+        self._asked: tuple[Version, bytes] | None = None  # for the evaluation of what, last
+        self._ask_at = 0.0  # when to look next whether Redis still knows that
         self._save_at, self._checkpoint_error = 0.0, ""
         self._slowest, self._save_seconds = 0.0, checkpoints.last_save()  # of an update, of the last save
         self._make_networks(agent, update, seed, two_processes)
@@ -134,6 +136,7 @@ class Learner:
     def _step(self) -> bool:
         if self._evaluation_due:
             self._ask_for_evaluation()
+        self._ask_again_if_forgotten()
         sample = self.replay.sample(self.config.batch_size)
         self.env_steps = max(self.env_steps, sample.env_steps)
         if sample.status is not SampleStatus.BATCH:
@@ -222,8 +225,18 @@ class Learner:
 
     def _ask_for_evaluation(self) -> None:
         blob = self._serialize_finite(self.update.average.policy_weights())
-        self.bus.publish_weights(Version(self.epoch, self.updates), blob, evaluate=True)
+        self._asked = Version(self.epoch, self.updates), blob
+        self.bus.publish_weights(*self._asked, evaluate=True)
         self._evaluation_due = False
+
+    def _ask_again_if_forgotten(self) -> None:
+        """A Redis that lost data asks for nothing, or for an older policy: the checkpoint would get no evaluation."""
+        if self._asked is None or time.monotonic() < self._ask_at:
+            return
+        self._ask_at = time.monotonic() + LOOK_SECONDS
+        newest = self.bus.latest_version(evaluate=True)
+        if newest is None or newest < self._asked[0]:
+            self.bus.publish_weights(*self._asked, evaluate=True)
 
     def _serialize_finite(self, weights: dict[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
         """Weights as they are sent and saved. Raises RmcError where they are not finite: neither must then happen."""

@@ -3,6 +3,7 @@
 import time
 
 from rmc.common.bus.protocol import Ack, Bus, ReplayOwner
+from rmc.common.errors import RmcError
 from rmc.replay_server.commit_record import Progress
 from rmc.replay_server.rate_limiter import RateLimiter
 
@@ -24,13 +25,17 @@ class Credit:
         Raises BusUnavailable, BusFull, FencedError.
         """
         if not self._published or time.monotonic() >= self._republish_at:
-            self._republish_at = time.monotonic() + REPUBLISH_PERIOD
             self._bus.commit(self._owner, self._published or self._acks(progress), progress.publish())
+            self._republish_at = time.monotonic() + REPUBLISH_PERIOD  # sooner where that failed
         acks = {actor: ack for actor, ack in self._acks(progress).items() if self._published.get(actor) != ack}
         quantum = max(1, self._limiter.slack_steps // (8 * len(self._own_actors)))
         if acks and (at_once or any(self._grown(actor, ack) >= quantum for actor, ack in acks.items())):
-            self._bus.commit(self._owner, acks, progress.publish())
-            self._published.update(acks)
+            self._published.update(acks)  # before they are heard: Redis may take a commit whose answer never comes
+            try:
+                self._bus.commit(self._owner, acks, progress.publish())
+            except RmcError:
+                self._republish_at = 0.0
+                raise
 
     def _acks(self, progress: Progress) -> dict[int, Ack]:
         """What every actor seen so far has committed, and how far it may step."""

@@ -74,9 +74,7 @@ def open_store(folder: Path, spec: WindowSpec, capacity: int, exponent: float) -
         ring = Ring(folder / "ring", spec, capacity)
         priorities = _map_priorities(folder / "priorities", ring)
         store = ReplayStore(ring, priorities, SumTree(capacity), lock, exponent)
-        leaves = valid_leaves(store)
-        store.tree.rebuild(leaves)
-        _warn_of_torn_rows(ring.progress.windows - int(np.count_nonzero(leaves)))
+        store.tree.rebuild(valid_leaves(store))
     except BaseException:
         os.close(lock)
         raise
@@ -100,8 +98,9 @@ def _lock(folder: Path) -> int:
     return lock
 
 
-def _warn_of_torn_rows(torn: int) -> None:
+def warn_of_torn_rows(store: ReplayStore) -> None:
     """A committed row without its serial was lost to a power cut, or found damaged when it was drawn."""
+    torn = store.ring.progress.windows - int(np.count_nonzero(store.tree.leaves()))
     if torn:
         log.warning("replay ring: %d windows were damaged or torn by a crash; they are never drawn", torn)
 

@@ -22,7 +22,7 @@ from rmc.replay_server.credit import Credit
 from rmc.replay_server.episode import find_episode
 from rmc.replay_server.observation_sums import observation_sums
 from rmc.replay_server.rate_limiter import RateLimiter
-from rmc.replay_server.recovery import open_store, valid_leaves
+from rmc.replay_server.recovery import open_store, valid_leaves, warn_of_torn_rows
 from rmc.replay_server.ring import Slots
 from rmc.replay_server.stream_reader import IngestBatch, StreamReader
 
@@ -95,6 +95,8 @@ class ReplayServer:
             self._go_on_from(newest)
         if self._store.tree.total == 0.0:
             self._begin_empty()
+        else:
+            warn_of_torn_rows(self._store)
         return epoch
 
     def _read_published(self) -> Progress | None:

@@ -16,7 +16,8 @@ OURS = {
     "RMC, rewards times 0.01": "train ENV --reward-scale 0.01",  # of HumanoidStandup-v5, whose are in the hundreds
     "RMC, target entropy -A, rewards times 0.01": earlier("--reward-scale 0.01"),
     "RMC, heads of 1024": "train ENV --heads 1024 1024",
-    "RMC, no contact forces": earlier("--env-kwargs include_cfrc_ext_in_observation=false"),
+    "RMC, no contact forces": "train ENV --env-kwargs include_cfrc_ext_in_observation=false",  # as Ant-v4's
+    "RMC, target entropy -A, no contact forces": earlier("--env-kwargs include_cfrc_ext_in_observation=false"),
     "RMC, h alone": earlier("--head-input hidden"),
     "RMC, policy at every update": earlier("--head-input hidden --policy-delay 1"),
     "RMC, target critics": before(),

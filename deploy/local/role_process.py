@@ -59,8 +59,13 @@ class Process:
         self.stop = StopSignal()
         self.stop.install()
         patience = float(os.environ.get(PATIENCE_VARIABLE, PATIENCE_SECONDS))
-        self.bus = connect(place.redis_url, place.run, Deadline(patience, self.stop))
-        self.config = self._registered_config(place.run, Deadline(patience, self.stop))
+        try:
+            self.bus = connect(place.redis_url, place.run, Deadline(patience, self.stop))
+            self.config = self._registered_config(place.run, Deadline(patience, self.stop))
+        except ConfigError:
+            if self.stop.terminated:  # no fault of the options: its launcher starts it again
+                raise SystemExit(self.stop.exit_status) from None
+            raise
 
     def _registered_config(self, run: str, waits: Deadline) -> RunConfig:
         """The run's config; a Redis that has just come back empty gets it again within moments."""

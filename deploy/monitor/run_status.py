@@ -47,6 +47,7 @@ class RunStatus:
         self.last: EvaluationStatus | None = None
         self.best: EvaluationStatus | None = None
         self.final_steps: int | None = None  # once the run has its result
+        self.is_past = False  # whether newer words are there, and not taken in yet
         self.heard = "*"  # which roles speak all the time; of a baseline the launcher alone
         self._pace = Pace()
         self._checkpoints: dict[int, int] = {}  # environment steps by update
@@ -148,7 +149,7 @@ class RunStatus:
     @property
     def _is_training(self) -> bool:
         """Whether roles are to speak: not before the first word of this start, nor once the learner is at its end."""
-        return not (self.is_over or self._is_trained) and self._spoke_last >= self._began
+        return not (self.is_past or self.is_over or self._is_trained) and self._spoke_last >= self._began
 
     @property
     def stalled_s(self) -> float:

@@ -17,7 +17,7 @@ from rmc.deploy.local.role_environment import URL_VARIABLE, working_folder
 from rmc.deploy.local.supervisor import QUICK_DEATHS
 from rmc.deploy.ray.placement import LEARNER, RolePlacement, groups, nodes_by_room, places
 from rmc.deploy.ray.ring_nodes import RingLocations
-from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, is_full
+from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, is_for_now
 from rmc.deploy.ray.role_handle import RoleHandle
 from rmc.deploy.redis.connect import PATIENCE_VARIABLE
 from rmc.deploy.run import tls
@@ -41,7 +41,7 @@ class Hosts:
         self._handles: dict[str, RoleHandle] = {}
         self._groups: dict[str, Any] = {}
         self._lost: dict[str, list[float]] = {}  # when hosts died for good, by role
-        self._full: dict[str, float] = {}  # when one last had no room on its node's disk
+        self._short: dict[str, float] = {}  # when a node last had no room or no process for one
 
     def start(self, config: RunConfig) -> None:
         """Place every role, or find again those that an earlier launcher of the run has placed."""
@@ -116,15 +116,15 @@ class Hosts:
     def _forget_dead(self, one: RoleHandle) -> None:
         """Of a host that Ray does not start again: the next ``place`` makes another.
 
-        One without room on its node's disk is tried until it has some, and said once.
+        One whose node has no room on its disk, or no process to give, is tried until it has, and said once.
         """
         del self._handles[one.name]
         now = time.monotonic()
-        said = self._full.get(one.name, float("-inf")) > now - LOST_SECONDS
-        if not (is_full(one.dead) and said):
+        said = self._short.get(one.name, float("-inf")) > now - LOST_SECONDS
+        if not (is_for_now(one.dead) and said):
             log.warning("the host of %s is gone: %s", one.name, one.dead)
-        if is_full(one.dead):
-            self._full[one.name] = now
+        if is_for_now(one.dead):
+            self._short[one.name] = now
             return
         lost = [when for when in self._lost.get(one.name, []) if now - when < LOST_SECONDS]
         self._lost[one.name] = [*lost, now]

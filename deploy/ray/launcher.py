@@ -66,17 +66,11 @@ def check_on_head() -> None:
 
 
 def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None:
-    """Start a run's launcher on this node, which must be the head. Raises ConfigError."""
-    context = ray.get_runtime_context()
-    for file in (tls.CERTIFICATE, tls.KEY):  # for the address that the head has now
-        (folder.path / file).unlink(missing_ok=True)
-    command = launcher_command(str(folder.path), context.gcs_address, options)
-    actor = ray.remote(LauncherActor).options(
-        name=actor_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
-        max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
-    )  # fmt: skip
-    task = Task(folder.name, folder.identity(), command, users_path(), {}, working_folder())
-    host = actor.remote(task, str(folder.path), config.learner.keep_checkpoints)
+    """Start the launcher of a locked run on this node, which must be the head; unlocks it. Raises ConfigError."""
+    try:
+        host = _created(config, folder, options)
+    finally:
+        folder.unlock()  # for the launcher: another start finds the actor's name
     try:
         ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)
     except BaseException as error:  # Ctrl-C, too
@@ -87,10 +81,30 @@ def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None
         raise ConfigError("--launcher", "ray", fix) from None
 
 
+def _created(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> Any:
+    context = ray.get_runtime_context()
+    for file in (tls.CERTIFICATE, tls.KEY):  # for the address that the head has now
+        (folder.path / file).unlink(missing_ok=True)
+    command = launcher_command(str(folder.path), context.gcs_address, options)
+    actor = ray.remote(LauncherActor).options(
+        name=actor_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
+        max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
+    )  # fmt: skip
+    task = Task(folder.name, folder.identity(), command, users_path(), {}, working_folder())
+    try:
+        return actor.remote(task, str(folder.path), config.learner.keep_checkpoints)
+    except ValueError:  # another has the name
+        raise _is_trained(folder) from None
+
+
 def check_not_there(folder: RunFolder) -> None:
     """Raises ConfigError where the run has a launcher, if only one that is being started again."""
-    if is_there(folder):
-        raise ConfigError("--run-dir", str(folder.path), "this run is being trained; rmc attach watches it")
+    if folder.secret_file.exists() and is_there(folder):  # asking one that has never begun would make one
+        raise _is_trained(folder)
+
+
+def _is_trained(folder: RunFolder) -> ConfigError:
+    return ConfigError("--run-dir", str(folder.path), "this run is being trained; rmc attach watches it")
 
 
 def is_there(folder: RunFolder) -> bool:

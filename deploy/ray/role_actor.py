@@ -16,7 +16,7 @@ import ray
 from rmc.common.errors import CheckpointError
 from rmc.common.whole_file import NO_ROOM
 from rmc.deploy.local.role_command import RoleCommand
-from rmc.deploy.local.supervisor import EXIT_CONFIG, RoleProcess
+from rmc.deploy.local.supervisor import EXIT_CONFIG, NO_PROCESS, RoleProcess
 from rmc.deploy.ray.node import leave_rays_worker, private_folder
 
 NAMESPACE = "rmc"
@@ -28,6 +28,7 @@ STOP_SECONDS = 5.0
 SETTLE_SECONDS = 60.0  # for the last checkpoint to reach the head
 CLAIM_SECONDS = 60.0  # for a launcher that is being started again
 FULL = tuple(map(os.strerror, NO_ROOM))
+FOR_NOW = (*FULL, *map(os.strerror, NO_PROCESS), "can't start new thread")
 AWAY = (ray.exceptions.RayError, ValueError, CheckpointError, OSError)  # of who keeps the checkpoints
 
 
@@ -79,6 +80,11 @@ def scratch_folder(name: str) -> Path:
 def is_full(error: str) -> bool:
     """Whether it is a disk without room, by an error's text, which is all that Ray brings from another node."""
     return any(words in error for words in FULL)
+
+
+def is_for_now(error: str) -> bool:
+    """Whether a node has no room on its disk, no process or no memory to give now, likewise by an error's text."""
+    return any(words in error for words in FOR_NOW)
 
 
 def actor_name(run: str, role: str) -> str:
@@ -190,7 +196,10 @@ class RoleActor:
         self._end()
         self._watcher.join()  # it must not take the new process's absence, or its presence, for the old one's end
         self._replaced = False
-        self._start()
+        try:
+            self._start()
+        except (OSError, RuntimeError):  # no process or thread to be had now: Ray starts this host again
+            os._exit(1)
 
     def _end(self) -> None:
         self._role.signal(15)

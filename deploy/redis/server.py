@@ -84,6 +84,7 @@ class RedisServer:
         self.folder, self.maxmemory, self.port, self.users = folder, maxmemory, port, users
         self.socket = folder / "redis.sock"
         self.process: subprocess.Popen[bytes] | None = None
+        self._unread = False  # whether its file has users that it may not know of
         if len(os.fsencode(self.socket)) > SOCKET_PATH_LIMIT:
             raise ConfigError("TMPDIR", str(folder), f"a socket path may have {SOCKET_PATH_LIMIT} bytes at most")
 
@@ -116,8 +117,10 @@ class RedisServer:
         self._wait()
 
     def tend(self) -> None:
-        """Start it again where it is not alive; where that cannot be done now, the next look tries again."""
+        """Start it again where it is not alive, or let it read its users; what fails now is tried at the next look."""
         if self.alive():
+            if self._unread:
+                self._read_users()
             return
         log.warning("the embedded Redis died or lost its socket; starting it again")
         try:
@@ -135,10 +138,14 @@ class RedisServer:
 
     def admit(self, users: RedisUsers) -> None:
         """Take other users than before, of the same secret. A server that is away reads of them when it comes back."""
-        self.users = users
+        self.users, self._unread = users, True
         self._write_users()
+        self._read_users()
+
+    def _read_users(self) -> None:
         with closing(self._client()) as client, suppress(*AWAY):
             client.acl_load()
+            self._unread = False
 
     def _client(self) -> redis.Redis:
         return redis.Redis.from_url(self.url(), socket_timeout=ANSWER_SECONDS)

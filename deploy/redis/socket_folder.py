@@ -47,9 +47,11 @@ class SocketFolder:
             return False
         try:
             self.path.mkdir(0o700)
-            lock = _locked(self.path)
         except OSError as error:
             raise RoleDied(f"{self.path} was removed, and cannot be made again ({error.strerror})") from None
+        lock = None
+        with suppress(OSError):  # as when it was made first
+            lock = _locked(self.path)
         if self._lock is not None:
             os.close(self._lock)
         self._lock = lock

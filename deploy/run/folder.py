@@ -27,6 +27,7 @@ from rmc.deploy.run.migrations import migrated
 
 log = logging.getLogger(__name__)
 SECRET_LENGTH = 64  # hexadecimal characters
+BOOT = Path("/proc/sys/kernel/random/boot_id")  # no two machines have one
 LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
 RESULT = (
     "env_steps",
@@ -221,7 +222,11 @@ class RunFolder:
         if self._lock is None:
             raise self._is_trained()
         self._was = self.path.stat()
-        self._note(" ".join(["training", str(os.getpid()), *_process_space()]))
+        try:
+            self._note(" ".join(["training", str(os.getpid()), *_process_space()]))
+        except BaseException:  # a full disk; a notebook would keep the lock
+            self.unlock()
+            raise
 
     def check_untrained(self) -> None:
         """Raises ConfigError where a launcher trains it."""
@@ -233,11 +238,14 @@ class RunFolder:
 
     def check_there(self) -> None:
         """Raises ConfigError where it is not the folder any more that was locked, or has lost what it goes on from."""
-        files = (self.path / "config.json", self.secret_file)
-        with suppress(FileNotFoundError, NotADirectoryError):
-            same = self._was is None or os.path.samestat(self._was, self.path.stat())
-            if same and all(map(Path.exists, files)):
+        try:
+            here, *_ = [path.stat() for path in (self.path, self.path / "config.json", self.secret_file)]
+            if self._was is None or os.path.samestat(self._was, here):
                 return
+        except (FileNotFoundError, NotADirectoryError):
+            pass
+        except OSError:  # a network's disk that is away for a moment
+            return
         fix = "was deleted or moved while it was trained; if it was moved, give its new place to go on"
         raise ConfigError("--run-dir", str(self.path), fix)
 
@@ -276,10 +284,10 @@ class RunFolder:
 
     def trained_elsewhere(self) -> str:
         """The machine or container whose launcher trains this run; empty where that is here, or none does."""
-        (host, *container), space = _process_space(), (self.path / ".lock").read_text().split()[2:]
-        if space == [host, *container][: len(space)]:  # versions before noted the machine alone
+        here, space = _process_space(), (self.path / ".lock").read_text().split()[2:]
+        if space == here[: len(space)]:  # versions before noted less
             return ""
-        return f"another container of {host}" if space[0] == host else space[0]
+        return f"another machine or container called {space[0]}" if space[0] == here[0] else space[0]
 
     def ended(self) -> int | None:
         """The exit status of the launcher that trained it last, if that came to an end of its own.
@@ -296,10 +304,10 @@ class RunFolder:
 
 
 def _process_space() -> list[str]:
-    """Where this process has its number: the machine, and the container on it."""
+    """Where this process has its number: the machine, the container on it, and the boot, as names may be shared."""
     space = [socket.gethostname()]
     with suppress(OSError):  # not on Linux
-        space.append(os.readlink("/proc/self/ns/pid"))
+        space += [os.readlink("/proc/self/ns/pid"), BOOT.read_text().strip()]
     return space
 
 

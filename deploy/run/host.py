@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from rmc.deploy.run.preflight import cores, existing_parent
+from rmc.deploy.run.preflight import cores, existing_parent, free_memory
 
 COPIED_BYTES, COPIES = 64 << 20, 3
 SAMPLED_BYTES = 16 << 20  # copied for every record, in some milliseconds: more than the caches of a core hold
@@ -30,7 +30,7 @@ class Machine:
 def this_machine(folder: Path) -> Machine:
     """What there is now; the disk is the one that ``folder`` is or would be on."""
     handles, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    memory, disk = psutil.virtual_memory().available, shutil.disk_usage(existing_parent(folder)).free
+    memory, disk = free_memory(), shutil.disk_usage(existing_parent(folder)).free
     return Machine(cores(), memory, disk, handles, _copied_bytes_per_s())
 
 

@@ -20,6 +20,7 @@ class MetricsTail:
     def __init__(self, path: Path, recent_bytes: int = RECENT_BYTES, read_from: int = 0) -> None:
         """``read_from`` is the byte from which on records are wanted; then there are no evaluations before."""
         self._path, self._recent_bytes, self._position = path, recent_bytes, read_from
+        self.at_end = True  # whether the last look has reached the end
 
     def take(self, most_bytes: int = -1) -> list[dict[str, Any]]:
         """Those that are new since the last call, or the first ``most_bytes`` of them."""
@@ -31,6 +32,7 @@ class MetricsTail:
             self._position = min(self._position, size)  # it may have been cut
             file.seek(self._position)
             text = file.read(most_bytes)
+            self.at_end = self._position + len(text) >= size
             whole = text[: text.rfind(b"\n") + 1]
             self._position += len(whole)
             return [*before, *filter(None, map(parse_record, whole.splitlines()))]

@@ -4,6 +4,7 @@ import logging
 import os
 import shutil
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -70,11 +71,16 @@ WHY_NOT = {  # by the part of the config, and then by the option
 
 
 def open_run(
-    config: RunConfig, run_dir: Path | None, if_exists: IfExists, options: LaunchOptions | None = None
+    config: RunConfig,
+    run_dir: Path | None,
+    if_exists: IfExists,
+    options: LaunchOptions | None = None,
+    check: Callable[[RunFolder], None] = lambda _: None,
 ) -> RunFolder:
     """Make or take up a run's folder, locked. Raises ConfigError before anything is written where it may not be.
 
     ``options`` say how it is started, for its history, and what a new one begins with.
+    ``check`` is asked once it is locked, and may raise ConfigError.
     """
     options = options or LaunchOptions(run_dir)
     folder = _named(run_dir or Path("runs") / default_name(config.env.id, config.preset, config.seed))
@@ -95,6 +101,7 @@ def open_run(
     make(folder)
     folder.lock()
     try:
+        check(folder)
         if not there:
             forget_start(folder)
         if initial is not None:  # before there is a config, without which it is no run

@@ -6,6 +6,7 @@ import re
 import shutil
 import socket
 from contextlib import suppress
+from math import ceil
 from pathlib import Path
 
 import psutil
@@ -16,6 +17,10 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.replay_server import ring
 
 CONTAINER_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+CPU_LIMITS = (  # of CPU time in a period of it
+    (Path("/sys/fs/cgroup/cpu.max"),),
+    (Path("/sys/fs/cgroup/cpu/cpu.cfs_quota_us"), Path("/sys/fs/cgroup/cpu/cpu.cfs_period_us")),
+)
 DISK_RESERVE = 256 << 20  # bytes left for checkpoints, metrics and logs
 
 
@@ -96,12 +101,17 @@ def check_batch_fits(config: RunConfig) -> None:
     """
     spec, heads, size = config.window_spec(), config.agent.heads, config.learner.batch_size
     step = 4 * 5 * config.agent.hidden + 2 * 6 * sum(heads)
-    window, memory = spec.dtype.itemsize + spec.train * step, min(_memory_limit(), psutil.virtual_memory().available)
+    window, memory = spec.dtype.itemsize + spec.train * step, free_memory()
     if size * window <= memory:
         return
     fault = f"an update of windows of {spec.steps} steps takes {gb(size * window)} of {gb(memory)} free memory"
     fix = f"take at most {memory // window}" if memory >= window else "take fewer steps a window"
     raise ConfigError("--batch-size", size, f"{fault}; {fix}")
+
+
+def free_memory() -> int:
+    """Bytes that are free, no more than a container may have."""
+    return min(_memory_limit(), int(psutil.virtual_memory().available))
 
 
 def _memory_limit() -> int:
@@ -123,8 +133,13 @@ def existing_parent(path: Path) -> Path:
 
 
 def cores() -> int:
-    """Cores that this process may use; macOS only says how many there are."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores that this process may use, at most those of a container's CPU time. On macOS all that there are."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    for files in CPU_LIMITS:
+        with suppress(OSError, ValueError):  # no such version of cgroups, or "max"
+            quota, period = map(int, " ".join(path.read_text() for path in files).split())
+            count = min(count, ceil(quota / period)) if quota > 0 else count
+    return count
 
 
 def check_device(device: str) -> None:

@@ -14,6 +14,7 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.redis_url import has_password
 from rmc.common.checkpoint import PROGRESS
 from rmc.common.errors import ConfigError
+from rmc.common.user_path import user_path
 from rmc.deploy.run.config import from_dict, option
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import Launcher, LaunchOptions
@@ -44,8 +45,10 @@ def note_start(
 ) -> None:
     """Add a line that is on the disk before the run goes on. Raises OSError."""
     launch = {name: getattr(options, name) for name in KEPT}
-    if options.redis_url is not None and has_password(options.redis_url):
+    if (url := options.redis_url) is not None and has_password(url):
         launch["redis_url"] = None  # it must be said again
+    elif url is not None and url.startswith("file:"):  # it may go on elsewhere
+        launch["redis_url"] = f"file:{user_path(url.removeprefix('file:')).absolute()}"
     start = Start(time.time(), version("rmc-rl"), _env_steps(folder), changes, launch, init_from)
     path = folder.history_file
     torn = path.exists() and not path.read_bytes().endswith(b"\n")  # by a crash

@@ -43,7 +43,7 @@ def _watched(
     config: RunConfig, options: LaunchOptions, console: Console, callback: Callback | None
 ) -> tuple[RunFolder, int]:
     launcher.check_on_head()
-    if options.run_dir is not None and options.if_exists != "new" and (options.run_dir / "secret").exists():
+    if options.run_dir is not None and options.if_exists != "new":
         launcher.check_not_there(RunFolder(options.run_dir))
     placement.check_room(config, options.device)
     fit = placement.actors_that_fit(config)
@@ -52,8 +52,7 @@ def _watched(
     validate(config)  # again: the cluster may have changed the number of actors
     check_machine(config, options)
     place_for_sockets()
-    folder = open_run(config, options.run_dir, options.if_exists, options)
-    folder.unlock()
+    folder = open_run(config, options.run_dir, options.if_exists, options, launcher.check_not_there)
     launcher.launch(config, folder, options)
     console.print(f"run folder {folder.path}", soft_wrap=True)
     if note := reach_note(config):

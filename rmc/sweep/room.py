@@ -4,12 +4,10 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-import psutil
-
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.preflight import DISK_RESERVE, cores, existing_parent, gb, ring_bytes
+from rmc.deploy.run.preflight import DISK_RESERVE, cores, existing_parent, free_memory, gb, ring_bytes
 from rmc.sweep.job import Job
 
 PROCESS_BYTES = 400 << 20  # of one with torch and MuJoCo; measured in docs/performance.md: 203 to 498 MB
@@ -28,8 +26,7 @@ def run_memory(config: RunConfig, lockstep: bool) -> int:
 
 def runs_that_fit(run_cores: int, memory: int) -> int:
     """How many runs this machine's cores and free memory hold, at least one."""
-    free: int = psutil.virtual_memory().available
-    return max(1, min(cores() // run_cores, free // memory))
+    return max(1, min(cores() // run_cores, free_memory() // memory))
 
 
 def check_disk(folder: Path, jobs: Sequence[Job], ring: int, at_once: int, dropped: bool) -> None:

@@ -8,6 +8,7 @@ import json
 import re
 import tomllib
 from collections.abc import Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -215,9 +216,16 @@ def read_ranges(words: Sequence[str]) -> dict[str, Range | list[Any]]:
         if ends is None:
             ranges[name] = read_values(text)
         else:
-            low, high = read_values(ends[1])[0], read_values(ends[2])[0]
-            ranges[name] = _checked_range(f"search.{name}", low, high, bool(ends[3]))
+            ranges[name] = _checked_range(f"search.{name}", _number(ends[1]), _number(ends[2]), bool(ends[3]))
     return ranges
+
+
+def _number(text: str) -> Any:
+    """As every option reads one, else the text."""
+    for read in (int, float):
+        with suppress(ValueError):
+            return read(text)
+    return text
 
 
 def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:

@@ -131,6 +131,17 @@ def test_plays_what_it_is_asked_to_once() -> None:
     evaluator.close()
 
 
+def test_an_older_policy_that_redis_brings_back_is_not_played_again() -> None:
+    bus = MemoryBus()
+    evaluator = Evaluator(1, counting, AGENT, EvaluatorConfig(episodes=2), bus, clock=itertools.count().__next__)
+    publish(bus, 20, evaluate=True)
+    step_until_idle(evaluator)
+    publish(bus, 10, evaluate=True)
+    assert not evaluator.step()
+    assert evaluator.metrics()["eval_update"] == 20
+    evaluator.close()
+
+
 def test_a_policy_that_cannot_be_read_is_refused_and_the_next_one_played(caplog: pytest.LogCaptureFixture) -> None:
     bus = MemoryBus()
     evaluator = Evaluator(1, counting, AGENT, EvaluatorConfig(episodes=2), bus, clock=itertools.count().__next__)

@@ -81,6 +81,15 @@ def test_its_last_evaluation_is_no_training_time(tmp_path, monkeypatch):
     assert RunFolder(tmp_path / "run").result()["wall_s"] == len(played) - 1
 
 
+def test_it_speaks_while_it_plays(tmp_path, monkeypatch):
+    monkeypatch.setattr(baselines, "RECORD_SECONDS", 0.0)
+    assert run(config(), tmp_path / "run") == 0
+    roles = [record["role"] for record in RunFolder(tmp_path / "run").records()]
+    said = "".join({"launcher": "l", "learner": "", "evaluator": "e"}[role] for role in roles)
+    assert said.index("e") > 101 + 20  # it comes at step 101
+    assert len(said) - said.rindex("e") > 20  # the last one follows the training
+
+
 def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):
     run(config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=600), tmp_path / "run")
     torch.set_num_threads(2)  # as a process has it that has trained nothing

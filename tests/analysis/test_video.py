@@ -83,6 +83,15 @@ def test_it_lasts_as_long_as_the_episode_whatever_is_repeated(tmp_path: Path) ->
         assert frames(out) == (length, pytest.approx(1.2, abs=0.1))
 
 
+def test_one_with_a_limit_is_filmed_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rmc.actors.evaluator.LONGEST_EPISODE", 5)
+    for limit, length in ((0, 5), (8, 8)):
+        config = EnvConfig("tests.habits:Draws-v0", env_kwargs={"picture": "sound"}, time_limit=limit)
+        folder = make_run(tmp_path / f"{limit}", AGENTS["robust"], config.id, env_kwargs=config.env_kwargs)
+        video.record(load_policy(folder.path), config, 0, tmp_path / "film.mp4")
+        assert frames(tmp_path / "film.mp4")[0] == length
+
+
 def test_what_a_module_does_as_it_is_imported_is_the_environments_alone(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "moves.py").write_text(MOVES)
     monkeypatch.syspath_prepend(tmp_path)

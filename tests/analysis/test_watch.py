@@ -30,8 +30,10 @@ from rmc.analysis.live_run import POINTS, Curve, LiveRun
 from rmc.cli.main import run
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
+from rmc.deploy.run.starts import note_start
 from tests.analysis.browser import opened
 from tests.cli.test_main import complaint
 
@@ -323,6 +325,29 @@ def test_roles_of_an_earlier_start_are_not_counted(folder: RunFolder) -> None:
     say(folder, "actor-0", busy_share=0.5)
     roles = (LiveRun("run", folder.path).look() or {})["roles"]
     assert [one["count"] for one in roles if one["kind"] == "actor"] == [1]
+
+
+def test_the_past_is_drawn_where_it_was_and_nobody_is_silent_meanwhile(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    note_start(folder, {}, LaunchOptions(folder.path), None)
+    lines = folder.history_file.read_text().splitlines()
+    resumed = json.dumps(json.loads(lines[-1]) | {"env_steps": 50_000, "time": time.time() - 2_000})
+    folder.history_file.write_text("\n".join([*lines[:-1], resumed, ""]))
+    for second in range(1_500):
+        when = time.time() - 1_500 + second
+        say(folder, "replay", time=when, env_steps=50 * second)
+        say(folder, "learner", time=when, updates_per_s=10.0, env_steps=50 * second)
+    monkeypatch.setattr(live_run, "LOOK_BYTES", 1 << 14)
+    watched, notices, looks = LiveRun("run", folder.path), [], 0
+    while news := watched.look():
+        notices.append(news.get("notices", {}))
+        looks += 1
+    assert looks > 5
+    assert not any("silent" in one for one in notices)
+    points = watched.everything()["curves"]["updates_per_s"][1]
+    assert points[0][0] < 1_000
+    assert len({steps for steps, _ in points}) > 100
 
 
 def test_counters_make_events_that_do_not_repeat(folder: RunFolder) -> None:

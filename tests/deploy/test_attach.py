@@ -79,7 +79,15 @@ def test_nor_is_one_in_another_container_of_this_machine(folder: RunFolder, monk
     folder.lock()
     assert folder.trained_elsewhere() == ""
     monkeypatch.setattr("os.readlink", lambda path: f"{path} of another")
-    with pytest.raises(ConfigError, match=rf"is trained on another container of {socket.gethostname()}; stop it there"):
+    with pytest.raises(ConfigError, match=rf"another machine or container called {socket.gethostname()}; stop it"):
+        stop(folder)
+    folder.unlock()
+
+
+def test_nor_is_one_on_another_machine_of_the_same_name(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder.lock()
+    monkeypatch.setattr("rmc.deploy.run.folder.BOOT", folder.path / "config.json")
+    with pytest.raises(ConfigError, match=rf"another machine or container called {socket.gethostname()}; stop it"):
         stop(folder)
     folder.unlock()
 

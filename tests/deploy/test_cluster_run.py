@@ -16,11 +16,12 @@ pytest.importorskip("ray")
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.env.config import EnvConfig
-from rmc.common.errors import BusUnavailable, RoleDied
+from rmc.common.errors import BusUnavailable, ConfigError, RoleDied
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.ray import hosts as ray_hosts
+from rmc.deploy.ray import launcher as ray_launcher
 from rmc.deploy.ray import run as ray_run
 from rmc.deploy.ray.hosts import Hosts
 from rmc.deploy.ray.placement import RolePlacement
@@ -28,6 +29,7 @@ from rmc.deploy.ray.role_actor import RoleActor
 from rmc.deploy.ray.run import ClusterRun
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 
@@ -131,8 +133,16 @@ def hosts(tmp_path: Path) -> Hosts:
     return Hosts(folder, "cpu", False, lambda role: f"redis://{role}")
 
 
-@pytest.mark.parametrize(("why", "ends"), [("OSError: [Errno 28] No space left on device", False), ("killed", True)])
-def test_a_host_on_a_full_disk_is_tried_again(
+@pytest.mark.parametrize(
+    ("why", "ends"),
+    [
+        ("OSError: [Errno 28] No space left on device", False),
+        ("BlockingIOError: [Errno 11] Resource temporarily unavailable", False),
+        ("RuntimeError: can't start new thread", False),
+        ("killed", True),
+    ],
+)
+def test_a_host_whose_node_has_no_room_or_process_now_is_tried_again(
     hosts: Hosts, why: str, ends: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     def lose() -> None:
@@ -149,6 +159,23 @@ def test_a_host_on_a_full_disk_is_tried_again(
         lose()
     assert not hosts._handles
     assert len(caplog.messages) == (ray_hosts.QUICK_DEATHS if ends else 1)
+
+
+def test_a_second_start_is_told_that_the_run_is_trained(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = list[bool]()
+
+    def remote(*_: object) -> None:
+        held.append(folder.trainer() is not None)
+        raise ray_launcher.ray.exceptions.ActorAlreadyExistsError("the name is taken")
+
+    context = SimpleNamespace(gcs_address="", get_node_id=lambda: "0" * 56)
+    monkeypatch.setattr(ray_launcher.ray, "get_runtime_context", lambda: context)
+    options = SimpleNamespace(options=lambda **_: SimpleNamespace(remote=remote))
+    monkeypatch.setattr(ray_launcher.ray, "remote", lambda _: options)
+    folder.lock()
+    with pytest.raises(ConfigError, match=r"^--run-dir=.*: this run is being trained; rmc attach watches it$"):
+        ray_launcher.launch(folder.config(), folder, LaunchOptions(folder.path, "resume", "ray"))
+    assert (held, folder.trainer()) == ([True], None)
 
 
 def test_a_launcher_may_lose_its_working_folder(hosts: Hosts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

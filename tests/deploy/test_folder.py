@@ -85,6 +85,8 @@ def test_a_full_disk_keeps_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with monkeypatch.context() as patch:
         patch.setattr(os, "pwrite", full)
         folder.unlock(130)
+        with pytest.raises(OSError, match="No space"):
+            folder.lock()
     RunFolder(tmp_path).lock()
 
 

@@ -56,6 +56,18 @@ def test_every_option_may_change_or_is_refused_with_the_reason(path: str, folder
         assert len(starts(folder)) == 1
 
 
+def test_a_start_that_is_refused_once_it_has_the_lock_writes_nothing(folder: RunFolder) -> None:
+    """On Ray another start may have been between."""
+
+    def refuse(locked: RunFolder) -> None:
+        assert locked.trainer() is not None
+        raise ConfigError("--run-dir", str(locked.path), "this run is being trained")
+
+    with pytest.raises(ConfigError, match="is being trained"):
+        open_run(dataclasses.replace(CONFIG, total_steps=9_000), folder.path, "resume", check=refuse)
+    assert (folder.config(), len(starts(folder)), folder.trainer()) == (CONFIG, 1, None)
+
+
 def test_the_history_is_a_line_a_start(folder: RunFolder) -> None:
     assert format_starts(folder) == "1 start"
     folder.metrics.write_text('{"role": "learner", "env_steps": 1200}\n{"role": "replay", "env_steps": 1230}\n{"ro')
@@ -88,9 +100,12 @@ def test_an_older_run_has_no_history(folder: RunFolder) -> None:
 
 
 @pytest.mark.parametrize(
-    ("url", "kept"), [("file:redis-url", "file:redis-url"), ("redis://:hush@localhost:1", None), (None, None)]
+    ("url", "kept"), [("file:redis-url", "file:/redis-url"), ("redis://:hush@localhost:1", None), (None, None)]
 )
-def test_how_it_was_started_is_kept_but_no_password(url: str | None, kept: str | None, tmp_path: Path) -> None:
+def test_how_it_was_started_is_kept_but_no_password(
+    url: str | None, kept: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir("/")
     options = LaunchOptions(tmp_path / "run", "fail", "manual", "cuda:1", url, all_cpus=True)
     folder = open_run(CONFIG, tmp_path / "run", "fail", options)
     folder.unlock()

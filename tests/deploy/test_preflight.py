@@ -1,6 +1,7 @@
 """What does not fit this machine is refused in one line, which says what does."""
 
 import dataclasses
+import os
 import re
 import shutil
 from pathlib import Path
@@ -13,7 +14,9 @@ import torch
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.run import preflight
 from rmc.deploy.run.config import RunConfig, WindowConfig
+from rmc.deploy.run.host import this_machine
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.preflight import (
     DISK_RESERVE,
@@ -21,9 +24,11 @@ from rmc.deploy.run.preflight import (
     check_device,
     check_machine,
     check_ring_fits,
+    cores,
     ring_bytes,
 )
 from rmc.deploy.run.presets import robust
+from rmc.sweep.room import runs_that_fit
 
 
 @pytest.fixture
@@ -65,8 +70,6 @@ def test_a_run_that_goes_on_is_offered_no_capacity_that_it_would_refuse(memory: 
 
 
 def test_a_containers_memory_is_what_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rmc.deploy.run import preflight
-
     limit = tmp_path / "memory.max"
     monkeypatch.setattr(preflight, "CONTAINER_LIMITS", (limit, tmp_path / "none"))
     for text in (None, "max\n", str(1 << 62)):
@@ -80,6 +83,26 @@ def test_a_containers_memory_is_what_counts(tmp_path: Path, monkeypatch: pytest.
     large = dataclasses.replace(config, replay=dataclasses.replace(config.replay, capacity=100_000))
     with pytest.raises(ConfigError, match=r"^--capacity=100000: takes .* of 0.001 GB memory; take at most \d+$"):
         check_ring_fits(large, LaunchOptions(tmp_path))
+    assert this_machine(tmp_path).free_memory_bytes == 1_000_000
+    assert runs_that_fit(1, 1_000_000) == 1
+
+
+@pytest.mark.parametrize(
+    ("texts", "most"),
+    [
+        (("max 100000\n",), None), (("100000 100000\n",), 1), (("150000 100000\n",), 2), (("10000 100000\n",), 1),
+        (("-1\n", "100000\n"), None), (("100000\n", "100000\n"), 1), ((), None),
+    ],
+)  # fmt: skip
+def test_so_is_its_share_of_the_cores(
+    texts: tuple[str, ...], most: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [tmp_path / f"{number}" for number in range(max(1, len(texts)))]
+    for file, text in zip(files, texts, strict=False):
+        file.write_text(text)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(64)))
+    monkeypatch.setattr(preflight, "CPU_LIMITS", ((tmp_path / "none",), tuple(files)))
+    assert cores() == (most or 64)
 
 
 def test_a_gpu_that_is_not_there_is_refused_with_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,8 +118,6 @@ def test_a_gpu_that_is_not_there_is_refused_with_those_that_are(monkeypatch: pyt
 
 
 def test_a_run_is_refused_so_before_it_starts_but_on_a_gpu(memory: int, tmp_path, monkeypatch) -> None:
-    from rmc.deploy.run import preflight
-
     monkeypatch.setattr(preflight, "check_device", lambda _: None)
     options = LaunchOptions(tmp_path / "run", "fail", "local", "cpu", None)
     with pytest.raises(ConfigError, match="--batch-size=64"):

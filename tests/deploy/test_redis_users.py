@@ -214,11 +214,14 @@ def test_users_that_come_while_the_server_stands_still_get_in_later(tmp_path: Pa
     with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=USERS) as server:
         assert server.process is not None
         server.process.send_signal(signal.SIGSTOP)
-        server.admit(RedisUsers(USERS.run, SECRET, (*USERS.roles, "actor-2")))
+        more = RedisUsers(USERS.run, SECRET, (*USERS.roles, "actor-2"))
+        server.admit(more)
+        server.tend()
         server.process.send_signal(signal.SIGCONT)
-        more = bus_of(server, "actor-1")
-        more.ping()
-        more.redis.close()
+        server.tend()
+        late = bus_of(server, "actor-2")
+        late.ping()
+        late.redis.close()
 
 
 def test_passwords_are_nowhere_to_be_read(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """A role's host on Ray, without a cluster: what it does when its role ends or is ended."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -88,6 +89,20 @@ def test_a_role_that_is_replaced_does_not_end_its_host(host: RoleActor, ends: li
     assert after.pid is not None
     os.kill(after.pid, 9)
     assert wait_for(ends, 10.0) == [1]
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.EAGAIN, os.strerror(errno.EAGAIN)), RuntimeError("can't start new thread")]
+)
+def test_a_host_that_can_start_no_process_ends_itself(
+    error: Exception, host: RoleActor, ends: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start() -> None:
+        raise error
+
+    monkeypatch.setattr(host._role, "start", start)
+    host.restart()
+    assert ends == [1]
 
 
 class Learner(LearnerActor):

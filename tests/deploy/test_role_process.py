@@ -1,5 +1,7 @@
 """How a role finds its run, and waits for a Redis that is away or full."""
 
+import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -15,10 +17,11 @@ from rmc.common.bus.protocol import EntryId
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusFull, ConfigError
-from rmc.common.process.role import StopSignal
+from rmc.common.process.role import TERMINATED_STATUS, StopSignal
 from rmc.common.shard import Shard
 from rmc.deploy.local.replay_process import drop_unread
 from rmc.deploy.local.role_process import Process, RunConnection, until_taken
+from rmc.deploy.redis import connect as connecting
 from rmc.deploy.redis.connect import Deadline, connect
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.server import RedisServer
@@ -45,6 +48,16 @@ def test_a_role_waits_for_a_redis_that_is_coming_back(short: Path, caplog: pytes
             waiting.result().ping()
     (message,) = caplog.messages
     assert message.startswith(f"waiting up to 20 s for the Redis at unix://{short}/redis.sock: ")
+
+
+@pytest.mark.usefixtures("handlers")
+def test_one_that_is_ended_while_it_waits_says_so(short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RMC_PATIENCE", "60")
+    monkeypatch.setattr(connecting, "RECONNECT_SLEEP", 0.0)
+    monkeypatch.setattr(connecting.log, "warning", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    with pytest.raises(SystemExit) as ended:
+        Process(RunConnection("run", f"unix://{short}/redis.sock"))
+    assert ended.value.code == TERMINATED_STATUS
 
 
 @pytest.mark.usefixtures("handlers")

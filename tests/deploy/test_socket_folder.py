@@ -1,5 +1,6 @@
 """Where a run's sockets lie: where they fit, locked, and swept once their launcher is gone."""
 
+import errno
 import os
 import signal
 import stat
@@ -145,6 +146,18 @@ def test_one_that_others_removed_is_made_again_and_locked(temporary: Path) -> No
     with pytest.raises(RoleDied, match=r"was removed, and cannot be made again \(File exists\)"):
         folder.renew()
     folder.path.unlink()
+    folder.close()
+
+
+def test_so_is_one_on_a_disk_that_locks_no_folders(temporary: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+
+    monkeypatch.setattr(socket_folder, "try_lock", refuse)
+    folder = SocketFolder()
+    folder.path.rmdir()
+    assert folder.renew()
+    assert folder.path.is_dir()
     folder.close()
 
 

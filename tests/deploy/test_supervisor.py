@@ -3,6 +3,7 @@
 import errno
 import os
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from rmc.common.errors import RoleDied
 from rmc.common.process.role import TERMINATED_STATUS
 from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.local import supervisor
+from rmc.deploy.local.fork_server import ForkServer
 from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.local.supervisor import QuickDeaths, RoleProcess, Supervisor
 from tests.waiting import wait_until
@@ -163,6 +165,22 @@ def test_where_no_process_can_be_started_now_it_is_tried_again(quick: Path, monk
     assert not role.start_or_wait()
     tend_until(role)
     assert (role.finished, role.restarts) == (True, 1)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="there is no fork server elsewhere")
+def test_so_it_is_with_the_process_that_forks_roles(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refusals = iter([errno.EAGAIN])
+    start = ForkServer.start
+
+    def scarce(self: ForkServer) -> None:
+        if number := next(refusals, None):
+            raise OSError(number, os.strerror(number))
+        start(self)
+
+    monkeypatch.setattr(ForkServer, "start", scarce)
+    roles = Supervisor([], lambda _: {}, quick, lambda _: 0.0)
+    roles.start()
+    roles.stop()
 
 
 def test_another_fault_of_a_start_is_told(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:

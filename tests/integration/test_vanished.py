@@ -1,5 +1,7 @@
 """Folders that vanish while a run is trained."""
 
+import errno
+import os
 import shutil
 import subprocess
 import time
@@ -52,6 +54,21 @@ def test_each_way_is_seen(vanish: Callable[[Path], None], tmp_path: Path) -> Non
     folder.check_there()
     vanish(folder.path)
     with pytest.raises(ConfigError, match="was deleted or moved while it was trained"):
+        folder.check_there()
+    folder.unlock()
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.ESTALE, errno.EIO, errno.ENOTCONN])
+def test_a_network_disk_that_is_away_for_a_moment_is_no_folder_gone(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+
+    def away(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "stat", away)
         folder.check_there()
     folder.unlock()
 

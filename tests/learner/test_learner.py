@@ -113,6 +113,26 @@ def test_weights_that_redis_forgot_are_out_again(setting):
     assert setting.bus.latest_version() == (1, 0)
 
 
+@pytest.mark.parametrize(("left", "waits"), [("nothing", True), ("an older one", False)])
+def test_an_evaluation_that_redis_forgot_is_asked_for_again(setting, monkeypatch, left, waits):
+    monkeypatch.setattr("rmc.learner.learner.LOOK_SECONDS", 0.0)
+    setting.update()
+    before = setting.bus._weights[True] = setting.bus._weights[False]
+    setting.feed(60)
+    while setting.learner.step():
+        pass
+    setting.learner.checkpoint()
+    asked, number = setting.bus.weights(evaluate=True), setting.learner.updates
+    setting.bus._weights.clear()
+    if left == "an older one":
+        setting.bus._weights[True] = before
+    if not waits:
+        setting.feed(60)
+    assert setting.learner.step() is not waits
+    assert setting.bus.weights(evaluate=True) == asked
+    assert asked[0] == (1, number)
+
+
 def test_weights_that_an_outage_kept_back_are_sent_after_it(setting, monkeypatch):
     """Redis may come back with the ones before."""
 

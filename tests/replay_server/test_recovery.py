@@ -14,7 +14,7 @@ from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import ConfigError
 from rmc.common.replay import SampleStatus
 from rmc.learner.replay_client import ReplayClient
-from rmc.replay_server.recovery import ReplayStore, open_store, valid_leaves
+from rmc.replay_server.recovery import ReplayStore, open_store, valid_leaves, warn_of_torn_rows
 from rmc.replay_server.sum_tree import SumTree
 from tests.holding import held_for_a_moment
 from tests.replay_server.replay_child import ACTORS, SECRET
@@ -142,6 +142,7 @@ def test_rows_torn_by_a_power_cut_hold_no_window(tmp_path: Path, caplog: pytest.
         assert np.flatnonzero(valid_leaves(store)).tolist() == [0, 1, 2, 3, 4, 6, 8, 9]
         assert store.ring.holds(np.array([3, 4, 5, 7, 13, 14])).tolist() == [False, True, False, False, True, False]
         assert store.tree.total == pytest.approx(8 * 2.0**0.6)
+        warn_of_torn_rows(store)
     assert "2 windows were damaged or torn by a crash; they are never drawn" in caplog.text
 
 

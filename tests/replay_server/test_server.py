@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -482,6 +483,48 @@ def test_what_redis_did_not_hear_is_said_when_it_is_back(make: Make, away: str) 
     assert ack is not None
     assert ack.id == EntryId(1, 1)
     assert bus.read({0: EntryId(0, -1)}, 10) == []
+
+
+class Late(MemoryBus):
+    """Redis that, where ``late``, carries a commit out after its caller has given up."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.late, self.heard = False, list[EntryId]()
+
+    def commit(self, *args: Any) -> None:
+        super().commit(*args)
+        self.heard += [self._acks[0].id] if 0 in self._acks else []
+        if self.late:
+            self.late = False
+            raise BusUnavailable("away")
+
+
+def test_no_ack_goes_back_after_a_commit_whose_answer_was_late(make: Make) -> None:
+    server, sender = filled(make(on=(bus := Late())), bus, 2)
+    sender.send(2)
+    bus.late = True
+    with pytest.raises(BusUnavailable):
+        drain(server)
+    server._credit._republish_at = 0.0
+    drain(server)
+    assert bus.heard == sorted(bus.heard)
+    assert bus.heard[-1] == EntryId(1, 2)
+
+
+def test_what_redis_did_not_hear_twice_is_said_at_once_when_it_is_back(
+    make: Make, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server, sender = filled(make(), bus, 2)
+    sender.send(2)
+    with monkeypatch.context() as away:
+        away.setattr(bus, "commit", Mock(side_effect=BusUnavailable("away")))
+        for _ in range(2):
+            with pytest.raises(BusUnavailable):
+                server.step()
+    server.step()
+    assert bus.ack(0) == server._credit._published[0]
+    assert server._credit._published[0].id == EntryId(1, 2)
 
 
 def test_what_is_refused_is_refused_once_though_redis_goes_away(make: Make) -> None:

@@ -197,7 +197,9 @@ def test_what_another_redis_held_is_read_once_the_older_server_is_fenced(
         old.bus.commit(old.owner, {}, old._store.ring.progress.publish())
 
 
-def test_a_power_cut_loses_the_end_of_a_ring_alone(make: Make, bus: MemoryBus, tmp_path: Path) -> None:
+def test_a_power_cut_loses_the_end_of_a_ring_alone(
+    make: Make, bus: MemoryBus, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     server, sender = filled(make(actors=1), bus, 50)
     server.sample(4)
     shutil.copytree(tmp_path / "replay", tmp_path / "on disk")
@@ -209,6 +211,9 @@ def test_a_power_cut_loses_the_end_of_a_ring_alone(make: Make, bus: MemoryBus, t
     for name in ("env_steps", "windows", "draws", "drawn_steps"):
         assert after[name] == before[name], name
     assert np.count_nonzero(valid_leaves(server._store)) == 50
+    assert [record.getMessage() for record in caplog.records if "torn" in record.message] == [
+        "replay ring: 3 windows were damaged or torn by a crash; they are never drawn"
+    ]
     sample = server.sample(64)
     assert sample.rows is not None
     assert sample.rows["serial"].max() < 50

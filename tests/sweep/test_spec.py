@@ -10,7 +10,7 @@ from rmc.cli.sweep_command import default_folder, read
 from rmc.common.errors import ConfigError
 from rmc.sweep.grid import grid_jobs
 from rmc.sweep.job import run_name
-from rmc.sweep.spec import Range, Spec, read_seeds, read_spec, read_values
+from rmc.sweep.spec import Range, Spec, read_ranges, read_seeds, read_spec, read_values
 
 PENDULUM = "InvertedPendulum-v5"
 
@@ -73,6 +73,10 @@ def test_a_search_has_ranges_and_choices() -> None:
     assert search is not None
     ranges = {"learning_rate": Range(1e-5, 1e-2, log=True), "n_step": Range(1, 5), "scheme": [1, 3]}
     assert (search.ranges, search.trials, search.prune) == (ranges, 7, False)
+    assert read_ranges(["warmup_steps=1_000..5e3", "gamma=.9...99"]) == {
+        "warmup_steps": Range(1_000, 5_000.0),
+        "gamma": Range(0.9, 0.99),
+    }
     choices = spec_of(PENDULUM, "--search", "init_from=../a,../b").search
     assert choices is not None
     assert choices.ranges == {"init_from": ["../a", "../b"]}
