@@ -6,12 +6,13 @@ The run's folder looks like that of ``rmc train``, so that ``rmc plot`` reads bo
 
 import dataclasses
 import json
+import math
 import shutil
 import time
 from contextlib import closing, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -135,11 +136,10 @@ class _Run(BaseCallback):
         self.config, self.folder, self._console, self._stop = config, folder, console, stop
         self._model = model
         self._began, self._wall_before = time.monotonic(), wall_seconds(folder.metrics)
-        self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, 0.0
+        self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, math.inf
         self._next_evaluation = self._after(min(self.steps, _evaluated_steps(folder)))  # one that was cut is made up
-        self._metrics: TextIO | None = None  # it has no first word before that
         self._initial = self._first_evaluation()
-        self._metrics = folder.metrics.open("a", buffering=1)
+        self._metrics, self._record_at = folder.metrics.open("a", buffering=1), 0.0
 
     @property
     def steps(self) -> int:
@@ -155,10 +155,10 @@ class _Run(BaseCallback):
             with suppress(_Stopped):
                 self._model.sb3.learn(missing, self, reset_num_timesteps=False, log_interval=None)
         self._model.save(self.folder)
-        self._write_progress()
+        self._write_progress(finished=self.steps >= self.config.total_steps)
+        self._record_at = math.inf  # the last evaluation is no training time
 
     def close(self) -> None:
-        assert self._metrics is not None
         self._metrics.close()
 
     def _on_step(self) -> bool:
@@ -211,16 +211,15 @@ class _Run(BaseCallback):
     def _speak(self) -> None:
         """Say now and then how far it is: who says nothing for long is taken for hanging."""
         now = time.monotonic()
-        if self._metrics is not None and now >= self._record_at:
+        if now >= self._record_at:
             self._record_at = now + RECORD_SECONDS
             self._write_progress()
 
-    def _write_progress(self) -> None:
+    def _write_progress(self, finished: bool = False) -> None:
         self._write("launcher", {"wall_s": self._wall()})
-        self._write("learner", {"env_steps": self.steps, "updates": self._model.updates})
+        self._write("learner", {"env_steps": self.steps, "updates": self._model.updates, "finished": int(finished)})
 
     def _write(self, role: str, record: dict[str, Any]) -> None:
-        assert self._metrics is not None
         self._metrics.write(json.dumps({"role": role, "time": time.time(), **record}) + "\n")
 
     def _wall(self) -> float:

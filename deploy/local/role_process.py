@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from rmc.common.env.make import make_env
 from rmc.common.env.wrappers import Env
-from rmc.common.errors import BusFull, BusUnavailable, ConfigError
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RmcError
 from rmc.common.process.outage import OutageLog
 from rmc.common.process.role import RECONNECT_SLEEP, StopSignal
 from rmc.deploy.local.role_environment import SECRET_VARIABLE
@@ -59,11 +59,17 @@ class Process:
         self.stop = StopSignal()
         self.stop.install()
         patience = float(os.environ.get(PATIENCE_VARIABLE, PATIENCE_SECONDS))
-        try:
+        with self._unless_ended():
             self.bus = connect(place.redis_url, place.run, Deadline(patience, self.stop))
             self.config = self._registered_config(place.run, Deadline(patience, self.stop))
-        except ConfigError:
-            if self.stop.terminated:  # no fault of the options: its launcher starts it again
+
+    @contextmanager
+    def _unless_ended(self) -> Iterator[None]:
+        """A start that SIGTERM cuts short is no fault, and its launcher makes another. Raises SystemExit."""
+        try:
+            yield
+        except RmcError:
+            if self.stop.terminated:
                 raise SystemExit(self.stop.exit_status) from None
             raise
 
@@ -82,7 +88,7 @@ class Process:
 
         ``make_room`` is called before each new try where Redis has no memory left.
         """
-        with self.bus.repeated(lambda call: until_taken(call, role, self.stop, make_room)):
+        with self._unless_ended(), self.bus.repeated(lambda call: until_taken(call, role, self.stop, make_room)):
             self.bus.check_room(role)
             yield
 

@@ -106,6 +106,7 @@ class RedisServer:
         self.close()
         if self.users is not None:
             self._write_users()
+            self._unread = False
         tied = [sys.executable, "-I", parent_death.__file__, str(os.getpid()), server_binary(), "-"]
         with (self.folder / "redis.log").open("ab") as log:
             self.process = subprocess.Popen(
@@ -138,8 +139,9 @@ class RedisServer:
 
     def admit(self, users: RedisUsers) -> None:
         """Take other users than before, of the same secret. A server that is away reads of them when it comes back."""
-        self.users, self._unread = users, True
-        self._write_users()
+        self.users, self._unread = users, False
+        self._write_users()  # a file that is cut must not be read
+        self._unread = True
         self._read_users()
 
     def _read_users(self) -> None:

@@ -307,7 +307,8 @@ def _process_space() -> list[str]:
     """Where this process has its number: the machine, the container on it, and the boot, as names may be shared."""
     space = [socket.gethostname()]
     with suppress(OSError):  # not on Linux
-        space += [os.readlink("/proc/self/ns/pid"), BOOT.read_text().strip()]
+        space.append(os.readlink("/proc/self/ns/pid"))
+        space.append(BOOT.read_text().strip())
     return space
 
 

@@ -61,6 +61,10 @@ def run(words: list[str]) -> int:
         return _complain(str(error), CONFIG_STATUS)
     except KeyboardInterrupt:  # before the command took the signal over
         return INTERRUPTED_STATUS
+    except SystemExit as ended:  # of a role that was ended before it began
+        if not isinstance(ended.code, int):
+            raise
+        return ended.code
     except RmcError as error:
         if words[0] == "role":
             raise  # the supervisor shows its traceback

@@ -26,6 +26,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.starts import starts
 from tests import habits
@@ -84,10 +85,14 @@ def test_its_last_evaluation_is_no_training_time(tmp_path, monkeypatch):
 def test_it_speaks_while_it_plays(tmp_path, monkeypatch):
     monkeypatch.setattr(baselines, "RECORD_SECONDS", 0.0)
     assert run(config(), tmp_path / "run") == 0
-    roles = [record["role"] for record in RunFolder(tmp_path / "run").records()]
-    said = "".join({"launcher": "l", "learner": "", "evaluator": "e"}[role] for role in roles)
-    assert said.index("e") > 101 + 20  # it comes at step 101
-    assert len(said) - said.rindex("e") > 20  # the last one follows the training
+    folder = RunFolder(tmp_path / "run")
+    records = list(folder.records())
+    roles = [record["role"] for record in records if record["role"] != "learner"]
+    assert roles.index("evaluator") > 101 + 20  # it comes at step 101
+    assert [record["finished"] for record in records if record["role"] == "learner"][-2:] == [0, 1]
+    result = folder.result()
+    assert result is not None
+    assert wall_seconds(folder.metrics) <= result["wall_s"]  # without the last evaluation
 
 
 def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):

@@ -339,6 +339,7 @@ def test_the_past_is_drawn_where_it_was_and_nobody_is_silent_meanwhile(
         say(folder, "replay", time=when, env_steps=50 * second)
         say(folder, "learner", time=when, updates_per_s=10.0, env_steps=50 * second)
     monkeypatch.setattr(live_run, "LOOK_BYTES", 1 << 14)
+    monkeypatch.setattr("rmc.deploy.monitor.run_status.SILENT_SECONDS", 600.0)
     watched, notices, looks = LiveRun("run", folder.path), [], 0
     while news := watched.look():
         notices.append(news.get("notices", {}))

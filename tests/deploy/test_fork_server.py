@@ -15,7 +15,9 @@ import pytest
 
 from rmc.cli import fork_server
 from rmc.common.errors import RoleDied
+from rmc.common.process.role import TERMINATED_STATUS
 from rmc.deploy.local.fork_server import IMPORT_SECONDS, ForkedProcess, ForkServer
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")
 
@@ -58,6 +60,13 @@ def test_it_leads_a_group_has_its_title_and_dies_of_a_signal(shared: ForkServer,
     assert " ".join(psutil.Process(role.pid).cmdline()).endswith("-P -m rmc.cli.main role actor --run x --index 7")
     os.killpg(role.pid, signal.SIGKILL)
     assert role.wait(5) == -signal.SIGKILL
+
+
+def test_one_that_is_ended_while_it_waits_for_redis_says_so(shared: ForkServer, tmp_path: Path) -> None:
+    role = fork_actor(shared, tmp_path / "log", "0", RMC_REDIS_URL="unix:///a", RMC_PATIENCE="99")
+    wait_until(lambda: "waiting up to" in (tmp_path / "log").read_text(), 20)
+    os.kill(role.pid, signal.SIGTERM)
+    assert role.wait(20) == TERMINATED_STATUS
 
 
 def test_with_the_fork_server_go_those_it_forked_and_another_begins(shared: ForkServer, tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """Every role may do in Redis what its work takes, and nothing else; against a real server."""
 
+import errno
+import os
 import re
 import signal
 import socket
@@ -222,6 +224,22 @@ def test_users_that_come_while_the_server_stands_still_get_in_later(tmp_path: Pa
         late = bus_of(server, "actor-2")
         late.ping()
         late.redis.close()
+
+
+def test_a_file_of_users_that_is_cut_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(server: RedisServer) -> None:
+        (server.folder / "users.acl").write_text("")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=USERS) as server:
+        with monkeypatch.context() as patch:
+            patch.setattr(RedisServer, "_write_users", full)
+            with pytest.raises(OSError, match="No space"):
+                server.admit(RedisUsers(USERS.run, SECRET, (*USERS.roles, "actor-2")))
+        server.tend()
+        there = bus_of(server, "actor-1")
+        there.ping()
+        there.redis.close()
 
 
 def test_passwords_are_nowhere_to_be_read(tmp_path: Path) -> None:
