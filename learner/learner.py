@@ -22,6 +22,7 @@ from rmc.common.policy_header import PolicyHeader
 from rmc.common.replay import ObservationStatistics, Replay, Sample, SampleStatus
 from rmc.common.window import WindowSpec
 from rmc.learner.batch import clear_padding, importance_weights
+from rmc.learner.broadcast import Broadcast
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.learner.device_update import DeviceUpdate, HostCopy
 from rmc.learner.learner_checkpoint import NOT_OURS, LearnerProgress, all_finite, pack, take_up
@@ -35,7 +36,6 @@ from rmc.learner.update_order import make_update
 log = logging.getLogger(__name__)
 LARGE_REWARD = 1e4  # a step's, from which it is the likely cause of a divergence
 SAVE_AGAIN_SECONDS = 10.0  # after a checkpoint that could not be written
-LOOK_SECONDS = 5.0  # between looks whether Redis still has what is to be evaluated and, while waiting, what acts
 
 
 class Learner:
@@ -70,16 +70,13 @@ class Learner:
         self.spec, self.config, self.replay, self.bus, self.checkpoints = spec, config, replay, bus, checkpoints
         self.device, self._header = torch.device(device), header
         self.updates = self.env_steps = self.last_checkpoint = self._checkpoint_steps = 0
-        self.finished = self._evaluation_due = False
+        self.finished = False
         self._may_save = True
         self._observed_before = ObservationStatistics.none(spec)  # by the run that this one began with
         self._policy_learnt = False  # by that run
         self._waiting = ""
         self._largest_reward = 0.0  # that was learnt from, as it was scaled
-        self._look_at = 0.0  # when to ask next whether Redis still has the weights
-        self._published: Version | None = None  # last
-        self._asked: tuple[Version, bytes] | None = None  # for the evaluation of what, last
-        self._ask_at = 0.0  # when to look next whether Redis still knows that
+        self._acting, self._evaluated = Broadcast(bus), Broadcast(bus, evaluate=True)
         self._save_at, self._checkpoint_error = 0.0, ""
         self._slowest, self._save_seconds = 0.0, checkpoints.last_save()  # of an update, of the last save
         self._make_networks(agent, update, seed, two_processes)
@@ -134,16 +131,14 @@ class Learner:
             raise
 
     def _step(self) -> bool:
-        if self._evaluation_due:
-            self._ask_for_evaluation()
-        self._ask_again_if_forgotten()
+        self._acting.repeat_if_lost()
+        self._evaluated.repeat_if_lost()
         sample = self.replay.sample(self.config.batch_size)
         self.env_steps = max(self.env_steps, sample.env_steps)
         if sample.status is not SampleStatus.BATCH:
             self._flush()
         if sample.status is SampleStatus.WAIT:
             self._waiting = "experience"
-            self._publish_if_forgotten()
             return False
         if sample.status is SampleStatus.FINISHED:
             self._waiting = "disk"
@@ -209,34 +204,10 @@ class Learner:
 
     def publish(self) -> None:
         """Broadcast the policy with the newest observation statistics frozen into it. Raises FencedError."""
-        self._published = None  # until Redis has them
         self._freeze_statistics()
         blob = self._serialize_finite(self.agent.broadcast_weights())
         version = Version(self.epoch, self.updates or (TAKEN_OVER if self._policy_learnt else UNTRAINED))
-        self.bus.publish_weights(version, blob)
-        self._published = version
-
-    def _publish_if_forgotten(self) -> None:
-        """A Redis that lost data has old weights for a new actor, or none: it would wait for them, and we for it."""
-        if time.monotonic() >= self._look_at:
-            self._look_at = time.monotonic() + LOOK_SECONDS
-            if self.bus.latest_version() != self._published:
-                self.publish()
-
-    def _ask_for_evaluation(self) -> None:
-        blob = self._serialize_finite(self.update.average.policy_weights())
-        self._asked = Version(self.epoch, self.updates), blob
-        self.bus.publish_weights(*self._asked, evaluate=True)
-        self._evaluation_due = False
-
-    def _ask_again_if_forgotten(self) -> None:
-        """A Redis that lost data asks for nothing, or for an older policy: the checkpoint would get no evaluation."""
-        if self._asked is None or time.monotonic() < self._ask_at:
-            return
-        self._ask_at = time.monotonic() + LOOK_SECONDS
-        newest = self.bus.latest_version(evaluate=True)
-        if newest is None or newest < self._asked[0]:
-            self.bus.publish_weights(*self._asked, evaluate=True)
+        self._acting.publish(version, blob)
 
     def _serialize_finite(self, weights: dict[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
         """Weights as they are sent and saved. Raises RmcError where they are not finite: neither must then happen."""
@@ -267,7 +238,7 @@ class Learner:
             self.agent.freeze_statistics(*(torch.from_numpy(numbers).to(self.device) for numbers in sums))
 
     def checkpoint(self) -> bool:
-        """Save, broadcast, and ask for an evaluation of what was saved; ``step`` asks again if Redis is away.
+        """Save, and broadcast that: for an evaluation, and as what acts, since a resumed run begins with it, too.
 
         Whether it was saved: a disk that is full, or away, is tried again later, and training goes on until then.
         """
@@ -282,11 +253,11 @@ class Learner:
             self._checkpoint_error = error.reason
             return False
         self._checkpoint_error = ""
-        self._evaluation_due = True
         self.last_checkpoint, self._checkpoint_steps = self.updates, self.env_steps
         self._next_checkpoint = self._after(self.env_steps)
-        self.publish()  # a run that goes on from here begins with these weights, too
-        self._ask_for_evaluation()
+        averaged = self._serialize_finite(self.update.average.policy_weights())
+        self._evaluated.publish(Version(self.epoch, self.updates), averaged)
+        self.publish()
         return True
 
     def save(self) -> None:

@@ -115,7 +115,7 @@ def test_weights_that_redis_forgot_are_out_again(setting):
 
 @pytest.mark.parametrize(("left", "waits"), [("nothing", True), ("an older one", False)])
 def test_an_evaluation_that_redis_forgot_is_asked_for_again(setting, monkeypatch, left, waits):
-    monkeypatch.setattr("rmc.learner.learner.LOOK_SECONDS", 0.0)
+    monkeypatch.setattr("rmc.learner.broadcast.LOOK_SECONDS", 0.0)
     setting.update()
     before = setting.bus._weights[True] = setting.bus._weights[False]
     setting.feed(60)
@@ -143,7 +143,7 @@ def test_weights_that_an_outage_kept_back_are_sent_after_it(setting, monkeypatch
     with pytest.raises(BusUnavailable):
         setting.learner.publish()
     sent = []
-    monkeypatch.setattr(setting.bus, "publish_weights", lambda version, _: sent.append(version))
+    monkeypatch.setattr(setting.bus, "publish_weights", lambda version, *_: sent.append(version))
     assert not setting.learner.step()
     assert sent == [(1, 0)]
 
@@ -156,7 +156,7 @@ def test_weights_older_than_the_last_that_redis_has_are_replaced(setting):
     newest = setting.bus.latest_version()
     assert newest.update >= 8
     setting.bus._weights[False] = first  # its log lacks the last second
-    setting.learner._look_at = 0.0
+    setting.learner._acting._look_at = 0.0
     assert not setting.learner.step()
     assert setting.bus.latest_version() == (1, setting.learner.updates) >= newest
 
