@@ -20,13 +20,14 @@ class Broadcast:
 
     def publish(self, version: Version, blob: bytes) -> None:
         """Raises FencedError, and BusUnavailable; then ``repeat_if_lost`` sends them."""
-        self._newest, self._sent = (version, blob), False
+        self._newest, self._sent, self._look_at = (version, blob), False, time.monotonic() + LOOK_SECONDS
         self._bus.publish_weights(version, blob, self._evaluate)
         self._sent = True
 
     def repeat_if_lost(self) -> None:
-        """Look in Redis now and then. Raises FencedError."""
-        if self._newest is None or (self._sent and time.monotonic() < self._look_at):
+        """Look in Redis now and then. Raises as ``publish``: at every call until an evaluation is asked for."""
+        settled = self._sent or not self._evaluate  # updates go on without a Redis that only lacks what acts
+        if self._newest is None or (settled and time.monotonic() < self._look_at):
             return
         self._look_at = time.monotonic() + LOOK_SECONDS
         if not self._sent or self._bus.latest_version(self._evaluate) != self._newest[0]:

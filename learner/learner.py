@@ -256,8 +256,10 @@ class Learner:
         self.last_checkpoint, self._checkpoint_steps = self.updates, self.env_steps
         self._next_checkpoint = self._after(self.env_steps)
         averaged = self._serialize_finite(self.update.average.policy_weights())
-        self._evaluated.publish(Version(self.epoch, self.updates), averaged)
-        self.publish()
+        try:
+            self.publish()
+        finally:  # an outage between the two costs neither
+            self._evaluated.publish(Version(self.epoch, self.updates), averaged)
         return True
 
     def save(self) -> None:

@@ -109,6 +109,7 @@ def test_a_resumed_learner_takes_the_threads_that_were_chosen(setting):
 
 def test_weights_that_redis_forgot_are_out_again(setting):
     setting.bus._weights.clear()
+    setting.learner._acting._look_at = 0.0
     assert not setting.learner.step()
     assert setting.bus.latest_version() == (1, 0)
 
@@ -142,10 +143,32 @@ def test_weights_that_an_outage_kept_back_are_sent_after_it(setting, monkeypatch
     monkeypatch.setattr(setting.bus, "publish_weights", away)
     with pytest.raises(BusUnavailable):
         setting.learner.publish()
+    setting.feed(60)
+    assert setting.learner.step()  # what it has, it learns from until then
+    setting.learner._acting._look_at = 0.0
     sent = []
     monkeypatch.setattr(setting.bus, "publish_weights", lambda version, *_: sent.append(version))
-    assert not setting.learner.step()
+    assert setting.learner.step()
     assert sent == [(1, 0)]
+
+
+@pytest.mark.parametrize("away", [False, True], ids=["what acts", "what is evaluated"])
+def test_a_checkpoint_in_an_outage_sends_both_after_it(setting, monkeypatch, away):
+    setting.update()
+    publish, saved = setting.bus.publish_weights, setting.learner.updates
+
+    def one_is_lost(version, blob, evaluate):
+        if evaluate == away:
+            raise BusUnavailable("connection refused")
+        publish(version, blob, evaluate)
+
+    monkeypatch.setattr(setting.bus, "publish_weights", one_is_lost)
+    with pytest.raises(BusUnavailable):
+        setting.learner.checkpoint()
+    monkeypatch.setattr(setting.bus, "publish_weights", publish)
+    setting.learner._acting._look_at = 0.0
+    setting.learner.step()
+    assert {setting.bus.latest_version(evaluate) for evaluate in (False, True)} == {(1, saved)}
 
 
 def test_weights_older_than_the_last_that_redis_has_are_replaced(setting):
