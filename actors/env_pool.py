@@ -101,7 +101,7 @@ class EnvPool:
             observation, info = self._envs[i].reset(seed=None if number is None else self._seed_of(number))
         except Exception as error:
             log.warning("%s: environment %d broke in a reset: %s", self._name, i, error)
-            self._make_anew(i)
+            self._make_anew(i, error)
             observation, info = self._envs[i].reset(seed=self._seed_of(self._seeds_due.pop(i)))
         self._check_sizes(info)
         return observation, info.get("missing", False), info["privileged"] if self._spec.privileged else None
@@ -115,12 +115,12 @@ class EnvPool:
         self._broken_starts[i] = self._broken_starts[i] + 1 if step <= 1 else 0
         if self._broken_starts[i] >= BROKEN_STARTS:
             raise error
-        self._make_anew(i)
+        self._make_anew(i, error)
 
-    def _make_anew(self, i: int) -> None:
+    def _make_anew(self, i: int, error: Exception) -> None:
         self.broken += 1
         self._remade += 1
-        self._envs[i] = recreate_env(self._envs[i], self._make_env)
+        self._envs[i] = recreate_env(self._envs[i], self._make_env, error)
         self._seeds_due[i] = len(self._envs) * self._remade + i
 
     def _check_sizes(self, info: dict[str, Any]) -> None:

@@ -106,7 +106,7 @@ class Rollout:
                 log.warning("episode %d of an evaluation broke: %s", self.episode, error)
             self.fault = error
             self.broken, self._length = self.broken + 1, -1
-            self.env = recreate_env(self.env, self._make_env)
+            self.env = recreate_env(self.env, self._make_env, error)
             over = False
         self._judge(over)
         return self.episode < self.episodes and not self.cut

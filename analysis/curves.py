@@ -15,14 +15,7 @@ from rich.table import Table
 
 from rmc.analysis.history import History
 from rmc.analysis.out_file import PICTURES, check_writable
-from rmc.analysis.statistics import (
-    ENOUGH_SEEDS,
-    Scores,
-    interquartile_mean,
-    interval,
-    normalised,
-    probability_of_improvement,
-)
+from rmc.analysis.statistics import ENOUGH_SEEDS, Scores, interquartile_mean, interval, probability_of_improvement
 from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
 from rmc.deploy.monitor.figures import return_text
@@ -32,7 +25,9 @@ LABELS = {"env_steps": "environment steps", "updates": "updates", "wall_s": "wal
 LEGEND_WIDTH, LEGEND_LINE = 55, 0.22  # characters under a panel, inches
 SAME_LENGTH = 1.05  # runs overshoot their end a little
 POINTS, CURVE_RESAMPLES, COLUMNS, LAST, WIDTH = 100, 300, 3, 5, 120
+HEADINGS = ("agent", "seeds", "return", f"worst of last {LAST}", "steps", "updates", "wall s")
 Groups = dict[str, dict[str, list[History]]]  # environment -> agent -> its runs
+Line = tuple[NDArray[np.float64], NDArray[np.float64]]  # places, and returns there
 
 
 def grouped(histories: Sequence[History]) -> Groups:
@@ -66,7 +61,7 @@ def _comparable(agent: str, runs: list[History]) -> dict[str, list[History]]:
     return groups
 
 
-def curve(run: History, by: Axis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def curve(run: History, by: Axis) -> Line:
     """Where it was evaluated, and the returns there; it starts with what it had before training."""
     places = [float(getattr(one, by)) for one in run.evaluations]
     returns = [one.return_mean for one in run.evaluations]
@@ -91,7 +86,8 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
     handles: dict[str, Any] = {}
     for panel, (env, by_agent) in zip(panels, groups.items(), strict=False):
         for agent, runs in by_agent.items():
-            handles.setdefault(agent, _draw_agent(panel, runs, by, f"C{agents.index(agent) % 10}"))
+            color = f"C{agents.index(agent) % 10}"
+            handles.setdefault(agent, draw_agent(panel, [curve(run, by) for run in runs], color))
         panel.set_title(env)
         panel.set_xlabel(LABELS[by])
         panel.locator_params(axis="x", nbins=5)  # more would run into each other
@@ -103,12 +99,14 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
     figure.savefig(out, dpi=110)
 
 
-def _draw_agent(panel: Any, runs: list[History], by: Axis, color: str) -> Any:
-    curves = [curve(run, by) for run in runs]
-    if len(runs) < ENOUGH_SEEDS:
-        lines = [panel.plot(*one, color=color, linewidth=1.2, alpha=0.8)[0] for one in curves]
+def draw_agent(panel: Any, curves: list[Line], color: str) -> Any:
+    """Few runs as a line each, more as their mean and its interval where all have been; a line for the legend."""
+    low, high = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
+    if len(curves) < ENOUGH_SEEDS or low >= high:
+        style: Any = {"color": color, "linewidth": 1.2, "alpha": 0.8, "marker": "o", "markersize": 2.5}
+        lines = [panel.plot(*one, **style)[0] for one in curves]
         return lines[0]
-    places = np.linspace(max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves), POINTS)
+    places = np.linspace(low, high, POINTS)
     returns = np.stack([np.interp(places, *one) for one in curves])  # (R, POINTS)
     line = panel.plot(places, [interquartile_mean(at) for at in returns.T], color=color)[0]
     bands = [interval(interquartile_mean, at[:, None], resamples=CURVE_RESAMPLES) for at in returns.T]
@@ -139,15 +137,15 @@ def tables(groups: Groups, reference: str | None) -> list[Table]:
 
 def _table(env: str, by_agent: dict[str, list[History]], reference: str | None) -> Table:
     table = Table(title=env, title_justify="left", box=None, pad_edge=False)
-    columns = ["agent", "seeds", "return", f"worst of last {LAST}", "steps", "updates", "wall s"]
-    for name in [*columns, *(["scaled", "P(better)"] if reference else [])]:
+    for name in [*HEADINGS, *(["scaled", "P(better)"] if reference else [])]:
         table.add_column(name, justify="left" if name == "agent" else "right", no_wrap=name != "agent")
     for agent, runs in by_agent.items():
-        table.add_row(agent, *_cells(runs), *(_beside(runs, by_agent.get(reference, [])) if reference else []))
+        table.add_row(agent, *cells(runs), *(_beside(runs, by_agent.get(reference, [])) if reference else []))
     return table
 
 
-def _cells(runs: list[History]) -> list[str]:
+def cells(runs: list[History]) -> list[str]:
+    """An agent's, under the ``HEADINGS`` after its name."""
     seeds, unfinished = str(len(runs)), sum(not run.finished for run in runs)
     seeds += f", {unfinished} unfinished" if unfinished else ""
     ends = [run.env_steps for run in runs]
@@ -171,5 +169,5 @@ def _beside(runs: list[History], reference: list[History]) -> list[str]:
     if not reference or not initial:
         return ["", ""]
     low, high = np.array([np.mean(initial)]), last_returns(reference).mean(0)
-    share = "" if high == low else f"{normalised(last_returns(runs), low, high).mean():.2f}"
+    share = "" if high == low else f"{((last_returns(runs) - low) / (high - low)).mean():.2f}"
     return [share, f"{probability_of_improvement(last_returns(runs), last_returns(reference)):.2f}"]

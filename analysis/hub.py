@@ -42,16 +42,30 @@ def pull(repo: str, revision: str | None = None) -> Path:
 
 
 @contextmanager
-def _in_one_line(repo: str, revision: str | None = None) -> Iterator[None]:
-    """What the hub refuses, as a ConfigError; its library says nothing beside that."""
-    from huggingface_hub import constants, errors
-    from huggingface_hub.utils.logging import set_verbosity
-    from huggingface_hub.utils.tqdm import disable_progress_bars
+def _silent() -> Iterator[None]:
+    """The hub's library; afterwards it is as loud as the caller's program had it."""
+    from huggingface_hub.utils.logging import get_verbosity, set_verbosity
+    from huggingface_hub.utils.tqdm import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
 
+    verbosity, without_bars = get_verbosity(), are_progress_bars_disabled()
     disable_progress_bars()
     set_verbosity(logging.ERROR)
     try:
         yield
+    finally:
+        set_verbosity(verbosity)
+        if not without_bars:
+            enable_progress_bars()
+
+
+@contextmanager
+def _in_one_line(repo: str, revision: str | None = None) -> Iterator[None]:
+    """What the hub refuses, as a ConfigError; its library says nothing beside that."""
+    from huggingface_hub import constants, errors
+
+    try:
+        with _silent():
+            yield
     except errors.HFValidationError:
         raise ConfigError("REPO", repo, "no repository's name; give owner/name") from None
     except errors.GatedRepoError:

@@ -4,6 +4,8 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 
+from rich.filesize import decimal as size_text
+
 from rmc.analysis.bottleneck import busy_threads, threads_of_learner
 from rmc.analysis.host_faults import CROWDED
 from rmc.analysis.vitals import Vitals
@@ -86,36 +88,36 @@ def memory(config: RunConfig, roles: dict[str, RoleUse], machine: Machine) -> li
         uses[role.partition("-")[0]].append(use.memory_bytes)
     pages, total = ring_bytes(config), sum(map(sum, uses.values()))
     rows = [_role_memory(kind, each) for kind, each in uses.items()]
-    rows.append(Need("memory, pages of the ring", megabytes(pages)))
+    rows.append(Need("memory, pages of the ring", size_text(pages)))
     fits = total + pages <= machine.free_memory_bytes
-    return [*rows, Need("memory, all", megabytes(total + pages), f"{megabytes(machine.free_memory_bytes)} free", fits)]
+    return [*rows, Need("memory, all", size_text(total + pages), f"{size_text(machine.free_memory_bytes)} free", fits)]
 
 
 def _role_memory(kind: str, each: list[int]) -> Need:
     count = f" ({len(each)})" if len(each) > 1 else ""
-    return Need(f"memory, {kind}{count}", megabytes(sum(each)))
+    return Need(f"memory, {kind}{count}", size_text(sum(each)))
 
 
 def disk(config: RunConfig, trial: Trial, seconds: float, machine: Machine, ring_there: int) -> list[Need]:
     """What is to come of the ring, the checkpoints, what is recorded until the end, and all."""
     rows, kept = max(0, ring_bytes(config) - ring_there), config.learner.keep_checkpoints + KEPT_BESIDE
     count = config.total_steps // config.learner.checkpoint_steps + 1
-    saved, records = min(kept, count) * trial.checkpoint_bytes, trial.record_bytes_per_s * seconds
+    saved, records = min(kept, count) * trial.checkpoint_bytes, int(trial.record_bytes_per_s * seconds)
     free = max(0, machine.free_disk_bytes - DISK_RESERVE)
     return [
-        Need("disk, ring", megabytes(rows)),
-        Need(f"disk, {min(kept, count)} checkpoints", megabytes(saved)),
-        Need("disk, metrics", megabytes(records)),
-        Need("disk, all", megabytes(rows + saved + records), f"{megabytes(free)} free", rows + saved + records <= free),
+        Need("disk, ring", size_text(rows)),
+        Need(f"disk, {min(kept, count)} checkpoints", size_text(saved)),
+        Need("disk, metrics", size_text(records)),
+        Need("disk, all", size_text(rows + saved + records), f"{size_text(free)} free", rows + saved + records <= free),
     ]
 
 
 def bandwidth(config: RunConfig, fast: Speed, machine: Machine) -> list[Need]:
     """To and from the replay servers, beside a share of what this machine copies in memory."""
-    row, has = config.window_spec().dtype.itemsize, WIRE_SHARE * machine.copied_bytes_per_s
+    row, has = config.window_spec().dtype.itemsize, int(WIRE_SHARE * machine.copied_bytes_per_s)
     flows = {"to": fast.windows_per_s * row, "from": fast.updates_per_s * config.learner.batch_size * row}
     return [
-        Need(f"bandwidth {way} replay", f"{megabytes(flow)}/s", f"{megabytes(has)}/s", flow <= has, False)
+        Need(f"bandwidth {way} replay", f"{size_text(int(flow))}/s", f"{size_text(has)}/s", flow <= has, False)
         for way, flow in flows.items()
     ]
 
@@ -137,11 +139,3 @@ def threads(config: RunConfig, records: list[dict[str, Any]], machine: Machine) 
     busy = busy_threads(vitals, config, machine.cores)
     text = f"{learner} learner + {others} others, {busy:.1f} busy"
     return Need("threads", text, f"{machine.cores} cores", max(learner, busy) <= CROWDED * machine.cores, False)
-
-
-def megabytes(size: float) -> str:
-    """Bytes in the unit that suits them."""
-    return next(
-        (f"{size / unit:,.1f} {name}" for unit, name in ((1e9, "GB"), (1e6, "MB")) if size >= unit),
-        f"{size / 1e3:.1f} kB",
-    )

@@ -123,7 +123,7 @@ class Policy:
     def _in_environment(self, action: Floats) -> NDArray[Any]:
         """(N, A) in [-1, 1] -> (N, ...) as the environment takes it."""
         parts, scaled = self.header.layout.actions, self._scale(action)
-        if len(parts) > 1:
+        if len(parts) > 1 or parts[0].name:  # a Dict or a Tuple, be it of one box
             return scaled.astype(np.result_type(*(part.dtype for part in parts)))
         return scaled.astype(parts[0].dtype).reshape(len(action), *parts[0].shape)
 

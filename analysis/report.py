@@ -5,21 +5,18 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
-from statistics import mean, pstdev
 from typing import Any
 
-from rmc.analysis.curves import LAST, grouped
+from rmc.analysis.curves import HEADINGS, cells, grouped
 from rmc.analysis.history import History
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.report_run import ReportRun
 from rmc.common.extra import check_installed
 from rmc.common.whole_file import write_whole
-from rmc.deploy.monitor.figures import return_text
 from rmc.deploy.run.config import option
 from rmc.deploy.run.starts import format_starts
 
 PAGES = (".html", ".htm")
-COLUMNS = ("agent", "runs", "return", "each run", f"worst of last {LAST}", "steps", "updates", "wall s")
 CHARTS = (  # what is drawn over wall time: its name, its unit, and its lines by role and metric
     ("throughput of environment steps", "steps / s", {"collected": ("replay", "env_steps_per_s")}),
     ("throughput of updates", "updates / s", {"learner": ("learner", "updates_per_s")}),
@@ -53,7 +50,7 @@ def write_report(runs: Sequence[ReportRun], out: Path, with_video: bool) -> None
         "version": version("rmc-rl"),
         "runs": runs,
         "returns": _returns([run.history for run in runs if run.history is not None]),
-        "final_columns": COLUMNS,
+        "final_columns": HEADINGS,
         "unevaluated": [run.name for run in runs if run.history is None],
         "films": [film for film, _ in shown if film is not None],
         "rollouts": [rollouts for _, rollouts in shown],
@@ -85,27 +82,10 @@ def _returns(histories: list[History]) -> list[dict[str, Any]]:
                 "colours": colours,
                 "over_steps": returns(agents, colours, "env_steps"),
                 "over_wall": returns(agents, colours, "wall_s"),
-                "final": [final_row(agent, past) for agent, past in agents.items()],
+                "final": [[agent, *cells(past)] for agent, past in agents.items()],
             }
         )
     return rows
-
-
-def final_row(agent: str, past: list[History]) -> list[str]:
-    """An agent's last evaluations, as ``COLUMNS`` names them."""
-    last = [run.evaluations[-1].return_mean for run in past]
-    worst = min(one.return_mean for run in past for one in run.evaluations[-LAST:])
-    numbers = [mean(getattr(run, name) for run in past) for name in ("env_steps", "updates", "wall_s")]
-    deviation = f" ± {return_text(pstdev(last))}" if len(last) > 1 else ""
-    each = ", ".join(map(return_text, last))
-    return [
-        agent,
-        f"{len(past)}",
-        f"{return_text(mean(last))}{deviation}",
-        each,
-        return_text(worst),
-        *(f"{n:,.0f}" for n in numbers),
-    ]
 
 
 def _course(run: ReportRun) -> dict[str, Any]:
@@ -131,25 +111,27 @@ def _course(run: ReportRun) -> dict[str, Any]:
 def differences(runs: Sequence[ReportRun]) -> dict[str, Any]:
     """Options that are not alike in the runs that have them; of one run, those that are not its preset's."""
     if len(runs) == 1 and runs[0].folder.is_baseline():
-        options = [[option(path), _text(value)] for path, value in runs[0].options.items()]
+        options = [[option(path), words(value)] for path, value in runs[0].options.items()]
         return {"columns": [runs[0].name], "rows": options, "note": "Options. A baseline has no preset."}
     if len(runs) == 1:
         changed = runs[0].changed()
-        rows = [[option(path), *map(_text, values)] for path, values in changed.items()]
+        rows = [[option(path), *map(words, values)] for path, values in changed.items()]
         note = "Options that are not the preset's." if rows else "All options are the preset's."
         return {"columns": ["preset", runs[0].name], "rows": rows, "note": note}
     paths = list(dict.fromkeys(path for run in runs for path in run.options))
     values = {path: [run.options[path] for run in runs if path in run.options] for path in paths}
     differing = [path for path, settings in values.items() if any(one != settings[0] for one in settings)]
-    rows = [[path, *(_text(run.options[path]) if path in run.options else "-" for run in runs)] for path in differing]
+    rows = [[path, *(words(run.options[path]) if path in run.options else "-" for run in runs)] for path in differing]
     note = "Options that are not alike in all runs that have them." if rows else "All options are alike."
     return {"columns": [run.name for run in runs], "rows": rows, "note": note}
 
 
-def _text(value: Any) -> str:
-    """As it is typed, without the decimals of a whole number."""
+def words(value: Any) -> str:
+    """An option's value, as pages show it."""
+    if value in (None, {}, (), []):
+        return "none"
     if isinstance(value, bool):
         return "on" if value else "off"
     if isinstance(value, list | tuple):
-        return " ".join(map(_text, value))
+        return " ".join(map(words, value))
     return f"{value:,}".replace(",", " ") if isinstance(value, int) else str(value)

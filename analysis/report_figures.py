@@ -11,7 +11,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from rmc.analysis.curves import LABELS, Axis, curve
+from rmc.analysis.curves import LABELS, Axis, curve, draw_agent
 from rmc.analysis.history import History
 from rmc.analysis.report_run import ReportRun, Series
 from rmc.analysis.vitals import Vitals
@@ -44,7 +44,7 @@ def _drawn(figure: Figure) -> str:
 
 
 def returns(agents: dict[str, list[History]], colours: dict[str, str], by: Axis) -> str:
-    """Evaluation returns of one environment's agents: seeds as thin lines, and their mean ± deviation as a band."""
+    """Evaluation returns of one environment's agents, drawn as ``rmc plot`` does."""
     with rc_context(STYLE):
         figure = Figure(figsize=SIZE, layout="constrained")
         panel = figure.subplots()
@@ -53,28 +53,13 @@ def returns(agents: dict[str, list[History]], colours: dict[str, str], by: Axis)
         )
         for agent, runs in agents.items():
             lines = [(places / scale, values) for places, values in (curve(run, by) for run in runs)]
-            _draw_agent(panel, lines, colours[agent])
+            draw_agent(panel, lines, colours[agent])
         panel.set_xlabel(f"wall time ({unit})" if unit else LABELS[by])
         panel.set_ylabel("evaluation return")
         panel.locator_params(axis="x", nbins=6)
         if by == "env_steps":
             panel.xaxis.set_major_formatter(_steps)
         return _drawn(figure)
-
-
-def _draw_agent(panel: Any, lines: list[tuple[NDArray[np.float64], NDArray[np.float64]]], colour: str) -> None:
-    single = len(lines) == 1
-    for x, y in lines:
-        panel.plot(x, y, color=colour, linewidth=1.8 if single else 0.7, alpha=1.0 if single else 0.45, marker="o",
-                   markersize=3.0 if single else 1.5)  # fmt: skip
-    low, high = max(x[0] for x, _ in lines), min(x[-1] for x, _ in lines)
-    if single or low >= high:
-        return
-    places = np.linspace(low, high, POINTS)
-    values = np.stack([np.interp(places, x, y) for x, y in lines])  # (R, POINTS)
-    mean, deviation = values.mean(0), values.std(0)
-    panel.plot(places, mean, color=colour, linewidth=2.0)
-    panel.fill_between(places, mean - deviation, mean + deviation, color=colour, alpha=0.18, linewidth=0)
 
 
 def _steps(value: float, _: float) -> str:

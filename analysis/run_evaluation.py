@@ -21,7 +21,7 @@ def evaluate_run(
     flicker: float | None = None,
     seconds: float = 0.0,
     watch: Watch = lambda _: None,
-    env_timeout: float | None = None,
+    baseline_timeout: float | None = None,
 ) -> dict[str, Any]:
     """As ``evaluate_policy``: a policy, read or its file, or a run's checkpoint; of a baseline's run its last state.
 
@@ -32,14 +32,13 @@ def evaluate_run(
         check_range("--flicker", flicker, (0.0, 1.0))
     if isinstance(source, PolicyFile) or not is_baseline(source):
         policy = source if isinstance(source, PolicyFile) else read_policy(source, checkpoint)
-        policy = policy if env_timeout is None else policy.with_timeout(env_timeout)
         return evaluate_policy(policy, episodes, flicker, seconds, watch)
     if checkpoint != "latest":
         raise ConfigError("--checkpoint", checkpoint, "a baseline keeps its last state only; use latest")
     check_baselines(str(source))
     from rmc.analysis import baselines  # an extra
 
-    return baselines.evaluate(RunFolder(user_path(source)), episodes, flicker, seconds, watch, env_timeout)
+    return baselines.evaluate(RunFolder(user_path(source)), episodes, flicker, seconds, watch, baseline_timeout)
 
 
 def is_baseline(source: str | Path) -> bool:

@@ -18,13 +18,11 @@ def expanded(path: Path) -> list[Path]:
 
     Raises ConfigError where a folder or a pattern has none.
     """
-    if (path / "config.json").exists():
-        return [path]
     if path.is_dir():
         folders = sorted(run_folders(path))
-        if not folders:
+        if not folders and not (path / "config.json").exists():  # all that a run has at first
             raise ConfigError("RUNS", str(path), "no run in there; give runs, or a folder that holds some")
-        return folders
+        return folders or [path]
     if path.exists() or not glob.has_magic(str(path)):
         return [path]
     matched = sorted(map(Path, glob.glob(str(path), recursive=True)))

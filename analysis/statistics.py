@@ -41,8 +41,3 @@ def probability_of_improvement(scores: Scores, others: Scores) -> float:
     """P(a run of the first scores above one of the second), ties a half, mean over environments: (R, E), (R', E)."""
     above = np.sign(scores[:, None] - others[None, :])
     return float((0.5 + 0.5 * above).mean())
-
-
-def normalised(scores: Scores, low: Scores, high: Scores) -> Scores:
-    """0 is ``low``, 1 is ``high``, both (E,)."""
-    return (scores - low) / (high - low)

@@ -37,16 +37,20 @@ PROBE_SECONDS = 60.0  # beside the time that the environment has to be made and 
 FRAMES_PER_SECOND = 30
 MODE, PICTURE = "rgb_array", "an array (height, width, 3) of uint8"
 ENVS_FAULT = 3  # exit status of a probe whose environment is at fault
+_own_choice = ""  # the backend that an earlier video has been given, where the user names none
 
 
 def prepare(env: EnvConfig, out: Path) -> None:
     """See that an episode can be filmed, and choose what renders. Raises ConfigError, which says why not."""
+    global _own_choice
     check_installed("video", ("imageio_ffmpeg",), "--video", str(out))
     check_writable("--video", out, VIDEOS)
     fault = _mode_fault(env)
     if fault is not None:
         raise ConfigError("--video", str(out), f"{env.id} cannot be filmed: {fault}")
-    os.environ["MUJOCO_GL"] = _working_backend(env, out)
+    backend = _working_backend(env, out)
+    if backend != os.environ.get("MUJOCO_GL"):
+        os.environ["MUJOCO_GL"] = _own_choice = backend
 
 
 def _mode_fault(env: EnvConfig) -> str | None:
@@ -129,7 +133,7 @@ def _working_backend(env: EnvConfig, out: Path) -> str:
     """The first backend that renders, tried in processes of their own: a failed one spoils a process for others."""
     chosen = os.environ.get("MUJOCO_GL")
     failures = {}
-    for backend in (chosen,) if chosen else BACKENDS:
+    for backend in (chosen,) if chosen and chosen != _own_choice else BACKENDS:
         status, words = _probed(backend, env)
         if status == 0:
             return backend

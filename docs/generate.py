@@ -9,6 +9,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from rmc.analysis.report import words
 from rmc.cli.train_options import Train
 from rmc.common.env.config import RANGES as ENV_RANGES
 from rmc.common.env.config import EnvConfig
@@ -172,7 +173,7 @@ def _rows(defaults: Any, paper_config: Any, section: str) -> list[str]:
         value, other = getattr(defaults, item.name), getattr(paper_config, item.name)
         if dataclasses.is_dataclass(value) or item.name == "id":
             continue
-        default = _text(value) if value == other or item.name == "preset" else f"{_text(value)} ({_text(other)})"
+        default = words(value) if value == other or item.name == "preset" else f"{words(value)} ({words(other)})"
         takes = _takes(hints[item.name], limits.get(section + item.name))
         rows.append(f"| `{option(item.name)}` | {takes} | {default} | {help_texts[item.name]} | {WHEN[item.name]} |")
     return rows
@@ -182,14 +183,14 @@ def _launch_rows(names: list[str]) -> list[str]:
     help_texts = _docstrings(Train)
     defaults = {item.name: item.default for item in dataclasses.fields(Train)}
     takes = {name: _takes(hint, None) for name, hint in get_type_hints(Train).items()}
-    cells = {name: (takes[name], _text(defaults[name]), help_texts[name], WHEN[name]) for name in names}
+    cells = {name: (takes[name], words(defaults[name]), help_texts[name], WHEN[name]) for name in names}
     return [f"| `{option(name)}` | {' | '.join(texts)} |" for name, texts in cells.items()]
 
 
 def _takes(hint: Any, limits: tuple[float, float] | None) -> str:
     """The values of a type, or the least and the most; empty where a text is taken."""
     if limits is not None:
-        low, high = (_text(int(limit) if limit == int(limit) else limit) for limit in limits)
+        low, high = (words(int(limit) if limit == int(limit) else limit) for limit in limits)
         return f"{low} to {high}" if limits[1] < ENDLESS else f"at least {low}"
     if hint is bool:
         return "on, off"
@@ -208,16 +209,6 @@ def _docstrings(kind: type[Any]) -> dict[str, str]:
             assert isinstance(after.value, ast.Constant)
             docstrings[field.target.id] = " ".join(str(after.value.value).split())
     return docstrings
-
-
-def _text(value: Any) -> str:
-    if value in (None, {}, ()):
-        return "none"
-    if isinstance(value, bool):
-        return "on" if value else "off"
-    if isinstance(value, tuple):
-        return " ".join(map(str, value))
-    return f"{value:,}".replace(",", " ") if isinstance(value, int) else str(value)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ WAYS = {
     "longer windows": "--burn-in 20 --trained-steps 30",
     "observation beside": "--head-input hidden+observation",
     "no memory": "--head-input observation --hidden 8 --embedding 0 --no-grounding --scheme 2",
-    "no grounding": "--no-grounding --scheme 1",
     "not averaged": "--policy-ema-updates 0",
     "clipped": "--clip-norm 40 --policy-ema-updates 0",
     "scheme 1": "--scheme 1 --clip-norm 40 --policy-ema-updates 0",

@@ -15,7 +15,6 @@ BEFORE = {
     "heads 256 256": "--batch-size 32 --heads 256 256",
     "batch 8": "--batch-size 8",
     "batch 8, temperature's rate 1e-3": "--batch-size 8 --alpha-learning-rate 1e-3",
-    "batch 4": "--batch-size 4",
     "batch 4, ratio 24": "--batch-size 4 --replay-ratio 24",
     "batch 16, n-step 3": "--batch-size 16 --n-step 3",
     "batch 16, observation beside": "--batch-size 16 --head-input hidden+observation",

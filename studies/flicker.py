@@ -19,7 +19,6 @@ STUDY = Study(
         "RMC, target critics": before("--flicker 0.5"),
         "SAC, 4 frames": "baseline sac ENV --flicker 0.5 --frame-stack 4",
         "RecurrentPPO": "baseline recurrent-ppo ENV --flicker 0.5",
-        "RecurrentPPO zoo": "baseline recurrent-ppo ENV --flicker 0.5 --settings zoo",
         "RMC, all seen": "train ENV",
         "SAC, all seen": "baseline sac ENV",
     },

@@ -26,7 +26,6 @@ STUDY = Study(
     "generalisation",
     {
         "RMC": "train ENV",
-        "RMC, not filling": before("--no-impute-missing"),
         "RMC, target critics": before(),
         "RMC, not averaged": before("--policy-ema-updates 0"),
         "RMC, clipped": before("--clip-norm 40 --policy-ema-updates 0"),

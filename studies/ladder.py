@@ -1,4 +1,4 @@
-"""From SAC to RMC, one thing at a time: where does the return go, or come from?
+"""From SAC towards RMC, one thing at a time: where does the return go, or come from?
 
 The first rung is stable-baselines3's SAC with its own defaults; the second the same through our actors, replay server
 and learner. Every later one keeps what the one before has, as far as it is not the thing that changes.
@@ -24,9 +24,6 @@ RUNGS = {
     "a memory alone": before(f"{BARE} --scheme 2"),
     "the model's loss": before(f"{BARE} --scheme 1"),
     "grounding": before("--scheme 1"),
-    "no value in the memory, robust": before(),
-    "curiosity": before("--curiosity 0.1 --curiosity-scale std"),
-    "batch norm, no curiosity": "train ENV",
 }
 STUDY = Study("ladder", RUNGS, small=Scale(60_000, (1, 2)))
 

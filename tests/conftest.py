@@ -145,7 +145,7 @@ def _running_children() -> list[psutil.Process]:
 @pytest.fixture(autouse=True)
 def no_environment_has_changed_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that changed it in an earlier test is forgotten."""
-    monkeypatch.setattr(ApartCall, "env_state", None)
+    monkeypatch.setattr(ApartCall, "env_states", {})
     monkeypatch.setattr(ApartCall, "changed", {})
 
 

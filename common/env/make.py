@@ -8,6 +8,7 @@ import importlib
 import importlib.util
 import inspect
 import logging
+import operator
 import os
 import sys
 import warnings
@@ -48,7 +49,7 @@ def make_env(config: EnvConfig, render: bool = False, privileged: bool = False) 
     _redirect_mujoco_warnings()
     with ApartCall(config.id, "make", config.env_timeout):
         spec = find_spec(config.id)
-        limit = config.time_limit or spec.max_episode_steps
+        limit = config.time_limit or _registered_limit(config.id, spec.max_episode_steps)
         _check_delay(config, limit)
         env: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
     fault = call_env("spaces", lambda: space_fault(env.observation_space, env.action_space))
@@ -128,10 +129,18 @@ def _as_seen(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None, privi
     return FrameStack(wrapped, config.frame_stack) if config.frame_stack > 1 else wrapped
 
 
-def recreate_env(env: Env, make_env: Callable[[], Env]) -> Env:
-    """Another one in the place of a broken one."""
+def recreate_env(env: Env, make_env: Callable[[], Env], error: BaseException | None) -> Env:
+    """Another one in the place of one that broke in ``error``, which is let go first: only one may be able to exist.
+
+    Raises what ``make_env`` raises.
+    """
     with suppress(Exception):
         env.close()
+    while error is not None and error.__traceback__ is not None:  # its frames hold the environment
+        error = error.with_traceback(None).__cause__ or error.__context__
+    while isinstance(env, gym.Wrapper):  # the caller holds the outermost, which may be closed once more
+        env.env, env = gym.Env(), env.env
+    del env
     return make_env()
 
 
@@ -174,6 +183,17 @@ def env_layout(config: EnvConfig, privileged: bool = False) -> EnvLayout:
         fix = f'{config.id} gives no info["privileged"], and nothing is taken from what is seen; leave the option'
         raise ConfigError("--privileged-critic", True, fix)
     return layout
+
+
+def _registered_limit(env_id: str, limit: Any) -> int | None:
+    """The steps that an environment is registered with. Raises ConfigError where they are no whole number from 1 on."""
+    if limit is None:
+        return None
+    with suppress(TypeError):
+        if (steps := operator.index(limit)) >= 1:
+            return steps
+    fix = "register a whole number from 1 on, or None"
+    raise ConfigError("ENV", env_id, f"its max_episode_steps is {limit!r}; {fix}")
 
 
 def _check_delay(config: EnvConfig, limit: int | None) -> None:

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,10 @@ import numpy as np
 from rmc.common.process.watchdog import EnvCall
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ROUNDING = (  # in torch.backends, in its older way and in its newer one
+    "cuda.matmul.allow_tf32", "cudnn.allow_tf32",
+    "cuda.matmul.fp32_precision", "cudnn.conv.fp32_precision", "cudnn.rnn.fp32_precision",
+)  # fmt: skip
 
 
 class ProcessState(NamedTuple):
@@ -64,13 +69,31 @@ class ProcessState(NamedTuple):
 @contextmanager
 def torch_as_imported() -> Iterator[None]:
     """Torch's defaults as a fresh process has them; afterwards all is as the caller's program had it."""
-    theirs, torch = ProcessState.read(), sys.modules.get("torch")
-    if torch is not None:
-        theirs._replace(dtype=torch.float32, gradients=True, device=torch.device("cpu")).install(theirs)
+    import torch  # slow
+
+    theirs, rounding = ProcessState.read(), _rounding(torch.backends)
+    theirs._replace(dtype=torch.float32, gradients=True, device=torch.device("cpu")).install(theirs)
+    flushes = (torch.tensor(1e-40) * 1).item() == 0.0  # a denormal: nothing can be asked
+    devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()  # type: ignore[no-untyped-call]
     try:
-        yield
+        with torch.random.fork_rng(devices, device_type="cuda"):
+            yield
     finally:
+        for holder, name, value in rounding:
+            setattr(holder, name, value)
+        torch.set_flush_denormal(flushes)
         theirs.install(ProcessState.read())
+
+
+def _rounding(backends: Any) -> list[tuple[Any, str, Any]]:
+    """What a GPU's products are rounded to: what holds each flag, its name and its value."""
+    flags = []
+    for flag in ROUNDING:
+        path, _, name = flag.rpartition(".")
+        with suppress(AttributeError, RuntimeError):  # an older torch, or one that was set in the newer way
+            holder = attrgetter(path)(backends)
+            flags.append((holder, name, getattr(holder, name)))
+    return flags
 
 
 def _go(folder: str | None) -> None:
@@ -92,15 +115,16 @@ class ApartCall(EnvCall):
     A step is not looked at for changes of its own. Signals' handlers stay ours.
     """
 
-    env_state: ProcessState | None = None  # where it differs from ours
+    env_states: dict[str, ProcessState] = {}  # noqa: RUF012 - by environment, where it differs from ours
     changed: dict[str, Any] = {}  # noqa: RUF012 - by any environment of this process: what, and into what
 
     def __enter__(self) -> "ApartCall":
         super().__enter__()
-        self._ours = ProcessState.read() if self.name != "step" or ApartCall.env_state is not None else None
+        env_state = ApartCall.env_states.get(self.env_id)
+        self._ours = ProcessState.read() if self.name != "step" or env_state is not None else None
         self._random = _random_state() if self.name == "make" else None
-        if self._ours is not None and ApartCall.env_state is not None:
-            ApartCall.env_state._replace(handlers=self._ours.handlers).install(self._ours)
+        if self._ours is not None and env_state is not None:
+            env_state._replace(handlers=self._ours.handlers).install(self._ours)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -118,7 +142,9 @@ class ApartCall(EnvCall):
             changed["random"] = None
         ApartCall.changed |= changed
         ours.install(now)
-        ApartCall.env_state = now if set(changed) - {"handlers", "random"} else None
+        ApartCall.env_states.pop(self.env_id, None)
+        if set(changed) - {"handlers", "random"}:
+            ApartCall.env_states[self.env_id] = now
 
 
 def _random_state() -> tuple[Any, ...]:

@@ -126,9 +126,14 @@ def train(
             time.sleep(TICK_SECONDS)
         run.supervisor.stop()
         monitor.watch(run.bus)  # what the roles said last; a Redis that is away has lost it
-        return monitor.learner_finished() or (run.finished() and not stop.requested and saved_steps(folder) >= total)
+        return is_over(monitor, folder, run.finished() and not stop.requested, total)
     finally:
         run.close()
+
+
+def is_over(monitor: Monitor, folder: RunFolder, ended: bool, total: int) -> bool:
+    """Whether the learner has said so or, where Redis has lost that, has ``ended`` unasked with the total saved."""
+    return monitor.learner_finished() or (ended and saved_steps(folder) >= total)
 
 
 def saved_steps(folder: RunFolder) -> int:

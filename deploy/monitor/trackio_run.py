@@ -10,12 +10,12 @@ from rmc.deploy.run.tracking import Tracking
 
 
 class TrackioRun:
-    """Called as the run's folder and the tracker's id: Trackio continues a run by its name."""
+    """Called as the run's first folder and the tracker's id: Trackio continues a run by its name."""
 
     def __init__(self, folder: RunFolder, tracking: Tracking) -> None:
         self._run = trackio.init(
             tracking.project,
-            f"{folder.path.name}-{tracking.id}",
+            f"{tracking.name}-{tracking.id}",
             config={**folder.settings(), "tags": list(tracking.tags)},
             resume="allow",
             embed=False,

@@ -18,7 +18,7 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.common.whole_file import write_whole
-from rmc.deploy.local.launcher import TICK_SECONDS, asked_to_stop, saved_steps
+from rmc.deploy.local.launcher import TICK_SECONDS, asked_to_stop, is_over
 from rmc.deploy.local.supervisor import HELD_SECONDS
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.ray.hosts import Hosts
@@ -190,8 +190,8 @@ def train(
             time.sleep(TICK_SECONDS)
         run.stop("stopped by its launcher" if stop.requested else "finished")
         monitor.watch(run.bus)  # what the roles said last
-        trained = run.hosts.finished() and not stop.requested and saved_steps(folder) >= run.config.total_steps
-        over = monitor.learner_finished() or trained  # one that was stopped has ended cleanly, too
+        ended = run.hosts.finished() and not stop.requested  # one that was stopped has ended cleanly, too
+        over = is_over(monitor, folder, ended, run.config.total_steps)
         return over
     finally:
         run.close(over)

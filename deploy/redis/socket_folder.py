@@ -38,13 +38,13 @@ class SocketFolder:
             if self._lock is not None:
                 return
 
-    def renew(self) -> bool:
-        """Make it again where others, like a cleaner of old files, have removed it; whether they had.
+    def renew(self) -> None:
+        """Make it again where others, like a cleaner of old files, have removed it.
 
         Raises RoleDied where it cannot be made again.
         """
         if self.path.is_dir() and (self._lock is None or os.path.samestat(os.fstat(self._lock), self.path.stat())):
-            return False
+            return
         try:
             self.path.mkdir(0o700)
         except OSError as error:
@@ -56,7 +56,6 @@ class SocketFolder:
             os.close(self._lock)
         self._lock = lock
         log.warning("%s was removed; it is made again", self.path)
-        return True
 
     def close(self) -> None:
         """Remove it. One that others have removed is no fault."""

@@ -4,9 +4,11 @@ The only place that knows every config at once; each role is given its own part.
 """
 
 import dataclasses
+import difflib
 import json
 import types
 import typing
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import version
@@ -266,6 +268,12 @@ def changes(was: Any, now: Any) -> dict[str, list[Any]]:
 def option(path: str) -> str:
     """The command line's name of a config path: ``replay.replay_ratio`` is ``--replay-ratio``."""
     return "--" + path.rpartition(".")[2].replace("_", "-")
+
+
+def meant(word: str, known: Iterable[str], otherwise: str = "") -> str:
+    """The end of a message on a word that is not known: what is most like it, or ``otherwise``."""
+    near = difflib.get_close_matches(word, known, 1)
+    return f"; did you mean {near[0]}?" if near else otherwise
 
 
 def option_words(name: str, value: Any) -> list[str]:

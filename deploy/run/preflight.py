@@ -10,6 +10,7 @@ from math import ceil
 from pathlib import Path
 
 import psutil
+from rich.filesize import decimal as size_text
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
@@ -84,13 +85,13 @@ def check_ring_fits(config: RunConfig, options: LaunchOptions) -> None:
     free_disk = shutil.disk_usage(existing_parent((options.run_dir or Path("runs")).resolve())).free
     room = ring_bytes_there(config, options) + max(0, free_disk - DISK_RESERVE)
     if size > room:
-        rest = f"{gb(free_disk)} are free, {gb(DISK_RESERVE)} of which are left for checkpoints and logs"
+        rest = f"{size_text(free_disk)} are free, {size_text(DISK_RESERVE)} of which are left for checkpoints and logs"
         fix = f"take at most {most(room)}" if most(room) else "make room"
-        raise ConfigError("--capacity", capacity, f"takes {gb(size)} of disk, {rest}; {fix}")
+        raise ConfigError("--capacity", capacity, f"takes {size_text(size)} of disk, {rest}; {fix}")
     memory = _memory_limit()
     if size > memory:
         fix = f"take at most {most(memory)}" if most(memory) else "take a machine with more"
-        raise ConfigError("--capacity", capacity, f"takes {gb(size)} of {gb(memory)} memory; {fix}")
+        raise ConfigError("--capacity", capacity, f"takes {size_text(size)} of {size_text(memory)} memory; {fix}")
 
 
 def check_batch_fits(config: RunConfig) -> None:
@@ -102,9 +103,9 @@ def check_batch_fits(config: RunConfig) -> None:
     spec, heads, size = config.window_spec(), config.agent.heads, config.learner.batch_size
     step = 4 * 5 * config.agent.hidden + 2 * 6 * sum(heads)
     window, memory = spec.dtype.itemsize + spec.train * step, free_memory()
-    if size * window <= memory:
+    if (needed := size * window) <= memory:
         return
-    fault = f"an update of windows of {spec.steps} steps takes {gb(size * window)} of {gb(memory)} free memory"
+    fault = f"an update of windows of {spec.steps} steps takes {size_text(needed)} of {size_text(memory)} free memory"
     fix = f"take at most {memory // window}" if memory >= window else "take fewer steps a window"
     raise ConfigError("--batch-size", size, f"{fault}; {fix}")
 
@@ -121,10 +122,6 @@ def _memory_limit() -> int:
         with suppress(OSError, ValueError):  # no such version of cgroups, or "max"
             memory = min(memory, int(path.read_text()))
     return memory
-
-
-def gb(size: int) -> str:
-    return f"{size / 1e9:.3g} GB"
 
 
 def existing_parent(path: Path) -> Path:

@@ -31,6 +31,7 @@ class Tracking:
     tags: tuple[str, ...]
     id: str
     video_every: int = 0  # evaluations; 0 films the final policy alone
+    name: str = ""  # of the run's folder when the tracker first had it
 
 
 def choose_tracking(options: LaunchOptions) -> Tracking | None:
@@ -49,8 +50,9 @@ def choose_tracking(options: LaunchOptions) -> Tracking | None:
     if tracker == VIDEOS and not every:
         return None
     _check(tracker, project, tags, every)
-    same = before is not None and (before.tracker, before.project) == (tracker, project)
-    return Tracking(tracker, project, tags, before.id if same and before else secrets.token_hex(4), every)
+    if before is None or (before.tracker, before.project) != (tracker, project):
+        return Tracking(tracker, project, tags, secrets.token_hex(4), every)
+    return Tracking(tracker, project, tags, before.id, every, before.name)
 
 
 def _refuse_without_tracker(options: LaunchOptions) -> None:
@@ -75,18 +77,19 @@ def _check(tracker: str, project: str, tags: tuple[str, ...], video_every: int) 
 
 
 def keep_tracking(folder: RunFolder, tracking: Tracking | None) -> None:
-    """Write it into the run's folder, or that there is none."""
+    """Write it into the run's folder, whose name it takes where it has none, or that there is none."""
     if tracking is None:
         _file(folder.path).unlink(missing_ok=True)
     else:
-        write_whole(_file(folder.path), f"{json.dumps(dataclasses.asdict(tracking))}\n".encode())
+        named = dataclasses.asdict(tracking) | {"name": tracking.name or folder.path.name}
+        write_whole(_file(folder.path), f"{json.dumps(named)}\n".encode())
 
 
 def kept_tracking(path: Path) -> Tracking | None:
     """That of a run's folder, None where it has none. Raises ConfigError where the file is damaged."""
     names, kept = {item.name for item in dataclasses.fields(Tracking)}, None
     try:
-        settings = {"video_every": 0} | read_object(_file(path))  # a version before had none
+        settings = {"video_every": 0, "name": ""} | read_object(_file(path))  # older versions had neither
         kept = from_dict(Tracking, {name: value for name, value in settings.items() if name in names}, "")
     except (FileNotFoundError, NotADirectoryError):
         return None

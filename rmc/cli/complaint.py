@@ -1,11 +1,10 @@
 """What the parser says of words that it cannot read."""
 
-import difflib
 import re
 from collections.abc import Sequence
 
 from rmc.cli.parser import COMMANDS, option_names
-from rmc.deploy.run.config import option
+from rmc.deploy.run.config import meant, option
 
 ENDS = ("For full helptext", "Argument helptext", "Arguments are applied", "Perhaps you meant", "Available subcommands")
 
@@ -27,16 +26,11 @@ def _near(words: Sequence[str]) -> str:
     options["sweep"] += options["train"]
     command, *rest = words or [""]
     if command not in options:
-        return _meant(command, list(options))
+        return meant(command, options)
     flags = [word.partition("=")[0].replace("_", "-") for word in rest if word.startswith("--")]
     for flag in flags:
         if flag.replace("--no-", "--", 1) in options[command]:
             continue
         others = [f"rmc {other}" for other, known in options.items() if flag in known and other != "role"]
-        return f"; {flag} is an option of {others[0]}" if others else _meant(flag, options[command])
+        return f"; {flag} is an option of {others[0]}" if others else meant(flag, options[command])
     return ""
-
-
-def _meant(word: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(word, known, 1)
-    return f"; did you mean {close[0]}?" if close else ""

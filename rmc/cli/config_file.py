@@ -1,6 +1,5 @@
 """``--config FILE.toml``: options of ``rmc train`` in a file; those of the command line win."""
 
-import difflib
 import itertools
 import tomllib
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from rmc.common.bus.redis_url import value_without_passwords
 from rmc.common.env.config import check_kwargs, write_kwargs
 from rmc.common.errors import ConfigError
 from rmc.common.user_path import user_path
-from rmc.deploy.run.config import option_words
+from rmc.deploy.run.config import meant, option_words
 
 RENAMED = {
     "fill-blanks": "impute-missing",
@@ -78,8 +77,7 @@ def _read(path: Path) -> dict[str, Any]:
 def _check(path: Path, name: str, value: Any, names: Sequence[str]) -> None:
     told = value_without_passwords(value)
     if name not in names:
-        near = difflib.get_close_matches(name, names, 1)
-        fix = f"did you mean {near[0]}?" if near else "rmc train --help-all lists them"
-        raise ConfigError(f"{OPTION} {path}: {name}", told, f"is no option; {fix}")
+        fix = meant(name, names, "; rmc train --help-all lists them")
+        raise ConfigError(f"{OPTION} {path}: {name}", told, f"is no option{fix}")
     if not all(isinstance(one, str | bool | int | float) for one in (value if isinstance(value, list) else [value])):
         raise ConfigError(f"{OPTION} {path}: {name}", told, "give a number, text, true, false or a list of such")

@@ -18,7 +18,7 @@ BASIC = frozenset(
 ALL_OPTIONS = "--help-all"
 
 
-def only_basic(command: Any, names: Set[str] = BASIC) -> Any:
+def only_basic(command: Any, names: Set[str]) -> Any:
     """A command's dataclass of whose options the help shows those of these ``names``; it is for showing help alone."""
     kind = type(command)
     hints = typing.get_type_hints(kind, include_extras=True)

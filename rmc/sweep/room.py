@@ -4,10 +4,12 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from rich.filesize import decimal as size_text
+
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.preflight import DISK_RESERVE, cores, existing_parent, free_memory, gb, ring_bytes
+from rmc.deploy.run.preflight import DISK_RESERVE, cores, existing_parent, free_memory, ring_bytes
 from rmc.sweep.job import Job
 
 PROCESS_BYTES = 400 << 20  # of one with torch and MuJoCo; measured in docs/performance.md: 203 to 498 MB
@@ -35,6 +37,6 @@ def check_disk(folder: Path, jobs: Sequence[Job], ring: int, at_once: int, dropp
     count = min(new, at_once) if dropped else new
     free = shutil.disk_usage(existing_parent(folder.resolve())).free - DISK_RESERVE
     if count * ring > max(0, free):
-        fix = f"{count} rings take {gb(count * ring)}, {gb(max(0, free))} are free; "
+        fix = f"{count} rings take {size_text(count * ring)}, {size_text(max(0, free))} are free; "
         way = "take fewer --jobs or a smaller capacity" if dropped else "take --drop-replay, or a smaller capacity"
         raise ConfigError("--sweep-dir", str(folder), fix + way)

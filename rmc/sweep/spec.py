@@ -3,7 +3,6 @@
 SPEC.toml: ``env``, ``seeds``, ``[options]`` that every run has, and ``[grid]`` or ``[search]``.
 """
 
-import difflib
 import json
 import re
 import tomllib
@@ -17,7 +16,7 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.redis_url import value_without_passwords
 from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import flat
+from rmc.deploy.run.config import flat, meant
 from rmc.deploy.run.presets import robust
 
 KEYS = ("env", "seeds", "options", "grid", "search")
@@ -113,9 +112,8 @@ def check_name(place: str, name: str, value: Any, names: Set[str] = NAMES) -> No
     if name in OWN:
         raise ConfigError(place, told, "every run has its own; give env and seeds")
     if name not in names:
-        near = difflib.get_close_matches(name, names, 1)
-        hint = f"did you mean {near[0]}?" if near else "rmc train --help lists them"
-        raise ConfigError(place, told, f"no option that a sweep's runs take; {hint}")
+        hint = meant(name, names, "; rmc train --help lists them")
+        raise ConfigError(place, told, f"no option that a sweep's runs take{hint}")
     for one in value if isinstance(value, list) else [value]:
         if name == "env_kwargs" and isinstance(one, dict):
             check_kwargs(one)
@@ -146,9 +144,8 @@ def read_spec(path: Path, words: Sequence[str]) -> Spec:
 def _check_keys(place: str, raw: dict[str, Any], names: Sequence[str]) -> None:
     for name, value in raw.items():
         if name not in names:
-            near = difflib.get_close_matches(name, names, 1)
-            hint = f"did you mean {near[0]}?" if near else f"use {', '.join(names)}"
-            raise ConfigError(f"{place}{name}", value, f"no such key; {hint}")
+            hint = meant(name, names, f"; use {', '.join(names)}")
+            raise ConfigError(f"{place}{name}", value, f"no such key{hint}")
 
 
 def _plain_names(raw: dict[str, Any]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import itertools
 import re
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -514,6 +515,17 @@ def test_a_reset_that_breaks_is_tried_once_more_on_a_new_environment() -> None:
     play(actor, reader, 1000)
     assert actor.metrics()["broken_episodes"] == 1
     assert audit(reader.rows(), SPEC).trained.total() == 1000
+
+
+@pytest.mark.parametrize("call", ["step", "reset"])
+def test_one_that_can_exist_only_once_is_made_anew(call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RMC_TEST_LOCK", str(tmp_path / "lock"))
+    env = EnvConfig("tests.only_one_env:OnlyOne-v0", env_kwargs={"breaks_in": call})
+    config = dataclasses.replace(CONFIG, envs_per_actor=1)
+    actor, reader = begun(MemoryBus(), config=config, make=partial(make_env, env))
+    play(actor, reader, 300)
+    assert actor.metrics()["broken_episodes"] > 2
+    assert_each_step_once_with_cuts(reader.rows(), 300)
 
 
 def test_a_reward_that_the_scale_makes_infinite_breaks_the_episode() -> None:

@@ -1,6 +1,7 @@
 """The evaluator: whole deterministic episodes, side by side, and one record for each policy asked for."""
 
 import itertools
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -190,6 +191,18 @@ def test_an_episode_that_breaks_is_left_out_and_its_environment_made_anew() -> N
     assert not is_whole(evaluation_metrics(some))
     with pytest.raises(RmcError, match="broke in each of 2 episodes"):
         play_episodes(runner, lambda: Dead(counting()), 2, seed=4)
+
+
+def test_one_that_can_exist_only_once_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RMC_TEST_LOCK", str(tmp_path / "lock"))
+    counter = itertools.count()
+
+    def breaking_twice() -> Env:
+        breaks_in = "step" if next(counter) < 2 else ""
+        return make_env(EnvConfig("tests.only_one_env:OnlyOne-v0", env_kwargs={"breaks_in": breaks_in}))
+
+    played = play_episodes(runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT)), breaking_twice, 3, 0)
+    assert (played.broken, len(played.returns)) == (2, 1)
 
 
 def test_the_evaluator_counts_them_and_makes_new_environments() -> None:

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from rmc.analysis import curves, history
 from rmc.analysis.history import Evaluation, History
+from rmc.analysis.run_paths import expanded
 from rmc.cli.main import run
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
@@ -235,6 +236,17 @@ def test_a_folder_of_runs_at_any_depth_and_a_pattern_can_be_plotted(tmp_path, ca
         assert fault in complaint(["plot", str(tmp_path / words), *out], capsys)
 
 
+def test_a_folder_of_runs_may_hold_another_programs_config(tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        for file in ("config.json", "metrics.jsonl"):
+            (tmp_path / name / file).touch()
+    assert expanded(tmp_path) == [tmp_path / "a", tmp_path / "b"]
+    (tmp_path / "a" / "metrics.jsonl").unlink()
+    assert expanded(tmp_path / "a") == [tmp_path / "a"]  # a run that has only begun
+
+
 def test_a_run_without_an_evaluation_is_refused(tmp_path):
     (tmp_path / "config.json").write_text(to_json(robust(EnvConfig("Hopper-v5"))))
     with pytest.raises(ConfigError, match="no evaluation yet"):
@@ -250,13 +262,17 @@ def test_few_seeds_are_lines_and_many_a_band(tmp_path):
     from matplotlib.figure import Figure
 
     panel = Figure().subplots()
-    curves._draw_agent(panel, groups["HalfCheetah-v5"]["SAC"], "env_steps", "C0")
+    few, many = (groups["HalfCheetah-v5"][agent] for agent in ("SAC", "RMC"))
+    curves.draw_agent(panel, [curves.curve(run, "env_steps") for run in few], "C0")
     assert (len(panel.lines), len(panel.collections)) == (2, 0)
     assert panel.lines[0].get_xdata().tolist() == [0.0, 1000.0, 2000.0, 3000.0]
     panel = Figure().subplots()
-    line = curves._draw_agent(panel, groups["HalfCheetah-v5"]["RMC"], "wall_s", "C0")
+    line = curves.draw_agent(panel, [curves.curve(run, "wall_s") for run in many], "C0")
     assert (len(panel.lines), len(panel.collections)) == (1, 1)
     assert line.get_ydata()[-1] == pytest.approx(np.mean([101, 102, 103]))
+    panel = Figure().subplots()
+    curves.draw_agent(panel, [(np.array([float(place)]), np.array([7.0])) for place in range(5)], "C0")  # apart
+    assert ([line.get_marker() for line in panel.lines], len(panel.collections)) == (["o"] * 5, 0)
     curves.draw(groups, "updates", tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 10_000
 
@@ -279,13 +295,13 @@ def test_a_reference_that_learnt_nothing_is_no_scale():
 
 def test_the_table_compares_with_a_reference():
     runs = [history_of(seed=s, last=200.0) for s in range(5)] + [
-        history_of("SAC", seed=s, last=100.0) for s in range(2)
+        history_of("SAC", seed=s, last=100.0, initial=50.0) for s in range(2)
     ]
     text = shown(curves.tables(curves.grouped(runs), "SAC"))
     assert "200 [200, 200]" in text
     assert "100 (100, 100)" in text
     ours = next(line for line in text.splitlines() if "RMC" in line)
-    assert ours.split()[-2:] == ["2.00", "1.00"]
+    assert ours.split()[-2:] == ["3.00", "1.00"]
     with pytest.raises(ConfigError, match="--reference"):
         curves.tables(curves.grouped(runs), "PPO")
 

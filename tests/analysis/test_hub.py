@@ -92,6 +92,28 @@ def test_the_cards_lines_load_it(hub: Hub, call: Call, tmp_path: Path) -> None:
     assert "Pendulum-v1: return" in played.stdout
 
 
+LOUD = """
+from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars, logging
+from rmc import ConfigError, load_policy
+for name in ("me/mute", "me/nothing"):
+    logging.set_verbosity_info()
+    try:
+        load_policy(f"hf://{name}")
+    except ConfigError:
+        pass
+    print(are_progress_bars_disabled(), logging.get_verbosity() == logging.INFO)
+    disable_progress_bars()
+"""
+
+
+def test_the_programs_own_downloads_are_as_loud_afterwards(hub: Hub, call: Call, tmp_path: Path) -> None:
+    path = make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1").path / "checkpoints" / "000000007"
+    hub.repos["me/mute"] = {"policy.safetensors": (path / "policy.safetensors").read_bytes()}
+    done = call("-c", LOUD, folder=tmp_path, token="")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines() == ["False True", "True True"]
+
+
 WRONG = [
     (["push", "run", "me/x"], "", "HF_TOKEN=None: no token; set it to one that may write, or run hf auth login"),
     (["push", "run", "me/x"], "hf_reads", "REPO='me/x': the hub refuses it (HTTP 401); use a token that may"),

@@ -172,6 +172,15 @@ def test_a_dictionary_of_actions_comes_in_a_row(tmp_path: Path, monkeypatch: pyt
     assert (action[1:] < 0).all()
 
 
+def test_so_does_a_dictionary_or_a_tuple_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    box = gym.spaces.Box(0, 2, (2, 3))
+    for space, shape in ((gym.spaces.Dict(arm=box), (6,)), (gym.spaces.Tuple([box]), (6,)), (box, (2, 3))):
+        monkeypatch.setattr(Joints, "action_space", space)
+        policy = load_policy(make_run(tmp_path / type(space).__name__, AGENTS["robust"], "Joints-v0").path)
+        action = policy.act([0.0, 0.0, 0.0], units="environment")
+        assert (action.shape, action.dtype) == (shape, np.float32)
+
+
 @pytest.mark.parametrize("agent", AGENTS)
 def test_a_batch_is_as_many_policies(agent: str, tmp_path: Path) -> None:
     """Each with its own memory, missing frames and episodes' starts."""

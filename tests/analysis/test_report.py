@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from rmc.analysis import report, video
+from rmc.analysis.curves import HEADINGS
 from rmc.analysis.doctor import examine
 from rmc.analysis.history import Evaluation, History
 from rmc.analysis.report_run import DRAWN, ReportRun
@@ -132,13 +133,11 @@ def test_a_browser_shows_it_without_a_network(trained: Path, other: Path, tmp_pa
 def test_the_table_is_of_all_runs_of_an_agent(trained: Path, other: Path) -> None:
     evaluations = [[Evaluation(100, 10, 1.0, 5.0, 0.0), Evaluation(200, 20, 2.0, mean, 0.0)] for mean in (10.0, 20.0)]
     past = [History("RMC", "E", seed, 200, 20, 2.0, 0.0, scores, True) for seed, scores in enumerate(evaluations)]
-    row = report.final_row("RMC", past)
-    assert dict(zip(report.COLUMNS, row, strict=True)) == {
-        "agent": "RMC", "runs": "2", "return": "15 ± 5", "each run": "10, 20", "worst of last 5": "5",
-        "steps": "200", "updates": "20", "wall s": "2",
+    (row,) = report._returns(past)[0]["final"]
+    assert dict(zip(HEADINGS, row, strict=True)) == {
+        "agent": "RMC", "seeds": "2", "return": "15 (10, 20)", "worst of last 5": "5", "steps": "200", "updates": "20",
+        "wall s": "2",
     }  # fmt: skip
-    small = report.final_row("RMC", [History("RMC", "E", 0, 100, 10, 1.0, 0.0, [Evaluation(100, 10, 1.0, 0.46, 0.0)])])
-    assert small[2:5] == ["0.46", "0.46", "0.46"]
     runs = [ReportRun.read(path) for path in (trained, other)]
     assert {run.about.agent for run in runs} == {"RMC debug --replay-ratio 64.0"}
     assert len(report.newest(runs)) == 1  # of an agent one policy is played

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rmc.analysis.statistics import interquartile_mean, interval, normalised, probability_of_improvement
+from rmc.analysis.statistics import interquartile_mean, interval, probability_of_improvement
 
 
 @pytest.mark.parametrize("count", [1, 3, 4, 5, 8, 30])
@@ -49,8 +49,3 @@ def test_environments_are_resampled_each_for_itself():
     alike = np.tile(np.arange(6.0)[:, None], 2)
     low, high = interval(lambda x: float(x[:, 0].mean() - x[:, 1].mean()), alike, resamples=200)
     assert low < -0.5 < 0.5 < high
-
-
-def test_scores_are_scaled_by_environment():
-    scores = normalised(np.array([[5.0, 0.0], [10.0, 50.0]]), np.array([0.0, -50.0]), np.array([10.0, 50.0]))
-    assert scores.tolist() == [[0.5, 0.5], [1.0, 1.0]]

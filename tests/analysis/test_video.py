@@ -141,6 +141,22 @@ def test_a_backend_that_hangs_is_passed_over_and_named(tmp_path: Path, capsys, m
     assert "libegl1 or libosmesa6" in line
 
 
+def test_what_was_chosen_for_one_video_is_not_taken_for_the_users_choice(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+
+    def probed(backend: str, env: EnvConfig) -> tuple[int, str]:
+        return int(env.id == "HalfCheetah-v5" and backend != "osmesa"), "no display"
+
+    monkeypatch.setattr(video, "_probed", probed)
+    for env, backend in (("Pendulum-v1", "egl"), ("HalfCheetah-v5", "osmesa")):
+        video.prepare(EnvConfig(env), tmp_path / "episode.mp4")
+        assert os.environ["MUJOCO_GL"] == backend
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    for _ in range(2):  # which is the user's
+        video.prepare(EnvConfig("Pendulum-v1"), tmp_path / "episode.mp4")
+        assert os.environ["MUJOCO_GL"] == "glfw"
+
+
 def test_a_grid_of_flicker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = str(make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5").path)
     assert main.run(["evaluate", folder, "--episodes", "2", "--flicker", "0", "0.5", "1"]) == 0

@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 import rmc
 from rmc.deploy.run.config import checked, to_json
@@ -190,6 +191,17 @@ def test_without_a_folder_the_result_names_the_one_that_was_made(
     result = rmc.train(dataclasses.replace(CONFIG, total_steps=600), launcher="lockstep")
     assert Path(result["run_dir"]).parent == tmp_path / "runs"
     assert rmc.resume(result["run_dir"])["env_steps"] == result["env_steps"] == 600
+
+
+def test_what_torch_draws_and_rounds_is_the_callers_afterwards(tmp_path: Path) -> None:
+    torch.set_flush_denormal(False)
+    torch.manual_seed(123)
+    products = torch.backends.cuda.matmul, torch.backends.cudnn
+    before, flags = torch.get_rng_state(), [one.allow_tf32 for one in products]
+    rmc.train(dataclasses.replace(CONFIG, total_steps=600), tmp_path / "run", launcher="lockstep")
+    assert torch.equal(torch.get_rng_state(), before)
+    assert [one.allow_tf32 for one in products] == flags
+    assert (torch.tensor(1e-40) * 1).item() > 0  # a denormal
 
 
 class Enough(Exception):

@@ -2,16 +2,19 @@
 
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
-from rmc.common.env.process_state import ApartCall, ProcessState
+from rmc.common.env.process_state import ApartCall, ProcessState, torch_as_imported
+from rmc.learner.precision import set_precision
 from tests import meddling_env
 from tests.command import rmc
 from tests.counting_env import CountingEnv
@@ -29,6 +32,40 @@ def test_both_find_the_process_as_they_left_it(habit: str, when: str) -> None:
         assert ProcessState.read() == before
     env.close()
     assert ProcessState.read() == before
+
+
+def test_what_one_environment_has_changed_another_does_not_find() -> None:
+    make_env(EnvConfig("tests.meddling_env:Meddling-dtype-early-v0")).close()
+    with ApartCall("Other-v0", "make", 1.0):
+        assert torch.get_default_dtype() == torch.float32
+    with ApartCall("tests.meddling_env:Meddling-dtype-early-v0", "reset", 1.0):
+        assert torch.get_default_dtype() == torch.float64
+
+
+@pytest.fixture
+def in_the_newer_way() -> Iterator[None]:
+    torch.backends.cuda.matmul.fp32_precision = "tf32"
+    yield
+    torch.backends.cuda.matmul.allow_tf32 = False
+    torch.backends.cuda.matmul.fp32_precision = "none"
+
+
+def rounding(newer: bool) -> list[object]:
+    backends = torch.backends
+    flags: list[object] = [] if newer else [backends.cuda.matmul.allow_tf32, backends.cudnn.allow_tf32]
+    return [*flags, *(one.fp32_precision for one in (backends.cuda.matmul, backends.cudnn.conv, backends.cudnn.rnn))]
+
+
+@pytest.mark.parametrize("newer", [False, True])
+def test_a_callers_rounding_is_kept_in_either_of_torchs_ways(newer: bool, request: pytest.FixtureRequest) -> None:
+    """Who has said it in the newer way may not ask in the older."""
+    if newer:
+        request.getfixturevalue("in_the_newer_way")
+    before = rounding(newer)
+    with torch_as_imported():
+        set_precision("fp32" if newer else "auto", torch.device("cuda"))
+        assert rounding(newer) != before
+    assert rounding(newer) == before
 
 
 class Homeless(CountingEnv):
@@ -63,7 +100,7 @@ def test_check_env_names_what_is_changed(capsys: pytest.CaptureFixture[str]) -> 
         "the random generators that all share",
     ):  # fmt: skip
         assert words in output
-    ApartCall.changed, ApartCall.env_state = {}, None
+    ApartCall.changed, ApartCall.env_states = {}, {}
     main.run(["check-env", "tests.counting_env:Counting-v0", "--steps", "50"])
     assert "it changes" not in capsys.readouterr().out
 

@@ -1,6 +1,5 @@
 """What a launcher on Ray decides, without a cluster."""
 
-import json
 import os
 import time
 from collections.abc import Callable
@@ -9,17 +8,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 pytest.importorskip("ray")
 
-from rmc.common.bus.memory_bus import MemoryBus
-from rmc.common.checkpoint import PROGRESS, CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusUnavailable, ConfigError, RoleDied
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local.role_command import RoleCommand
-from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.ray import hosts as ray_hosts
 from rmc.deploy.ray import launcher as ray_launcher
 from rmc.deploy.ray import run as ray_run
@@ -27,7 +22,6 @@ from rmc.deploy.ray.hosts import Hosts
 from rmc.deploy.ray.placement import RolePlacement
 from rmc.deploy.ray.role_actor import RoleActor
 from rmc.deploy.ray.run import ClusterRun
-from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
@@ -75,26 +69,18 @@ def test_the_lowest_actors_run(monkeypatch: pytest.MonkeyPatch, running: str, cl
     assert look() == ended  # one at a time
 
 
-class Ended(SimpleNamespace):
-    """A run whose roles have all ended cleanly; Redis was away, and has lost what the learner said last."""
-
-    def __init__(self, config: RunConfig) -> None:
-        hosts = SimpleNamespace(restarts=dict, waiting=dict, finished=lambda: True)
-        super().__init__(config=config, hosts=hosts, bus=MemoryBus())
-        self.start, self.stop, self.close = lambda: None, lambda _: None, lambda _: None
-
-
-@pytest.mark.parametrize(("missing", "is_over"), [(0, True), (1, False)])
-def test_a_run_whose_last_word_redis_has_lost_is_over_if_its_checkpoint_is(
-    missing: int, is_over: bool, folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("over", [True, False])
+def test_a_run_is_over_by_the_rule_of_a_local_one(
+    over: bool, folder: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = folder.config()
-    monkeypatch.setattr(ray_run, "ClusterRun", lambda *_: Ended(config))
-    progress = json.dumps({"env_steps": config.total_steps - missing}).encode()
-    CheckpointFolder(folder.checkpoints).save(7, {PROGRESS: progress})
-    monitor = Monitor(folder, config, Console(quiet=True))
-    assert ray_run.train(config, folder, "cpu", False, False, monitor, StopSignal()) == is_over
-    monitor.close()
+    config, closed = folder.config(), list[bool]()
+    hosts, nothing = SimpleNamespace(restarts=dict, waiting=dict, finished=lambda: True), lambda *_: None
+    run = SimpleNamespace(config=config, hosts=hosts, bus=None, start=nothing, stop=nothing, close=closed.append)
+    monkeypatch.setattr(ray_run, "ClusterRun", lambda *_: run)
+    monkeypatch.setattr(ray_run, "is_over", lambda *given: given[1:] == (folder, True, config.total_steps) and over)
+    monitor: Any = SimpleNamespace(watch=nothing)
+    assert ray_run.train(config, folder, "cpu", False, False, monitor, StopSignal()) == over
+    assert closed == [over]
 
 
 def test_a_redis_that_is_away_is_asked_again_to_stop(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:

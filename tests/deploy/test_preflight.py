@@ -49,7 +49,7 @@ def run(trained_steps: int, batch_size: int) -> RunConfig:
 def test_a_batch_of_long_windows_that_no_memory_holds_is_refused_with_the_largest_that_it_may(memory: int) -> None:
     check_batch_fits(run(990, 8))
     with pytest.raises(
-        ConfigError, match=r"^--batch-size=64: .* of windows of 1000 steps takes .* GB of 0.2 GB"
+        ConfigError, match=r"^--batch-size=64: .* of windows of 1000 steps takes .* of 200.0 MB"
     ) as error:
         check_batch_fits(run(990, 64))
     most = int(str(error.value).rpartition(" ")[2])
@@ -64,7 +64,7 @@ def test_a_run_that_goes_on_is_offered_no_capacity_that_it_would_refuse(memory: 
     config = robust(EnvConfig("HalfCheetah-v5"))
     (tmp_path / "config.json").write_text("{}")
     for options in (LaunchOptions(tmp_path), LaunchOptions(None)):
-        with pytest.raises(ConfigError, match=r"^--capacity=70000: takes .* GB of 0.2 GB memory; ") as error:
+        with pytest.raises(ConfigError, match=r"^--capacity=70000: takes .* of 200.0 MB memory; ") as error:
             check_ring_fits(config, options)
         assert ("take at most" in str(error.value)) == (options.run_dir is None)
 
@@ -77,11 +77,11 @@ def test_a_containers_memory_is_what_counts(tmp_path: Path, monkeypatch: pytest.
             limit.write_text(text)
         check_batch_fits(run(990, 8))
     limit.write_text("1000000\n")
-    with pytest.raises(ConfigError, match=r"^--batch-size=8: .* of 0.001 GB free memory; take "):
+    with pytest.raises(ConfigError, match=r"^--batch-size=8: .* of 1.0 MB free memory; take "):
         check_batch_fits(run(990, 8))
     config = run(15, 8)
     large = dataclasses.replace(config, replay=dataclasses.replace(config.replay, capacity=100_000))
-    with pytest.raises(ConfigError, match=r"^--capacity=100000: takes .* of 0.001 GB memory; take at most \d+$"):
+    with pytest.raises(ConfigError, match=r"^--capacity=100000: takes .* of 1.0 MB memory; take at most \d+$"):
         check_ring_fits(large, LaunchOptions(tmp_path))
     assert this_machine(tmp_path).free_memory_bytes == 1_000_000
     assert runs_that_fit(1, 1_000_000) == 1
@@ -139,7 +139,7 @@ def test_a_ring_that_the_disk_does_not_hold_is_refused_with_the_largest_that_it_
             config, replay=dataclasses.replace(config.replay, capacity=capacity, replay_shards=shards)
         )
 
-    with pytest.raises(ConfigError, match=r"^--capacity=100000: takes 0.37\d GB of disk") as error:
+    with pytest.raises(ConfigError, match=r"^--capacity=100000: takes 37\d\.\d MB of disk") as error:
         check_ring_fits(of(100_000), options)
     most = int(re.findall(r"\d+", str(error.value))[-1])
     check_ring_fits(of(most - most % shards), options)

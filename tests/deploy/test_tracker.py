@@ -26,7 +26,7 @@ from rmc.deploy.monitor.tracker import Tracker, start_tracker
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
-from rmc.deploy.run.tracking import Tracking, keep_tracking
+from rmc.deploy.run.tracking import Tracking, keep_tracking, kept_tracking
 from tests import wandb_file
 from tests.processes import alive
 from tests.waiting import wait_until
@@ -142,6 +142,18 @@ def test_trackio_has_the_run_over_its_starts(
     assert (tmp_path / "trackio" / "media" / film["video"]["file_path"]).stat().st_size > 100
     about = json.loads(config)
     assert (about["env"]["id"], about["tags"]) == ("InvertedPendulum-v5", ["a", "b"])
+
+
+def test_trackio_knows_a_run_whose_folder_has_another_name(folder: RunFolder, tmp_path: Path) -> None:
+    started(folder, "trackio").close({"state": "stopped", "env_steps": 700})
+    renamed = RunFolder(folder.path.rename(tmp_path / "second"))
+    keep_tracking(renamed, kept_tracking(renamed.path))
+    tracker = start_tracker(renamed)
+    assert tracker is not None
+    tracker.close(RESULT)
+    with sqlite3.connect(tmp_path / "trackio" / "my-project.db") as store:
+        assert store.execute("select distinct run_name from metrics").fetchall() == [("first-0123abcd",)]
+    store.close()
 
 
 @pytest.mark.filterwarnings("ignore::sqlalchemy.exc.SADeprecationWarning")  # MLflow's own

@@ -39,6 +39,7 @@ def test_how_often_it_is_filmed_goes_on_with_the_run(folder: RunFolder) -> None:
     assert alone is not None
     assert (alone.tracker, alone.video_every) == ("videos", 2)
     keep_tracking(folder, alone)
+    alone = dataclasses.replace(alone, name="run")
     assert kept_tracking(folder.path) == chosen(folder) == alone  # a run that goes on is filmed further
     assert chosen(folder, video_every=0) is None
     with pytest.raises(ConfigError, match=r"^--track-tags=.*: say which tracker: --track wandb"):
@@ -51,17 +52,30 @@ def test_what_a_version_before_has_kept_is_read(folder: RunFolder) -> None:
 
 
 def test_a_run_that_goes_on_stays_the_same_in_its_tracker(folder: RunFolder) -> None:
-    first = chosen(folder, track="trackio", track_project="mine", track_tags=("a",))
-    keep_tracking(folder, first)
+    given = chosen(folder, track="trackio", track_project="mine", track_tags=("a",))
+    assert given is not None
+    keep_tracking(folder, given)
+    first = dataclasses.replace(given, name="run")
     assert kept_tracking(folder.path) == chosen(folder) == chosen(folder, track="trackio") == first
     tagged = chosen(folder, track_tags=("c",))
-    assert first is not None
     assert tagged == dataclasses.replace(first, tags=("c",))
     for elsewhere in ({"track": "wandb"}, {"track_project": "other"}):
         other = chosen(folder, **elsewhere)
         assert other is not None
         assert other.id != first.id
     assert chosen(folder, if_exists="new") is None
+
+
+def test_its_name_there_is_that_of_the_folder_at_its_first_start(folder: RunFolder) -> None:
+    """As today's is for one of a version before, which kept none; elsewhere it is another run."""
+    (folder.path / "tracking.json").write_text('{"tracker": "trackio", "project": "x", "tags": [], "id": "y"}')
+    keep_tracking(folder, chosen(folder))
+    renamed = RunFolder(folder.path.rename(folder.path.with_name("renamed")))
+    for words, name in (({}, "run"), ({"track_project": "other"}, "renamed")):
+        keep_tracking(renamed, chosen(renamed, **words))
+        kept = kept_tracking(renamed.path)
+        assert kept is not None
+        assert kept.name == name
 
 
 def test_it_can_be_left(folder: RunFolder) -> None:

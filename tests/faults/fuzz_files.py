@@ -25,7 +25,7 @@ from typing import Any
 from rmc.analysis import curves, history
 from rmc.analysis.live_run import LiveRun
 from rmc.analysis.policy import load_policy
-from rmc.analysis.report import CHARTS, differences, final_row, newest
+from rmc.analysis.report import CHARTS, differences, newest
 from rmc.analysis.report_run import ReportRun
 from rmc.cli import commands
 from rmc.cli.run_options import Doctor, List, Stats
@@ -160,7 +160,7 @@ def reported(run: Path) -> None:
     differences([one, one])
     str((one.name, one.state, one.env_steps, one.findings, format_starts(one.folder), one.about))
     if one.history is not None:
-        final_row("", [one.history])
+        curves.cells([one.history])
     for _, _, lines in CHARTS:
         for metric in lines.values():
             one.series(*metric)

@@ -33,8 +33,6 @@ def config(env: str = "InvertedPendulum-v5", **options: Any) -> RunConfig:
 
 VARIANTS: list[dict[str, Any]] = [
     {"scheme": 4},  # what changes the update alone is compared with a plain one in tests/learner/test_variants.py
-    {"update_order": "alternate"},
-    {"curiosity": 0.5, "curiosity_scale": "std"},
     {"stride": 5},
     {"priority_exponent": 0.0, "importance_exponent": 0.0},
     {"initial_priority": "actor"},
