@@ -13,7 +13,7 @@ from rich.console import Console
 from rmc.actors.evaluator import Rollout, evaluation_metrics, first_start, play_episodes
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.analysis.policy_file import PolicyFile
-from rmc.common.agent import Agent
+from rmc.common.agent import initial_agent
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import first_env
 from rmc.common.env.wrappers import Env
@@ -105,8 +105,5 @@ def evaluate_policy(
 
 def initial_policy(config: RunConfig) -> bytes:
     """The policy that the run's learner starts from, before it has learnt anything."""
-    spec = config.window_spec()
-    torch.manual_seed(config.seed)
-    agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
-    agent.start_gates(spec.steps)
+    agent = initial_agent(config.window_spec(), config.agent, config.seed)
     return safetensors.torch.save(agent.policy_weights())

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 
 from rmc.common.agent_config import CRITIC_PARTS, LOG_STD_RANGE, NORMALIZED_CLIP, POLICY_PARTS, STD_FLOOR, AgentConfig
 from rmc.common.critic import TwinQ
+from rmc.common.window import WindowSpec
 
 
 class Normalizer(nn.Module):
@@ -309,3 +310,15 @@ class Agent(nn.Module):
             for name, value in self.state_dict().items()
             if name.startswith(parts)
         }
+
+
+def initial_agent(spec: WindowSpec, config: AgentConfig, seed: int) -> Agent:
+    """As it is before anything is learnt. Torch's own random numbers go on as if none had been drawn."""
+    drawn = torch.get_rng_state()
+    torch.default_generator.manual_seed(seed)  # a GPU's stay as they are
+    try:
+        agent = Agent(spec.obs_dim, spec.action_dim, config, spec.missing, spec.privileged)
+        agent.start_gates(spec.steps)
+    finally:
+        torch.set_rng_state(drawn)
+    return agent

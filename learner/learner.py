@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rmc.common.agent import Agent
+from rmc.common.agent import initial_agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import TAKEN_OVER, UNTRAINED, Bus, Version
 from rmc.common.checkpoint import STATE, CheckpointFolder
@@ -89,15 +89,11 @@ class Learner:
     def _make_networks(self, agent: AgentConfig, update: UpdateConfig, seed: int, two_processes: bool) -> None:
         """The agent on its device, and its update, which runs here or has a process for each half."""
         torch.set_flush_denormal(True)  # into which Adam's moments of idle units decay: 13 % slower on a CPU
-        torch.manual_seed(seed)  # the networks' initial weights
-        spec = self.spec
-        self.agent = Agent(spec.obs_dim, spec.action_dim, agent, spec.missing, spec.privileged)
-        self.agent.start_gates(spec.steps)
-        self.agent.to(self.device)
+        self.agent = initial_agent(self.spec, agent, seed).to(self.device)
         bf16 = set_precision(self.config.precision, self.device)
         self.update = make_update(self.agent, update, seed, bf16)
         updated = PipelinedUpdate if two_processes else DeviceUpdate
-        self._updated: DeviceUpdate | PipelinedUpdate = updated(self.update, spec, self.config.batch_size)
+        self._updated: DeviceUpdate | PipelinedUpdate = updated(self.update, self.spec, self.config.batch_size)
 
     def _begin(self) -> None:
         """Lock the checkpoints, go on from the newest, and become the run's one learner, in an epoch of its own.

@@ -10,7 +10,8 @@ def set_precision(precision: Precision, device: torch.device) -> bool:
 
     "auto" is what is fast: bfloat16 on a CPU that has it, TensorFloat-32 on a GPU, where bfloat16's casts cost kernels.
     """
-    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = precision == "auto"
+    if device.type == "cuda":
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = precision == "auto"
     return precision == "bf16" or (precision == "auto" and has_fast_bf16(device))
 
 

@@ -11,6 +11,7 @@ import logging
 import operator
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -136,10 +137,13 @@ def recreate_env(env: Env, make_env: Callable[[], Env], error: BaseException | N
     """
     with suppress(Exception):
         env.close()
-    while error is not None and error.__traceback__ is not None:  # its frames hold the environment
-        error = error.with_traceback(None).__cause__ or error.__context__
-    while isinstance(env, gym.Wrapper):  # the caller holds the outermost, which may be closed once more
-        env.env, env = gym.Env(), env.env
+    seen: list[BaseException] = []
+    while error is not None and error not in seen:  # frames that are over hold the environment
+        traceback.clear_frames(error.__traceback__)
+        seen.append(error)
+        error = error.__cause__ or error.__context__
+    if isinstance(env, gym.Wrapper):  # the caller holds the outermost, which may be closed once more
+        env.env = gym.Env()
     del env
     return make_env()
 

@@ -7,7 +7,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,10 +14,6 @@ import numpy as np
 from rmc.common.process.watchdog import EnvCall
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-ROUNDING = (  # in torch.backends, in its older way and in its newer one
-    "cuda.matmul.allow_tf32", "cudnn.allow_tf32",
-    "cuda.matmul.fp32_precision", "cudnn.conv.fp32_precision", "cudnn.rnn.fp32_precision",
-)  # fmt: skip
 
 
 class ProcessState(NamedTuple):
@@ -71,29 +66,14 @@ def torch_as_imported() -> Iterator[None]:
     """Torch's defaults as a fresh process has them; afterwards all is as the caller's program had it."""
     import torch  # slow
 
-    theirs, rounding = ProcessState.read(), _rounding(torch.backends)
+    theirs = ProcessState.read()
     theirs._replace(dtype=torch.float32, gradients=True, device=torch.device("cpu")).install(theirs)
     flushes = (torch.tensor(1e-40) * 1).item() == 0.0  # a denormal: nothing can be asked
-    devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()  # type: ignore[no-untyped-call]
     try:
-        with torch.random.fork_rng(devices, device_type="cuda"):
-            yield
+        yield
     finally:
-        for holder, name, value in rounding:
-            setattr(holder, name, value)
         torch.set_flush_denormal(flushes)
         theirs.install(ProcessState.read())
-
-
-def _rounding(backends: Any) -> list[tuple[Any, str, Any]]:
-    """What a GPU's products are rounded to: what holds each flag, its name and its value."""
-    flags = []
-    for flag in ROUNDING:
-        path, _, name = flag.rpartition(".")
-        with suppress(AttributeError, RuntimeError):  # an older torch, or one that was set in the newer way
-            holder = attrgetter(path)(backends)
-            flags.append((holder, name, getattr(holder, name)))
-    return flags
 
 
 def _go(folder: str | None) -> None:
@@ -115,12 +95,12 @@ class ApartCall(EnvCall):
     A step is not looked at for changes of its own. Signals' handlers stay ours.
     """
 
-    env_states: dict[str, ProcessState] = {}  # noqa: RUF012 - by environment, where it differs from ours
+    env_states: dict[str, ProcessState] = {}  # noqa: RUF012 - by an environment's module, where it differs from ours
     changed: dict[str, Any] = {}  # noqa: RUF012 - by any environment of this process: what, and into what
 
     def __enter__(self) -> "ApartCall":
         super().__enter__()
-        env_state = ApartCall.env_states.get(self.env_id)
+        env_state = ApartCall.env_states.get(self._module())
         self._ours = ProcessState.read() if self.name != "step" or env_state is not None else None
         self._random = _random_state() if self.name == "make" else None
         if self._ours is not None and env_state is not None:
@@ -132,6 +112,10 @@ class ApartCall(EnvCall):
             self._part(self._ours)
         super().__exit__(*error)
 
+    def _module(self) -> str:
+        """That registers it, whose import may change the process for all that it registers; or its id."""
+        return self.env_id.rpartition(":")[0] or self.env_id
+
     def _part(self, ours: ProcessState) -> None:
         now = ProcessState.read()
         if ours.dtype is None and now.dtype is not None:  # torch was imported meanwhile
@@ -142,9 +126,9 @@ class ApartCall(EnvCall):
             changed["random"] = None
         ApartCall.changed |= changed
         ours.install(now)
-        ApartCall.env_states.pop(self.env_id, None)
+        ApartCall.env_states.pop(self._module(), None)
         if set(changed) - {"handlers", "random"}:
-            ApartCall.env_states[self.env_id] = now
+            ApartCall.env_states[self._module()] = now
 
 
 def _random_state() -> tuple[Any, ...]:

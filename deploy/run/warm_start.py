@@ -13,7 +13,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from rmc.common.agent import Agent
+from rmc.common.agent import Agent, initial_agent
 from rmc.common.agent_config import POLICY_PARTS
 from rmc.common.checkpoint import PROGRESS, STATE
 from rmc.common.errors import ConfigError, first_line
@@ -107,11 +107,8 @@ def _check_sizes(
 
 def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages: bool) -> JointUpdate:
     """The run's own learner before its first update, with what is taken in its place."""
-    spec, prefixes = config.window_spec(), PARTS[parts]
-    torch.manual_seed(config.seed)  # the rest is as the learner would make it
-    agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
-    update = make_update(agent, config.update, config.seed)
-    weights = {name: value for name, value in state["agent"].items() if name.startswith(prefixes)}
+    update = make_update(initial_agent(config.window_spec(), config.agent, config.seed), config.update, config.seed)
+    weights = {name: value for name, value in state["agent"].items() if name.startswith(PARTS[parts])}
     update.agent.load_state_dict(update.agent.state_dict() | weights)
     if update.target_memory is not None:
         update.target_memory.load_state_dict(update.agent.memory.state_dict())

@@ -193,14 +193,15 @@ def test_without_a_folder_the_result_names_the_one_that_was_made(
     assert rmc.resume(result["run_dir"])["env_steps"] == result["env_steps"] == 600
 
 
-def test_what_torch_draws_and_rounds_is_the_callers_afterwards(tmp_path: Path) -> None:
+def test_what_torch_draws_is_the_callers_also_meanwhile(tmp_path: Path) -> None:
     torch.set_flush_denormal(False)
     torch.manual_seed(123)
-    products = torch.backends.cuda.matmul, torch.backends.cudnn
-    before, flags = torch.get_rng_state(), [one.allow_tf32 for one in products]
-    rmc.train(dataclasses.replace(CONFIG, total_steps=600), tmp_path / "run", launcher="lockstep")
-    assert torch.equal(torch.get_rng_state(), before)
-    assert [one.allow_tf32 for one in products] == flags
+    drawn: list[float] = []
+    config = dataclasses.replace(CONFIG, total_steps=600)
+    rmc.train(config, tmp_path / "run", launcher="lockstep", callback=lambda _: drawn.append(torch.rand(1).item()))
+    drawn.append(torch.rand(1).item())
+    torch.manual_seed(123)
+    assert drawn == [torch.rand(1).item() for _ in drawn]
     assert (torch.tensor(1e-40) * 1).item() > 0  # a denormal
 
 

@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from gymnasium.spaces import Box
 from gymnasium.wrappers import TransformObservation
 
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.make import env_layout, first_env, further_env, make_env
+from rmc.common.env.make import env_layout, first_env, further_env, make_env, recreate_env
 from rmc.common.errors import ConfigError, RmcError
+from tests.counting_env import CountingEnv
 from tests.memory_env import ANSWER_STEPS
 
 REPOSITORY = Path(__file__).parents[2]
@@ -308,3 +310,23 @@ def test_what_a_further_environment_is_refused_for_stays_a_refusal() -> None:
         further_env(lambda: make_env(EnvConfig("no_such_module:Thing-v0")), "an environment of actor-0's 8")
     with pytest.raises(RmcError, match="an environment of actor-0's 8 cannot be made beside the others"):
         further_env(lambda: [][0], "an environment of actor-0's 8")
+
+
+def test_one_that_its_module_keeps_is_made_anew_as_it_is() -> None:
+    """A robot, of which there is one: nothing of it is taken apart."""
+    kept = gym.Wrapper(CountingEnv())
+    gym.register("Kept-v0", lambda: kept)
+    make = partial(make_env, EnvConfig("Kept-v0"))
+    recreate_env(make(), make, None).reset(seed=0)
+
+
+def test_a_callers_own_error_keeps_its_traceback() -> None:
+    make = partial(make_env, EnvConfig("tests.counting_env:Counting-v0"))
+    theirs, error = KeyError("theirs"), RuntimeError("the simulation is unstable")
+    try:
+        raise theirs
+    except KeyError:
+        with pytest.raises(RuntimeError):
+            raise error from theirs
+        recreate_env(make(), make, error)
+    assert theirs.__traceback__ is not None

@@ -2,7 +2,6 @@
 
 import os
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import gymnasium as gym
@@ -42,30 +41,21 @@ def test_what_one_environment_has_changed_another_does_not_find() -> None:
         assert torch.get_default_dtype() == torch.float64
 
 
-@pytest.fixture
-def in_the_newer_way() -> Iterator[None]:
-    torch.backends.cuda.matmul.fp32_precision = "tf32"
-    yield
-    torch.backends.cuda.matmul.allow_tf32 = False
-    torch.backends.cuda.matmul.fp32_precision = "none"
+def test_what_a_module_changes_all_its_environments_find() -> None:
+    """Its import, which no second environment repeats, may do so."""
+    make_env(EnvConfig("tests.meddling_env:Meddling-dtype-early-v0")).close()
+    with ApartCall("tests.meddling_env:Meddling-folder-late-v0", "make", 1.0):
+        assert torch.get_default_dtype() == torch.float64
 
 
-def rounding(newer: bool) -> list[object]:
-    backends = torch.backends
-    flags: list[object] = [] if newer else [backends.cuda.matmul.allow_tf32, backends.cudnn.allow_tf32]
-    return [*flags, *(one.fp32_precision for one in (backends.cuda.matmul, backends.cudnn.conv, backends.cudnn.rnn))]
-
-
-@pytest.mark.parametrize("newer", [False, True])
-def test_a_callers_rounding_is_kept_in_either_of_torchs_ways(newer: bool, request: pytest.FixtureRequest) -> None:
-    """Who has said it in the newer way may not ask in the older."""
-    if newer:
-        request.getfixturevalue("in_the_newer_way")
-    before = rounding(newer)
-    with torch_as_imported():
-        set_precision("fp32" if newer else "auto", torch.device("cuda"))
-        assert rounding(newer) != before
-    assert rounding(newer) == before
+def test_a_callers_rounding_stays_where_no_gpu_learns() -> None:
+    torch.set_float32_matmul_precision("medium")
+    try:
+        with torch_as_imported():
+            set_precision("auto", torch.device("cpu"))
+        assert torch.get_float32_matmul_precision() == "medium"
+    finally:
+        torch.set_float32_matmul_precision("highest")
 
 
 class Homeless(CountingEnv):
