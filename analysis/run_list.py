@@ -15,7 +15,7 @@ from rmc.deploy.monitor.figures import duration, number
 from rmc.deploy.monitor.recorded import recorded_status
 from rmc.deploy.monitor.table import STYLES
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.metrics_tail import LISTED_BYTES
+from rmc.deploy.run.metrics_tail import LISTED_BYTES, wall_seconds
 
 DAMAGED = "damaged"
 # Each column, and the console's width from which it is shown.
@@ -54,6 +54,9 @@ def summary(path: Path) -> RunSummary:
     folder = RunFolder(path)
     try:
         status, result = recorded_status(folder, LISTED_BYTES), folder.result() or {}
+        elapsed = result.get("wall_s", status.elapsed_s)
+        if elapsed is None:  # many actors have spoken since its launcher
+            elapsed = wall_seconds(folder.metrics) or None
     except (ConfigError, OSError) as error:
         return RunSummary(str(path), fault=str(error))
     returns = [status.last.return_mean] if status.last is not None else []
@@ -70,7 +73,7 @@ def summary(path: Path) -> RunSummary:
         status.total_steps,
         returns[-1] if returns else None,
         max(best, default=None),
-        result.get("wall_s", status.elapsed_s),
+        elapsed,
     )
 
 

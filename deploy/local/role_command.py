@@ -10,7 +10,7 @@ from rmc.deploy.run.launch_options import LaunchOptions
 
 @dataclass(frozen=True)
 class RoleCommand:
-    """How a role is started: ``rmc`` and its words."""
+    """How a role is started: ``rmc`` and its words. A run's name, which may begin with a dash, is in one with --run."""
 
     name: str
     words: tuple[str, ...]
@@ -23,14 +23,14 @@ class RoleCommand:
 def actor_commands(config: RunConfig, run: str) -> list[RoleCommand]:
     """One for every actor of the ``run``."""
     return [
-        _playing(config, f"actor-{index}", "actor", "--run", run, "--index", str(index))
+        _playing(config, f"actor-{index}", "actor", f"--run={run}", "--index", str(index))
         for index in range(config.actors)
     ]
 
 
 def evaluator_commands(config: RunConfig, run: str) -> list[RoleCommand]:
     """One, or none where the run is not evaluated while it trains."""
-    return [_playing(config, "evaluator", "evaluator", "--run", run)] if config.evaluator.episodes else []
+    return [_playing(config, "evaluator", "evaluator", f"--run={run}")] if config.evaluator.episodes else []
 
 
 def _playing(config: RunConfig, name: str, *words: str) -> RoleCommand:
@@ -39,13 +39,13 @@ def _playing(config: RunConfig, name: str, *words: str) -> RoleCommand:
 
 def learner_command(run: str, checkpoints: str, device: str, secrets: Sequence[str]) -> RoleCommand:
     """The learner's; ``secrets`` are the options that say where the run's secret files are."""
-    words = ("--run", run, *secrets, "--folder", checkpoints, "--device", device)
+    words = (f"--run={run}", *secrets, "--folder", checkpoints, "--device", device)
     return RoleCommand("learner", ("role", "learner", *words), single_thread=False, ends=True)
 
 
 def replay_command(shard: Shard, run: str, folder: str, listen: str, secrets: Sequence[str]) -> RoleCommand:
     """A replay server's, which has no torch and so is not forked from what has."""
-    words = ("--run", run, *secrets, "--folder", folder, "--listen", listen, "--shard", str(shard.index))
+    words = (f"--run={run}", *secrets, "--folder", folder, "--listen", listen, "--shard", str(shard.index))
     return RoleCommand(shard.role, ("role", "replay", *words), forked=False)
 
 

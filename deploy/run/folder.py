@@ -285,7 +285,8 @@ class RunFolder:
     def trained_elsewhere(self) -> str:
         """The machine or container whose launcher trains this run; empty where that is here, or none does."""
         here, space = _process_space(), (self.path / ".lock").read_text().split()[2:]
-        if space == here[: len(space)]:  # versions before noted less
+        first = 1 if len(space) == 3 else 0  # a machine may be renamed; versions before noted less
+        if space[first:] == here[first : len(space)]:
             return ""
         return f"another machine or container called {space[0]}" if space[0] == here[0] else space[0]
 

@@ -171,8 +171,8 @@ def has_more_than_a_start(folder: RunFolder) -> bool:
     """Whether something is at its path that a start without a config does not leave, one that was killed early on."""
     if not folder.path.is_dir():
         return folder.path.exists()
-    left = {path.name for path in folder.path.iterdir()}
-    if not left <= LEFT:
+    there = list(folder.path.iterdir())
+    if any(path.name not in LEFT or path.is_symlink() for path in there):  # a link shows what is another's
         return True
     kept = (folder.checkpoints / name for name in ("000000000", ".tmp-000000000"))
     initial = {file for path in kept for file in path.glob("*")}

@@ -28,8 +28,7 @@ def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
     path = _named(words)
     if path is None:
         return words, ""
-    read = {name.replace("_", "-"): value for name, value in _read(path).items()}
-    options = {RENAMED.get(name, name).replace("-", "_"): value for name, value in read.items()}
+    options = _options(path)
     env, kwargs = options.pop("env", ""), options.pop("env_kwargs", {})
     if not isinstance(env, str):
         raise ConfigError(f"{OPTION} {path}: env", env, 'write the environment\'s id, like env = "HalfCheetah-v5"')
@@ -72,6 +71,19 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigError(OPTION, str(path), f"cannot be read ({error.strerror}); give a TOML file") from None
     except ValueError as error:  # no TOML, or no UTF-8
         raise ConfigError(OPTION, str(path), f"is not TOML ({error}); fix it") from None
+
+
+def _options(path: Path) -> dict[str, Any]:
+    """By their present names. Raises ConfigError where one is there twice."""
+    options: dict[str, Any] = {}
+    written: dict[str, str] = {}
+    for name, value in _read(path).items():
+        plain = name.replace("_", "-")
+        plain = RENAMED.get(plain, plain).replace("-", "_")
+        if plain in options:
+            raise ConfigError(f"{OPTION} {path}: {plain}", [written[plain], name], "is there twice; leave one of them")
+        options[plain], written[plain] = value, name
+    return options
 
 
 def _check(path: Path, name: str, value: Any, names: Sequence[str]) -> None:

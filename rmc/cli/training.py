@@ -124,7 +124,7 @@ def _trained(config: RunConfig, folder: RunFolder, options: LaunchOptions, monit
     if options.metrics_port is not None:
         console.print(f"metrics on {options.metrics_host}, port {options.metrics_port}", soft_wrap=True)
     if options.launcher == "manual":
-        console.print(f"start the roles with --run {shlex.quote(folder.name)}", soft_wrap=True)
+        console.print(f"start the roles with --run={shlex.quote(folder.name)}", soft_wrap=True)
     try:
         # before and after, nothing runs that Ctrl-C could not end at once
         with signals_caught() as stop, _metrics_served(folder, monitor, options):

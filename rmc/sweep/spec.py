@@ -137,7 +137,7 @@ def read_spec(path: Path, words: Sequence[str]) -> Spec:
             raise ConfigError(part, raw[part], f"write it as a table, [{part}]")
     search = _search(raw["search"]) if "search" in raw else None
     seeds = read_seeds(raw.get("seeds", 0))
-    options, grid = (_plain_names(raw.get(part, {})) for part in ("options", "grid"))
+    options, grid = (_plain_names(part, raw.get(part, {})) for part in ("options", "grid"))
     return Spec(raw["env"], seeds, options, grid, search, tuple(words))
 
 
@@ -148,8 +148,12 @@ def _check_keys(place: str, raw: dict[str, Any], names: Sequence[str]) -> None:
             raise ConfigError(f"{place}{name}", value, f"no such key{hint}")
 
 
-def _plain_names(raw: dict[str, Any]) -> dict[str, Any]:
-    return {name.replace("-", "_"): value for name, value in raw.items()}
+def _plain_names(place: str, raw: dict[str, Any]) -> dict[str, Any]:
+    plain = {name.replace("-", "_"): value for name, value in raw.items()}
+    for name in plain if len(plain) < len(raw) else ():
+        if len(written := [one for one in raw if one.replace("-", "_") == name]) > 1:
+            raise ConfigError(f"{place}.{name}", written, "is there twice; leave one of them")
+    return plain
 
 
 def _search(raw: dict[str, Any]) -> Search:
@@ -160,7 +164,7 @@ def _search(raw: dict[str, Any]) -> Search:
             expected = {int: "a whole number", bool: "true or false", dict: "a table, [search.ranges]"}[kinds[name]]
             raise ConfigError(f"search.{name}", value, f"write {expected}")
     ranges = {name: _range(f"search.{name}", value) for name, value in raw.get("ranges", {}).items()}
-    return Search(**{**raw, "ranges": _plain_names(ranges)})
+    return Search(**{**raw, "ranges": _plain_names("search", ranges)})
 
 
 def _range(place: str, raw: Any) -> Range | list[Any]:

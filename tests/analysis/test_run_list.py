@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from rmc.analysis.run_list import RunSummary, runs, table
+from rmc.analysis.run_list import RunSummary, runs, summary, table
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
@@ -73,6 +73,17 @@ def test_every_run_is_found_with_what_became_of_it(root: Path) -> None:
         assert fault is not None
         assert str(root / name) in fault
         assert "\n" not in fault
+
+
+def test_a_run_of_many_actors_has_its_time(tmp_path: Path) -> None:
+    """Whose launcher's last word is far from the end."""
+    folder = run_in(tmp_path / "run", 0)
+    line = json.dumps({"role": "actor-7", "time": time.time(), "more": "x" * 1000})
+    with folder.metrics.open("a") as file:
+        file.write(f"{line}\n" * 300)
+    assert summary(folder.path).elapsed_s == 9.0
+    folder.metrics.write_text(f"{line}\n" * 300)
+    assert summary(folder.path).elapsed_s is None
 
 
 @pytest.mark.parametrize("width", [40, 80, 120, 250])

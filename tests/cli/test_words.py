@@ -1,5 +1,6 @@
 """Options from a file, numbers as people write them, the two lengths of help."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,13 @@ def test_a_wrong_file_is_refused(
     message = complaint(["train", *([PENDULUM] if "env =" not in text else []), "--config", str(file)], capsys)
     assert name in message
     assert fix in message
+
+
+@pytest.mark.parametrize("names", [["n-step", "n_step"], ["policy_average", "policy_ema_updates"]])
+def test_an_option_that_a_file_names_twice_is_refused(names: list[str], file: Path) -> None:
+    file.write_text("".join(f"{name} = {value}\n" for value, name in enumerate(names, 2)))
+    with pytest.raises(ConfigError, match=re.escape(f": {names[-1]}={names}: is there twice; leave one")):
+        parser.parse(["train", PENDULUM, "--config", str(file)])
 
 
 def test_a_list_at_the_files_end_takes_no_environment_in(file: Path) -> None:

@@ -165,9 +165,9 @@ def test_a_killed_launcher_and_a_role_that_somebody_ended_come_back(nodes: Clust
         steps = training.newest("replay", "env_steps")
         training.wait_for(lambda: training.newest("replay", "env_steps") > steps + 200)
         training.wait_for_updates(100)
-        (replay,) = _pids(f"rmc.cli.main role replay --run {folder.name}")
+        (replay,) = _pids(f"rmc.cli.main role replay --run={folder.name}")
         os.kill(replay, signal.SIGTERM)  # it ends cleanly, though nobody wants the run to end
-        training.wait_for(lambda: _pids(f"rmc.cli.main role replay --run {folder.name}") not in ([], [replay]))
+        training.wait_for(lambda: _pids(f"rmc.cli.main role replay --run={folder.name}") not in ([], [replay]))
         training.wait_for_updates(100)
         training.interrupt()
     assert training.process.returncode == 130

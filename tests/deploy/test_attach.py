@@ -69,6 +69,8 @@ def test_a_trainer_that_was_killed_has_not_ended(folder: RunFolder) -> None:
 def test_a_trainer_on_another_machine_is_not_ours_to_stop(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     folder.lock()
     monkeypatch.setattr("socket.gethostname", lambda: "elsewhere")
+    assert folder.trained_elsewhere() == ""  # this one, which has another name now
+    monkeypatch.setattr("rmc.deploy.run.folder.BOOT", folder.path / "config.json")
     with pytest.raises(ConfigError, match=r"is trained on .*; stop it there"):
         stop(folder)
     folder.unlock()

@@ -94,6 +94,18 @@ def test_of_a_run_of_weeks_a_start_parses_what_was_said_last(
     assert 0 < sum(parsed) < 1.1 * metrics_tail.LISTED_BYTES
 
 
+@pytest.mark.parametrize("link", ["checkpoints", "logs"])
+def test_a_folder_that_shows_what_another_run_has_is_left_alone(link: str, tmp_path: Path) -> None:
+    kept = tmp_path / "old" / link / "000001000" / "policy"
+    kept.parent.mkdir(parents=True)
+    kept.write_text("of value")
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / link).symlink_to(tmp_path / "old" / link)
+    with pytest.raises(ConfigError, match="is there and is no run's folder"):
+        open_run(CONFIG, tmp_path / "new", "resume")
+    assert kept.read_text() == "of value"
+
+
 def test_an_older_run_has_no_history(folder: RunFolder) -> None:
     folder.history_file.unlink()
     assert (starts(folder), format_starts(folder), last_launch(folder)) == ([], "", LaunchOptions(folder.path))

@@ -90,7 +90,7 @@ def test_roles_by_hand_over_tcp(redis_url: str, run_name: str, tmp_path: Path) -
     with ExitStack() as stack:
         training = stack.enter_context(Training(folder, "--total-steps", "1200", "--checkpoint-steps", "600", *options))
         training.wait_for(lambda: "start the roles with" in training.text())
-        name = training.text().partition("--run ")[2].split()[0]
+        name = training.text().partition("--run=")[2].split()[0]
         told = {"RMC_SECRET": (folder / "secret").read_text().strip(), "RMC_REDIS_URL": redis_url}
         places = {"NAME": name, "file:redis-url": options[-1], "runs/by-hand": str(folder)}
         roles = []

@@ -151,6 +151,15 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(
     assert os.listdir() == ["spec.toml"]
 
 
+@pytest.mark.parametrize("table", ["options", "grid", "search.ranges"])
+def test_an_option_that_a_table_names_twice_is_refused(table: str, tmp_path: Path) -> None:
+    path = tmp_path / "spec.toml"
+    path.write_text(f'env = "{PENDULUM}"\n[{table}]\nscheme = [3]\nn-step = [1]\nn_step = [3]\n')
+    place = table.partition(".")[0]
+    with pytest.raises(ConfigError, match=rf"{place}\.n_step=\['n-step', 'n_step'\]: is there twice; leave one"):
+        read_spec(path, [])
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
