@@ -122,7 +122,7 @@ WHEN = {
     "latent_target": "`ema` where the latent rank in the metrics falls; it cost return (`studies/notebook.md`)",
     "target_memory": "`ema` for slower targets; it cost return in a trial (`studies/notebook.md`)",
     "policy_q": "`first` for the paper",
-    "curiosity": "up where rewards are rare (50 found the goal of MountainCarContinuous-v0), 0 where observations flicker for long",
+    "curiosity": "up where rewards are rare, as 50 where a goal alone pays; 0 where observations flicker for long",
     "curiosity_scale": "`std` makes beta mean the same in every environment, `raw` is the paper's",
     "curiosity_steps": "as long as exploration should last",
     "policy_ema_updates": "0 to evaluate and save what acts; up where evaluations swing",
