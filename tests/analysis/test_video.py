@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,18 @@ os.chdir("/")
 torch.set_default_dtype(torch.float64)
 gymnasium.register("Moves-v0", Draws)
 """
+
+
+@pytest.fixture(autouse=True)
+def chosen_backend(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a video's test chooses to draw with is no other test's."""
+    before = os.environ.get("MUJOCO_GL")
+    monkeypatch.setattr(video, "_own_choice", "")
+    yield
+    monkeypatch.undo()
+    os.environ.pop("MUJOCO_GL", None)
+    if before is not None:
+        os.environ["MUJOCO_GL"] = before
 
 
 def evaluate(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
