@@ -8,7 +8,7 @@ import difflib
 import json
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import version
@@ -274,6 +274,20 @@ def meant(word: str, known: Iterable[str], otherwise: str = "") -> str:
     """The end of a message on a word that is not known: what is most like it, or ``otherwise``."""
     near = difflib.get_close_matches(word, known, 1)
     return f"; did you mean {near[0]}?" if near else otherwise
+
+
+def plain_names(
+    place: str, raw: Mapping[str, Any], renamed: Mapping[str, str] = types.MappingProxyType({})
+) -> dict[str, Any]:
+    """What a file says of options, by their present names. Raises ConfigError where one is at ``place`` twice."""
+    written: dict[str, str] = {}
+    for name in raw:
+        dashed = name.replace("_", "-")
+        plain = renamed.get(dashed, dashed).replace("-", "_")
+        if plain in written:
+            raise ConfigError(f"{place}{plain}", [written[plain], name], "is there twice; leave one of them")
+        written[plain] = name
+    return {plain: raw[name] for plain, name in written.items()}
 
 
 def option_words(name: str, value: Any) -> list[str]:

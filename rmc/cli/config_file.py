@@ -10,7 +10,7 @@ from rmc.common.bus.redis_url import value_without_passwords
 from rmc.common.env.config import check_kwargs, write_kwargs
 from rmc.common.errors import ConfigError
 from rmc.common.user_path import user_path
-from rmc.deploy.run.config import meant, option_words
+from rmc.deploy.run.config import meant, option_words, plain_names
 
 RENAMED = {
     "fill-blanks": "impute-missing",
@@ -28,7 +28,7 @@ def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
     path = _named(words)
     if path is None:
         return words, ""
-    options = _options(path)
+    options = plain_names(f"{OPTION} {path}: ", _read(path), RENAMED)
     env, kwargs = options.pop("env", ""), options.pop("env_kwargs", {})
     if not isinstance(env, str):
         raise ConfigError(f"{OPTION} {path}: env", env, 'write the environment\'s id, like env = "HalfCheetah-v5"')
@@ -71,19 +71,6 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigError(OPTION, str(path), f"cannot be read ({error.strerror}); give a TOML file") from None
     except ValueError as error:  # no TOML, or no UTF-8
         raise ConfigError(OPTION, str(path), f"is not TOML ({error}); fix it") from None
-
-
-def _options(path: Path) -> dict[str, Any]:
-    """By their present names. Raises ConfigError where one is there twice."""
-    options: dict[str, Any] = {}
-    written: dict[str, str] = {}
-    for name, value in _read(path).items():
-        plain = name.replace("_", "-")
-        plain = RENAMED.get(plain, plain).replace("-", "_")
-        if plain in options:
-            raise ConfigError(f"{OPTION} {path}: {plain}", [written[plain], name], "is there twice; leave one of them")
-        options[plain], written[plain] = value, name
-    return options
 
 
 def _check(path: Path, name: str, value: Any, names: Sequence[str]) -> None:

@@ -16,7 +16,7 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.redis_url import value_without_passwords
 from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import flat, meant
+from rmc.deploy.run.config import flat, meant, plain_names
 from rmc.deploy.run.presets import robust
 
 KEYS = ("env", "seeds", "options", "grid", "search")
@@ -137,7 +137,7 @@ def read_spec(path: Path, words: Sequence[str]) -> Spec:
             raise ConfigError(part, raw[part], f"write it as a table, [{part}]")
     search = _search(raw["search"]) if "search" in raw else None
     seeds = read_seeds(raw.get("seeds", 0))
-    options, grid = (_plain_names(part, raw.get(part, {})) for part in ("options", "grid"))
+    options, grid = (plain_names(f"{part}.", raw.get(part, {})) for part in ("options", "grid"))
     return Spec(raw["env"], seeds, options, grid, search, tuple(words))
 
 
@@ -148,14 +148,6 @@ def _check_keys(place: str, raw: dict[str, Any], names: Sequence[str]) -> None:
             raise ConfigError(f"{place}{name}", value, f"no such key{hint}")
 
 
-def _plain_names(place: str, raw: dict[str, Any]) -> dict[str, Any]:
-    plain = {name.replace("-", "_"): value for name, value in raw.items()}
-    for name in plain if len(plain) < len(raw) else ():
-        if len(written := [one for one in raw if one.replace("-", "_") == name]) > 1:
-            raise ConfigError(f"{place}.{name}", written, "is there twice; leave one of them")
-    return plain
-
-
 def _search(raw: dict[str, Any]) -> Search:
     _check_keys("search.", raw, SEARCH_KEYS)
     kinds = {"trials": int, "sampler_seed": int, "prune": bool, "ranges": dict}
@@ -164,7 +156,7 @@ def _search(raw: dict[str, Any]) -> Search:
             expected = {int: "a whole number", bool: "true or false", dict: "a table, [search.ranges]"}[kinds[name]]
             raise ConfigError(f"search.{name}", value, f"write {expected}")
     ranges = {name: _range(f"search.{name}", value) for name, value in raw.get("ranges", {}).items()}
-    return Search(**{**raw, "ranges": _plain_names("search", ranges)})
+    return Search(**{**raw, "ranges": plain_names("search.", ranges)})
 
 
 def _range(place: str, raw: Any) -> Range | list[Any]:
