@@ -55,7 +55,7 @@ def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: 
             console.print(f"run folder {folder.path}", soft_wrap=True)
             status = _conduct(config, folder, model, console, stop)
     finally:
-        folder.unlock(status)
+        folder.lock.release(status)
     return status
 
 
@@ -105,7 +105,7 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
     elif has_more_than_a_start(folder):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no baseline's; give another one")
     make(folder)
-    folder.lock()
+    folder.lock.take()
     if not there:
         forget_start(folder)
     return folder, changed

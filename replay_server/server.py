@@ -16,15 +16,15 @@ from rmc.common.metrics import Means, Rate
 from rmc.common.replay import EPISODE_BYTES, ObservationStatistics, Sample, SampleStatus
 from rmc.common.shard import WHOLE, Shard
 from rmc.common.window import Rows, WindowSpec
-from rmc.replay_server.commit_record import Progress, decode_published
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.credit import Credit
 from rmc.replay_server.episode import find_episode
 from rmc.replay_server.observation_sums import observation_sums
 from rmc.replay_server.rate_limiter import RateLimiter
-from rmc.replay_server.recovery import open_store, valid_leaves, warn_of_torn_rows
+from rmc.replay_server.recovery import open_store
 from rmc.replay_server.ring import Slots
 from rmc.replay_server.stream_reader import IngestBatch, StreamReader
+from rmc.replay_server.takeover import take_over
 
 log = logging.getLogger(__name__)
 PRIORITY_FLOOR = 1e-6  # so that every window keeps a chance
@@ -78,74 +78,10 @@ class ReplayServer:
         capacity = -(-config.capacity // self._shard.count)
         self._store = open_store(folder, self.spec, capacity, config.priority_exponent)
         try:
-            epoch = self._take_over()
-            self._begin_epoch(epoch, config.replay_ratio, warmup_steps)
+            return take_over(self._store, self.bus, self.name, self.spec, config.replay_ratio, warmup_steps)
         except BaseException:
             self._store.close()
             raise
-        return epoch
-
-    def _take_over(self) -> int:
-        """Our epoch. What was published is read once we have it: the server before us commits nothing after that."""
-        ring = self._store.ring
-        epoch = self.bus.take_epoch(self.name, ring.progress.replay_epoch)
-        while (newest := self._read_published()) is not None and newest.replay_epoch >= epoch:  # in another Redis
-            epoch = self.bus.take_epoch(self.name, newest.replay_epoch)
-        if newest is not None:
-            self._go_on_from(newest)
-        if self._store.tree.total == 0.0:
-            self._begin_empty()
-        else:
-            warn_of_torn_rows(self._store)
-        return epoch
-
-    def _read_published(self) -> Progress | None:
-        published = self.bus.progress(self.name)
-        newest = decode_published(published, self.spec.statistics, self.spec.counts) if published else None
-        if published and newest is None:
-            log.warning("%s: the counters that were published are damaged; going on from the ring's", self.name)
-        return newest
-
-    def _go_on_from(self, newest: Progress) -> None:
-        """Of counters that were published and those of this ring, take the later.
-
-        Published by a server that never wrote here: that one's ring is lost, and what this one holds is older and
-        goes, for no serial may name two windows. By one that did: a power cut has lost the end of this ring.
-        """
-        ring = self._store.ring
-        another = newest.replay_epoch > ring.progress.replay_epoch
-        if not another and not newest.is_after(ring.progress):
-            return
-        if another:
-            newest.valid_from = newest.next_serial
-        ring.progress = newest
-        self._store.tree.rebuild(valid_leaves(self._store))
-
-    def _begin_empty(self) -> None:
-        """The counters go on, and warm-up is collected once more before the next draw."""
-        progress = self._store.ring.progress
-        progress.valid_from = progress.next_serial
-        progress.begun_env_steps = progress.env_steps
-        progress.begun_drawn_steps = progress.drawn_steps + progress.elsewhere_steps
-        if progress.next_serial:
-            log.warning(
-                "%s: the ring of %d windows is lost; begins empty at environment step %d",
-                self.name, progress.next_serial, progress.env_steps,
-            )  # fmt: skip
-
-    def _begin_epoch(self, epoch: int, replay_ratio: float, warmup_steps: int) -> None:
-        self._store.ring.progress.replay_epoch = epoch
-        self._hold_ratio(replay_ratio, warmup_steps)
-        self._store.ring.commit()
-        self._store.ring.flush_commit()  # by its epoch this ring is known again after a power cut, too
-
-    def _hold_ratio(self, replay_ratio: float, warmup_steps: int) -> None:
-        """A ratio other than before counts from here: nothing is owed for what was, and nobody waits for it."""
-        progress = self._store.ring.progress
-        if progress.replay_ratio != replay_ratio:
-            progress.replay_ratio = replay_ratio
-            progress.begun_drawn_steps = progress.drawn_steps + progress.elsewhere_steps
-            progress.begun_env_steps = progress.env_steps - min(progress.inserted, warmup_steps)
 
     # -- in ---------------------------------------------------------------------------------------------
 

@@ -79,7 +79,7 @@ def _folder(config: RunConfig, path: Path) -> Iterator[RunFolder]:
     try:
         yield folder
     finally:
-        folder.unlock()
+        folder.lock.release()
 
 
 def _train(config: RunConfig, folder: RunFolder, device: str, watcher: Monitor, stop: StopSignal) -> dict[str, RoleUse]:

@@ -36,13 +36,13 @@ def watch(
     catch_up(status, tail)
     view = View(status, console)
     try:
-        while folder.ended() is None and not gone():
+        while folder.lock.ended() is None and not gone():
             catch_up(status, tail, callback)
             time.sleep(LOOK_SECONDS)
     finally:
         catch_up(status, tail, callback)
         view.close(run_state(folder))
-    return folder.ended()
+    return folder.lock.ended()
 
 
 class LauncherGone:
@@ -52,16 +52,16 @@ class LauncherGone:
         self._folder, self._seen_at = folder, time.monotonic()
 
     def __call__(self) -> bool:
-        if self._folder.trainer() is not None:
+        if self._folder.lock.trainer() is not None:
             self._seen_at = time.monotonic()
         return time.monotonic() - self._seen_at > AWAY_SECONDS
 
 
 def launcher_pid(folder: RunFolder) -> int:
     """The launcher's process. Raises ConfigError where nobody trains this run."""
-    comes_back = (folder.path / "learner-at").exists() and folder.ended() is None  # on Ray, where it was killed
+    comes_back = (folder.path / "learner-at").exists() and folder.lock.ended() is None  # on Ray, where it was killed
     deadline = time.monotonic() + AWAY_SECONDS * comes_back
-    while (trainer := folder.trainer()) is None:
+    while (trainer := folder.lock.trainer()) is None:
         if time.monotonic() >= deadline:
             folder.settings()
             over, more = ("it is finished", " --total-steps N") if folder.result() else ("nobody trains it now", "")
@@ -91,14 +91,14 @@ def _owner(process: int) -> str:
 def stop(folder: RunFolder) -> int:
     """Ask the launcher to end the run cleanly, and wait until it has; its exit status. Raises ConfigError."""
     trainer = launcher_pid(folder)
-    if elsewhere := folder.trained_elsewhere():
+    if elsewhere := folder.lock.trained_elsewhere():
         raise ConfigError("RUN", str(folder.path), f"is trained on {elsewhere}; stop it there")
     _ask(folder, trainer)
     seconds = STOP_SECONDS + CheckpointFolder(folder.checkpoints).patience(0.0)
     deadline = time.monotonic() + seconds
-    while folder.trainer() is not None:
+    while folder.lock.trainer() is not None:
         if time.monotonic() > deadline:
             raise ConfigError("RUN", str(folder.path), f"did not end within {seconds:.0f} s; see {folder.logs}")
         time.sleep(LOOK_SECONDS)
-    ended = folder.ended()
+    ended = folder.lock.ended()
     return 0 if ended is None else ended

@@ -102,7 +102,7 @@ class Monitor:
                 self._cursors[role] = end
 
     def _look_at_folder(self) -> None:
-        self._folder.check_there()
+        self._folder.lock.check_there()
         if self._folder.writable() != self._writable:
             self._writable = not self._writable
             change = "can be written again" if self._writable else "is read-only: training goes on, its end waits"

@@ -70,7 +70,7 @@ def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None
     try:
         host = _created(config, folder, options)
     finally:
-        folder.unlock()  # for the launcher: another start finds the actor's name
+        folder.lock.release()  # for the launcher: another start finds the actor's name
     try:
         ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)
     except BaseException as error:  # Ctrl-C, too

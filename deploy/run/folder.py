@@ -3,14 +3,12 @@
 ``runs/<env>__<preset>__<seed>__<time>/``
 """
 
-import fcntl
 import hashlib
 import json
 import logging
 import os
 import re
 import secrets
-import socket
 import tempfile
 import time
 from collections.abc import Iterator
@@ -20,15 +18,14 @@ from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite, is_metric
 from rmc.common.errors import ConfigError
-from rmc.common.process.file_lock import WITHOUT_LOCKS, take_lock, try_lock
 from rmc.common.whole_file import NO_ROOM, write_whole
 from rmc.deploy.run.config import RunConfig, check_sizes, from_json, to_json
 from rmc.deploy.run.migrations import migrated
+from rmc.deploy.run.run_lock import RunLock
 
 log = logging.getLogger(__name__)
 SECRET_LENGTH = 64  # hexadecimal characters
-BOOT = Path("/proc/sys/kernel/random/boot_id")  # no two machines have one
-LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
+ROOM_SECONDS = 1.0  # between looks whether a full disk has room
 RESULT = (
     "env_steps",
     "updates",
@@ -52,9 +49,8 @@ class RunFolder:
         self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"
         self.initial_file, self.sizes_file = self.path / "initial.json", self.path / "sizes.json"
         self.history_file = self.path / "history.jsonl"
+        self.lock = RunLock(self.path)
         self._identity = ""  # before it is asked for
-        self._lock: int | None = None
-        self._was: os.stat_result | None = None  # when it was locked
 
     @property
     def name(self) -> str:
@@ -138,8 +134,8 @@ class RunFolder:
             if self.writable() and not said:  # that it is not, others say
                 log.warning("%s finds no room; waiting until there is some", self.result_file)
                 said = True
-            self.check_there()
-            time.sleep(LOCK_SECONDS)
+            self.lock.check_there()
+            time.sleep(ROOM_SECONDS)
 
     def _wrote(self, path: Path, content: bytes) -> bool:
         """Whether there was room, and a folder that can be written."""
@@ -216,101 +212,9 @@ class RunFolder:
         finally:
             Path(temporary).unlink(missing_ok=True)
 
-    def lock(self) -> None:
-        """Be the one launcher of this run. Raises ConfigError where another one is."""
-        self._lock = take_lock(self.path / ".lock", LOCK_SECONDS)
-        if self._lock is None:
-            raise self._is_trained()
-        self._was = self.path.stat()
-        try:
-            self._note(" ".join(["training", str(os.getpid()), *_process_space()]))
-        except BaseException:  # a full disk; a notebook would keep the lock
-            self.unlock()
-            raise
-
-    def check_untrained(self) -> None:
-        """Raises ConfigError where a launcher trains it."""
-        if self.trainer() is not None:
-            raise self._is_trained()
-
-    def _is_trained(self) -> ConfigError:
-        return ConfigError("--run-dir", str(self.path), "this run is being trained; stop it first")
-
-    def check_there(self) -> None:
-        """Raises ConfigError where it is not the folder any more that was locked, or has lost what it goes on from."""
-        try:
-            here, *_ = [path.stat() for path in (self.path, self.path / "config.json", self.secret_file)]
-            if self._was is None or os.path.samestat(self._was, here):
-                return
-        except (FileNotFoundError, NotADirectoryError):
-            pass
-        except OSError:  # a network's disk that is away for a moment
-            return
-        fix = "was deleted or moved while it was trained; if it was moved, give its new place to go on"
-        raise ConfigError("--run-dir", str(self.path), fix)
-
     def writable(self) -> bool:
         """Whether files can be made in it."""
         return os.access(self.path, os.W_OK, effective_ids=os.access in os.supports_effective_ids)
-
-    def unlock(self, status: int | None = None) -> None:
-        """Let another launcher in; ``status`` is how this one ended, if it trained."""
-        if self._lock is not None:
-            with suppress(OSError):  # no room
-                self._note("" if status is None else f"ended {status}")
-            os.close(self._lock)
-            self._lock = None
-
-    def _note(self, text: str) -> None:
-        """Over what is there: on a full disk that needs no new block."""
-        assert self._lock is not None
-        content = text.encode()
-        os.pwrite(self._lock, content.ljust(os.fstat(self._lock).st_size), 0)
-        os.ftruncate(self._lock, len(content))
-
-    def trainer(self) -> int | None:
-        """The process of the launcher that trains this run now, if one does, wherever that is."""
-        try:
-            with (self.path / ".lock").open("rb") as file:
-                word, *rest = file.read().decode().split()
-                free = try_lock(file.fileno(), fcntl.LOCK_SH)
-                return None if free or word != "training" else int(rest[0])
-        except (FileNotFoundError, ValueError, IndexError):
-            return None
-        except OSError as error:
-            if error.errno not in WITHOUT_LOCKS:
-                raise
-            return None  # a copy: no launcher trains where it cannot lock
-
-    def trained_elsewhere(self) -> str:
-        """The machine or container whose launcher trains this run; empty where that is here, or none does."""
-        here, space = _process_space(), (self.path / ".lock").read_text().split()[2:]
-        first = 1 if len(space) == 3 else 0  # a machine may be renamed; versions before noted less
-        if space[first:] == here[first : len(space)]:
-            return ""
-        return f"another machine or container called {space[0]}" if space[0] == here[0] else space[0]
-
-    def ended(self) -> int | None:
-        """The exit status of the launcher that trained it last, if that came to an end of its own.
-
-        Raises ConfigError where that is damaged.
-        """
-        try:
-            word, _, number = (self.path / ".lock").read_text().partition(" ")
-            return int(number) if word == "ended" else None
-        except FileNotFoundError:
-            return None
-        except ValueError as error:
-            raise ConfigError("RUN", str(self.path), f".lock is damaged ({error}); remove that file") from None
-
-
-def _process_space() -> list[str]:
-    """Where this process has its number: the machine, the container on it, and the boot, as names may be shared."""
-    space = [socket.gethostname()]
-    with suppress(OSError):  # not on Linux
-        space.append(os.readlink("/proc/self/ns/pid"))
-        space.append(BOOT.read_text().strip())
-    return space
 
 
 def _link(temporary: str, path: Path) -> None:

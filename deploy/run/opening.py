@@ -99,7 +99,7 @@ def open_run(
     elif not there and has_more_than_a_start(folder):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
     make(folder)
-    folder.lock()
+    folder.lock.take()
     try:
         check(folder)
         if not there:
@@ -113,7 +113,7 @@ def open_run(
         folder.secret()
         folder.reopen(config.total_steps)  # last: a start that fails before takes no result along
     except BaseException:  # a notebook lives on, and would keep the lock
-        folder.unlock()
+        folder.lock.release()
         raise
     return folder
 

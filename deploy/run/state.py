@@ -20,18 +20,13 @@ def run_state(folder: RunFolder) -> State:
 
 
 def _locked_state(folder: RunFolder) -> State:
-    if folder.trainer() is not None:
+    if folder.lock.trainer() is not None:
         return "training"
     if folder.result() is not None:
         return "finished"
-    status = folder.ended()
-    if status is None:
-        return _unended(folder)
-    return "stopped" if status == STOPPED else "failed"
-
-
-def _unended(folder: RunFolder) -> State:
-    lock = folder.path / ".lock"
-    if lock.exists() and lock.read_text().startswith("training"):
+    status = folder.lock.ended()
+    if status is not None:
+        return "stopped" if status == STOPPED else "failed"
+    if folder.lock.lost():
         return "lost"
     return "stopped" if folder.metrics.exists() else "new"

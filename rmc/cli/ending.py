@@ -15,7 +15,7 @@ from rmc.deploy.run.state import STOPPED
 
 def print_end(folder: RunFolder, console: Console) -> int:
     """Print how a run ended that another process trained; its exit status."""
-    status = folder.ended()
+    status = folder.lock.ended()
     if status == 0:
         return print_result(folder, console)
     if status == STOPPED:

@@ -68,7 +68,7 @@ def _passes_on(stop: StopSignal, folder: RunFolder) -> Callable[[], bool]:
 
     def gone() -> bool:
         nonlocal stopped
-        if stop.requested and (trainer := folder.trainer()) not in (None, stopped):
+        if stop.requested and (trainer := folder.lock.trainer()) not in (None, stopped):
             stopped = trainer
             with suppress(ProcessLookupError):  # it has just ended
                 os.kill(trainer, signal.SIGTERM)

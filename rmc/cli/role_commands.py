@@ -54,7 +54,7 @@ def launch(command: LauncherRole) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends it cleanly while no role is there yet, too
     folder = RunFolder(command.run)
     config = folder.config()
-    folder.lock()
+    folder.lock.take()
     named = {item.name: getattr(command, item.name) for item in dataclasses.fields(command) if item.name != "run"}
     launch_options = LaunchOptions(folder.path, launcher="ray", **named)
     return training.conduct(config, folder, launch_options, terminal(400))

@@ -55,7 +55,7 @@ def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
         check_machine(config, options)
     except ConfigError:
         if options.goes_on and options.run_dir is not None:
-            RunFolder(options.run_dir).check_untrained()  # by whom its port and memory would be taken
+            RunFolder(options.run_dir).lock.check_untrained()  # by whom its port and memory would be taken
         raise
     if options.launcher == "local":
         place_for_sockets()
@@ -114,7 +114,7 @@ def _conduct(
             if tracker is not None:
                 tracker.close(end)
         finally:  # a second Ctrl-C may end what a tracker still sends
-            folder.unlock(status)
+            folder.lock.release(status)
     console.print(f"before training: {format_evaluation(before)}")
     return print_result(folder, console)
 

@@ -135,7 +135,7 @@ def _end(at_work: list[_AtWork]) -> None:
 
 def drop_replay(job: Job) -> None:
     """Remove a finished run's rings. Its checkpoints, metrics and result stay; trained longer, it fills another."""
-    if RunFolder(job.folder).trainer() is not None:  # by hand, longer than the sweep did
+    if RunFolder(job.folder).lock.trainer() is not None:  # by hand, longer than the sweep did
         return
     for ring in RunFolder(job.folder).rings():
         shutil.rmtree(ring, ignore_errors=True)

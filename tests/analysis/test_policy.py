@@ -68,7 +68,7 @@ def make_run(
 def run_of(path: Path, config: RunConfig, header: bool = True) -> RunFolder:
     """A run's folder with one checkpoint of an agent that was never trained; without ``header`` as of RMC 0.1.0."""
     folder, spec = open_run(config, path, "fail"), config.window_spec()
-    folder.unlock()
+    folder.lock.release()
     torch.manual_seed(0)
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
     agent.normalizer.freeze(torch.tensor(10), torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))

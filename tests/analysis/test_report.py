@@ -189,11 +189,11 @@ def test_a_run_that_trains_and_was_never_evaluated(trained: Path, tmp_path: Path
     (path / "metrics.jsonl").write_text("\n".join(kept[: len(kept) // 2]) + '\n{"role": "lear')
     (path / "checkpoints").mkdir()
     folder = RunFolder(path)
-    folder.lock()
+    folder.lock.take()
     try:
         text = written(tmp_path / "report.html", str(path))
     finally:
-        folder.unlock()
+        folder.lock.release()
     assert "<td>training</td>" in text
     assert "Without an evaluation yet: begun." in text
     assert "No video: " in text

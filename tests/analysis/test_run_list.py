@@ -31,7 +31,7 @@ def run_in(path: Path, status: int | None, scores: tuple[float, ...] = ()) -> Ru
         *({"role": "evaluator", "eval_return_mean": score, "eval_update": 5} for score in scores[-1:]),
     ]
     folder.metrics.write_text("".join(json.dumps(record) + "\n" for record in records))
-    folder.unlock(status)
+    folder.lock.release(status)
     return folder
 
 

@@ -70,7 +70,7 @@ def folder(tmp_path: Path) -> Iterator[RunFolder]:
     """A run that begins to train: nothing is written yet."""
     begun = open_run(CONFIG, tmp_path / "<b>run", "fail")
     yield begun
-    begun.unlock()
+    begun.lock.release()
 
 
 def say(folder: RunFolder, role: str, **metrics: Any) -> None:
@@ -109,7 +109,7 @@ def test_a_browser_shows_each_new_line_the_end_and_a_resume(serve: Serve, folder
         assert shows("learner started again") < SHOWN_SECONDS
         assert shows("actor-0: refused weights, 2 times") < SHOWN_SECONDS
         folder.write_result(RESULT)
-        folder.unlock(0)
+        folder.lock.release(0)
         assert shows("finished") + shows("11.5 ± 0.5") < SHOWN_SECONDS
         again = open_run(dataclasses.replace(CONFIG, total_steps=9000), folder.path, "resume")
         say(folder, "learner", env_steps=1600, updates_per_s=88.5)
@@ -117,7 +117,7 @@ def test_a_browser_shows_each_new_line_the_end_and_a_resume(serve: Serve, folder
         assert shows("start 2 from step 700 --total-steps 2000 to 9000") < SHOWN_SECONDS
         assert page.js("document.documentElement.scrollWidth - document.documentElement.clientWidth") == 0
         assert page.js("document.querySelectorAll('b').length") == 0
-        again.unlock(130)
+        again.lock.release(130)
         shows("stopped")
 
 
@@ -154,7 +154,7 @@ def test_a_page_of_other_runs_than_before_shows_nothing_of_those(
         page.seconds_until("document.body.innerText.includes('9.25 /s')")
         assert "model loss" not in page.js("document.body.innerText")
         assert page.js("document.querySelectorAll('section').length") == 1
-    other.unlock()
+    other.lock.release()
 
 
 def test_a_run_made_anew_in_its_folder_shows_nothing_of_the_old_one(folder: RunFolder) -> None:
@@ -162,12 +162,12 @@ def test_a_run_made_anew_in_its_folder_shows_nothing_of_the_old_one(folder: RunF
     say(folder, "learner", env_steps=1700, updates_per_s=5.0, model_loss=1.0)
     say(folder, "evaluator", eval_return_mean=999.0, eval_return_std=0.0, eval_update=9, eval_env_steps=1700)
     assert (live.look() or {})["best_evaluation"] is not None
-    folder.unlock()
+    folder.lock.release()
     shutil.rmtree(folder.path)
     anew = open_run(dataclasses.replace(CONFIG, seed=7), folder.path, "fail")
     say(anew, "learner", env_steps=10, updates_per_s=9.0)
     found = live.look() or {}
-    anew.unlock()
+    anew.lock.release()
     assert (found["whole"], found["seed"], found["best_evaluation"]) == (True, 7, None)
     assert found["curves"] == {"updates_per_s": (0, [(10, 9.0)])}
     say(anew, "learner", env_steps=20, updates_per_s=9.0)
@@ -187,7 +187,7 @@ def test_a_page_without_news_is_told_that_its_server_is_there(monkeypatch: pytes
 
 def test_runs_stand_side_by_side_with_their_newest_picture_and_video(serve: Serve, tmp_path: Path) -> None:
     for name in ("one", "two"):
-        open_run(CONFIG, tmp_path / "runs" / name, "fail").unlock(130)
+        open_run(CONFIG, tmp_path / "runs" / name, "fail").lock.release(130)
     one = tmp_path / "runs" / "one"
     (one / "videos").mkdir()
     imsave(one / "inspect.png", np.zeros((8, 12)))
@@ -404,7 +404,7 @@ def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch, capsys:
 def test_a_run_that_cannot_be_read_is_told_and_the_others_are_shown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    open_run(CONFIG, tmp_path / "runs" / "good", "fail").unlock(130)
+    open_run(CONFIG, tmp_path / "runs" / "good", "fail").lock.release(130)
     (tmp_path / "runs" / "newer" / "checkpoints").mkdir(parents=True)
     (tmp_path / "runs" / "newer" / "config.json").write_text('{"format": 999}')
     shown: list[LiveRun] = []

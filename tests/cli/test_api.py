@@ -107,7 +107,7 @@ def test_a_choice_that_there_is_none_of_is_refused(options: dict[str, Any], line
 
 def test_a_tilde_is_the_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
-    open_run(CONFIG, tmp_path / "run", "fail").unlock()
+    open_run(CONFIG, tmp_path / "run", "fail").lock.release()
     with pytest.raises(rmc.ConfigError, match=rf"^--run-dir='{tmp_path}/run': is there already"):
         rmc.train(CONFIG, "~/run", if_exists="fail")
     with pytest.raises(rmc.ConfigError, match=f"^RUN='{tmp_path}/none': no config.json there"):
@@ -168,7 +168,7 @@ def test_a_start_that_fails_lets_the_next_one_in(tmp_path: Path, monkeypatch: py
         patch.setattr(RunFolder, "write_config", full)
         with pytest.raises(OSError, match="No space left"):
             rmc.train(CONFIG, tmp_path / "run", launcher="lockstep")
-    RunFolder(tmp_path / "run").lock()
+    RunFolder(tmp_path / "run").lock.take()
 
 
 def test_a_role_finds_modules_beside_the_script_that_trains(tmp_path: Path) -> None:
@@ -226,7 +226,7 @@ def test_a_callback_hears_each_record_and_its_error_ends_a_run_that_goes_on(laun
     written = [json.loads(line) for line in folder.metrics.read_text().splitlines()]
     assert heard.pop() == {}
     assert [record for record in written if record in heard] == heard
-    assert folder.ended() == STOPPED
+    assert folder.lock.ended() == STOPPED
     steps = written[len(heard)]["env_steps"]
     heard.clear()
     result = rmc.resume(tmp_path / "run", total_steps=steps + 300, callback=heard.append)

@@ -106,7 +106,7 @@ def test_an_environment_whose_actions_have_other_bounds_is_named(
         assert f"{says}; undo that, or train another run" in complaint([*words, str(run.path)], capsys)
     with pytest.raises(ConfigError, match="now has the highest actions"):
         load_policy(kept.path).make_env()
-    open_run(kept.config(), kept.path, "resume").unlock()
+    open_run(kept.config(), kept.path, "resume").lock.release()
     monkeypatch.undo()
     with pytest.raises(ConfigError, match=r"the highest actions \[1.0, 1.0\], the run was trained with \[1.0, 5.0\]"):
         open_run(kept.config(), kept.path, "resume")
@@ -115,7 +115,7 @@ def test_an_environment_whose_actions_have_other_bounds_is_named(
 def test_a_run_keeps_its_number_of_flags(tmp_path: Path) -> None:
     config = debug(EnvConfig("Pendulum-v1", drop_sensors=0.2))
     run = open_run(config, tmp_path / "run", "fail")
-    run.unlock()
+    run.lock.release()
     run.write_sizes({"observations": 3, "flags of what is missing": 1})  # and nothing of actions, as an older version
     with pytest.raises(ConfigError, match="now has 3 flags of what is missing, the run was trained with 1"):
         open_run(config, run.path, "resume")
@@ -125,7 +125,7 @@ def test_a_run_of_whole_episodes_keeps_their_length(tmp_path: Path) -> None:
     config = debug(EnvConfig("InvertedPendulum-v5"))
     config = dataclasses.replace(config, actor=dataclasses.replace(config.actor, state_strategy="episode"))
     run = open_run(config, tmp_path / "run", "fail")
-    run.unlock()
+    run.lock.release()
     run.write_sizes(config.sizes() | {"steps an episode": 500})
     with pytest.raises(ConfigError, match="now has 1000 steps an episode, the run was trained with 500"):
         open_run(config, run.path, "resume")

@@ -324,7 +324,7 @@ def test_without_a_temporary_folder_nothing_starts(
 
 def opened_run(folder: Path) -> RunFolder:
     run = open_run(debug(EnvConfig(PENDULUM)), folder, "fail")
-    run.unlock()
+    run.lock.release()
     return run
 
 
@@ -350,7 +350,7 @@ def test_a_folder_that_is_no_runs_is_refused(capsys: pytest.CaptureFixture[str],
 def test_a_folder_in_use_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     run = open_run(debug(EnvConfig(PENDULUM)), tmp_path / "run", "fail")
     assert "stop it first" in complaint([*DEBUG, "--run-dir", str(tmp_path / "run")], capsys)
-    run.unlock()
+    run.lock.release()
 
 
 def test_a_corrupt_checkpoint_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -420,7 +420,7 @@ def test_new_takes_a_folder_beside(tmp_path: Path) -> None:
     config = debug(EnvConfig(PENDULUM))
     opened_run(tmp_path / "run")
     beside = open_run(config, tmp_path / "run", "new")
-    beside.unlock()
+    beside.lock.release()
     assert beside.path == tmp_path / "run-2"
 
 
@@ -429,7 +429,7 @@ def test_a_runs_folder_is_its_owners_alone_until_they_open_it(tmp_path: Path) ->
     run = opened_run(tmp_path / "run")
     assert [stat.S_IMODE(path.stat().st_mode) for path in (run.path, run.secret_file)] == [0o700, 0o600]
     run.path.chmod(0o750)
-    open_run(run.config(), run.path, "resume").unlock()
+    open_run(run.config(), run.path, "resume").lock.release()
     assert stat.S_IMODE(run.path.stat().st_mode) == 0o750
 
 

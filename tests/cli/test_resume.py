@@ -30,7 +30,7 @@ def run(tmp_path: Path) -> RunFolder:
         update=dataclasses.replace(config.update, learning_rate=0.1 + 0.2),
     )  # fmt: skip
     folder = open_run(config, tmp_path / "run", "fail", LaunchOptions(tmp_path / "run", "fail", "lockstep", "cuda"))
-    folder.unlock()
+    folder.lock.release()
     return folder
 
 
@@ -80,7 +80,7 @@ def test_what_is_said_is_all_that_changes(run: RunFolder) -> None:
 def test_another_launcher_takes_the_device_alone_along(tmp_path: Path) -> None:
     path, config = tmp_path / "run", debug(EnvConfig(PENDULUM))
     last = LaunchOptions(path, "resume", "ray", "cuda", None, "local", all_cpus=True, tls=True, metrics_port=9464)
-    open_run(config, path, "fail", last).unlock()
+    open_run(config, path, "fail", last).lock.release()
     assert parsed("resume", path)[1] == last
     assert parsed("resume", path, "--launcher", "local")[1] == LaunchOptions(path, "resume", "local", "cuda")
     assert parsed("resume", path, "--launcher", "ray", "--no-tls")[1] == dataclasses.replace(last, tls=False)
@@ -89,7 +89,7 @@ def test_another_launcher_takes_the_device_alone_along(tmp_path: Path) -> None:
 
 def test_a_run_that_was_served_goes_on_without(run: RunFolder) -> None:
     last = LaunchOptions(run.path, metrics_port=9464, metrics_host="0.0.0.0")
-    open_run(run.config(), run.path, "resume", last).unlock()
+    open_run(run.config(), run.path, "resume", last).lock.release()
     launch = parsed("resume", run.path, "--metrics-port", "None")[1]
     assert launch.metrics_port is None
     check_port(launch)
@@ -151,7 +151,7 @@ def begun(config: BaselineConfig, path: Path) -> RunFolder:
     sizes = baselines._sizes(config)
     folder, changed = baselines._open_folder(config, path, sizes)
     baselines._write_start(config, folder, sizes, changed)
-    folder.unlock()
+    folder.lock.release()
     return folder
 
 

@@ -57,7 +57,7 @@ def folder(tmp_path, monkeypatch):
 
 def conducted(folder, console=QUIET, launcher="local"):
     """Its launcher's exit status."""
-    folder.lock()
+    folder.lock.take()
     return conduct(folder.config(), folder, LaunchOptions(folder.path, launcher=launcher), console)
 
 
@@ -104,7 +104,7 @@ def test_an_evaluation_without_end_shows_that_it_goes_on_and_is_cut(tmp_path, mo
     monkeypatch.setattr(evaluation, "SAY_SECONDS", 0.1)
     config, output, began = folder.config(), io.StringIO(), time.monotonic()
     config = replace(config, evaluator=replace(config.evaluator, evaluation_seconds=0.5))
-    folder.lock()
+    folder.lock.take()
     placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
     assert conduct(config, folder, placement, Console(file=output, width=200)) == 0
     assert 1.0 < time.monotonic() - began < 60
@@ -151,7 +151,7 @@ def test_a_stop_signal_amid_the_evaluations_stops_the_run(folder, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(training, amid, lambda *_: signal.raise_signal(signal.SIGTERM))
             assert conducted(folder) == STOPPED
-        assert folder.ended() == STOPPED
+        assert folder.lock.ended() == STOPPED
     assert signal.getsignal(signal.SIGTERM) == before
 
 
@@ -184,8 +184,8 @@ def test_a_second_ctrl_c_amid_the_upload_leaves_no_lock(folder, monkeypatch):
     monkeypatch.setattr(training, "_launch", lambda *_: False)
     with pytest.raises(KeyboardInterrupt):
         conducted(folder)
-    assert folder.ended() == STOPPED
-    RunFolder(folder.path).lock()
+    assert folder.lock.ended() == STOPPED
+    RunFolder(folder.path).lock.take()
 
 
 def test_why_a_run_has_failed_stays_in_its_folder(folder, monkeypatch):

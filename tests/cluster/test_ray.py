@@ -143,7 +143,7 @@ def test_a_node_is_lost_and_another_comes(nodes: Cluster, tmp_path: Path) -> Non
         assert steps == sorted(steps)
         assert training.newest("replay", "entry_gaps") == training.newest("replay", "dead_letters") == 0
 
-        trainer = RunFolder(folder).trainer()
+        trainer = RunFolder(folder).lock.trainer()
         assert trainer is not None
         done = rmc("stop", str(folder), env=ENVIRONMENT)
         assert done.returncode == 0, done.stderr
@@ -158,10 +158,10 @@ def test_a_killed_launcher_and_a_role_that_somebody_ended_come_back(nodes: Clust
     folder = RunFolder(tmp_path / "run")
     with Training(folder.path, *ENDLESS, "--launcher", "ray", "--ray-address", nodes.address) as training:
         training.wait_for_updates(50)
-        before = folder.trainer()
+        before = folder.lock.trainer()
         assert before is not None
         os.kill(before, signal.SIGKILL)
-        training.wait_for(lambda: folder.trainer() not in (None, before))
+        training.wait_for(lambda: folder.lock.trainer() not in (None, before))
         steps = training.newest("replay", "env_steps")
         training.wait_for(lambda: training.newest("replay", "env_steps") > steps + 200)
         training.wait_for_updates(100)

@@ -25,5 +25,5 @@ def handlers() -> Iterator[None]:
 def folder(tmp_path: Path) -> RunFolder:
     """A run's that nobody trains."""
     run = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
-    run.unlock()
+    run.lock.release()
     return run

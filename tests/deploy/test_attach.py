@@ -28,10 +28,10 @@ import sys, time
 from pathlib import Path
 from rmc.deploy.run.folder import RunFolder
 folder = RunFolder(Path(sys.argv[1]))
-folder.lock()
+folder.lock.take()
 print("locked", flush=True)
 sys.stdin.readline()
-folder.unlock(int(sys.argv[2]))
+folder.lock.release(int(sys.argv[2]))
 """
 
 
@@ -46,57 +46,57 @@ def holder(folder: RunFolder, status: int) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_a_trainer_is_known_until_it_ends(folder: RunFolder) -> None:
-    assert (folder.trainer(), folder.ended()) == (None, None)
+    assert (folder.lock.trainer(), folder.lock.ended()) == (None, None)
     with holder(folder, 130) as owner:
-        assert folder.trainer() == owner.pid == launcher_pid(folder)
+        assert folder.lock.trainer() == owner.pid == launcher_pid(folder)
         with pytest.raises(ConfigError, match="this run is being trained; stop it first"):
-            folder.lock()
-        assert folder.trainer() == owner.pid  # who was refused has changed nothing
-        assert folder.ended() is None
+            folder.lock.take()
+        assert folder.lock.trainer() == owner.pid  # who was refused has changed nothing
+        assert folder.lock.ended() is None
         owner.communicate("\n")
-    assert (folder.trainer(), folder.ended()) == (None, 130)
+    assert (folder.lock.trainer(), folder.lock.ended()) == (None, 130)
 
 
 def test_a_trainer_that_was_killed_has_not_ended(folder: RunFolder) -> None:
     with holder(folder, 0) as owner:
         owner.kill()
-    assert (folder.trainer(), folder.ended()) == (None, None)
-    folder.lock()
-    assert folder.trainer() == os.getpid()
-    folder.unlock()
+    assert (folder.lock.trainer(), folder.lock.ended()) == (None, None)
+    folder.lock.take()
+    assert folder.lock.trainer() == os.getpid()
+    folder.lock.release()
 
 
 def test_a_trainer_on_another_machine_is_not_ours_to_stop(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder.lock()
+    folder.lock.take()
     monkeypatch.setattr("socket.gethostname", lambda: "elsewhere")
-    assert folder.trained_elsewhere() == ""  # this one, which has another name now
-    monkeypatch.setattr("rmc.deploy.run.folder.BOOT", folder.path / "config.json")
+    assert folder.lock.trained_elsewhere() == ""  # this one, which has another name now
+    monkeypatch.setattr("rmc.deploy.run.run_lock.BOOT", folder.path / "config.json")
     with pytest.raises(ConfigError, match=r"is trained on .*; stop it there"):
         stop(folder)
-    folder.unlock()
+    folder.lock.release()
 
 
 def test_nor_is_one_in_another_container_of_this_machine(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     """There, another process has its number."""
-    folder.lock()
-    assert folder.trained_elsewhere() == ""
+    folder.lock.take()
+    assert folder.lock.trained_elsewhere() == ""
     monkeypatch.setattr("os.readlink", lambda path: f"{path} of another")
     with pytest.raises(ConfigError, match=rf"another machine or container called {socket.gethostname()}; stop it"):
         stop(folder)
-    folder.unlock()
+    folder.lock.release()
 
 
 def test_nor_is_one_on_another_machine_of_the_same_name(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:  # where a sandbox hides it, the container is known all the same
-        patch.setattr("rmc.deploy.run.folder.BOOT", folder.path / "none")
-        folder.lock()
+        patch.setattr("rmc.deploy.run.run_lock.BOOT", folder.path / "none")
+        folder.lock.take()
         assert len((folder.path / ".lock").read_text().split()) == 4
-        folder.unlock()
-    folder.lock()
-    monkeypatch.setattr("rmc.deploy.run.folder.BOOT", folder.path / "config.json")
+        folder.lock.release()
+    folder.lock.take()
+    monkeypatch.setattr("rmc.deploy.run.run_lock.BOOT", folder.path / "config.json")
     with pytest.raises(ConfigError, match=rf"another machine or container called {socket.gethostname()}; stop it"):
         stop(folder)
-    folder.unlock()
+    folder.lock.release()
 
 
 def test_of_several_replay_servers_none_takes_the_steps_back(folder: RunFolder) -> None:
@@ -181,13 +181,13 @@ def test_before_the_roles_and_after_them_nobody_is_silent(
     said = [{"role": role, "time": time.time() - ago} for role, ago in words.items()]
     ended = [{**said[-1], "finished": 1}] if words.get("launcher") == 40.0 else []
     folder.metrics.write_text("".join(json.dumps(one) + "\n" for one in [*said, *ended]))
-    folder.lock()
+    folder.lock.take()
     watch(folder, Console(file=printed, width=500), lambda: next(looks) > 2)
     assert "0 of" in printed.getvalue()
     assert "silent" not in printed.getvalue()
     assert recorded_status(folder).state == "training"
     assert "silent" not in notices(recorded_status(folder))
-    folder.unlock()
+    folder.lock.release()
 
 
 def test_who_speaks_and_then_falls_silent_in_a_start_that_goes_on(

@@ -115,7 +115,7 @@ def test_a_port_that_a_run_has_is_not_written_again(folder: RunFolder, monkeypat
 def hosts(tmp_path: Path) -> Hosts:
     """Of a run that has none yet."""
     folder: RunFolder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
-    folder.unlock()
+    folder.lock.release()
     return Hosts(folder, "cpu", False, lambda role: f"redis://{role}")
 
 
@@ -151,17 +151,17 @@ def test_a_second_start_is_told_that_the_run_is_trained(folder: RunFolder, monke
     held = list[bool]()
 
     def remote(*_: object) -> None:
-        held.append(folder.trainer() is not None)
+        held.append(folder.lock.trainer() is not None)
         raise ray_launcher.ray.exceptions.ActorAlreadyExistsError("the name is taken")
 
     context = SimpleNamespace(gcs_address="", get_node_id=lambda: "0" * 56)
     monkeypatch.setattr(ray_launcher.ray, "get_runtime_context", lambda: context)
     options = SimpleNamespace(options=lambda **_: SimpleNamespace(remote=remote))
     monkeypatch.setattr(ray_launcher.ray, "remote", lambda _: options)
-    folder.lock()
+    folder.lock.take()
     with pytest.raises(ConfigError, match=r"^--run-dir=.*: this run is being trained; rmc attach watches it$"):
         ray_launcher.launch(folder.config(), folder, LaunchOptions(folder.path, "resume", "ray"))
-    assert (held, folder.trainer()) == ([True], None)
+    assert (held, folder.lock.trainer()) == ([True], None)
 
 
 def test_a_launcher_may_lose_its_working_folder(hosts: Hosts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -152,10 +152,10 @@ def test_a_second_start_is_not_told_of_the_port_that_the_first_one_has(
 ) -> None:
     with socket.create_server((HERE, 0)) as taken:
         port = taken.getsockname()[1]
-        folder.lock()
+        folder.lock.take()
         words = ["resume", str(folder.path), "--metrics-port", str(port)]
         assert main.run(words) == 2
-        folder.unlock()
+        folder.lock.release()
     assert capsys.readouterr().err == f"rmc: --run-dir='{folder.path}': this run is being trained; stop it first\n"
 
 

@@ -72,9 +72,9 @@ def test_a_run_is_known_by_its_folder_or_its_secret(tmp_path: Path, changed: int
 
 def test_a_full_disk_keeps_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = RunFolder(tmp_path)
-    folder.lock()
-    folder.unlock(130)
-    folder.lock()
+    folder.lock.take()
+    folder.lock.release(130)
+    folder.lock.take()
     text = (tmp_path / ".lock").read_text()
     assert text.startswith("training ")
     assert str(os.getpid()) in text
@@ -84,10 +84,10 @@ def test_a_full_disk_keeps_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "pwrite", full)
-        folder.unlock(130)
+        folder.lock.release(130)
         with pytest.raises(OSError, match="No space"):
-            folder.lock()
-    RunFolder(tmp_path).lock()
+            folder.lock.take()
+    RunFolder(tmp_path).lock.take()
 
 
 def test_all_who_make_it_at_once_have_the_same(tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_a_copy_on_a_disk_without_locks_can_be_read(
 ) -> None:
     folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
     shutil.copytree(folder.path, tmp_path / "copy")
-    folder.unlock()
+    folder.lock.release()
     monkeypatch.setattr("fcntl.flock", raising(fault))
     assert run_state(RunFolder(tmp_path / "copy")) == "lost"
 
@@ -172,8 +172,8 @@ def test_a_folder_of_another_owner_that_can_be_written_is_taken(tmp_path: Path) 
     folder = RunFolder(tmp_path / "run")
     with as_nobody():
         make(folder)
-        folder.lock()
-        folder.unlock()
+        folder.lock.take()
+        folder.lock.release()
         folder.secret()
     assert folder.secret_file.stat().st_uid == folder.checkpoints.stat().st_uid == 65534
     assert stat.S_IMODE(folder.secret_file.stat().st_mode) == 0o600
@@ -209,7 +209,9 @@ def test_a_run_that_is_made_longer_has_no_result_until_it_ends(folder: RunFolder
     config = folder.config()
     folder.write_result(dict.fromkeys(RESULT, config.total_steps))
     for more, there in ((0, True), (1, False)):
-        open_run(dataclasses.replace(config, total_steps=config.total_steps + more), folder.path, "resume").unlock()
+        open_run(
+            dataclasses.replace(config, total_steps=config.total_steps + more), folder.path, "resume"
+        ).lock.release()
         assert (folder.result() is not None) == there
 
 
@@ -244,7 +246,7 @@ def test_starts_in_the_same_second_get_a_folder_each(
     assert {one.path.name for one in runs} == {name, *(f"{name}-{number}" for number in (2, 3, 4))}
     assert {stat.S_IMODE(one.path.stat().st_mode) for one in runs} == {0o700}
     for one in runs:
-        one.unlock()
+        one.lock.release()
 
 
 def test_a_place_for_runs_that_is_none_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -281,7 +283,7 @@ def test_a_folder_that_turns_read_only_is_waited_for(
     messages = [message.partition("run ")[2] for message in caplog.messages]
     assert messages == ["is read-only: training goes on, its end waits", "can be written again"]
     monitor.close()
-    folder.unlock()
+    folder.lock.release()
 
 
 @contextmanager
@@ -315,7 +317,7 @@ def test_a_result_waits_for_room(
         write(path, content)
 
     monkeypatch.setattr(run_folder, "write_whole", full_at_first)
-    monkeypatch.setattr(run_folder, "LOCK_SECONDS", 0.01)
+    monkeypatch.setattr(run_folder, "ROOM_SECONDS", 0.01)
     folder.write_result(dict.fromkeys(RESULT, 1))
     assert folder.result() == dict.fromkeys(RESULT, 1)
     assert [one.getMessage() for one in caplog.records] == [
@@ -377,13 +379,13 @@ def test_a_newer_damaged_checkpoint_is_told_where_the_run_goes_on(
 ) -> None:
     config = debug(EnvConfig("Pendulum-v1"))
     folder = open_run(config, tmp_path / "run", "fail")
-    folder.unlock()
+    folder.lock.release()
     checkpoints = CheckpointFolder(folder.checkpoints)
     for update in (10, 20, 30):
         checkpoints.save(update, {"state": b"x"})
     for update in (20, 30):
         (checkpoints.path(update) / "state").write_bytes(b"y")
-    open_run(config, tmp_path / "run", "resume").unlock()
+    open_run(config, tmp_path / "run", "resume").lock.release()
     messages = [record.getMessage() for record in caplog.records]
     assert len(messages) == 2
     assert all(

@@ -44,7 +44,7 @@ def test_every_option_may_change_or_is_refused_with_the_reason(path: str, folder
     was = flat(CONFIG)[path]
     changed = with_value(CONFIG, path, another(path, was))
     if path in MAY_CHANGE:
-        open_run(changed, folder.path, "resume").unlock()
+        open_run(changed, folder.path, "resume").lock.release()
         assert folder.config() == changed
         assert starts(folder)[-1].changes == {path: [was, flat(changed)[path]]}
     else:
@@ -60,12 +60,12 @@ def test_a_start_that_is_refused_once_it_has_the_lock_writes_nothing(folder: Run
     """On Ray another start may have been between."""
 
     def refuse(locked: RunFolder) -> None:
-        assert locked.trainer() is not None
+        assert locked.lock.trainer() is not None
         raise ConfigError("--run-dir", str(locked.path), "this run is being trained")
 
     with pytest.raises(ConfigError, match="is being trained"):
         open_run(dataclasses.replace(CONFIG, total_steps=9_000), folder.path, "resume", check=refuse)
-    assert (folder.config(), len(starts(folder)), folder.trainer()) == (CONFIG, 1, None)
+    assert (folder.config(), len(starts(folder)), folder.lock.trainer()) == (CONFIG, 1, None)
 
 
 def test_the_history_is_a_line_a_start(folder: RunFolder) -> None:
@@ -74,8 +74,8 @@ def test_the_history_is_a_line_a_start(folder: RunFolder) -> None:
     folder.history_file.write_bytes(folder.history_file.read_bytes() + b'{"time": 1.0, "vers')  # torn by a crash
     replay = dataclasses.replace(CONFIG.replay, replay_ratio=8.0)
     longer = dataclasses.replace(CONFIG, total_steps=9_000, replay=replay)
-    open_run(longer, folder.path, "resume").unlock()
-    open_run(longer, folder.path, "resume").unlock()
+    open_run(longer, folder.path, "resume").lock.release()
+    open_run(longer, folder.path, "resume").lock.release()
     assert [start.env_steps for start in starts(folder)] == [0, 1_230, 1_230]
     assert starts(folder)[-1].changes == {}
     assert format_starts(folder) == "3 starts; from step 1,230 --total-steps 4000 to 9000, --replay-ratio 32 to 8"
@@ -89,7 +89,7 @@ def test_of_a_run_of_weeks_a_start_parses_what_was_said_last(
     folder.metrics.write_text(line * 20_000 + '{"role": "replay", "env_steps": 9000}\n')
     parsed, parse = [], metrics_tail.parse_record
     monkeypatch.setattr(metrics_tail, "parse_record", lambda line: parsed.append(len(line)) or parse(line))
-    open_run(CONFIG, folder.path, "resume").unlock()
+    open_run(CONFIG, folder.path, "resume").lock.release()
     assert starts(folder)[-1].env_steps == 9_000
     assert 0 < sum(parsed) < 1.1 * metrics_tail.LISTED_BYTES
 
@@ -120,6 +120,6 @@ def test_how_it_was_started_is_kept_but_no_password(
     monkeypatch.chdir("/")
     options = LaunchOptions(tmp_path / "run", "fail", "manual", "cuda:1", url, all_cpus=True)
     folder = open_run(CONFIG, tmp_path / "run", "fail", options)
-    folder.unlock()
+    folder.lock.release()
     assert last_launch(folder) == LaunchOptions(folder.path, "resume", "manual", "cuda:1", kept, all_cpus=True)
     assert "hush" not in folder.history_file.read_text()

@@ -21,33 +21,33 @@ def folder(tmp_path: Path) -> RunFolder:
 
 def test_a_run_is_trained_until_it_ends(folder: RunFolder) -> None:
     assert run_state(folder) == "training"
-    folder.unlock(130)
+    folder.lock.release(130)
     assert run_state(folder) == "stopped"
 
 
 @pytest.mark.parametrize("status", [1, 2])
 def test_any_other_end_is_a_failure(folder: RunFolder, status: int) -> None:
-    folder.unlock(status)
+    folder.lock.release(status)
     assert run_state(folder) == "failed"
 
 
 def test_a_run_with_a_result_is_finished(folder: RunFolder) -> None:
     folder.write_result(dict.fromkeys((*RESULT, "initial_return_mean"), 1.0))
     assert run_state(folder) == "training"
-    folder.unlock(0)
+    folder.lock.release(0)
     assert run_state(folder) == "finished"
 
 
 def test_one_whose_launcher_was_killed_is_lost(folder: RunFolder) -> None:
     lock = folder.path / ".lock"
     text = lock.read_text()
-    folder.unlock()
+    folder.lock.release()
     lock.write_text(text)
     assert run_state(folder) == "lost"
 
 
 def test_one_that_nobody_has_trained_is_new(folder: RunFolder) -> None:
-    folder.unlock()
+    folder.lock.release()
     assert run_state(folder) == "new"
     folder.metrics.write_text(json.dumps({"role": "learner"}) + "\n")
     assert run_state(folder) == "stopped"  # as runs of earlier versions noted it

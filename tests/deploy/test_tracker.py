@@ -43,7 +43,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
     monkeypatch.setenv("HOME", str(tmp_path))  # where a login would be
     monkeypatch.delenv("WANDB_API_KEY", raising=False)
     run = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "first", "fail")
-    run.unlock()
+    run.lock.release()
     return run
 
 

@@ -21,6 +21,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import InitParts, LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
+from rmc.deploy.run.run_lock import RunLock
 from rmc.deploy.run.starts import format_starts
 from tests.deploy.test_config import with_value
 from tests.integration.test_lockstep import trained
@@ -40,7 +41,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """A run that has learnt something, in lockstep."""
     folder = open_run(CONFIG, tmp_path_factory.mktemp("source") / "run", "fail")
     trained(CONFIG, folder.path)
-    folder.unlock()
+    folder.lock.release()
     return folder
 
 
@@ -54,7 +55,7 @@ def state(folder: RunFolder) -> dict[str, dict[str, torch.Tensor]]:
 def begin(config: RunConfig, path: Path, source: RunFolder, parts: InitParts = "all", which: str = "") -> RunFolder:
     options = LaunchOptions(path, init_from=f"{source.path}{which}", init_parts=parts)
     folder = open_run(config, path, "resume", options)
-    folder.unlock()
+    folder.lock.release()
     return folder
 
 
@@ -148,21 +149,21 @@ class Killed(Exception):
     """The start."""
 
 
-@pytest.mark.parametrize("before", ["lock", "reopen", "write_config", "write_sizes"])
+@pytest.mark.parametrize("before", ["take", "reopen", "write_config", "write_sizes"])
 def test_a_start_that_is_killed_is_made_again_by_the_same_words(
     before: str, source: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    killed: list[RunFolder] = []
+    killed: list[RunLock] = []
 
-    def kill(folder: RunFolder, *_: object) -> None:
-        killed.append(folder)
+    def kill(place: RunFolder | RunLock, *_: object) -> None:
+        killed.append(place if isinstance(place, RunLock) else place.lock)
         raise Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr(RunFolder, before, kill)
+        patched.setattr(RunLock if before == "take" else RunFolder, before, kill)
         with pytest.raises(Killed):
             begin(OTHER, tmp_path / "run", source)
-    killed[0].unlock()
+    killed[0].release()
     folder = begin(OTHER, tmp_path / "run", source)
     assert read_policy(folder.path, "0").header == OTHER.policy_header()
     assert format_starts(folder) == ("2 starts" if before in ("write_sizes", "reopen") else "1 start") + (
@@ -210,7 +211,7 @@ def test_grounding_says_nothing_of_a_policy(source: RunFolder, tmp_path: Path) -
 
 def test_a_state_that_is_cut_is_one_line(source: RunFolder, tmp_path: Path) -> None:
     copied = open_run(CONFIG, tmp_path / "copied", "fail")
-    copied.unlock()
+    copied.lock.release()
     progress = json.dumps({"updates": 5, "env_steps": 50}).encode()
     CheckpointFolder(copied.checkpoints).save(5, {"learner.pt": b"PK", "progress.json": progress})
     message = r"--init-from='.*copied': its checkpoint 5 cannot be used \(.+\); use another"

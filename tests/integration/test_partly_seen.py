@@ -83,7 +83,7 @@ def test_its_policy_knows_what_is_missing_and_nothing_of_what_critics_see(tmp_pa
     settings = partial(checkpoint_steps=200)
     folder = open_run(settings, tmp_path / "run", "fail")
     lockstep = trained(settings, folder.path)
-    folder.unlock()
+    folder.lock.release()
     sent = lockstep.bus.weights()
     assert sent is not None
     policy = load_policy(folder.path)
@@ -125,7 +125,7 @@ def test_a_run_whose_critics_see_more_begins_with_another(tmp_path: Path) -> Non
     settings = partial(checkpoint_steps=200)
     source = open_run(settings, tmp_path / "source", "fail")
     trained(settings, source.path)
-    source.unlock()
+    source.lock.release()
     theirs, other = state(source)["agent"], dataclasses.replace(settings, seed=9)
     for parts, learnt in (("all", True), ("memory+world-model", False)):
         begun = Lockstep(other, begin(other, tmp_path / parts, source, parts).path)

@@ -51,11 +51,11 @@ def emptied(folder: Path) -> None:
 def test_each_way_is_seen(vanish: Callable[[Path], None], tmp_path: Path) -> None:
     folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
     assert folder.secret()
-    folder.check_there()
+    folder.lock.check_there()
     vanish(folder.path)
     with pytest.raises(ConfigError, match="was deleted or moved while it was trained"):
-        folder.check_there()
-    folder.unlock()
+        folder.lock.check_there()
+    folder.lock.release()
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.ESTALE, errno.EIO, errno.ENOTCONN])
@@ -69,8 +69,8 @@ def test_a_network_disk_that_is_away_for_a_moment_is_no_folder_gone(
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "stat", away)
-        folder.check_there()
-    folder.unlock()
+        folder.lock.check_there()
+    folder.lock.release()
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def test_runs_are_spread_and_their_folders_come_without_the_ring(tmp_path: Path)
     for name in sweep.states():
         run = RunFolder(folder / name)
         assert run.result() is not None
-        assert run.ended() == 0
+        assert run.lock.ended() == 0
         assert {"config.json", "metrics.jsonl", "checkpoints"} <= {path.name for path in run.path.iterdir()}
         assert not run.rings()
         assert "after training" in (folder / "logs" / f"{name}.log").read_text()
@@ -60,7 +60,7 @@ def test_a_stopped_and_a_lost_run_go_on_with_the_same_command(tmp_path: Path) ->
         assert sweep.interrupt() == 130
     assert sweep.states() == {"seed=0": "stopped"}
     run = RunFolder(folder / "seed=0")
-    assert run.ended() == 130
+    assert run.lock.ended() == 130
     saved = sorted(path.name for path in run.checkpoints.glob("[0-9]*"))
     assert saved
     with Sweeping(folder, spec, *RAY) as sweep:

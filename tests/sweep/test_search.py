@@ -211,7 +211,7 @@ def test_a_trial_far_below_the_others_is_stopped_in_order(tmp_path: Path) -> Non
     assert sweep.states()["trial-4"] == "pruned"
     assert re.search(r"^5 of 5: learning_rate \S+, scheme \d, trial-4: pruned: return ", sweep.text(), re.MULTILINE)
     assert "1 pruned" in sweep.text()
-    assert RunFolder(folder / "trial-4").ended() == 130
+    assert RunFolder(folder / "trial-4").lock.ended() == 130
 
 
 def test_without_optuna_it_is_said_how_to_install_it(

@@ -137,7 +137,7 @@ def test_ctrl_c_ends_all_in_order_and_a_kill_leaves_nothing(tmp_path: Path) -> N
         assert not alive(processes)
         assert sweep.states() == {"seed=1": "stopped", "seed=2": "stopped", "seed=3": "waiting"}
     for name in OTHERS:
-        assert RunFolder(folder / name).ended() == 130  # it has saved
+        assert RunFolder(folder / name).lock.ended() == 130  # it has saved
         assert max((folder / name / "checkpoints").glob("[0-9]*")).is_dir()
     with Sweeping(folder, *words) as sweep:
         sweep.wait_for(lambda: all(sweep.run_process(name) for name in OTHERS))
@@ -246,7 +246,7 @@ def made(folder: Path, gamma: float = 0.99) -> Job:
     job = Job(folder, words, 0, {"gamma": gamma})
     config = read(job)[0]
     run_folder = open_run(config, folder, "fail")
-    run_folder.unlock()
+    run_folder.lock.release()
     result = {"updates": 1, "wall_s": 1.0, "eval_return_mean": 12_345.6, "eval_return_std": 0.0, "eval_episodes": 1}
     run_folder.write_result({**result, "env_steps": config.total_steps, "initial_return_mean": 0.0})
     return job
@@ -280,11 +280,11 @@ def test_the_rings_of_all_replay_servers_are_dropped(tmp_path: Path) -> None:
     job = Job(tmp_path, (), 0)
     for name in ("replay", "replay-0", "replay-11", "replay-counters", "checkpoints"):
         (tmp_path / name).mkdir()
-    lock = RunFolder(tmp_path)
-    lock.lock()
+    run = RunFolder(tmp_path)
+    run.lock.take()
     drop_replay(job)
     assert (tmp_path / "replay").is_dir()  # somebody trains it longer
-    lock.unlock()
+    run.lock.release()
     (tmp_path / ".lock").unlink()
     drop_replay(job)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoints", "replay-counters"]

@@ -1,0 +1,122 @@
+"""The lock of a run's folder: which launcher trains the run, where, and how the last one ended.
+
+``.lock`` holds ``training PID MACHINE CONTAINER BOOT`` while a launcher trains the run, then ``ended STATUS``.
+"""
+
+import fcntl
+import os
+import socket
+from contextlib import suppress
+from pathlib import Path
+
+from rmc.common.errors import ConfigError
+from rmc.common.process.file_lock import WITHOUT_LOCKS, take_lock, try_lock
+
+BOOT = Path("/proc/sys/kernel/random/boot_id")  # no two machines have one
+LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
+
+
+class RunLock:
+    """One launcher has it at a time, and it goes with the launcher's process."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._file = folder, folder / ".lock"
+        self._handle: int | None = None
+        self._locked_folder: os.stat_result | None = None
+
+    def take(self) -> None:
+        """Be the one launcher of this run. Raises ConfigError where another one is."""
+        self._handle = take_lock(self._file, LOCK_SECONDS)
+        if self._handle is None:
+            raise self._is_trained()
+        self._locked_folder = self._folder.stat()
+        try:
+            self._note(" ".join(["training", str(os.getpid()), *_process_space()]))
+        except BaseException:  # a full disk; a notebook would keep the lock
+            self.release()
+            raise
+
+    def release(self, status: int | None = None) -> None:
+        """Let another launcher in; ``status`` is how this one ended, if it trained."""
+        if self._handle is not None:
+            with suppress(OSError):  # no room
+                self._note("" if status is None else f"ended {status}")
+            os.close(self._handle)
+            self._handle = None
+
+    def _note(self, text: str) -> None:
+        """Over what is there: on a full disk that needs no new block."""
+        assert self._handle is not None
+        content = text.encode()
+        os.pwrite(self._handle, content.ljust(os.fstat(self._handle).st_size), 0)
+        os.ftruncate(self._handle, len(content))
+
+    def check_there(self) -> None:
+        """Raises ConfigError where it is not the folder any more that was locked, or has lost what it goes on from."""
+        needed = (self._folder, self._folder / "config.json", self._folder / "secret")
+        try:
+            here, *_ = [path.stat() for path in needed]
+            if self._locked_folder is None or os.path.samestat(self._locked_folder, here):
+                return
+        except (FileNotFoundError, NotADirectoryError):
+            pass
+        except OSError:  # a network's disk that is away for a moment
+            return
+        fix = "was deleted or moved while it was trained; if it was moved, give its new place to go on"
+        raise ConfigError("--run-dir", str(self._folder), fix)
+
+    def check_untrained(self) -> None:
+        """Raises ConfigError where a launcher trains the run."""
+        if self.trainer() is not None:
+            raise self._is_trained()
+
+    def _is_trained(self) -> ConfigError:
+        return ConfigError("--run-dir", str(self._folder), "this run is being trained; stop it first")
+
+    def trainer(self) -> int | None:
+        """The process of the launcher that trains this run now, if one does, wherever that is."""
+        try:
+            with self._file.open("rb") as file:
+                word, *rest = file.read().decode().split()
+                free = try_lock(file.fileno(), fcntl.LOCK_SH)
+                return None if free or word != "training" else int(rest[0])
+        except (FileNotFoundError, ValueError, IndexError):
+            return None
+        except OSError as error:
+            if error.errno not in WITHOUT_LOCKS:
+                raise
+            return None  # a copy: no launcher trains where it cannot lock
+
+    def trained_elsewhere(self) -> str:
+        """The machine or container whose launcher trains this run; empty where that is here, or none does."""
+        here, space = _process_space(), self._file.read_text().split()[2:]
+        first = 1 if len(space) == 3 else 0  # a machine may be renamed; versions before noted less
+        if space[first:] == here[first : len(space)]:
+            return ""
+        return f"another machine or container called {space[0]}" if space[0] == here[0] else space[0]
+
+    def ended(self) -> int | None:
+        """The exit status of the launcher that trained it last, if that came to an end of its own.
+
+        Raises ConfigError where that is damaged.
+        """
+        try:
+            word, _, number = self._file.read_text().partition(" ")
+            return int(number) if word == "ended" else None
+        except FileNotFoundError:
+            return None
+        except ValueError as error:
+            raise ConfigError("RUN", str(self._folder), f".lock is damaged ({error}); remove that file") from None
+
+    def lost(self) -> bool:
+        """Whether the launcher that trained it last is gone without a word."""
+        return self._file.exists() and self._file.read_text().startswith("training") and self.trainer() is None
+
+
+def _process_space() -> list[str]:
+    """Where this process has its number: the machine, the container on it, and the boot, as names may be shared."""
+    space = [socket.gethostname()]
+    with suppress(OSError):  # not on Linux
+        space.append(os.readlink("/proc/self/ns/pid"))
+        space.append(BOOT.read_text().strip())
+    return space
