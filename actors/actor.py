@@ -21,10 +21,10 @@ from rmc.actors.unacked_entries import UnackedEntries
 from rmc.actors.window_builder import WindowBuilder
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import TAKEN_OVER, UNTRAINED, Ack, Bus, Version
-from rmc.common.env.wrappers import Env, Floats
+from rmc.common.env.wrappers import Env
 from rmc.common.errors import BusFull, BusUnavailable, FencedError, MessageError
 from rmc.common.metrics import Means, Rate
-from rmc.common.window import Rows, WindowSpec
+from rmc.common.window import Floats, Rows, WindowSpec
 
 log = logging.getLogger(__name__)
 POLL_SECONDS = 0.02  # between looks at the bus while there is nothing to do but wait

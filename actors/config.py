@@ -30,7 +30,7 @@ class ActorConfig:
     reward_scale: float = 1.0
     """Factor on the rewards that are learnt from; reported returns are unscaled."""
     refresh_steps: int = 400
-    """Environment steps of an actor between two checks for new weights."""
+    """Agent steps of an actor between two checks for new weights."""
     chunk_windows: int = 16
     """Windows sent in one entry."""
     chunk_seconds: float = 0.5

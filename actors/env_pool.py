@@ -11,9 +11,9 @@ import numpy as np
 
 from rmc.actors.window_builder import Transition
 from rmc.common.env.make import further_env, recreate_env
-from rmc.common.env.wrappers import Env, Floats
+from rmc.common.env.wrappers import Env
 from rmc.common.errors import EnvFault
-from rmc.common.window import BoolArray, WindowSpec
+from rmc.common.window import BoolArray, Floats, WindowSpec
 
 log = logging.getLogger(__name__)
 BROKEN_STARTS = 5  # episodes in a row that an environment breaks in their first step before the actor gives up

@@ -13,15 +13,15 @@ from contextlib import suppress
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rmc.actors.config import EvaluatorConfig
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.protocol import Bus, Version
 from rmc.common.env.make import further_env, recreate_env
-from rmc.common.env.wrappers import Env, Floats
+from rmc.common.env.wrappers import Env
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, EnvFault, MessageError
+from rmc.common.window import BoolArray, Floats
 
 log = logging.getLogger(__name__)
 POLL_SECONDS = 0.1  # between looks for a policy to play
@@ -46,7 +46,7 @@ class PolicyLike(Protocol):
         self,
         observation: Floats,
         prev_action: Floats,
-        missing: NDArray[np.bool_],
+        missing: BoolArray,
         state: Floats,
         noise: Floats | None,
         /,
@@ -251,7 +251,7 @@ class Evaluator:
         self._env.close()
 
 
-def evaluation_metrics(rollout: Rollout) -> dict[str, Any]:
+def evaluation_record(rollout: Rollout) -> dict[str, Any]:
     """What an evaluation is told by, in records and results."""
     return {
         "eval_return_mean": float(np.mean(rollout.returns)),
@@ -265,4 +265,4 @@ def evaluation_metrics(rollout: Rollout) -> dict[str, Any]:
 def _record(rollout: Rollout, version: Version) -> dict[str, Any]:
     if not rollout.returns:
         return {"eval_broken_episodes": rollout.broken}
-    return evaluation_metrics(rollout) | {"eval_steps": rollout.steps, "eval_update": version.update}
+    return evaluation_record(rollout) | {"eval_steps": rollout.steps, "eval_update": version.update}

@@ -5,22 +5,20 @@ Float32 throughout; agrees with ``rmc.common.agent`` (its modules are the refere
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
 from rmc.common.agent_config import CRITIC_PARTS, LOG_STD_RANGE, NORMALIZED_CLIP, AgentConfig
 from rmc.common.errors import MessageError
-from rmc.common.window import BoolArray
-
-Floats = NDArray[np.float32]
+from rmc.common.window import BoolArray, Floats
 
 
 def _of_shape(weights: dict[str, Tensor], name: str, like: Tensor) -> Tensor:
@@ -41,6 +39,17 @@ def _check_finite(weights: dict[str, Tensor]) -> None:
 
 
 PLAIN: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}  # whatever the caller's program has as default
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch's, for a policy's products: their last bits depend on it, and a process that has begun more cannot fork."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class _Linear:

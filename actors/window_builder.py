@@ -11,11 +11,8 @@ GRU state before it. ``k`` below counts the steps of an episode.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rmc.common.window import BoolArray, Rows, WindowSpec
-
-Floats = NDArray[np.float32]
+from rmc.common.window import BoolArray, Floats, Rows, WindowSpec
 
 
 class Now(NamedTuple):

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from sb3_contrib import CrossQ, RecurrentPPO
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -24,9 +23,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig, Choice, choose
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
-from rmc.common.env.wrappers import Floats
 from rmc.common.errors import ConfigError, first_line
 from rmc.common.whole_file import write_whole
+from rmc.common.window import BoolArray, Floats
 from rmc.deploy.run.folder import RunFolder
 
 CLASSES: dict[str, Any] = {
@@ -129,7 +128,7 @@ class SB3Adapter:
         return actions, nothing
 
     def act(
-        self, observation: Floats, _prev_action: Floats, _missing: NDArray[np.bool_], state: Floats, _: Floats | None
+        self, observation: Floats, _prev_action: Floats, _missing: BoolArray, state: Floats, _: Floats | None
     ) -> tuple[Floats, Floats]:
         """(N, O) -> (N, A), as ``PolicyRunner.act``; of the rest nothing is used."""
         scaled = self._scaled(observation)
@@ -141,7 +140,8 @@ class SB3Adapter:
 def saved_player(config: BaselineConfig, saved: Path, env: EnvConfig) -> SB3Adapter:
     """What was saved, to be played in ``env``. Raises ConfigError where it cannot be read."""
     with reading(saved):
-        model = CLASSES[config.algorithm].load(saved / MODEL, device="cpu")
+        unseeded = {"seed": None}  # the generators that all share are the caller's
+        model = CLASSES[config.algorithm].load(saved / MODEL, device="cpu", custom_objects=unseeded)
         return SB3Adapter(model, _kept_scaling(saved / SCALES, env))
 
 

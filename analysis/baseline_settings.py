@@ -9,8 +9,9 @@ from typing import Any, Literal
 
 from rmc.common.env.config import EnvConfig, check_range
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import from_dict, option
+from rmc.deploy.run.config import from_dict
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.option_names import option
 
 Algorithm = Literal["sac", "crossq", "td3", "ddpg", "ppo", "recurrent-ppo"]
 Settings = Literal["paper", "zoo", "default"]
@@ -53,9 +54,9 @@ class BaselineConfig:
     seed: int = 0
     """Seed of networks, environment and sampling."""
     total_steps: int = 1_000_000
-    """Environment steps of the run."""
+    """Agent steps of the run."""
     checkpoint_steps: int = 10_000
-    """Environment steps between evaluations."""
+    """Agent steps between evaluations."""
     episodes: int = 5
     """Episodes of an evaluation."""
     threads: int = 1
@@ -68,7 +69,7 @@ class BaselineConfig:
         return {"paper": f"{kind} 400-300", "zoo": f"{kind} zoo", "default": kind}[self.settings]
 
 
-def read(folder: RunFolder) -> BaselineConfig:
+def read_config(folder: RunFolder) -> BaselineConfig:
     """A baseline's config from its folder. Raises ConfigError."""
     raw = folder.settings()
     try:

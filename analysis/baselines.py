@@ -19,22 +19,24 @@ from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
 from rmc.actors.config import EvaluatorConfig
-from rmc.actors.evaluator import Rollout, evaluation_metrics, first_start, play_episodes
+from rmc.actors.evaluator import Rollout, evaluation_record, first_start, play_episodes
 from rmc.analysis.baseline_model import PROGRESS, BaselineModel, saved_player, saved_states
-from rmc.analysis.baseline_settings import BaselineConfig, read, validate
+from rmc.analysis.baseline_settings import BaselineConfig, read_config, validate
 from rmc.analysis.evaluation import FINAL_EPISODES, EvaluationProgress, Watch, missing_shares
 from rmc.common.env.make import env_layout, make_env
-from rmc.common.errors import ConfigError
+from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.config import changes, layout_sizes, option
+from rmc.deploy.monitor import main_metrics
+from rmc.deploy.monitor.metrics_log import MetricsLog
+from rmc.deploy.run.env_sizes import layout_sizes
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.metrics_tail import MetricsTail, wall_seconds
 from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.opening import default_name, forget_start, has_more_than_a_start, make, new_folder
+from rmc.deploy.run.option_names import changes, flat, option
 from rmc.deploy.run.starts import note_start, resume_command
-from rmc.deploy.run.state import STOPPED
 
 MAY_CHANGE = {"total_steps", "threads", "checkpoint_steps", "episodes", "env.env_timeout"}
 SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
@@ -76,7 +78,7 @@ def _conduct(
     if result is None:
         console.print(f"stopped at environment step {steps:,}; to go on:")
         console.print(f"  {resume_command(folder)}", soft_wrap=True)
-        return STOPPED
+        return STOPPED_STATUS
     folder.write_result(result)
     mean, deviation = result["eval_return_mean"], result["eval_return_std"]
     console.print(f"after training: return {mean:,.1f} ± {deviation:,.1f}; {folder.result_file}")
@@ -93,7 +95,7 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
     name = default_name(config.env.id, f"{config.algorithm}-{config.settings}", config.seed)
     folder = RunFolder(run_dir) if run_dir is not None else new_folder(Path("runs").resolve() / name)
     there = (folder.path / "config.json").exists() and folder.is_baseline()
-    before = read(folder) if there else config
+    before = read_config(folder) if there else config
     changed = changes(before, config)
     if refused := next((path for path in changed if path not in MAY_CHANGE), None):
         was, now = changed[refused]
@@ -139,7 +141,7 @@ class _Run(BaseCallback):
         self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, math.inf
         self._next_evaluation = self._after(min(self.steps, _evaluated_steps(folder)))  # one that was cut is made up
         self._initial = self._first_evaluation()
-        self._metrics, self._record_at = folder.metrics.open("a", buffering=1), 0.0
+        self._metrics, self._record_at = MetricsLog(folder, flat(config)), 0.0
 
     @property
     def steps(self) -> int:
@@ -188,7 +190,7 @@ class _Run(BaseCallback):
                 raise _Stopped
 
         seconds = EvaluatorConfig.evaluation_seconds
-        return evaluation_metrics(
+        return evaluation_record(
             play_episodes(player, lambda: make_env(self.config.env), episodes, seed, seconds, watch)
         )
 
@@ -220,7 +222,8 @@ class _Run(BaseCallback):
         self._write("learner", {"env_steps": self.steps, "updates": self._model.updates, "finished": int(finished)})
 
     def _write(self, role: str, record: dict[str, Any]) -> None:
-        self._metrics.write(json.dumps({"role": role, "time": time.time(), **record}) + "\n")
+        record = {"role": role, "time": time.time(), **record}
+        self._metrics.write(record, self.steps, main_metrics.evaluation_metrics(record))
 
     def _wall(self) -> float:
         return self._wall_before + time.monotonic() - self._began
@@ -262,7 +265,7 @@ def evaluate(
     env_timeout: float | None = None,
 ) -> dict[str, Any]:
     """Deterministic episodes of what a baseline's run saved last, as ``evaluate_policy``. Raises ConfigError."""
-    config, states = read(folder), saved_states(folder)
+    config, states = read_config(folder), saved_states(folder)
     if not states:
         raise ConfigError("RUN", str(folder.path), "it has no checkpoint yet; train it for longer")
     env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
@@ -274,4 +277,4 @@ def evaluate(
     seed = first_start(config.seed, final=True)
     rollout = play_episodes(player, lambda: make_env(env), episodes, seed, seconds, watch)
     about = {"env": env.id, "preset": config.name, "seed": config.seed, **progress}
-    return about | evaluation_metrics(rollout) | missing_shares(env)
+    return about | evaluation_record(rollout) | missing_shares(env)

@@ -20,9 +20,9 @@ from rmc.common.env.make import first_env, make_env
 from rmc.common.env.privileged import Privileged
 from rmc.common.env.process_state import changes
 from rmc.common.env.watched_env import WatchedEnv
-from rmc.common.env.wrappers import Env, Floats
+from rmc.common.env.wrappers import Env
 from rmc.common.errors import EnvFault
-from rmc.common.window import BoolArray
+from rmc.common.window import BoolArray, Floats
 from rmc.deploy.run.config import WindowConfig
 from rmc.deploy.run.memory_reach import format_reach
 

@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rmc.actors.evaluator import LONGEST_EPISODE, first_start
 from rmc.analysis.policy import load_policy
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.describe import layout_of, shown
+from rmc.common.env.describe import layout_of, visible_slice
 from rmc.common.env.layout import Part
 from rmc.common.env.make import make_env
-from rmc.common.env.wrappers import CorruptObservation, Delay, Env, Floats, FrameStack, ObservationSlice, SeenWrapper
+from rmc.common.env.wrappers import CorruptObservation, Delay, Env, FrameStack, ObservationSlice, SeenWrapper
 from rmc.common.errors import ConfigError
+from rmc.common.window import Doubles, Floats
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
@@ -42,7 +42,7 @@ class Episode:
     missing: Tensor  # (1, T + 1, M) bool
     privileged: Tensor  # (1, T + 1, P) normalised, what critics read beside
     own: Floats  # (T + 1, F), the environment's own observations
-    probe: dict[str, NDArray[np.float64]]  # by name (T + 1,), of info["probe"]
+    probe: dict[str, Doubles]  # by name (T + 1,), of info["probe"]
     terminated: bool = False  # not cut
 
     @property
@@ -66,7 +66,7 @@ class HiddenPart:
     flags: slice  # its own, where each number of what is seen has one
 
 
-class Record(SeenWrapper):
+class RecordFrames(SeenWrapper):
     """Keeps the newest observation of the environment that it wraps."""
 
     newest: Floats  # (F,), NaN where the environment itself calls it missing
@@ -76,12 +76,12 @@ class Record(SeenWrapper):
         return observation, info
 
 
-def recorded(env: Env) -> tuple[Env, Record]:
+def recorded(env: Env) -> tuple[Env, RecordFrames]:
     """The environment with a Record below all that hides, disturbs or stacks what is seen, and that Record."""
     above, inner = None, env
     while isinstance(inner, ObservationSlice | CorruptObservation | Delay | FrameStack):
         above, inner = inner, inner.env
-    record = Record(inner)
+    record = RecordFrames(inner)
     if above is None:
         return record, record
     above.env = record
@@ -93,7 +93,7 @@ def hidden_parts(env: Env, config: EnvConfig) -> list[HiddenPart]:
     whole = layout_of(
         env, dataclasses.replace(config, hide="nothing", frame_stack=1), {}, privileged=False
     ).observations
-    first, last, _ = (shown(env, config.hide) or slice(None)).indices(whole[-1].stop)
+    first, last, _ = (visible_slice(env, config.hide) or slice(None)).indices(whole[-1].stop)
     never_as_it_is, partly_missing = bool(config.noise or config.delay), bool(config.flicker or config.drop_sensors)
     parts = []
     for part in whole:
@@ -182,7 +182,7 @@ def _kept(info: dict[str, Any]) -> dict[str, Any]:
     return {**info, "probe": dict(probe) if isinstance(probe, dict) else probe}
 
 
-def _probes(values: list[Any], env_id: str) -> dict[str, NDArray[np.float64]]:
+def _probes(values: list[Any], env_id: str) -> dict[str, Doubles]:
     """``info["probe"]`` of every step, by name. Raises ConfigError where it is no dict of the same finite numbers."""
     for value in values:
         is_sound = isinstance(value, dict) and value.keys() == values[0].keys()
@@ -197,7 +197,7 @@ def _steps(episodes: list[Episode]) -> int:
 
 
 @torch.no_grad()
-def remembered(agent: Agent, episode: Episode) -> tuple[MemoryOutput, Tensor]:
+def unroll_episode(agent: Agent, episode: Episode) -> tuple[MemoryOutput, Tensor]:
     """The memory along an episode from its start, (1, T + 1, ·), and what it read, missing frames filled."""
     start = torch.zeros(1, agent.config.state_size(agent.obs_dim))
     memory, seen, _ = agent.unroll(episode.observation, episode.missing, episode.previous, start)

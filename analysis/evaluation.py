@@ -2,24 +2,23 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import safetensors.torch
-import torch
 from rich.console import Console
 
-from rmc.actors.evaluator import Rollout, evaluation_metrics, first_start, play_episodes
-from rmc.actors.policy_runner import PolicyRunner
-from rmc.analysis.policy_file import PolicyFile
+from rmc.actors.evaluator import Rollout, evaluation_record, first_start, play_episodes
+from rmc.actors.policy_runner import one_thread
+from rmc.analysis.policy_file import PolicyFile, policy_runner
 from rmc.common.agent import initial_agent
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import first_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 from rmc.common.policy_header import PolicyHeader
-from rmc.deploy.run.config import RunConfig, check_sizes, env_sizes, layout_sizes
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.env_sizes import check_sizes, env_sizes, layout_sizes
 
 FINAL_EPISODES = 10  # of a run's first and last evaluation
 SAY_SECONDS = 10.0  # between lines that an evaluation goes on
@@ -53,12 +52,11 @@ def evaluate_blob(
     Raises ConfigError where its environment cannot be made, or has other sizes than the policy.
     """
     env = header.env if flicker is None else dataclasses.replace(header.env, flicker=flicker)
-    runner = PolicyRunner(header.obs_dim, header.action_dim, header.agent, 1, header.layout.missing)
-    runner.load(blob)
-    with _one_thread():
+    runner = policy_runner(header, blob)
+    with one_thread():
         seed = first_start(header.seed, final=True)
         rollout = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
-    return evaluation_metrics(rollout) | missing_shares(env)
+    return evaluation_record(rollout) | missing_shares(env)
 
 
 def missing_shares(env: EnvConfig) -> dict[str, float]:
@@ -75,17 +73,6 @@ def policy_env(header: PolicyHeader, config: EnvConfig) -> Env:
         env.close()
         raise
     return env
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """A product's last bits depend on its threads, and an episode on them: so they must not on the machine's cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def evaluate_policy(

@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from rmc.analysis import baseline_settings
-from rmc.common.bus.metrics_record import is_finite, is_whole
+from rmc.common.bus.metrics_record import is_complete, is_finite
 from rmc.common.env.config import EnvConfig, write_kwargs
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig, changes, flat, option
+from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.opening import SAME_AGENT
+from rmc.deploy.run.option_names import changes, flat, option
 from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.starts import begun_with, starts
 
@@ -58,7 +59,7 @@ class History:
         return json.dumps(dataclasses.asdict(self))
 
 
-def read(path: Path) -> list[History]:
+def read_histories(path: Path) -> list[History]:
     """The histories in a run's folder, or in a file of lines. Raises ConfigError."""
     if path.is_dir():
         return [of_run(RunFolder(path))]
@@ -107,9 +108,9 @@ def of_run(folder: RunFolder) -> History:
     Evaluations are left out that were cut, or in which an episode broke.
     """
     about = describe(folder.path)
-    evaluations = _evaluations(filter(is_whole, folder.records()))
+    evaluations = _evaluations(filter(is_complete, folder.records()))
     result, initial = folder.result() or {}, folder.initial() or {}
-    if result and is_whole(result):
+    if result and is_complete(result):
         ours = not folder.is_baseline()  # of its last checkpoint's own evaluation only the update is known
         below = result["env_steps"], result["updates"] if ours else math.inf
         evaluations = [one for one in evaluations if one.env_steps < below[0] and one.updates < below[1]]
@@ -126,7 +127,7 @@ def of_run(folder: RunFolder) -> History:
         last.env_steps,
         last.updates,
         last.wall_s,
-        result.get("initial_return_mean", initial.get("eval_return_mean")) if is_whole(initial) else None,
+        result.get("initial_return_mean", initial.get("eval_return_mean")) if is_complete(initial) else None,
         evaluations,
         bool(result),
     )
@@ -145,7 +146,7 @@ def describe(path: Path) -> About:
     """Of a run of RMC, or of a baseline. Raises ConfigError."""
     folder = RunFolder(path)
     if folder.is_baseline():
-        baseline = baseline_settings.read(folder)
+        baseline = baseline_settings.read_config(folder)
         return About(" ".join([baseline.name, *_stack(baseline.env)]), _env_label(baseline.env), baseline.seed)
     config = folder.config()
     name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"

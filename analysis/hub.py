@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rmc.common.checkpoint import POLICY
-from rmc.common.errors import ConfigError, first_line
+from rmc.common.errors import ConfigError, first_line, one_line
 from rmc.common.extra import check_installed
 
 SCHEME = "hf:/"  # before a repository's name, where a path is asked for; a Path keeps but one of its slashes
@@ -82,7 +82,7 @@ def _in_one_line(repo: str, revision: str | None = None) -> Iterator[None]:
         fix = "use a token that may" if status in (401, 403) else "try again"
         raise ConfigError("REPO", repo, f"the hub refuses it (HTTP {status}); {fix}") from None
     except ValueError as error:  # its library's word for a model card that the hub refuses
-        raise ConfigError("REPO", repo, f"the hub refuses it ({' '.join(str(error).split())}); correct that") from None
+        raise ConfigError("REPO", repo, f"the hub refuses it ({one_line(error)}); correct that") from None
     except (*UNREACHED, errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError, errors.HTTPError) as error:  # type: ignore[attr-defined]
         cause = error.__cause__ if isinstance(error, errors.LocalEntryNotFoundError) and error.__cause__ else error
         fix = f"cannot be reached ({first_line(cause)}); try again with a network"

@@ -10,19 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from rmc.analysis.episodes import Episode, remembered
+from rmc.analysis.episodes import Episode, unroll_episode
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.critic import critic_input
+from rmc.common.window import Doubles
 
 DELAYS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 700, 1_000)
 EPISODES = 8  # in which observations are changed
 LATER = 4  # observations changed in each of them, beside the first
 CHANGED = 32  # dimensions at most: those that change h the most at once
 REACHED = 0.5  # share of the starts after which so many steps must be left
-Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class ReplayedEpisode:
 
     def __init__(self, agent: Agent, episode: Episode) -> None:
         self._agent, self._episode, self.steps = agent, episode, episode.action.shape[1]
-        memory, seen = remembered(agent, episode)
+        memory, seen = unroll_episode(agent, episode)
         before_actions = MemoryOutput(*(part[:, :-1] for part in memory))
         self.features = agent.features(before_actions)  # (1, T, Z), what the heads read
         self.outputs = self._outputs(before_actions, torch.arange(self.steps))

@@ -9,6 +9,7 @@ from rmc.analysis.episodes import Episode, HiddenPart
 from rmc.analysis.influence import Influence, influence
 from rmc.analysis.memory_probe import Probe, probes
 from rmc.common.agent import Agent
+from rmc.deploy.monitor.table import plain_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes  # an extra
@@ -20,7 +21,7 @@ WIDTH = 100  # columns that the tables take
 
 
 @dataclass(frozen=True)
-class Remembered:
+class MemoryInsight:
     """What an agent remembers."""
 
     first: Influence  # of an episode's first observation
@@ -33,9 +34,9 @@ class Remembered:
         return 1 + bool(self.probes)
 
 
-def remember(agent: Agent, episodes: list[Episode], parts: list[HiddenPart]) -> Remembered:
+def examine_memory(agent: Agent, episodes: list[Episode], parts: list[HiddenPart]) -> MemoryInsight:
     """From several episodes, and what they hide from the agent."""
-    return Remembered(*influence(agent, episodes), probes(agent, episodes, parts))
+    return MemoryInsight(*influence(agent, episodes), probes(agent, episodes, parts))
 
 
 def curves(one: Influence) -> dict[str, list[float]]:
@@ -43,7 +44,7 @@ def curves(one: Influence) -> dict[str, list[float]]:
     return {"h": one.h.tolist(), "Q": one.q.tolist(), "action": one.action.tolist()}
 
 
-def draw(memory: Remembered, axes: "list[Axes]") -> None:
+def draw(memory: MemoryInsight, axes: "list[Axes]") -> None:
     """Influence in the first of ``panels`` axes, probes in the second."""
     for name, one, style in (("first", memory.first, "-"), ("later", memory.later, "--")):
         for quantity, values in curves(one).items():
@@ -74,16 +75,16 @@ def _draw_probes(of: list[Probe], axis: "Axes") -> None:
     axis.legend(fontsize="small")
 
 
-def tables(memory: Remembered) -> list[str | Table]:
+def tables(memory: MemoryInsight) -> list[str | Table]:
     """For a terminal."""
     head = "one observation is changed; how much that changes later, as a share of each quantity's own spread:"
     return [head, _influence_table(memory), *([_probe_table(memory.probes)] if memory.probes else [])]
 
 
-def _influence_table(memory: Remembered) -> Table:
+def _influence_table(memory: MemoryInsight) -> Table:
     delays = [k for k in TABLE_DELAYS if k in {*memory.first.delays, *memory.later.delays}]
     heads = [f"{k} step{'s' * (k > 1)} later" if k == delays[0] else f"{k:,}" for k in delays]
-    table = Table("changed observation", "changes", *heads, box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table = plain_table(("changed observation", "changes", *heads))
     for name, one in (("first", memory.first), ("later", memory.later)):
         for quantity, values in curves(one).items():
             by_delay = dict(zip(one.delays, values, strict=True))
@@ -92,7 +93,7 @@ def _influence_table(memory: Remembered) -> Table:
 
 
 def _probe_table(of: list[Probe]) -> Table:
-    table = Table("hidden", "R² from h", "from the newest observation", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table = plain_table(("hidden", "R² from h", "from the newest observation"))
     for one in of:
         table.add_row(one.name, *(f"{value:.2f}" for value in (one.from_memory, one.from_newest)))
     return table

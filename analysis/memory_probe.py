@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rmc.analysis.episodes import Episode, HiddenPart, remembered
+from rmc.analysis.episodes import Episode, HiddenPart, unroll_episode
 from rmc.common.agent import Agent
+from rmc.common.window import BoolArray, Doubles
 
-Doubles = NDArray[np.float64]
 PENALTIES = (1e-4, 1e-2, 1.0)  # of the squared weights, as shares of the inputs' variance; one is chosen
 QUARTERS = 4  # of the episodes: two to train on, one to choose the penalty by, one to test on
 LEAST_SPREAD = 1e-6  # of what is read: what never changes says nothing
@@ -38,13 +38,13 @@ class Samples:
     newest: Doubles  # (N, O), the newest observation that was seen, normalised
     own: Doubles  # (N, F), the environment's own observation
     probe: dict[str, Doubles]  # (N,)
-    missing: NDArray[np.bool_]  # (N, M)
+    missing: BoolArray  # (N, M)
     quarter: NDArray[np.int64]  # (N,), the same for all steps of an episode
 
 
 def samples(agent: Agent, episodes: list[Episode]) -> Samples:
     """All steps of all episodes, each with its last observation."""
-    joined = [(index, episode, remembered(agent, episode)[0].hidden[0]) for index, episode in enumerate(episodes)]
+    joined = [(index, episode, unroll_episode(agent, episode)[0].hidden[0]) for index, episode in enumerate(episodes)]
     return Samples(
         np.concatenate([h.double().numpy() for _, _, h in joined]),
         np.concatenate([_newest(episode) for episode in episodes]),
@@ -92,7 +92,7 @@ def _of_part(rows: Samples, part: HiddenPart) -> Probe | None:
     )
 
 
-def _probe(name: str, rows: Samples, y: Doubles, at: NDArray[np.bool_]) -> Probe | None:
+def _probe(name: str, rows: Samples, y: Doubles, at: BoolArray) -> Probe | None:
     """Of (N, Y) at some of the steps; None where there is nothing to train or test on."""
     at = at & np.isfinite(y).all(1)  # what the environment itself lacks is known to nobody
     quarter, y = rows.quarter[at], y[at]

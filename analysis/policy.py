@@ -17,15 +17,15 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rmc.actors.policy_runner import PolicyRunner
+from rmc.actors.policy_runner import PolicyRunner, one_thread
 from rmc.analysis.evaluation import policy_env
-from rmc.analysis.policy_file import PolicyFile, read_policy
+from rmc.analysis.policy_file import PolicyFile, policy_runner, read_policy
 from rmc.common.env.layout import ActionScale
-from rmc.common.env.wrappers import Env, Floats
+from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 from rmc.common.policy_header import PolicyHeader
 from rmc.common.process import watchdog
-from rmc.common.window import BoolArray
+from rmc.common.window import BoolArray, Floats
 
 Units = Literal["agent", "environment"]
 UNITS = ("agent", "environment")
@@ -106,7 +106,8 @@ class Policy:
         runner = self._begin(len(rows))
         shape = self._prev_action.shape
         noise = self._rng.standard_normal(shape, np.float32) if explore else None
-        action, state = runner.act(rows, self._prev_action, absent, self._state, noise)
+        with one_thread():
+            action, state = runner.act(rows, self._prev_action, absent, self._state, noise)
         self._prev_action, self._state[:] = action, state
         result = action.copy() if units == "agent" else self._in_environment(action)
         return result[0] if one else result
@@ -114,11 +115,17 @@ class Policy:
     def _begin(self, rows: int) -> PolicyRunner:
         """What acts in so many episodes; new ones begin after ``reset``."""
         if self._runner is None:
-            header = self.header
-            runner = PolicyRunner(header.obs_dim, header.action_dim, header.agent, rows, header.layout.missing)
-            runner.load(self._file.blob)
-            self._runner, (self._prev_action, self._state) = runner, runner.start()
+            self._runner = policy_runner(self.header, self._file.blob, rows)
+            self._prev_action, self._state = self._runner.start()
         return self._runner
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the buffers that it acts with: a pickle would part them from their views."""
+        return self.__dict__ | {"_runner": self._runner is not None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ |= state
+        self._runner = policy_runner(self.header, self._file.blob, len(self._state)) if state["_runner"] else None
 
     def _in_environment(self, action: Floats) -> NDArray[Any]:
         """(N, A) in [-1, 1] -> (N, ...) as the environment takes it."""

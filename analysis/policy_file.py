@@ -9,12 +9,12 @@ import safetensors.torch
 import torch
 from safetensors import SafetensorError
 
-from rmc.actors.policy_runner import PolicyRunner
+from rmc.actors.policy_runner import PolicyRunner, one_thread
 from rmc.analysis import hub
 from rmc.common.agent import Agent
-from rmc.common.bus.metrics_record import is_finite, is_whole
+from rmc.common.bus.metrics_record import is_complete, is_finite
 from rmc.common.checkpoint import POLICY, PROGRESS
-from rmc.common.errors import ConfigError, MessageError, first_line
+from rmc.common.errors import ConfigError, MessageError, first_line, one_line
 from rmc.common.policy_header import METADATA_KEY, PolicyHeader
 from rmc.common.user_path import user_path
 from rmc.deploy.monitor.recorded import empty_status
@@ -78,7 +78,7 @@ def decode(blob: bytes) -> PolicyFile:
     difference = _difference(header, shapes)
     if difference:
         raise MessageError("other sizes than its header's", f"{difference}; copy it again")
-    _check_weights(header, blob)
+    policy_runner(header, blob)  # judges the weights
     return PolicyFile(header, blob)
 
 
@@ -86,8 +86,7 @@ def _shapes(blob: bytes) -> dict[str, tuple[int, ...]]:
     try:
         return {name: tuple(value.shape) for name, value in safetensors.torch.load(blob).items()}
     except (SafetensorError, ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())  # in one line, whatever it quotes
-        raise MessageError("cut, or no safetensors file", f"{reason}; copy it again") from None
+        raise MessageError("cut, or no safetensors file", f"{one_line(error)}; copy it again") from None
 
 
 def _facts(blob: bytes) -> Any:
@@ -135,8 +134,12 @@ def _difference(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> str
     return ""
 
 
-def _check_weights(header: PolicyHeader, blob: bytes) -> None:
-    PolicyRunner(header.obs_dim, header.action_dim, header.agent, 1, header.layout.missing).load(blob)
+def policy_runner(header: PolicyHeader, blob: bytes, rows: int = 1) -> PolicyRunner:
+    """What acts by these weights in so many episodes. Raises MessageError for weights that nothing can act by."""
+    with one_thread(), torch.inference_mode(mode=False):  # of the caller's, outside of which it may act, too
+        runner = PolicyRunner(header.obs_dim, header.action_dim, header.agent, rows, header.layout.missing)
+        runner.load(blob)
+    return runner
 
 
 def _of_run(folder: RunFolder, checkpoint: str) -> PolicyFile:
@@ -170,7 +173,7 @@ def _of_older_run(folder: RunFolder, files: dict[str, bytes]) -> PolicyFile:
     header = replace(config.policy_header(), env_steps=progress["env_steps"], updates=progress["updates"])
     if _difference(header, _shapes(files[POLICY])):
         raise MessageError("weights", "not a policy of this run (its networks have other sizes)")
-    _check_weights(header, files[POLICY])
+    policy_runner(header, files[POLICY])
     return PolicyFile(header, files[POLICY])
 
 
@@ -182,7 +185,7 @@ def _evaluated(header: PolicyHeader, folder: RunFolder) -> PolicyHeader:
         records = MetricsTail(folder.metrics).take()
         records = [record for record in records if record.get("eval_update") == header.updates]
     played: dict[str, Any] = records[-1] if records else {}
-    if not is_whole(played) or not all(is_finite(played.get(f"eval_{name}")) for name in EVALUATED):
+    if not is_complete(played) or not all(is_finite(played.get(f"eval_{name}")) for name in EVALUATED):
         return header
     mean, deviation, episodes = (played[f"eval_{name}"] for name in EVALUATED)
     return replace(header, eval_return_mean=mean, eval_return_std=deviation, eval_episodes=episodes)

@@ -13,7 +13,7 @@ from rmc.analysis.out_file import check_writable
 from rmc.analysis.report_run import ReportRun
 from rmc.common.extra import check_installed
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.config import option
+from rmc.deploy.run.option_names import option
 from rmc.deploy.run.starts import format_starts
 
 PAGES = (".html", ".htm")

@@ -13,9 +13,9 @@ from rmc.analysis.vitals import Record
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import changes, flat
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
+from rmc.deploy.run.option_names import changes, flat
 from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.state import State, run_state
 
@@ -70,9 +70,7 @@ class ReportRun:
         return [str(finding) for finding in examine(newest, self.folder.config())]
 
     def changed(self) -> dict[str, list[Any]]:
-        """Options that are not the preset's, with both values; of a baseline there are none."""
-        if self.folder.is_baseline():
-            return {}
+        """Options that are not the preset's, with both values; not for a baseline, which has no preset."""
         config = self.folder.config()
         return changes(preset_config(config.preset, EnvConfig(config.env.id)), config)
 

@@ -9,11 +9,11 @@ from rich.table import Table
 from rich.text import Text
 
 from rmc.analysis.run_paths import run_folders
-from rmc.common.bus.metrics_record import is_whole
+from rmc.common.bus.metrics_record import is_complete
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.figures import duration, number
 from rmc.deploy.monitor.recorded import recorded_status
-from rmc.deploy.monitor.table import STYLES
+from rmc.deploy.monitor.table import STYLES, plain_table
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import LISTED_BYTES, wall_seconds
 
@@ -62,7 +62,7 @@ def summary(path: Path) -> RunSummary:
     returns = [status.last.return_mean] if status.last is not None else []
     returns += [result["eval_return_mean"]] if result else []
     best = [status.best.return_mean] if status.best is not None else []
-    best += [result["eval_return_mean"]] if result and is_whole(result) else []
+    best += [result["eval_return_mean"]] if result and is_complete(result) else []
     return RunSummary(
         str(path),
         str(status.state),
@@ -80,10 +80,7 @@ def summary(path: Path) -> RunSummary:
 def table(summaries: Sequence[RunSummary], folder: Path, width: int) -> Table:
     """A row for each, with as many columns as there is room for; names are relative to ``folder``."""
     shown = [name for name, least in COLUMNS.items() if width >= least]
-    drawn = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
-    for name in shown:
-        right = name in ("steps", "return", "best", "done", "time")
-        drawn.add_column(name, justify="right" if right else "left", no_wrap=right, overflow="fold")
+    drawn = plain_table(shown, ("steps", "return", "best", "done", "time"))
     for one in summaries:
         cells = _cells(one, folder)
         drawn.add_row(*(cells[name] for name in shown))

@@ -21,8 +21,9 @@ from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.faults import call_env
-from rmc.common.env.make import entry_point, find_spec, make_env
+from rmc.common.env.make import make_env
 from rmc.common.env.process_state import ApartCall
+from rmc.common.env.registered import entry_point, find_spec
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError, EnvFault, RmcError, first_line
 from rmc.common.extra import check_installed
@@ -36,7 +37,6 @@ PROBE = "import sys; from rmc.analysis.video import probe; probe(*sys.argv[1:])"
 PROBE_SECONDS = 60.0  # beside the time that the environment has to be made and to reset
 FRAMES_PER_SECOND = 30
 MODE, PICTURE = "rgb_array", "an array (height, width, 3) of uint8"
-ENVS_FAULT = 3  # exit status of a probe whose environment is at fault
 _own_choice = ""  # the backend that an earlier video has been given, where the user names none
 
 
@@ -137,7 +137,7 @@ def _working_backend(env: EnvConfig, out: Path) -> str:
         status, words = _probed(backend, env)
         if status == 0:
             return backend
-        if status == ENVS_FAULT and ": render has not returned" not in words:  # a driver may hang in it
+        if status == watchdog.HUNG_STATUS and ": render has not returned" not in words:  # a driver may hang in it
             raise ConfigError("--video", str(out), f"{env.id} cannot be filmed: {words}")
         failures[backend] = words
     reasons = "; ".join(f"{backend}: {reason}" for backend, reason in failures.items())
@@ -183,7 +183,7 @@ def probe(env: str, import_path: str) -> None:
         if fault.__cause__ is not None and _is_renderers(fault.__cause__):
             raise fault.__cause__ from None
         sys.stderr.write(f"{fault}\n")
-        sys.exit(ENVS_FAULT)
+        sys.exit(watchdog.HUNG_STATUS)  # as of an environment that hangs
     finally:
         descendants.end_children()
 

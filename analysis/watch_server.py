@@ -37,7 +37,7 @@ HEADERS = {
 }
 
 
-class Broadcast:
+class EventStream:
     """What is new of the runs, to every open page. Each look is read and encoded once, however many there are."""
 
     def __init__(self, runs: Sequence[LiveRun]) -> None:
@@ -108,7 +108,7 @@ class TokenGuard:
             await PlainTextResponse("open the address that rmc watch has printed\n", 401)(scope, receive, send)
 
 
-def application(runs: Sequence[LiveRun], broadcast: Broadcast, host: str, token: str) -> Starlette:
+def application(runs: Sequence[LiveRun], broadcast: EventStream, host: str, token: str) -> Starlette:
     """The page of these runs, at ``host``; without a ``token`` for browsers of this machine alone."""
     page = files("rmc.analysis").joinpath("watch.html").read_text(encoding="utf-8")
 
@@ -134,7 +134,7 @@ def serve(runs: Sequence[LiveRun], listener: socket.socket, host: str, token: st
     """Serve the page on a socket until Ctrl-C, which is a KeyboardInterrupt."""
 
     async def run() -> None:
-        broadcast = Broadcast(runs)
+        broadcast = EventStream(runs)
         config = uvicorn.Config(
             application(runs, broadcast, host, token), lifespan="off", ws="none", log_config=None, access_log=False,
             proxy_headers=False, server_header=False, headers=list(HEADERS.items()),

@@ -12,18 +12,18 @@ from typing import BinaryIO, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rmc.analysis import memory_picture
-from rmc.analysis.episodes import Episode, Player, remembered
-from rmc.analysis.memory_picture import Remembered, remember
+from rmc.analysis.episodes import Episode, Player, unroll_episode
+from rmc.analysis.memory_picture import MemoryInsight, examine_memory
 from rmc.analysis.out_file import PICTURES, check_writable
 from rmc.analysis.value_bias import ValueBias, value_bias
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError, first_line
 from rmc.common.extra import check_installed
+from rmc.common.window import Floats
 from rmc.deploy.run.checkpoint_choice import checkpoint_number, choose_checkpoint
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
@@ -34,7 +34,6 @@ from rmc.learner.losses import model_error
 
 HORIZONS = (1, 5, 15)  # steps ahead
 SHOWN, SHOWN_STEPS = 4, 100  # dimensions in the picture, those that change the most, and from when on how long
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
 
     ``norm`` is that of the world model's error.
     """
-    memory, seen = remembered(agent, episode)
+    memory, seen = unroll_episode(agent, episode)
     prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
     latent_change = memory.hidden[0].diff(dim=0)
     real = episode.observation[0, 1:].masked_fill(episode.missing[0, 1:], torch.nan)
@@ -119,7 +118,7 @@ def _error(predicted: Tensor, episode: Episode, horizon: int) -> tuple[Tensor, T
     return ((predicted - end).abs() * seen).sum(0), ((end - start).abs() * seen).sum(0)
 
 
-def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, Remembered, ValueBias | None]:
+def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, MemoryInsight, ValueBias | None]:
     """Play several episodes, look at the first, and write the picture with what is remembered. Raises ConfigError."""
     check_installed("plot", ("matplotlib",), "--out", str(out))
     check_writable("--out", out, PICTURES)
@@ -128,7 +127,7 @@ def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, Remembered,
     with closing(Player(folder, agent, config, number)) as player:
         episodes, hidden = player.several(), player.hidden_parts()
     insight = look(agent, episodes[0], config.update.model_norm)
-    memory = remember(agent, episodes, hidden)
+    memory = examine_memory(agent, episodes, hidden)
     draw(insight, _title(config), out, memory)
     value = value_bias(agent, episodes, config.update.gamma) if config.update.n_step == 1 else None
     return insight, memory, value
@@ -157,7 +156,7 @@ def _title(config: RunConfig) -> str:
     return f"{config.env.id}, {config.preset}, seed {config.seed}"
 
 
-def draw(insight: Insight, title: str, out: Path | BinaryIO, memory: Remembered | None = None) -> None:
+def draw(insight: Insight, title: str, out: Path | BinaryIO, memory: MemoryInsight | None = None) -> None:
     """Predicted against real amid the episode, curiosity and reward over all of it; then what is remembered."""
     from matplotlib.figure import Figure  # an extra
 

@@ -218,7 +218,7 @@ def _serve(url: str, folder: str, spec: WindowSpec, config: ReplayConfig, core: 
     os.sched_setaffinity(0, {core})
     bus = RedisBus(url, RUN)
     server = ReplayServer(spec, config, Path(folder), 0, ENDLESS, 1, ENDLESS, bus)
-    process = ReplayProcess(server, SocketServer(server, spec, f"unix:{folder}/replay.sock", SECRET, 1024))
+    process = ReplayProcess(server, SocketServer(server, f"unix:{folder}/replay.sock", SECRET, 1024))
     while bus.stop_requested() is None:
         end = time.monotonic() + 0.5
         while time.monotonic() < end:

@@ -32,7 +32,7 @@ class CheckpointFolder:
     def __init__(self, folder: Path, keep: int = 3) -> None:
         self.folder, self.keep = folder, keep
         self._lock: int | None = None
-        self.damaged: set[int] = set()  # passed over by latest(): the run goes on from before them
+        self.damaged: dict[int, str] = {}  # their faults; passed over by latest(): the run goes on from before them
 
     def lock(self) -> None:
         """Become the one writer. Raises ConfigError where another process stays it."""
@@ -61,7 +61,7 @@ class CheckpointFolder:
         """Where a checkpoint lies."""
         return self.folder / f"{number:09d}"
 
-    def save(self, number: int, files: Mapping[str, bytes]) -> Path:
+    def save(self, number: int, files: Mapping[str, bytes]) -> None:
         """Write a checkpoint so that it is there whole or not at all, then drop the oldest ones.
 
         Raises CheckpointError where it cannot be written; those before it stay, and nothing of it.
@@ -89,9 +89,8 @@ class CheckpointFolder:
             shutil.rmtree(temporary, ignore_errors=True)
             reason = error.strerror or "?"
             raise CheckpointError(f"checkpoint {final} cannot be written ({reason})", reason) from None
-        self.damaged.discard(number)
+        self.damaged.pop(number, None)
         self._prune(number)
-        return final
 
     def note_epoch(self, epoch: int) -> None:
         """The writer's, so that the next one's is larger though Redis forgets; where there is no room, unnoted."""
@@ -131,7 +130,7 @@ class CheckpointFolder:
         """
         best, numbers = self.best(), self.numbers()
         whole = [number for number in numbers if number <= written and number not in self.damaged]
-        kept = {best, *whole[-self.keep :], *(number for number in numbers if number > written)} - self.damaged
+        kept = {best, *whole[-self.keep :], *(number for number in numbers if number > written)} - self.damaged.keys()
         for number in numbers:
             if number not in kept:
                 shutil.rmtree(self.path(number), ignore_errors=True)  # the next one tries again
@@ -160,7 +159,7 @@ class CheckpointFolder:
                 return number, self.load(number)
             except CheckpointError as error:
                 log.warning("%s; falling back to an older one", error)
-                self.damaged.add(number)
+                self.damaged[number] = str(error)
         return None
 
     def mark_best(self, number: int, score: float) -> bool:

@@ -12,6 +12,9 @@ RmcError
 └── RoleDied             a supervised role ended too often
 """
 
+CONFIG_STATUS = 2  # exit status of an error that starting again cannot fix
+STOPPED_STATUS = 130  # after Ctrl-C, as shells have it
+
 
 class RmcError(Exception):
     """Base class: catching it catches everything raised on purpose."""
@@ -24,6 +27,10 @@ class ConfigError(RmcError):
         shown = field if field.isprintable() else repr(field)  # a stranger's key
         super().__init__(f"{shown}={value!r}: {fix}")
         self.field, self.value, self.fix = field, value, fix
+
+    def __reduce__(self) -> tuple[type["ConfigError"], tuple[str, object, str]]:
+        """Whole across processes, where pickle would make it of its message alone."""
+        return type(self), (self.field, self.value, self.fix)
 
 
 class EnvFault(RmcError):
@@ -64,6 +71,11 @@ class CheckpointError(RmcError):
 
 class RoleDied(RmcError):
     """A role died more often than the supervisor restarts it."""
+
+
+def one_line(error: BaseException) -> str:
+    """An error's own words, without its line breaks."""
+    return " ".join(str(error).split())
 
 
 def first_line(error: BaseException) -> str:

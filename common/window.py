@@ -26,7 +26,10 @@ ROW_ALIGNMENT = 64  # bytes: a cache line, so that whole-row gathers run at memo
 CHECKSUM_BYTES = 4
 
 Rows = NDArray[np.void]
+Slots = NDArray[np.int64]  # of a ring's rows
 BoolArray = NDArray[np.bool_]
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 Field = tuple[str, str, tuple[int, ...]] | tuple[str, np.dtype[Any]]
 HEADER_FIELDS: list[Field] = [
     ("serial", "<i8", ()),  # given by the ring; slot = serial mod capacity

@@ -13,7 +13,8 @@ from rmc.analysis.report import words
 from rmc.cli.train_options import Train
 from rmc.common.env.config import RANGES as ENV_RANGES
 from rmc.common.env.config import EnvConfig
-from rmc.deploy.run.config import option
+from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.option_names import option
 from rmc.deploy.run.presets import paper, robust
 from rmc.deploy.run.validation import RANGES
 
@@ -180,7 +181,7 @@ def _rows(defaults: Any, paper_config: Any, section: str) -> list[str]:
 
 
 def _launch_rows(names: list[str]) -> list[str]:
-    help_texts = _docstrings(Train)
+    help_texts = _docstrings(LaunchOptions) | _docstrings(Train)
     defaults = {item.name: item.default for item in dataclasses.fields(Train)}
     takes = {name: _takes(hint, None) for name, hint in get_type_hints(Train).items()}
     cells = {name: (takes[name], words(defaults[name]), help_texts[name], WHEN[name]) for name in names}

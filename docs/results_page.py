@@ -67,7 +67,7 @@ class Row:
 
 @cache
 def _lines(file: str) -> list[History]:
-    return history.read(LINES / f"{file}.jsonl")
+    return history.read_histories(LINES / f"{file}.jsonl")
 
 
 @cache

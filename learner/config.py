@@ -36,7 +36,7 @@ class UpdateConfig:
     curiosity_scale: Literal["raw", "std"] = "raw"
     """Curiosity as it is (the paper), or divided by its running standard deviation."""
     curiosity_steps: int = 100_000
-    """Environment steps after which beta has decayed to 0, linearly."""
+    """Agent steps after which beta has decayed to 0, linearly."""
     scheme: Literal[1, 2, 3, 4, 5, 6] = 1
     """Whose losses train the memory: 1 model and value, 2 value, 3 model, 4 all, 5 model and policy, 6 value and
     policy (table 1 of the paper)."""
@@ -80,7 +80,7 @@ class LearnerConfig:
     publish_updates: int = 20
     """Updates between broadcasts of the policy."""
     checkpoint_steps: int = 10_000
-    """Environment steps between checkpoints. The evaluator plays the newest one whenever it is free."""
+    """Agent steps between checkpoints. The evaluator plays the newest one whenever it is free."""
     keep_checkpoints: int = 3
     """Newest checkpoints kept, beside the best."""
     precision: Precision = "auto"

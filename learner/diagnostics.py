@@ -10,15 +10,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.critic import critic_input
-from rmc.common.window import BoolArray, Rows, WindowSpec
+from rmc.common.window import BoolArray, Floats, Rows, WindowSpec
 from rmc.learner import losses
 
-Floats = NDArray[np.float32]
 SLICE = 4  # windows of a batch that are looked at
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.compiled import compiled
+from rmc.common.window import Floats
 
 Bits = NDArray[np.uint16]  # bfloat16
-Floats = NDArray[np.float32]
 FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 ONE, TWO, HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
 EXP_RANGE = np.float32(87.0)  # beyond it float32 overflows

@@ -74,7 +74,7 @@ def _bf16_copy(rounded: Mapping[Tensor, Tensor], weight: Tensor) -> NDArray[np.u
     return NOT_ROUNDED if bf16 is None else bf16.view(-1).view(torch.uint16).numpy()
 
 
-def adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
+def make_adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Adam:
     """Adam for the parts of the agent that are named; memory and temperature have step sizes of their own."""
     heads = [part for part in parts if part not in ("memory", "log_alpha") and getattr(agent, part) is not None]
     memory = list(agent.memory.parameters()) if "memory" in parts else []

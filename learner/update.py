@@ -23,7 +23,7 @@ from rmc.learner.batch import Batch, Plan, has_missing, update_steps
 from rmc.learner.config import UpdateConfig
 from rmc.learner.diagnostics import Trace, model_metrics, unexplained_change, value_metrics
 from rmc.learner.fused import fuse
-from rmc.learner.optimizers import adam, by_optimizer, polyak_update
+from rmc.learner.optimizers import by_optimizer, make_adam, polyak_update
 from rmc.learner.policy_average import PolicyAverage
 from rmc.learner.unroll import impute_and_unroll, unroll
 
@@ -94,7 +94,7 @@ class JointUpdate:
         self.policy_loss = torch.zeros((), device=device)  # the policy's last
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
-        return [adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, VALUE_PARTS)]
+        return [make_adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, VALUE_PARTS)]
 
     def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
         """One update from a Batch; ``beta`` is a scalar tensor."""

@@ -7,7 +7,7 @@ from rmc.common.agent import Agent
 from rmc.common.window import WindowSpec
 from rmc.learner.batch import Batch, Plan
 from rmc.learner.config import UpdateConfig
-from rmc.learner.optimizers import adam
+from rmc.learner.optimizers import make_adam
 from rmc.learner.update import JointUpdate, UpdateResult, detached
 
 
@@ -27,7 +27,7 @@ class AlternateUpdate(JointUpdate):
     )
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
-        return [adam(self.agent, self.config, "memory", part) for part, _ in self._stages()]
+        return [make_adam(self.agent, self.config, "memory", part) for part, _ in self._stages()]
 
     def _stages(self) -> list[tuple[str, tuple[str, ...]]]:
         return [(part, names) for part, names in self._STAGES if getattr(self.agent, part) is not None]

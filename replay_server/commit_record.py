@@ -38,7 +38,7 @@ class Progress:
     """The replay's counters. Mutable: the server changes it, then commits it."""
 
     statistics: int  # D
-    counts: int = 1  # C
+    counts: int  # C
     valid_from: int = 0  # the oldest serial that may be sampled
     next_serial: int = 0
     env_steps: int = 0  # inserted
@@ -102,12 +102,12 @@ class Progress:
         return _CRC.pack(zlib.crc32(payload)) + payload
 
 
-def is_whole(published: bytes) -> bool:
+def crc_matches(published: bytes) -> bool:
     """Whether this is as ``Progress.publish`` made it."""
     return published[: _CRC.size] == _CRC.pack(zlib.crc32(published[_CRC.size :]))
 
 
-def decode_progress(payload: bytes, statistics: int, counts: int = 1) -> Progress:
+def decode_progress(payload: bytes, statistics: int, counts: int) -> Progress:
     """The inverse of ``Progress.encode``, for bytes whose CRC was right."""
     *counters, observations, streams = _COUNTERS.unpack_from(payload)
     sums = np.frombuffer(payload, np.float64, 2 * statistics, _COUNTERS.size).reshape(2, statistics).copy()
@@ -122,10 +122,10 @@ def decode_progress(payload: bytes, statistics: int, counts: int = 1) -> Progres
     return progress
 
 
-def decode_published(published: bytes, statistics: int, counts: int = 1) -> Progress | None:
+def decode_published(published: bytes, statistics: int, counts: int) -> Progress | None:
     """``Progress.publish`` as a bus has kept it; None where it is damaged or not of such observations."""
     payload = published[_CRC.size :]
-    if not is_whole(published) or len(payload) < _COUNTERS.size:
+    if not crc_matches(published) or len(payload) < _COUNTERS.size:
         return None
     streams = _COUNTERS.unpack_from(payload)[-1]
     size = _COUNTERS.size + 16 * statistics + streams * _STREAM_BYTES
@@ -135,7 +135,7 @@ def decode_published(published: bytes, statistics: int, counts: int = 1) -> Prog
     return decode_progress(payload, statistics, counts)
 
 
-def record_bytes(statistics: int, counts: int = 1) -> int:
+def record_bytes(statistics: int, counts: int) -> int:
     """Room for one copy, in whole pages. A ratio always fits: without it the size is never a multiple of 16."""
     further = _RATIO.size + 8 * (counts - 1) if counts > 1 else 0
     size = _HEADER.size + _COUNTERS.size + 16 * statistics + further + MAX_STREAMS * _STREAM_BYTES
@@ -145,7 +145,7 @@ def record_bytes(statistics: int, counts: int = 1) -> int:
 class RecordPair:
     """Both copies, in a mapped region of ``2 * record_bytes(statistics, counts)`` bytes."""
 
-    def __init__(self, region: NDArray[np.uint8], statistics: int, counts: int = 1) -> None:
+    def __init__(self, region: NDArray[np.uint8], statistics: int, counts: int) -> None:
         self._statistics, self._counts = statistics, counts
         half = record_bytes(statistics, counts)
         self._copies = [region[:half].data, region[half : 2 * half].data]

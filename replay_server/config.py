@@ -10,9 +10,9 @@ class ReplayConfig:
     capacity: int = 70_000
     """Windows kept; the oldest are overwritten."""
     replay_ratio: float = 128.0
-    """Trained steps drawn per new environment step, from the end of the warm-up on."""
+    """Trained steps drawn per new agent step, from the end of the warm-up on."""
     warmup_steps: int = 5_000
-    """Environment steps before the first draw."""
+    """Agent steps before the first draw."""
     priority_exponent: float = 0.6
     """How strongly priorities steer sampling; 0 is uniform."""
     replay_shards: int = 1

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from rmc.replay_server.ring import Ring, Slots
+from rmc.common.window import Slots
+from rmc.replay_server.ring import Ring
 
 CHUNK = 1024  # serials looked through at once
 FARTHEST = 65_536  # serials looked through at most: the learner waits for its next batch meanwhile

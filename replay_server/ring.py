@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from rmc.common.errors import ConfigError
 from rmc.common.row_checksum import add_checksums, whole_rows
-from rmc.common.window import Rows, WindowSpec
+from rmc.common.window import Rows, Slots, WindowSpec
 from rmc.replay_server.commit_record import Progress, RecordPair, record_bytes
 from rmc.replay_server.former_rows import former_fingerprints, former_row_bytes
 from rmc.replay_server.row_check import row_faults
@@ -31,7 +31,6 @@ _IDENTITY_BYTES = 4096
 _MAGIC = b"RMCRING3"
 REWRITTEN_ROWS = 4096  # at once
 log = logging.getLogger(__name__)
-Slots = NDArray[np.int64]
 Serials = NDArray[np.int64]
 
 

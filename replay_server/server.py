@@ -15,14 +15,13 @@ from rmc.common.bus.protocol import Bus, ReplayOwner, Version
 from rmc.common.metrics import Means, Rate
 from rmc.common.replay import EPISODE_BYTES, ObservationStatistics, Sample, SampleStatus
 from rmc.common.shard import WHOLE, Shard
-from rmc.common.window import Rows, WindowSpec
+from rmc.common.window import Rows, Slots, WindowSpec
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.credit import Credit
 from rmc.replay_server.episode import find_episode
 from rmc.replay_server.observation_sums import observation_sums
 from rmc.replay_server.rate_limiter import RateLimiter
 from rmc.replay_server.recovery import open_store
-from rmc.replay_server.ring import Slots
 from rmc.replay_server.stream_reader import IngestBatch, StreamReader
 from rmc.replay_server.takeover import take_over
 

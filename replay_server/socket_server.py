@@ -29,7 +29,6 @@ import numpy as np
 from rmc.common.errors import AuthenticationError, ConfigError, FencedError, MessageError
 from rmc.common.replay import SampleStatus
 from rmc.common.shared_batches import SharedBatches, reserve_memory, shared_bytes
-from rmc.common.window import WindowSpec
 from rmc.common.wire import NONCE_BYTES, Kind, is_proof, proof
 from rmc.replay_server.connection import ClientConnection, Frame
 from rmc.replay_server.server import ReplayServer
@@ -52,7 +51,6 @@ class SocketServer:
     def __init__(
         self,
         server: ReplayServer,
-        spec: WindowSpec,
         address: str,
         secret: bytes,
         max_batch: int,
@@ -60,7 +58,7 @@ class SocketServer:
     ) -> None:
         if not secret:
             raise ConfigError("secret", "", "the run's secret must not be empty")
-        self._server, self._spec, self._secret, self._max_batch, self._tls = server, spec, secret, max_batch, tls
+        self._server, self._secret, self._max_batch, self._tls = server, secret, max_batch, tls
         self._listener, self._path, self.address = _listen(address)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, READ)
@@ -169,7 +167,7 @@ class SocketServer:
         self._register_learner(connection, frame.meta.get("epoch"))
         connection.authenticated = True
         answer = proof(self._secret, b"server", nonce, connection.challenge)
-        connection.send(Kind.WELCOME, {"proof": answer, "fingerprint": self._spec.fingerprint})
+        connection.send(Kind.WELCOME, {"proof": answer, "fingerprint": self._server.spec.fingerprint})
 
     def _register_learner(self, connection: ClientConnection, epoch: Any) -> None:
         """Only the newest learner is served, so that one which was stopped and replaced writes nothing any more."""
@@ -207,12 +205,12 @@ class SocketServer:
         self._check_batch_size(batch_size)
         if connection.socket.family != socket.AF_UNIX or connection.shared is not None:
             raise MessageError("kind", "SHARE, on a unix socket and once")
-        descriptor = reserve_memory(shared_bytes(self._spec, batch_size))
+        descriptor = reserve_memory(shared_bytes(self._server.spec, batch_size))
         if descriptor is None:
             connection.send(Kind.SHARE, {})
             return
         try:
-            connection.shared = SharedBatches(descriptor, self._spec, batch_size)
+            connection.shared = SharedBatches(descriptor, self._server.spec, batch_size)
             connection.send_descriptor(Kind.SHARE, descriptor)
         finally:
             os.close(descriptor)

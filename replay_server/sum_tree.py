@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.compiled import compiled
+from rmc.common.window import Slots
 
 Values = NDArray[np.float64]
-Slots = NDArray[np.int64]
 
 
 @compiled

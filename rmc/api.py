@@ -11,23 +11,23 @@ from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium
+from gymnasium.envs.registration import EnvSpec
 
 from rmc.analysis.evaluation import FINAL_EPISODES
 from rmc.analysis.run_evaluation import evaluate_run
 from rmc.cli import training
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.make import DM_CONTROL, PYBULLET
 from rmc.common.env.process_state import torch_as_imported
-from rmc.common.errors import ConfigError
+from rmc.common.env.registered import DM_CONTROL, PYBULLET
+from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.common.process import watchdog
 from rmc.common.user_path import user_path
 from rmc.deploy.monitor.recorded import Callback
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig, checked
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import PATH_VARIABLE, IfExists, InitParts, Launcher, LaunchOptions, Tracker
+from rmc.deploy.run.launch_options import PATH_VARIABLE, IfExists, InitParts, Launcher, LaunchOptions, TrackerName
 from rmc.deploy.run.starts import last_launch
-from rmc.deploy.run.state import STOPPED
 
 
 def train(
@@ -43,7 +43,7 @@ def train(
     tls: bool = False,
     init_from: str | Path | None = None,
     init_parts: InitParts = "all",
-    track: Tracker | Literal["off"] | None = None,
+    track: TrackerName | Literal["off"] | None = None,
     track_project: str | None = None,
     track_tags: Sequence[str] = (),
     video_every: int | None = None,
@@ -66,16 +66,16 @@ def train(
     if isinstance(track_tags, str):
         raise ConfigError("track_tags", track_tags, "take a list of texts")
     options = LaunchOptions(
-        None if run_dir is None else user_path(run_dir),
-        if_exists,
-        launcher,
-        str(device),
-        redis_url,
-        ray_address,
-        all_cpus,
-        tls,
+        run_dir=None if run_dir is None else user_path(run_dir),
+        if_exists=if_exists,
         init_from=None if init_from is None else str(init_from),
         init_parts=init_parts,
+        launcher=launcher,
+        device=str(device),
+        redis_url=redis_url,
+        ray_address=ray_address,
+        all_cpus=all_cpus,
+        tls=tls,
         track=track,
         track_project=track_project,
         track_tags=tuple(track_tags),
@@ -148,7 +148,7 @@ def _train(config: RunConfig, options: LaunchOptions, callback: Callback | None)
         folder, status = training.train(config, options, terminal(), hears)
     if hears is not None and hears.error is not None:
         raise hears.error
-    if status == STOPPED:
+    if status == STOPPED_STATUS:
         raise KeyboardInterrupt
     result = folder.result()
     assert result is not None  # written by every run that ends cleanly
@@ -171,18 +171,19 @@ def _check_importable(env: EnvConfig) -> None:
     if script is not None:  # where modules beside it are, which this one can import
         os.environ[PATH_VARIABLE] = str(Path(script).resolve().parent)
     spec = gymnasium.registry.get(env.id)
-    factory = spec.entry_point if spec is not None else None
-    module = factory.partition(":")[0] if isinstance(factory, str) else getattr(factory, "__module__", "")
-    known = module.startswith("gymnasium.") or env.id.startswith((DM_CONTROL, PYBULLET))
-    if module == "__main__" or (module and not known and not _is_plugin(env.id)):
+    if spec is not None and not env.id.startswith((DM_CONTROL, PYBULLET)) and not _is_known_to_all(spec):
         fix = f'name the module that registers it, "module:{env.id}", or take launcher="lockstep"'
         raise ConfigError("ENV", env.id, f"is registered in this process alone, not in the roles' own; {fix}")
 
 
-def _is_plugin(env_id: str) -> bool:
-    """Whether every process knows it that imports gymnasium."""
-    code = "import gymnasium, sys; sys.exit(sys.argv[1] not in gymnasium.registry)"
-    return subprocess.run([sys.executable, "-c", code, env_id], capture_output=True, check=False).returncode == 0
+def _is_known_to_all(spec: EnvSpec) -> bool:
+    """Whether every process that imports gymnasium has it, with the same class, keywords and time limit."""
+    code = (
+        "import gymnasium, sys; spec = gymnasium.registry[sys.argv[1]]; "
+        "print((str(spec.entry_point), spec.max_episode_steps, spec.kwargs))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, spec.id], capture_output=True, check=False, text=True)
+    return done.stdout.endswith(f"{(str(spec.entry_point), spec.max_episode_steps, spec.kwargs)}\n")
 
 
 def evaluate(

@@ -161,7 +161,7 @@ class Study:
         """Those that have no line yet, so many at once. Raises ConfigError for the first that fails, after the rest."""
         target = self.results(scale)
         target.parent.mkdir(parents=True, exist_ok=True)
-        histories = history.read(target) if target.exists() else []
+        histories = history.read_histories(target) if target.exists() else []
         done = {(one.agent, one.env.partition(",")[0], one.seed) for one in histories}
         failures: list[ConfigError] = []
 
@@ -191,7 +191,7 @@ def _begun(job: Job) -> None:
 
 def _line(job: Job) -> str:
     """A finished run's, under the name that the study has for it."""
-    (past,) = history.read(job.folder)
+    (past,) = history.read_histories(job.folder)
     return dataclasses.replace(past, agent=job.values["agent"], commit=commit()).to_line()
 
 

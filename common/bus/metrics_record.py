@@ -49,7 +49,7 @@ def is_finite(value: Any) -> TypeGuard[float]:
     return _is_number(value) and math.isfinite(value)
 
 
-def is_whole(evaluation: Mapping[str, Any]) -> bool:
+def is_complete(evaluation: Mapping[str, Any]) -> bool:
     """Whether all its episodes were played to their ends.
 
     Else it is compared with no other: of a task that punishes each step, one that was cut short would always be best.

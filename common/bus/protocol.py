@@ -21,13 +21,9 @@ Every Redis key, R = ``rmc:{run}``:
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
-
-from isal.isal_zlib import crc32
-
-from rmc.common.errors import MessageError
 
 MAX_EPOCH_GAP = 1 << 16  # epochs that a role can take at most beyond the last one that is known of it
 METRICS_KEPT = 300  # records of a role, at least: five minutes
@@ -191,21 +187,3 @@ class Bus(Protocol):
 
     def clear_stop(self) -> None:
         """Forget an earlier run's stop, before its roles start again."""
-
-
-PIECE_BYTES = 256 * 1024  # 10 MB blobs collapse redis-py; pieces of this size run at memory speed
-
-
-def split_pieces(blob: bytes) -> list[bytes]:
-    """A blob as pieces of at most 256 KiB, at least one."""
-    return [blob[start : start + PIECE_BYTES] for start in range(0, max(len(blob), 1), PIECE_BYTES)]
-
-
-def join_pieces(pieces: Sequence[bytes | None], crc: int) -> bytes:
-    """The blob again. Raises MessageError where a piece is missing or the CRC-32 differs."""
-    if any(piece is None for piece in pieces):
-        raise MessageError("weights", "a piece is gone: a newer version has replaced this one")
-    blob = b"".join(piece for piece in pieces if piece is not None)
-    if crc32(blob) != crc:
-        raise MessageError("crc", "weights")
-    return blob

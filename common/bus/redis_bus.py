@@ -14,10 +14,8 @@ from rmc.common.bus.protocol import (
     EntryId,
     ReplayAddress,
     ReplayOwner,
-    Version,
     actor_role,
 )
-from rmc.common.bus.redis_connection import RedisConnection
 from rmc.common.bus.weight_store import WeightStore
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError, MessageError
 
@@ -37,17 +35,13 @@ return 0
 """
 
 
-class RedisBus(RedisConnection):
+class RedisBus(WeightStore):
     """All roles of one run over one Redis. Not thread-safe: one per thread."""
-
-    @property
-    def _weights(self) -> WeightStore:
-        return WeightStore(self)  # not kept: a circle of references would keep its sockets open
 
     def expire(self, seconds: int | None) -> None:
         """Let all that this run has in Redis vanish after so many seconds; None takes that back."""
         pattern = re.sub(r"([*?\[\]\\])", r"\\\1", self.prefix) + ":*"
-        pieces, named = self._weights.pieces()
+        pieces, named = self.piece_keys()
         for key in self.call(lambda: list(self.redis.scan_iter(match=pattern, count=1000))):
             if seconds is not None:
                 self.call(self.redis.expire, key, seconds)
@@ -213,15 +207,6 @@ class RedisBus(RedisConnection):
         epoch, _, address = (raw or b"").partition(b" ")
         numbers = self.integers(epoch, 1)
         return ReplayAddress(numbers[0], address.decode(errors="replace")) if numbers else None
-
-    def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
-        self._weights.publish(version, blob, evaluate)
-
-    def latest_version(self, evaluate: bool = False) -> Version | None:
-        return self._weights.latest(evaluate)
-
-    def weights(self, evaluate: bool = False) -> tuple[Version, bytes] | None:
-        return self._weights.load(evaluate)
 
     def emit(self, role: str, record: Mapping[str, Any]) -> None:
         key, fields = self.key("metrics", role), {"r": encode_record(record)}

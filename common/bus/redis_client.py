@@ -8,7 +8,7 @@ import redis
 from redis.client import Pipeline
 from redis.exceptions import ResponseError
 
-from rmc.common.bus.redis_url import shown
+from rmc.common.bus.redis_url import redacted
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RmcError
 
 KEYS = "rmc:"  # how every key of ours begins
@@ -33,7 +33,7 @@ def refusal(error: ResponseError, url: str) -> RmcError:
         return BusFull(text)
     if code not in FIXES:
         return BusUnavailable(text)
-    return ConfigError("--redis-url", shown(url), f"it answers {text}; {FIXES[code]}")
+    return ConfigError("--redis-url", redacted(url), f"it answers {text}; {FIXES[code]}")
 
 
 def _name(error: ResponseError, command: tuple[Any, ...]) -> None:

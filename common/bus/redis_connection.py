@@ -13,7 +13,7 @@ from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
 from rmc.common.bus.redis_client import RedisClient, refusal
-from rmc.common.bus.redis_url import HIDDEN, fault, shown
+from rmc.common.bus.redis_url import HIDDEN, fault, redacted
 from rmc.common.errors import BusUnavailable, ConfigError
 
 TIMEOUT_SECONDS = 3.0  # that Redis may take for an answer; two of them are less than a learner waits for a batch
@@ -34,7 +34,7 @@ class RedisConnection:
         lost = (redis.exceptions.ConnectionError,)  # one that hangs would keep the role once more
         retry = Retry(ExponentialBackoff(cap=0.1, base=0.01), retries=3, supported_errors=lost)
         if fix := fault(url):
-            raise ConfigError("--redis-url", shown(url), fix)
+            raise ConfigError("--redis-url", redacted(url), fix)
         try:
             self.redis: Any = RedisClient.from_url(  # Any: its annotations do not know decode_responses
                 url, retry=retry, socket_timeout=TIMEOUT_SECONDS
@@ -44,7 +44,7 @@ class RedisConnection:
             if not all(0 < pool.connection_kwargs.get(name, 1) < TIMEOUT_LIMIT for name in TIMEOUTS):
                 raise ValueError
         except (ValueError, TypeError, redis.exceptions.RedisError):  # whose words may quote a password
-            raise ConfigError("--redis-url", shown(url), "its options are no good; fix what follows ?") from None
+            raise ConfigError("--redis-url", redacted(url), "its options are no good; fix what follows ?") from None
         self.url, self.prefix = url, f"rmc:{run}"
         self.refused: Counter[str] = Counter()  # what roles wrote and could not be read, by reason
         self._repeat: Callable[[Callable[[], Any]], Any] | None = None

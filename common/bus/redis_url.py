@@ -1,9 +1,11 @@
 """A Redis's URL as it may be shown: its user-info and its query, either of which may hold a password, are left out."""
 
+import logging
 import re
 from typing import Any
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
+log = logging.getLogger(__name__)
 SCHEMES = ("redis", "rediss", "unix")
 HIDDEN = "…"  # stands for what may hold a password
 UNREADABLE = (
@@ -12,7 +14,7 @@ UNREADABLE = (
 )
 
 
-def shown(url: str) -> str:
+def redacted(url: str) -> str:
     """Scheme and place; the scheme alone where the URL cannot be parsed. A word without ``://`` shows nothing."""
     scheme, separator, _ = url.partition("://")
     if not separator or scheme not in SCHEMES:
@@ -37,7 +39,7 @@ def _place(parts: SplitResult) -> str:
 
 def fault(url: str) -> str:
     """Why it is refused, where a client may read it in another way than it was meant; empty where it may not."""
-    if shown(url).endswith(HIDDEN):
+    if redacted(url).endswith(HIDDEN):
         return UNREADABLE
     parts = urlsplit(url)
     if parts.scheme != "unix" and not re.fullmatch("[0-9]*", parts.path.strip("/")):
@@ -54,9 +56,16 @@ def has_password(url: str) -> bool:
     return bool(parts.password) or "password" in parse_qs(parts.query)
 
 
+def warn_of_password(url: str) -> None:
+    """Say that everybody on this machine can read the URL's password in a command line, if it has one."""
+    if has_password(url):
+        fix = "write the URL to a file that only you may read, and give --redis-url file:PATH"
+        log.warning("--redis-url=%r: everybody here can read its password in ps; %s", redacted(url), fix)
+
+
 def without_passwords(word: str) -> str:
     """A word of a command line, the URL or the login that it may end with as it may be shown."""
-    return re.sub(r"[\w+.-]*://.*|[^=]*@.*", lambda match: shown(match[0]), word, flags=re.DOTALL)
+    return re.sub(r"[\w+.-]*://.*|[^=]*@.*", lambda match: redacted(match[0]), word, flags=re.DOTALL)
 
 
 def value_without_passwords(value: Any) -> Any:

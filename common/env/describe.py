@@ -20,7 +20,7 @@ def structure(env: gym.Env[Any, Any]) -> dict[str, int]:
     return {name: int(size) for name, size in named.items() if not name.startswith("skipped")}
 
 
-def shown(env: gym.Env[Any, Any], hide: str) -> slice | None:
+def visible_slice(env: gym.Env[Any, Any], hide: str) -> slice | None:
     """Positions come first, and what follows is velocities and what depends on them; None shows all."""
     positions = structure(env).get("qpos", 0)
     return {"nothing": None, "velocities": slice(0, positions), "positions": slice(positions, None)}[hide]
@@ -35,7 +35,7 @@ def layout_of(env: Env, config: EnvConfig, info: dict[str, Any], privileged: boo
     low, high = bounds(actions)
     limit = env.spec.max_episode_steps if env.spec else None
     return EnvLayout(
-        _of_slice(_named(parts(observations), structure(env)), shown(env, config.hide)),
+        _of_slice(_named(parts(observations), structure(env)), visible_slice(env, config.hide)),
         config.frame_stack,
         parts(actions),
         tuple(low.tolist()),

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
-from rmc.common.errors import EnvFault, RmcError
+from rmc.common.errors import EnvFault, RmcError, one_line
 
 RAISED = (Exception, SystemExit)  # what a user's code may raise; a module that calls sys.exit ends nobody else
 INSTALLED = {"site-packages", "dist-packages"}
@@ -34,11 +34,6 @@ def describe_error(error: BaseException) -> str:
         return text
     name = f"{type(error).__name__}: {text}" if text else type(error).__name__
     return name if isinstance(error, SyntaxError) or not places else f"{name} ({places[-1]})"
-
-
-def one_line(error: BaseException) -> str:
-    """An error's own words, without its line breaks."""
-    return " ".join(str(error).split())
 
 
 def _users_places(error: BaseException) -> list[str]:

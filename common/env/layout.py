@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.errors import ConfigError
+from rmc.common.window import Doubles, Floats
 
 NUMBERS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64|128)")  # what numpy calls them
-Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class ActionScale:
         self._low, self._high, self._half_range = low, high, (high - low) / 2
         self._plain = bool((low == -1.0).all() and (high == 1.0).all())
 
-    def __call__(self, action: NDArray[np.float32]) -> NDArray[np.floating]:
+    def __call__(self, action: Floats) -> NDArray[np.floating]:
         """(..., A) -> (..., A) in the environment's units; the same array where those are [-1, 1]."""
         if self._plain:
             return action

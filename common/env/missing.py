@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rmc.common.env.wrappers import CorruptObservation, Env, Floats
-from rmc.common.window import BoolArray
+from rmc.common.env.wrappers import CorruptObservation, Env
+from rmc.common.window import BoolArray, Floats
 
 
 class Missing(CorruptObservation):

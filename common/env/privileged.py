@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from rmc.common.env.spaces import array
-from rmc.common.env.wrappers import Env, Floats, SeenWrapper
+from rmc.common.env.wrappers import Env, SeenWrapper
 from rmc.common.errors import EnvFault
+from rmc.common.window import Floats
 
 
 class Privileged(SeenWrapper):

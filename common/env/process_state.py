@@ -61,19 +61,45 @@ class ProcessState(NamedTuple):
         return {name for name, mine, theirs in zip(self._fields, self, other, strict=True) if mine != theirs}
 
 
+_dtype_lock = threading.Lock()
+_callers_dtypes: list[Any] = []  # of what now runs as in a fresh process; the first is the caller's program's
+
+
 @contextmanager
 def torch_as_imported() -> Iterator[None]:
-    """Torch's defaults as a fresh process has them; afterwards all is as the caller's program had it."""
+    """Torch's defaults as a fresh process has them; afterwards those of the caller's program.
+
+    The default dtype is one for all threads: it changes back once the last that needs this is over.
+    """
     import torch  # slow
 
-    theirs = ProcessState.read()
-    theirs._replace(dtype=torch.float32, gradients=True, device=torch.device("cpu")).install(theirs)
+    theirs, rounding = ProcessState.read(), _rounding()
+    with _dtype_lock:
+        _callers_dtypes.append(theirs.dtype)
+        theirs._replace(dtype=torch.float32, gradients=True, device=torch.device("cpu")).install(theirs)
     flushes = (torch.tensor(1e-40) * 1).item() == 0.0  # a denormal: nothing can be asked
     try:
         yield
     finally:
         torch.set_flush_denormal(flushes)
-        theirs.install(ProcessState.read())
+        if rounding is not None and rounding != _rounding():
+            torch.set_float32_matmul_precision(rounding[0])
+            torch.backends.cudnn.allow_tf32 = rounding[1]
+        with _dtype_lock:
+            now, first = ProcessState.read(), _callers_dtypes[0]
+            _callers_dtypes.pop()
+            if _callers_dtypes or now.dtype != torch.float32:  # or the caller has chosen another meanwhile
+                first = now.dtype
+            theirs._replace(dtype=first, folder=now.folder, numpy_errors=now.numpy_errors).install(now)
+
+
+def _rounding() -> tuple[str, bool] | None:
+    """How a GPU rounds float32 products; None where the caller has said so by both of torch's ways."""
+    import torch
+
+    with suppress(RuntimeError):
+        return torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
+    return None
 
 
 def _go(folder: str | None) -> None:

@@ -13,14 +13,13 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from rmc.common.env.faults import call_env
 from rmc.common.env.layout import ActionScale
 from rmc.common.env.spaces import array, bounds, vector
 from rmc.common.errors import EnvFault
+from rmc.common.window import BoolArray, Floats
 
-Floats = NDArray[np.float32]
 Env = gym.Env[Floats, Floats]
 log = logging.getLogger(__name__)
 RESET, STEP = ("observation", "info"), ("observation", "reward", "terminated", "truncated", "info")
@@ -111,7 +110,7 @@ def _bool(name: str, value: Any) -> bool:
     return value if isinstance(value, bool) else bool(_number(name, value, "a bool"))
 
 
-def _missing(value: Any, size: int) -> bool | NDArray[np.bool_]:
+def _missing(value: Any, size: int) -> bool | BoolArray:
     """A bool for the whole frame, or (O,) bools where there is one for each of its ``size`` numbers."""
     if isinstance(value, bool):
         return value

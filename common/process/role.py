@@ -43,9 +43,11 @@ class StopSignal:
         self.requested = self.terminated = False
 
     def install(self) -> None:
-        """Catch both signals in this process."""
-        signal.signal(signal.SIGTERM, lambda *_: self._terminate())
-        signal.signal(signal.SIGINT, lambda *_: self.request())
+        """Catch both signals in this process, but for those that a program around Python has taken for itself."""
+        if signal.getsignal(signal.SIGTERM) is not None:
+            signal.signal(signal.SIGTERM, lambda *_: self._terminate())
+        if signal.getsignal(signal.SIGINT) is not None:
+            signal.signal(signal.SIGINT, lambda *_: self.request())
 
     def _terminate(self) -> None:
         self.requested = self.terminated = True

@@ -43,7 +43,7 @@ class EnvCall:
 
     def __exit__(self, *_: object) -> None:
         self.over = True  # another thread may put it back
-        EnvCall.current = self._outer
+        EnvCall.current, self._outer = self._outer, None  # calls of several threads would make a chain without end
 
     def describe(self) -> str:
         """That it hangs, and where, in a line."""

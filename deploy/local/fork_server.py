@@ -14,8 +14,7 @@ from typing import Any, BinaryIO
 import msgpack
 
 from rmc.common.errors import RoleDied
-from rmc.common.process import parent_death
-from rmc.deploy.local.role_environment import SINGLE_THREAD, inherited, working_folder
+from rmc.deploy.local.role_environment import SINGLE_THREAD, start_process
 
 POLL_SECONDS = 0.01
 LOOK_SECONDS = 0.2  # between looks at whether to stop
@@ -100,13 +99,9 @@ class ForkServer:
             return
         self.close()
         self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        environment = {**inherited(), **SINGLE_THREAD, parent_death.PARENT_VARIABLE: str(os.getpid())}
         words = [sys.executable, "-P", "-m", "rmc.cli.fork_server", str(theirs.fileno())]
         with theirs, open_log(self._log) as log:
-            self._program = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0,
-                pass_fds=(theirs.fileno(),), cwd=working_folder(),
-            )  # fmt: skip
+            self._program = start_process(words, log, SINGLE_THREAD, (theirs.fileno(),))
         self._generation += 1
         self._ours.settimeout(LOOK_SECONDS)
         self._is_importing = True

@@ -16,7 +16,8 @@ from rmc.common.replay import Replay
 from rmc.deploy.local.role_process import Process, RunConnection, until_taken
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.preflight import check_device, cores, thread_choices, two_processes
+from rmc.deploy.run.host import cores
+from rmc.deploy.run.preflight import check_device, thread_choices, two_processes
 from rmc.learner.learner import Learner
 from rmc.learner.replay_client import ReplayClient
 from rmc.learner.sharded_replay import ShardedReplay

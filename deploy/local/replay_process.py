@@ -30,14 +30,13 @@ def drop_unread(bus: Bus, shard: Shard) -> None:
 def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> int:
     """A replay server's process; its ring lies in ``folder``, its socket at ``listen``."""
     secret, process = place.secret(), Process(place)
-    config, spec = process.config, process.config.window_spec()
-    shard = Shard(index, config.replay.replay_shards)
+    config, shard = process.config, Shard(index, process.config.replay.replay_shards)
     if not 0 <= index < shard.count:
         raise ConfigError("--shard", index, f"the run has replay servers 0 to {shard.count - 1}")
     context = tls.server_context(place.tls_folder) if place.tls_folder is not None else None
     with process.starting(shard.role, lambda: drop_unread(process.bus, shard)):
         server = make_server(config, folder, process.bus, shard)
-        sockets = SocketServer(server, spec, listen, secret, config.learner.batch_size, context)
+        sockets = SocketServer(server, listen, secret, config.learner.batch_size, context)
         process.bus.announce_replay(server.owner, sockets.address)
     run_role(ReplayProcess(server, sockets), process.bus, process.stop, idle_seconds=0.0)
     return process.stop.exit_status

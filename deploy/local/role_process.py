@@ -17,7 +17,8 @@ from rmc.common.process.outage import OutageLog
 from rmc.common.process.role import RECONNECT_SLEEP, StopSignal
 from rmc.deploy.local.role_environment import SECRET_VARIABLE
 from rmc.deploy.redis.connect import PATIENCE_SECONDS, PATIENCE_VARIABLE, Deadline, connect
-from rmc.deploy.run.config import RunConfig, check_sizes, env_sizes, from_registration
+from rmc.deploy.run.config import RunConfig, from_registration
+from rmc.deploy.run.env_sizes import check_sizes, env_sizes
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

@@ -10,22 +10,19 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
 
-from rmc.common.errors import RoleDied
-from rmc.common.process.parent_death import PARENT_VARIABLE
+from rmc.common.errors import CONFIG_STATUS, RoleDied
 from rmc.common.process.role import TERMINATED_STATUS
 from rmc.common.process.watchdog import HUNG_STATUS, HUNG_WORDS, SLACK
 from rmc.deploy.local.fork_server import ForkedProcess, ForkServer, open_log
 from rmc.deploy.local.role_command import RoleCommand
-from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, inherited, working_folder
+from rmc.deploy.local.role_environment import SINGLE_THREAD, command_line, start_process
 
 # So many deaths of a role's own in a row, each within so long of its start, end the run.
 QUICK_DEATHS, QUICK_SECONDS = 3, 60.0
 FIRST_BACKOFF, LONGEST_BACKOFF = 0.25, 10.0  # seconds before a role is started again, doubled at each quick death
 STOP_SECONDS = 3.5  # for the roles to end cleanly; then they are killed
 HELD_SECONDS = 20.0  # that a learner may be held by a replay server or Redis that hangs, before it hears and saves
-EXIT_CONFIG = 2  # the exit status of an error that starting again cannot fix
 TRACEBACK_BYTES = 8192
 NO_PROCESS = errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE  # for now
 log = logging.getLogger(__name__)
@@ -47,7 +44,7 @@ class QuickDeaths:
         hung = status == HUNG_STATUS or (status == 1 and last_words.startswith(HUNG_WORDS))
         lived -= SLACK * self.env_timeout if hung else 0.0
         self.count = self.count + 1 if lived < QUICK_SECONDS and not from_outside(status) else 0
-        if self.count >= QUICK_DEATHS or status == EXIT_CONFIG:
+        if self.count >= QUICK_DEATHS or status == CONFIG_STATUS:
             how = f"killed by signal {-status}" if status < 0 else f"exit status {status}"
             often = f"{self.count} times in a row soon after its start" if self.count > 1 else "at once"
             raise RoleDied(f"{self.name} ended {often}{where}, {how}; its last words:\n{last_words}")
@@ -83,22 +80,14 @@ class RoleProcess:
         return self._process.poll() if self._process is not None else None
 
     def start(self) -> None:
-        """Start its process, in a process group of its own: Ctrl-C is for the supervisor alone."""
+        """Start its process. Raises as ``ForkServer.fork`` does."""
         self.log_start = self.log.stat().st_size if self.log.exists() else 0
         self._started_at = time.monotonic()
         with open_log(self.log) as log:
             if self._fork_server is not None:
                 self._process = self._fork_server.fork(self.command.words, self._environment, log.fileno())
             else:
-                self._process = self._new_process(log)
-
-    def _new_process(self, log: BinaryIO) -> subprocess.Popen[bytes]:
-        environment = {**inherited(), **self._environment, PARENT_VARIABLE: str(os.getpid())}
-        words = command_line(self.command.words)
-        return subprocess.Popen(
-            words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0,
-            cwd=working_folder(),
-        )  # fmt: skip
+                self._process = start_process(command_line(self.command.words), log, self._environment)
 
     def tend(self) -> None:
         """Note a death, or start again when it is time. Raises RoleDied."""

@@ -19,6 +19,7 @@ from rmc.deploy.local.launcher import TICK_SECONDS, LocalRun
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.learner.config import MODEL_PROCESS
 
@@ -75,7 +76,7 @@ def run_trial(config: RunConfig, device: str, stop: StopSignal) -> Trial:
 
 @contextmanager
 def _folder(config: RunConfig, path: Path) -> Iterator[RunFolder]:
-    folder = open_run(config, path, "fail")
+    folder = open_run(config, LaunchOptions(path, "fail"))
     try:
         yield folder
     finally:

@@ -23,10 +23,8 @@ AWAY_SECONDS = 30.0  # a launcher on Ray that was killed begins again within tha
 STOP_SECONDS = 60.0
 
 
-def watch(
-    folder: RunFolder, console: Console, gone: Callable[[], bool], callback: Callback | None = None
-) -> int | None:
-    """Show a run until its launcher ends, and give its exit status; None where it is ``gone`` without one.
+def watch(folder: RunFolder, console: Console, gone: Callable[[], bool], callback: Callback | None = None) -> None:
+    """Show a run until its launcher ends, or is ``gone``.
 
     ``callback`` hears each record from now on.
     """
@@ -42,7 +40,6 @@ def watch(
     finally:
         catch_up(status, tail, callback)
         view.close(run_state(folder))
-    return folder.lock.ended()
 
 
 class LauncherGone:
@@ -88,8 +85,8 @@ def _owner(process: int) -> str:
         return "another user"
 
 
-def stop(folder: RunFolder) -> int:
-    """Ask the launcher to end the run cleanly, and wait until it has; its exit status. Raises ConfigError."""
+def stop(folder: RunFolder) -> None:
+    """Ask the launcher to end the run cleanly, and wait until it has. Raises ConfigError."""
     trainer = launcher_pid(folder)
     if elsewhere := folder.lock.trained_elsewhere():
         raise ConfigError("RUN", str(folder.path), f"is trained on {elsewhere}; stop it there")
@@ -100,5 +97,3 @@ def stop(folder: RunFolder) -> int:
         if time.monotonic() > deadline:
             raise ConfigError("RUN", str(folder.path), f"did not end within {seconds:.0f} s; see {folder.logs}")
         time.sleep(LOOK_SECONDS)
-    ended = folder.lock.ended()
-    return 0 if ended is None else ended

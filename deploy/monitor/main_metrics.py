@@ -15,7 +15,7 @@ def main_metrics(status: RunStatus) -> dict[str, float]:
     waits = {
         "waiting_share_learner": learner.get("waiting_share"),
         "waiting_share_replay": status.replay("waiting_share", mean),
-        "waiting_share_actors": status.over("actor-", "waiting_share", mean),
+        "waiting_share_actors": status.aggregate("actor-", "waiting_share", mean),
     }
     losses = {name: value for name, value in learner.items() if name.endswith("_loss")}
     metrics: dict[str, Any] = {

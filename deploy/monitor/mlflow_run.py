@@ -7,8 +7,8 @@ from typing import Any
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, RunData
 
-from rmc.deploy.run.config import flat
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.option_names import flat
 from rmc.deploy.run.tracking import Tracking
 
 ID = "rmc.id"  # the tag that tells a run from others of its name

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from rmc.common.bus.metrics_record import is_finite, is_whole
+from rmc.common.bus.metrics_record import is_complete, is_finite
 from rmc.common.bus.protocol import Bus
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable
@@ -18,10 +18,11 @@ from rmc.deploy.monitor.metrics_log import MetricsLog
 from rmc.deploy.monitor.recorded import Callback, empty_status
 from rmc.deploy.monitor.tracker import Tracker
 from rmc.deploy.monitor.view import View
-from rmc.deploy.run.config import RunConfig, flat
+from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.host import HostFigures
 from rmc.deploy.run.metrics_tail import MetricsTail, wall_seconds
+from rmc.deploy.run.option_names import flat
 
 RECORD_SECONDS = 5.0  # between the launcher's own records, and looks at the run's folder
 TOO_LATE = "checkpoint %d was dropped before its evaluation ended; raise --keep-checkpoints, or lower --episodes"
@@ -132,7 +133,7 @@ class Monitor:
 
     def _mark_best(self, record: dict[str, Any]) -> None:
         update, score = record.get("eval_update"), record.get("eval_return_mean")
-        if record["role"] == "evaluator" and is_whole(record) and isinstance(update, int) and is_finite(score):
+        if record["role"] == "evaluator" and is_complete(record) and isinstance(update, int) and is_finite(score):
             self._unmarked[update] = float(score)
         with suppress(OSError):  # no room; the next record tries again
             for update in list(self._unmarked):

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from rmc.common.bus.metrics_record import is_finite, is_whole
+from rmc.common.bus.metrics_record import is_complete, is_finite
 from rmc.deploy.monitor.pace import Pace
 from rmc.deploy.run.state import State
 
@@ -118,7 +118,7 @@ class RunStatus:
         deviation = deviation if is_finite(deviation) else None
         at = _steps(record.get("eval_env_steps"))
         self.last = EvaluationStatus(float(score), deviation, _steps(record["eval_update"]), at)
-        if is_whole(record) and (self.best is None or self.last.return_mean > self.best.return_mean):
+        if is_complete(record) and (self.best is None or self.last.return_mean > self.best.return_mean):
             self.best = self.last
 
     def silent(self) -> dict[str, float]:
@@ -208,9 +208,9 @@ class RunStatus:
 
     def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:
         """The sum or mean ``over`` all replay servers, or None."""
-        return self.over("replay", name, over)
+        return self.aggregate("replay", name, over)
 
-    def over(self, kind: str, name: str, how: Callable[[list[float]], float]) -> float | None:
+    def aggregate(self, kind: str, name: str, how: Callable[[list[float]], float]) -> float | None:
         """The sum or mean over all roles whose name begins with ``kind``, or None."""
         values = [record[name] for role, record in self.roles.items() if role.startswith(kind) and name in record]
         return how(values) if values else None

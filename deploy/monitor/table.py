@@ -2,6 +2,7 @@
 
 import re
 import textwrap
+from collections.abc import Collection, Iterable
 from statistics import mean
 from typing import Any
 
@@ -22,6 +23,14 @@ STYLES = {
     "new": "", "unknown": "",
 }  # fmt: skip
 Fact = tuple[str, str]  # a figure's name and its text
+
+
+def plain_table(headings: Iterable[str], right: Collection[str] = ()) -> Table:
+    """One without lines or rows; the columns that ``right`` names stand at the right, each of their cells in a line."""
+    drawn = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    for name in headings:
+        drawn.add_column(name, justify="right" if name in right else "left", no_wrap=name in right, overflow="fold")
+    return drawn
 
 
 def table(status: RunStatus, width: int, height: int | None = None) -> RenderableType:
@@ -146,7 +155,7 @@ def _roles(status: RunStatus, most: int) -> Table:
     groups, silent = _groups(status), status.silent()
     if sum(map(len, groups)) <= most:
         groups = [{role: record} for group in groups for role, record in group.items()]
-    roles = Table("role", "busy", "waiting", "for", box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    roles = plain_table(("role", "busy", "waiting", "for"))
     for group in groups[: max(0, most)]:
         shares = (_share(group, name) for name in ("busy_share", "waiting_share"))
         roles.add_row(count(group), *shares, _reasons(group, silent))

@@ -9,6 +9,7 @@ import psutil
 from ray._private.services import canonicalize_bootstrap_address
 
 from rmc.common.errors import ConfigError
+from rmc.common.user_path import user_path
 
 ANSWER_SECONDS = 5.0
 QUESTION = "/ray.rpc.NodeInfoGcsService/CheckAlive"
@@ -54,5 +55,5 @@ def _token(address: str) -> list[tuple[str, str]]:
         return []
     token, file = os.environ.get("RAY_AUTH_TOKEN"), os.environ.get("RAY_AUTH_TOKEN_PATH", "~/.ray/auth_token")
     with suppress(OSError):
-        token = token or Path(file).expanduser().read_text().strip()
+        token = token or user_path(file).read_text().strip()
     return [("authorization", f"Bearer {token}")] if token else []

@@ -49,7 +49,8 @@ def joined(address: str, cpus: int | None = None) -> Iterator[None]:
     finally:
         os.umask(mask)
         for number, handler in handlers.items():  # Ray takes SIGTERM for itself
-            signal.signal(number, handler)
+            if handler is not None:  # not set from Python
+                signal.signal(number, handler)
     try:
         yield
     finally:

@@ -10,11 +10,12 @@ from typing import Any
 import yaml
 from rich.console import Console
 
-from rmc.common.errors import ConfigError, RmcError
+from rmc.common.errors import ConfigError, RmcError, one_line
+from rmc.common.user_path import user_path
 
 UP_SECONDS = 900.0  # for all nodes to have joined once the head is up: new machines install everything first
 LOOK_SECONDS = 2.0
-TOKEN = Path("~/.ray/auth_token")
+TOKEN = "~/.ray/auth_token"
 # Counts what is alive; run on the head.
 COUNT = (
     "import ray; ray.init(address='auto', logging_level='ERROR'); print('alive', sum(n['Alive'] for n in ray.nodes()))"
@@ -26,7 +27,7 @@ LEFT = f"for i in $(seq 20); do n=$(pgrep -u $(id -u) -fc '{_RAYS}'); [ $n = 0 ]
 
 def up(path: Path, console: Console) -> None:
     """Bring a cluster up and wait until every node that its file promises is there. Raises RmcError."""
-    config = read(path)
+    config = read_cluster_file(path)
     secure_token()
     console.print(f"ray up {path}", soft_wrap=True)
     _ray("up", "-y", str(path))
@@ -42,7 +43,7 @@ def up(path: Path, console: Console) -> None:
 
 def down(path: Path, console: Console) -> None:
     """Take a cluster down; on machines of one's own also what ``ray down`` leaves running. Raises RmcError."""
-    config = read(path)
+    config = read_cluster_file(path)
     console.print(f"ray down {path}", soft_wrap=True)
     _ray("down", "-y", str(path))
     if config["provider"]["type"] != "local":
@@ -58,12 +59,12 @@ def down(path: Path, console: Console) -> None:
     console.print("no process of Ray is left on any node")
 
 
-def read(path: Path) -> dict[str, Any]:
+def read_cluster_file(path: Path) -> dict[str, Any]:
     """A cluster's file. Raises ConfigError where it is none."""
     try:
         config = yaml.safe_load(path.read_text())
     except (OSError, UnicodeError, yaml.YAMLError) as error:
-        raise ConfigError("CONFIG", str(path), f"cannot be read ({' '.join(str(error).split())})") from None
+        raise ConfigError("CONFIG", str(path), f"cannot be read ({one_line(error)})") from None
     provider = config.get("provider") if isinstance(config, dict) else None
     if not isinstance(provider, dict) or "type" not in provider:
         raise ConfigError("CONFIG", str(path), "is no Ray cluster's file; start from one in deploy/cluster/")
@@ -84,7 +85,7 @@ def expected_nodes(config: dict[str, Any]) -> int:
 
 def secure_token() -> None:
     """Make Ray's token where there is none, and let only its owner read it."""
-    path = TOKEN.expanduser()
+    path = user_path(TOKEN)
     mask = os.umask(0o077)
     try:
         if not path.exists():
@@ -123,7 +124,7 @@ def _stop_command(config: dict[str, Any]) -> str:
 
 def _ssh(config: dict[str, Any], address: str, command: str) -> str:
     auth = config.get("auth", {})
-    key = ["-i", str(Path(auth["ssh_private_key"]).expanduser())] if "ssh_private_key" in auth else []
+    key = ["-i", str(user_path(auth["ssh_private_key"]))] if "ssh_private_key" in auth else []
     options = ["-o", "BatchMode=yes", "-o", "StrictHostKeyChecking=no", "-o", "UserKnownHostsFile=/dev/null"]
     login = f"{auth.get('ssh_user', os.environ.get('USER', ''))}@{address}"
     words = ["ssh", "-q", *key, *options, "-o", "ConnectTimeout=10", login, command]

@@ -13,10 +13,10 @@ from urllib.parse import quote
 
 import ray
 
-from rmc.common.errors import CheckpointError
+from rmc.common.errors import CONFIG_STATUS, CheckpointError
 from rmc.common.whole_file import NO_ROOM
 from rmc.deploy.local.role_command import RoleCommand
-from rmc.deploy.local.supervisor import EXIT_CONFIG, NO_PROCESS, RoleProcess
+from rmc.deploy.local.supervisor import NO_PROCESS, RoleProcess
 from rmc.deploy.ray.node import leave_rays_worker, private_folder
 
 NAMESPACE = "rmc"
@@ -149,7 +149,7 @@ class RoleActor:
     def is_final_exit(self, status: int) -> bool:
         """Whether such an end is the last one; after any other, all starts again."""
         ended = status == ENDED_IN_ORDER and (self._task.command.ends or self._run_ends)
-        return ended or status == EXIT_CONFIG
+        return ended or status == CONFIG_STATUS
 
     def stopping(self, now: bool) -> None:
         """Whether the run is being ended; where it is not after all, a role that has heard so begins again."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from rmc.common.bus.redis_bus import RedisBus
-from rmc.common.bus.redis_url import shown
+from rmc.common.bus.redis_url import redacted
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError
 from rmc.common.process.role import RECONNECT_SLEEP, StopSignal
 from rmc.common.user_path import user_path
@@ -53,8 +53,8 @@ def connect(url: str, run: str, waits: Deadline | None = None) -> RedisBus:
                 bus.ping()
             return bus
         except BusUnavailable as error:
-            if waits is None or not waits.wait(f"the Redis at {shown(url)}: {error}"):
-                raise ConfigError("--redis-url", shown(url), f"no Redis answers there ({error})") from None
+            if waits is None or not waits.wait(f"the Redis at {redacted(url)}: {error}"):
+                raise ConfigError("--redis-url", redacted(url), f"no Redis answers there ({error})") from None
 
 
 def tried_again(call: Callable[[], T], stop: StopSignal) -> T:

@@ -11,7 +11,7 @@ from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.shard import Shard
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.folder import RunFolder
-from rmc.replay_server.commit_record import is_whole
+from rmc.replay_server.commit_record import crc_matches
 
 KEEP_SECONDS = 10.0
 log = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ class ProgressBackup:
         self._keep_at = time.monotonic() + KEEP_SECONDS
         with suppress(BusUnavailable, BusFull, OSError):  # the disk is full: those before stay
             progress = {role: raw for role in self._roles if (raw := bus.progress(role)) is not None}
-            if progress and all(map(is_whole, progress.values())):
+            if progress and all(map(crc_matches, progress.values())):
                 write_whole(self._path, msgpack.packb(self._before() | progress))
 
     def restore(self, bus: Bus) -> None:
@@ -60,7 +60,7 @@ class ProgressBackup:
             return {}
         progress = msgpack.unpackb(self._path.read_bytes())
         if not isinstance(progress, dict) or not all(
-            role in self._roles and isinstance(raw, bytes) and is_whole(raw) for role, raw in progress.items()
+            role in self._roles and isinstance(raw, bytes) and crc_matches(raw) for role, raw in progress.items()
         ):
             raise ValueError("damaged, or no counters of this run's replay servers")
         return progress

@@ -77,11 +77,9 @@ class RedisServer:
     is no port. Raises ConfigError where it cannot start. It dies with this process.
     """
 
-    def __init__(
-        self, folder: Path, maxmemory: int = MAXMEMORY, port: Port | None = None, users: RedisUsers | None = None
-    ) -> None:
+    def __init__(self, folder: Path, port: Port | None = None, users: RedisUsers | None = None) -> None:
         assert port is None or users is not None
-        self.folder, self.maxmemory, self.port, self.users = folder, maxmemory, port, users
+        self.folder, self.port, self.users = folder, port, users
         self.socket = folder / "redis.sock"
         self.process: subprocess.Popen[bytes] | None = None
         self._unread = False  # whether its file has users that it may not know of
@@ -169,7 +167,7 @@ class RedisServer:
             "unixsocketperm": "700",
             "save": "",
             "appendonly": "no",
-            "maxmemory": str(self.maxmemory),
+            "maxmemory": str(MAXMEMORY),
             "maxmemory-policy": "noeviction",
             "proto-max-bulk-len": str(MAX_VALUE),
             "daemonize": "no",

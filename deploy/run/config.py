@@ -4,11 +4,9 @@ The only place that knows every config at once; each role is given its own part.
 """
 
 import dataclasses
-import difflib
 import json
 import types
 import typing
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import version
@@ -17,22 +15,20 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.metrics_record import LARGEST
-from rmc.common.env.config import EnvConfig, check_kwargs, plain, write_kwargs
+from rmc.common.env.config import EnvConfig, check_kwargs, plain
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.make import env_layout
-from rmc.common.env.spaces import bounds
-from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 from rmc.common.policy_header import PolicyHeader
 from rmc.common.shard import Shard
 from rmc.common.window import WindowSpec
+from rmc.deploy.run.env_sizes import FLAGS, layout_sizes
 from rmc.deploy.run.migrations import FORMAT, migrated
+from rmc.deploy.run.option_names import flat
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
 
 Preset = Literal["robust", "memory", "paper", "debug"]
-FLAGS = "flags of what is missing"
-LOWEST, HIGHEST = "the lowest actions", "the highest actions"
 LARGEST_WINDOW = 32 << 20  # bytes, half of what our Redis takes as a value
 ConfigT = TypeVar("ConfigT")
 
@@ -174,30 +170,6 @@ def from_registration(text: bytes) -> RunConfig:
     return config
 
 
-def layout_sizes(layout: EnvLayout) -> dict[str, Any]:
-    """Those that every agent depends on, as ``RunConfig.sizes`` names them."""
-    extremes = {LOWEST: list(layout.action_low), HIGHEST: list(layout.action_high)}
-    return {"observations": layout.obs_dim, "actions": layout.action_dim, **extremes}
-
-
-def env_sizes(env: Env) -> dict[str, Any]:
-    """The same of an environment as ``make_env`` gives it."""
-    assert env.observation_space.shape
-    assert env.action_space.shape
-    low, high = bounds(env.get_wrapper_attr("raw_action_space"))
-    sizes = {"observations": env.observation_space.shape[0], "actions": env.action_space.shape[0]}
-    return {**sizes, LOWEST: low.tolist(), HIGHEST: high.tolist()}
-
-
-def check_sizes(env_id: str, before: dict[str, Any], sizes: dict[str, Any]) -> None:
-    """Raises ConfigError where the environment has other ``sizes`` than ``before``, when the run began."""
-    for name, now in sizes.items():
-        if before.get(name, now) != now:
-            what = f"{name} {now}" if isinstance(now, list) else f"{now} {name}"
-            fault = f"the environment now has {what}, the run was trained with {before[name]!r}"
-            raise ConfigError("ENV", env_id, f"{fault}; undo that, or train another run")
-
-
 def _read(text: str | bytes) -> Any:
     try:
         return json.loads(text)
@@ -248,52 +220,3 @@ def _matches(kind: Any, value: Any) -> bool:
     if kind is float:
         return type(value) is float or (type(value) is int and abs(value) < LARGEST)
     return type(value) is kind
-
-
-def flat(config: Any, prefix: str = "") -> dict[str, Any]:
-    """The values of a config, or of what JSON holds of one, by dotted path."""
-    values: dict[str, Any] = {}
-    for name, value in (config if isinstance(config, dict) else dataclasses.asdict(config)).items():
-        nested = isinstance(value, dict) and name != "env_kwargs"
-        values |= flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}
-    return values
-
-
-def changes(was: Any, now: Any) -> dict[str, list[Any]]:
-    """Of two configs of a kind: by the option's path, what it was and is."""
-    before, after = flat(was), flat(now)
-    return {path: [before[path], after[path]] for path in after if before[path] != after[path]}
-
-
-def option(path: str) -> str:
-    """The command line's name of a config path: ``replay.replay_ratio`` is ``--replay-ratio``."""
-    return "--" + path.rpartition(".")[2].replace("_", "-")
-
-
-def meant(word: str, known: Iterable[str], otherwise: str = "") -> str:
-    """The end of a message on a word that is not known: what is most like it, or ``otherwise``."""
-    near = difflib.get_close_matches(word, known, 1)
-    return f"; did you mean {near[0]}?" if near else otherwise
-
-
-def plain_names(
-    place: str, raw: Mapping[str, Any], renamed: Mapping[str, str] = types.MappingProxyType({})
-) -> dict[str, Any]:
-    """What a file says of options, by their present names. Raises ConfigError where one is at ``place`` twice."""
-    written: dict[str, str] = {}
-    for name in raw:
-        dashed = name.replace("_", "-")
-        plain = renamed.get(dashed, dashed).replace("-", "_")
-        if plain in written:
-            raise ConfigError(f"{place}{plain}", [written[plain], name], "is there twice; leave one of them")
-        written[plain] = name
-    return {plain: raw[name] for plain, name in written.items()}
-
-
-def option_words(name: str, value: Any) -> list[str]:
-    """An option as it is given on the command line."""
-    if isinstance(value, bool):
-        return [option(name) if value else option(f"no_{name}")]
-    if isinstance(value, dict):
-        return [option(name), *write_kwargs(value)]
-    return [option(name), *map(str, value)] if isinstance(value, list) else [f"{option(name)}={value}"]

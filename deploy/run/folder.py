@@ -19,7 +19,8 @@ from typing import Any
 from rmc.common.bus.metrics_record import is_finite, is_metric
 from rmc.common.errors import ConfigError
 from rmc.common.whole_file import NO_ROOM, write_whole
-from rmc.deploy.run.config import RunConfig, check_sizes, from_json, to_json
+from rmc.deploy.run.config import RunConfig, from_json, to_json
+from rmc.deploy.run.env_sizes import check_sizes
 from rmc.deploy.run.migrations import migrated
 from rmc.deploy.run.run_lock import RunLock
 

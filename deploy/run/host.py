@@ -1,18 +1,24 @@
-"""What the launcher's machine has left, cheap enough to be asked for with every record."""
+"""What this machine, or the container that this is in, has and has left."""
 
 import os
 import resource
 import shutil
 import time
+from contextlib import suppress
 from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
 
 import numpy as np
 import psutil
+from numpy.typing import NDArray
 
-from rmc.deploy.run.preflight import cores, existing_parent, free_memory
-
-COPIED_BYTES, COPIES = 64 << 20, 3
+CONTAINER_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+CPU_LIMITS = (  # of CPU time in a period of it
+    (Path("/sys/fs/cgroup/cpu.max"),),
+    (Path("/sys/fs/cgroup/cpu/cpu.cfs_quota_us"), Path("/sys/fs/cgroup/cpu/cpu.cfs_period_us")),
+)
+COPIED_BYTES, COPIES = 64 << 20, 3  # to know a machine by; the first copy meets pages that are not there yet
 SAMPLED_BYTES = 16 << 20  # copied for every record, in some milliseconds: more than the caches of a core hold
 
 
@@ -31,18 +37,44 @@ def this_machine(folder: Path) -> Machine:
     """What there is now; the disk is the one that ``folder`` is or would be on."""
     handles, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     memory, disk = free_memory(), shutil.disk_usage(existing_parent(folder)).free
-    return Machine(cores(), memory, disk, handles, _copied_bytes_per_s())
-
-
-def _copied_bytes_per_s() -> float:
-    """The fastest of a few copies that no cache holds."""
     source, target = np.ones(COPIED_BYTES, np.uint8), np.zeros(COPIED_BYTES, np.uint8)
-    seconds = []
-    for _ in range(COPIES):
-        began = time.perf_counter()
-        np.copyto(target, source)
-        seconds.append(time.perf_counter() - began)
-    return COPIED_BYTES / min(seconds)
+    return Machine(cores(), memory, disk, handles, max(_copied_per_s(source, target) for _ in range(COPIES)))
+
+
+def free_memory() -> int:
+    """Bytes that are free, no more than a container may have."""
+    return min(memory_limit(), int(psutil.virtual_memory().available))
+
+
+def memory_limit() -> int:
+    """Bytes of the machine, or of the container that this is in."""
+    memory = int(psutil.virtual_memory().total)
+    for path in CONTAINER_LIMITS:
+        with suppress(OSError, ValueError):  # no such version of cgroups, or "max"
+            memory = min(memory, int(path.read_text()))
+    return memory
+
+
+def existing_parent(path: Path) -> Path:
+    """The folder itself, or the nearest above it that is there."""
+    return next(one for one in (path, *path.parents) if one.exists())
+
+
+def cores() -> int:
+    """Cores that this process may use, at most those of a container's CPU time. On macOS all that there are."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    for files in CPU_LIMITS:
+        with suppress(OSError, ValueError):  # no such version of cgroups, or "max"
+            quota, period = map(int, " ".join(path.read_text() for path in files).split())
+            count = min(count, ceil(quota / period)) if quota > 0 else count
+    return count
+
+
+def _copied_per_s(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> float:
+    """By this thread's own CPU time, so that waiting for a CPU does not count: what is left is memory."""
+    began = time.thread_time()
+    np.copyto(target, source)
+    return source.nbytes / max(time.thread_time() - began, 1e-6)
 
 
 class HostFigures:
@@ -55,13 +87,8 @@ class HostFigures:
 
     def take(self) -> dict[str, float]:
         """Flat; shares of CPU time are since the last call."""
-        return _figures() | _disk(self._folder) | {"host_copy_bytes_per_s": self._copied_per_s()}
-
-    def _copied_per_s(self) -> float:
-        """By this thread's own CPU time, so that waiting for a CPU does not count: what is left is memory."""
-        began = time.thread_time()
-        np.copyto(self._target, self._source)
-        return SAMPLED_BYTES / max(time.thread_time() - began, 1e-6)
+        copied = _copied_per_s(self._source, self._target)
+        return _figures() | _disk(self._folder) | {"host_copy_bytes_per_s": copied}
 
 
 def _disk(folder: Path) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """How far back a memory can learn, beside how long an episode lasts, in one line."""
 
-from rmc.common.env.make import PYBULLET
+from rmc.common.env.registered import PYBULLET
 from rmc.deploy.run.config import RunConfig
 
 

@@ -1,6 +1,5 @@
 """Opens a run's folder: a new one, or one that goes on, with what may be other then."""
 
-import logging
 import os
 import shutil
 import time
@@ -10,15 +9,15 @@ from itertools import count
 from pathlib import Path
 
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.errors import CheckpointError, ConfigError
-from rmc.deploy.run.config import RunConfig, changes, option
+from rmc.common.errors import ConfigError
+from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import IfExists, LaunchOptions
+from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.option_names import changes, option
 from rmc.deploy.run.starts import begun_with, note_start
 from rmc.deploy.run.tracking import choose_tracking, keep_tracking
 from rmc.deploy.run.validation import validate_windows
 
-log = logging.getLogger(__name__)
 SAME_AGENT = {  # what a run that goes on may have otherwise, and learns the same
     "total_steps",
     "actors",
@@ -71,30 +70,25 @@ WHY_NOT = {  # by the part of the config, and then by the option
 
 
 def open_run(
-    config: RunConfig,
-    run_dir: Path | None,
-    if_exists: IfExists,
-    options: LaunchOptions | None = None,
-    check: Callable[[RunFolder], None] = lambda _: None,
+    config: RunConfig, options: LaunchOptions, check: Callable[[RunFolder], None] = lambda _: None
 ) -> RunFolder:
     """Make or take up a run's folder, locked. Raises ConfigError before anything is written where it may not be.
 
-    ``options`` say how it is started, for its history, and what a new one begins with.
+    ``options`` say which folder, how it is started, for its history, and what a new one begins with.
     ``check`` is asked once it is locked, and may raise ConfigError.
     """
-    options = options or LaunchOptions(run_dir)
-    folder = _named(run_dir or Path("runs") / default_name(config.env.id, config.preset, config.seed))
-    there = run_dir is not None and if_exists != "new" and (folder.path / "config.json").exists()
+    folder = _named(options.run_dir or Path("runs") / default_name(config.env.id, config.preset, config.seed))
+    there = options.goes_on
     tracking, before, initial = choose_tracking(options), config, None
     if there:
-        before = taken_up(folder, config, if_exists, options)
+        before = taken_up(folder, config, options)
     else:
         validate_windows(config)
         if options.init_from is not None:
             from rmc.deploy.run import warm_start  # imports torch
 
             initial = warm_start.prepare(config, options.init_from, options.init_parts)
-    if run_dir is None or if_exists == "new":
+    if options.run_dir is None or options.if_exists == "new":
         folder = new_folder(folder.path)
     elif not there and has_more_than_a_start(folder):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
@@ -187,9 +181,9 @@ def forget_start(folder: RunFolder) -> None:
     folder.history_file.unlink(missing_ok=True)
 
 
-def taken_up(folder: RunFolder, config: RunConfig, if_exists: IfExists, options: LaunchOptions) -> RunConfig:
+def taken_up(folder: RunFolder, config: RunConfig, options: LaunchOptions) -> RunConfig:
     """The config that a run had which continues this one. Raises ConfigError where it may not."""
-    if if_exists == "fail":
+    if options.if_exists == "fail":
         raise ConfigError("--run-dir", str(folder.path), "is there already; use --if-exists resume or new")
     before = folder.config()
     _check_changes(folder, before, config)
@@ -221,15 +215,6 @@ def _check_begun(folder: RunFolder, options: LaunchOptions) -> None:
 def check_checkpoints(folder: RunFolder) -> None:
     """Raises ConfigError where there are checkpoints but none is whole; damaged newer ones are told."""
     checkpoints = CheckpointFolder(folder.checkpoints)
-    faults = []
-    for number in reversed(checkpoints.numbers()):
-        try:
-            checkpoints.load(number)
-        except CheckpointError as error:
-            faults.append(str(error))
-            continue
-        for fault in faults:
-            log.warning("%s; the run goes on from the checkpoint of update %d", fault, number)
-        return
-    if faults:
-        raise ConfigError("--run-dir", str(folder.path), f"{faults[0]}; none is whole, so use another --run-dir")
+    if checkpoints.latest() is None and checkpoints.damaged:
+        fault = checkpoints.damaged[max(checkpoints.damaged)]
+        raise ConfigError("--run-dir", str(folder.path), f"{fault}; none is whole, so use another --run-dir")

@@ -5,23 +5,16 @@ import os
 import re
 import shutil
 import socket
-from contextlib import suppress
-from math import ceil
 from pathlib import Path
 
-import psutil
 from rich.filesize import decimal as size_text
 
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.host import existing_parent, free_memory, memory_limit
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.replay_server import ring
 
-CONTAINER_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
-CPU_LIMITS = (  # of CPU time in a period of it
-    (Path("/sys/fs/cgroup/cpu.max"),),
-    (Path("/sys/fs/cgroup/cpu/cpu.cfs_quota_us"), Path("/sys/fs/cgroup/cpu/cpu.cfs_period_us")),
-)
 DISK_RESERVE = 256 << 20  # bytes left for checkpoints, metrics and logs
 
 
@@ -37,18 +30,25 @@ def check_machine(config: RunConfig, options: LaunchOptions) -> None:
 def check_port(options: LaunchOptions) -> None:
     """Raises ConfigError where metrics are to be served, and cannot be there now."""
     host, port = options.metrics_host, options.metrics_port
-    if port is None:
-        return
-    if not 1 <= port <= 65_535:
-        raise ConfigError("--metrics-port", port, "take a port from 1 to 65535")
+    if port is not None:
+        listening(host, port, "--metrics-host", "--metrics-port", socket.AF_INET, lowest=1).close()
+
+
+def listening(
+    host: str, port: int, host_option: str, port_option: str, family: int = socket.AF_UNSPEC, lowest: int = 0
+) -> socket.socket:
+    """Raises ConfigError where there is no such address on this machine, or the port cannot be had."""
+    if not lowest <= port <= 65_535:
+        raise ConfigError(port_option, port, f"take a port from {lowest} to 65535")
     try:
-        *_, address = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_STREAM)[0]
-        socket.create_server(address[:2]).close()
+        found, *_, address = socket.getaddrinfo(host, port, family, socket.SOCK_STREAM)[0]
+        return socket.create_server(address[:2], family=found)
     except (OSError, UnicodeError) as error:
         if not isinstance(error, OSError) or isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
-            fix = "is no IPv4 address of this machine; take one, like 127.0.0.1"
-            raise ConfigError("--metrics-host", host, fix) from None
-        raise ConfigError("--metrics-port", port, f"{os.strerror(error.errno or 0)} on {host}; take another") from None
+            kind = "IPv4 address" if family == socket.AF_INET else "address"
+            raise ConfigError(host_option, host, f"is no {kind} of this machine; take one, like 127.0.0.1") from None
+        another = "another" if lowest else "another, or 0 for a free one"
+        raise ConfigError(port_option, port, f"{os.strerror(error.errno or 0)} on {host}; take {another}") from None
 
 
 def check_learner(config: RunConfig, device: str) -> None:
@@ -88,7 +88,7 @@ def check_ring_fits(config: RunConfig, options: LaunchOptions) -> None:
         rest = f"{size_text(free_disk)} are free, {size_text(DISK_RESERVE)} of which are left for checkpoints and logs"
         fix = f"take at most {most(room)}" if most(room) else "make room"
         raise ConfigError("--capacity", capacity, f"takes {size_text(size)} of disk, {rest}; {fix}")
-    memory = _memory_limit()
+    memory = memory_limit()
     if size > memory:
         fix = f"take at most {most(memory)}" if most(memory) else "take a machine with more"
         raise ConfigError("--capacity", capacity, f"takes {size_text(size)} of {size_text(memory)} memory; {fix}")
@@ -108,35 +108,6 @@ def check_batch_fits(config: RunConfig) -> None:
     fault = f"an update of windows of {spec.steps} steps takes {size_text(needed)} of {size_text(memory)} free memory"
     fix = f"take at most {memory // window}" if memory >= window else "take fewer steps a window"
     raise ConfigError("--batch-size", size, f"{fault}; {fix}")
-
-
-def free_memory() -> int:
-    """Bytes that are free, no more than a container may have."""
-    return min(_memory_limit(), int(psutil.virtual_memory().available))
-
-
-def _memory_limit() -> int:
-    """Bytes of the machine, or of the container that this is in."""
-    memory = int(psutil.virtual_memory().total)
-    for path in CONTAINER_LIMITS:
-        with suppress(OSError, ValueError):  # no such version of cgroups, or "max"
-            memory = min(memory, int(path.read_text()))
-    return memory
-
-
-def existing_parent(path: Path) -> Path:
-    """The folder itself, or the nearest above it that is there."""
-    return next(one for one in (path, *path.parents) if one.exists())
-
-
-def cores() -> int:
-    """Cores that this process may use, at most those of a container's CPU time. On macOS all that there are."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    for files in CPU_LIMITS:
-        with suppress(OSError, ValueError):  # no such version of cgroups, or "max"
-            quota, period = map(int, " ".join(path.read_text() for path in files).split())
-            count = min(count, ceil(quota / period)) if quota > 0 else count
-    return count
 
 
 def check_device(device: str) -> None:

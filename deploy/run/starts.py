@@ -15,10 +15,11 @@ from rmc.common.bus.redis_url import has_password
 from rmc.common.checkpoint import PROGRESS
 from rmc.common.errors import ConfigError
 from rmc.common.user_path import user_path
-from rmc.deploy.run.config import from_dict, option
+from rmc.deploy.run.config import from_dict
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import Launcher, LaunchOptions
 from rmc.deploy.run.metrics_tail import LISTED_BYTES, MetricsTail
+from rmc.deploy.run.option_names import option
 
 KEPT = (  # of how a run was started last
     "launcher", "device", "redis_url", "ray_address", "all_cpus", "tls", "metrics_port", "metrics_host",

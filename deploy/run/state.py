@@ -2,10 +2,10 @@
 
 from typing import Literal
 
+from rmc.common.errors import STOPPED_STATUS
 from rmc.deploy.run.folder import RunFolder
 
 State = Literal["new", "training", "finished", "stopped", "failed", "lost", "unknown"]
-STOPPED = 130  # exit status after Ctrl-C, as shells have it
 
 
 def run_state(folder: RunFolder) -> State:
@@ -26,7 +26,7 @@ def _locked_state(folder: RunFolder) -> State:
         return "finished"
     status = folder.lock.ended()
     if status is not None:
-        return "stopped" if status == STOPPED else "failed"
+        return "stopped" if status == STOPPED_STATUS else "failed"
     if folder.lock.lost():
         return "lost"
     return "stopped" if folder.metrics.exists() else "new"

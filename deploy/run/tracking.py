@@ -12,9 +12,10 @@ from typing import Literal
 from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.config import from_dict, option
+from rmc.deploy.run.config import from_dict
 from rmc.deploy.run.folder import RunFolder, read_object
-from rmc.deploy.run.launch_options import LaunchOptions, Tracker
+from rmc.deploy.run.launch_options import LaunchOptions, TrackerName
+from rmc.deploy.run.option_names import option
 
 PROJECT = "rmc"
 VIDEOS: Literal["videos"] = "videos"  # in a tracker's place: films alone
@@ -26,7 +27,7 @@ log = logging.getLogger(__name__)
 class Tracking:
     """A run as its tracker knows it; the ``id`` stays over all starts."""
 
-    tracker: Tracker | Literal["videos"]
+    tracker: TrackerName | Literal["videos"]
     project: str
     tags: tuple[str, ...]
     id: str
@@ -39,7 +40,7 @@ def choose_tracking(options: LaunchOptions) -> Tracking | None:
     resumes = options.run_dir is not None and options.if_exists == "resume"
     before = kept_tracking(options.run_dir) if options.run_dir is not None and resumes else None
     before = before if options.track != "off" else None
-    tracker: Tracker | Literal["videos"] = before.tracker if before else VIDEOS
+    tracker: TrackerName | Literal["videos"] = before.tracker if before else VIDEOS
     if options.track is not None and options.track != "off":
         tracker = options.track
     if tracker == VIDEOS and options.track != "off":

@@ -2,11 +2,12 @@
 
 from typing import Any, Literal, get_args
 
-from rmc.common.bus.redis_url import shown
+from rmc.common.bus.redis_url import redacted
 from rmc.common.env.config import check_env_config, check_range
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig, WindowConfig, option
-from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions, Tracker
+from rmc.deploy.run.config import RunConfig, WindowConfig
+from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions, TrackerName
+from rmc.deploy.run.option_names import option
 
 RANGES: dict[str, tuple[float, float]] = {  # both ends included
     "seed": (0, 2**63 - 1),
@@ -123,13 +124,13 @@ def validate_launch(config: RunConfig, options: LaunchOptions) -> None:
         ("--launcher", launcher, Launcher),
         ("--if-exists", options.if_exists, IfExists),
         ("--init-parts", options.init_parts, InitParts),
-        ("--track", track, Tracker | Literal["off"]),
+        ("--track", track, TrackerName | Literal["off"]),
     ):
         if value not in (choices := _choices(kind)):
             raise ConfigError(name, value, f"take {', '.join(choices)}")
     _validate_ray(options)
     if launcher == "lockstep" and options.redis_url is not None:
-        raise ConfigError("--redis-url", shown(options.redis_url), "a lockstep run has no use for one; leave it")
+        raise ConfigError("--redis-url", redacted(options.redis_url), "a lockstep run has no use for one; leave it")
     if launcher == "lockstep" and config.replay.replay_shards > 1:
         fix = "a lockstep run has one; use --launcher local"
         raise ConfigError("--replay-shards", config.replay.replay_shards, fix)
@@ -143,7 +144,8 @@ def _validate_ray(options: LaunchOptions) -> None:
     """What a run on Ray may not have, and what it alone may have."""
     launcher = options.launcher
     if launcher == "ray" and options.redis_url is not None:
-        raise ConfigError("--redis-url", shown(options.redis_url), "a run on Ray has a Redis of its own, on the head")
+        fix = "a run on Ray has a Redis of its own, on the head"
+        raise ConfigError("--redis-url", redacted(options.redis_url), fix)
     if launcher == "ray" and options.device not in ("cpu", "cuda"):
         raise ConfigError("--device", options.device, "take cpu or cuda; Ray says which GPU")
     if launcher != "ray" and options.all_cpus:

@@ -21,9 +21,11 @@ from rmc.common.replay import ObservationStatistics
 from rmc.common.user_path import user_path
 from rmc.common.window import WindowSpec
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
-from rmc.deploy.run.config import FLAGS, RunConfig, option
+from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.env_sizes import FLAGS
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import InitParts
+from rmc.deploy.run.option_names import option
 from rmc.learner.learner_checkpoint import LearnerProgress, pack
 from rmc.learner.update import JointUpdate
 from rmc.learner.update_order import make_update

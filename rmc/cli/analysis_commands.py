@@ -18,6 +18,8 @@ from rmc.analysis.evaluation import EvaluationProgress
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.analysis.policy_file import PolicyFile, read_policy
+from rmc.analysis.report import check_report, write_report
+from rmc.analysis.report_run import ReportRun
 from rmc.analysis.run_evaluation import MOST_EPISODES, check_baselines, evaluate_run, is_baseline
 from rmc.analysis.run_paths import each_readable
 from rmc.cli import run_options
@@ -158,7 +160,16 @@ def plot(command: run_options.Plot) -> int:
 def _histories(paths: Sequence[Path]) -> list[history.History]:
     """Of all that can be read; the others are told. Raises ConfigError where that is none."""
     fix = "no history in there; give runs that were evaluated"
-    histories = [one for read in each_readable(paths, history.read, fix) for one in read]
+    histories = [one for its_own in each_readable(paths, history.read_histories, fix) for one in its_own]
     if not histories:
         raise ConfigError("RUNS", " ".join(map(str, paths)), fix)
     return histories
+
+
+def report(command: run_options.Report) -> int:
+    check_report(command.out)
+    runs = each_readable(command.runs, lambda path: ReportRun.read(path.resolve()))
+    write_report(runs, command.out, command.video)
+    size = command.out.stat().st_size
+    terminal().print(f"{command.out}: {len(runs)} run{'s' * (len(runs) > 1)}, {size / 1e6:.1f} MB", soft_wrap=True)
+    return 0

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from rich.table import Table
 
 from rmc.deploy.monitor.figures import duration, number
+from rmc.deploy.monitor.table import plain_table
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.ray import cluster_runs, launcher
 from rmc.deploy.ray.launcher_actor import ClusterRunSummary
@@ -41,10 +42,8 @@ def _joined(address: str) -> Iterator[None]:
 
 
 def _table(summaries: dict[str, ClusterRunSummary | None]) -> Table:
-    drawn = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
-    for name in ("run", "env", "steps", "learner", "actors", "time", "folder"):
-        right = name in ("steps", "actors", "time")
-        drawn.add_column(name, justify="right" if right else "left", no_wrap=right, overflow="fold")
+    headings = ("run", "env", "steps", "learner", "actors", "time", "folder")
+    drawn = plain_table(headings, ("steps", "actors", "time"))
     for name, one in summaries.items():
         drawn.add_row(name, *(_cells(one) if one else ["its launcher does not answer"]))
     return drawn

@@ -10,7 +10,7 @@ from rmc.analysis.doctor import examine_run
 from rmc.cli import run_options, train_options, training
 from rmc.cli.dry_run import dry_run
 from rmc.cli.ending import print_end
-from rmc.cli.redis_password import warn_of_password
+from rmc.common.bus.redis_url import warn_of_password
 from rmc.common.extra import check_installed
 from rmc.deploy.monitor import attach as attachment
 from rmc.deploy.monitor.recorded import recorded_status, status_json

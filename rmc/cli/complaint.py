@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 
 from rmc.cli.parser import COMMANDS, option_names
-from rmc.deploy.run.config import meant, option
+from rmc.deploy.run.option_names import did_you_mean, option
 
 ENDS = ("For full helptext", "Argument helptext", "Arguments are applied", "Perhaps you meant", "Available subcommands")
 
@@ -26,11 +26,11 @@ def _near(words: Sequence[str]) -> str:
     options["sweep"] += options["train"]
     command, *rest = words or [""]
     if command not in options:
-        return meant(command, options)
+        return did_you_mean(command, options)
     flags = [word.partition("=")[0].replace("_", "-") for word in rest if word.startswith("--")]
     for flag in flags:
         if flag.replace("--no-", "--", 1) in options[command]:
             continue
         others = [f"rmc {other}" for other, known in options.items() if flag in known and other != "role"]
-        return f"; {flag} is an option of {others[0]}" if others else meant(flag, options[command])
+        return f"; {flag} is an option of {others[0]}" if others else did_you_mean(flag, options[command])
     return ""

@@ -1,7 +1,6 @@
 """``--config FILE.toml``: options of ``rmc train`` in a file; those of the command line win."""
 
 import itertools
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from rmc.common.bus.redis_url import value_without_passwords
 from rmc.common.env.config import check_kwargs, write_kwargs
 from rmc.common.errors import ConfigError
 from rmc.common.user_path import user_path
-from rmc.deploy.run.config import meant, option_words, plain_names
+from rmc.deploy.run.option_names import did_you_mean, option_words, plain_names, read_toml
 
 RENAMED = {
     "fill-blanks": "impute-missing",
@@ -28,7 +27,7 @@ def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
     path = _named(words)
     if path is None:
         return words, ""
-    options = plain_names(f"{OPTION} {path}: ", _read(path), RENAMED)
+    options = plain_names(f"{OPTION} {path}: ", read_toml(OPTION, path, "give a TOML file"), RENAMED)
     env, kwargs = options.pop("env", ""), options.pop("env_kwargs", {})
     if not isinstance(env, str):
         raise ConfigError(f"{OPTION} {path}: env", env, 'write the environment\'s id, like env = "HalfCheetah-v5"')
@@ -47,13 +46,13 @@ def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
 
 
 def _named(words: Sequence[str]) -> Path | None:
-    named = [user_path(value) for value in values_of(OPTION, words)]
+    named = [user_path(value) for value in option_values(OPTION, words)]
     if len(named) > 1:
         raise ConfigError(OPTION, " ".join(map(str, named)), "is there twice; give one file")
     return named[0] if named else None
 
 
-def values_of(option: str, words: Sequence[str]) -> list[str]:
+def option_values(option: str, words: Sequence[str]) -> list[str]:
     """What an option is given, in its order, as ``--option VALUE`` or ``--option=VALUE``."""
     pairs = itertools.zip_longest(words, words[1:])
     found = (
@@ -64,19 +63,10 @@ def values_of(option: str, words: Sequence[str]) -> list[str]:
     return [value for value in found if value is not None]
 
 
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text())
-    except OSError as error:
-        raise ConfigError(OPTION, str(path), f"cannot be read ({error.strerror}); give a TOML file") from None
-    except ValueError as error:  # no TOML, or no UTF-8
-        raise ConfigError(OPTION, str(path), f"is not TOML ({error}); fix it") from None
-
-
 def _check(path: Path, name: str, value: Any, names: Sequence[str]) -> None:
     told = value_without_passwords(value)
     if name not in names:
-        fix = meant(name, names, "; rmc train --help-all lists them")
+        fix = did_you_mean(name, names, "; rmc train --help-all lists them")
         raise ConfigError(f"{OPTION} {path}: {name}", told, f"is no option{fix}")
     if not all(isinstance(one, str | bool | int | float) for one in (value if isinstance(value, list) else [value])):
         raise ConfigError(f"{OPTION} {path}: {name}", told, "give a number, text, true, false or a list of such")

@@ -11,6 +11,7 @@ from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.trial import TRAINED_SECONDS, run_trial, trial_config
 from rmc.deploy.monitor.recorded import recorded_status
+from rmc.deploy.monitor.table import plain_table
 from rmc.deploy.redis.connect import connect
 from rmc.deploy.redis.socket_folder import place_for_sockets
 from rmc.deploy.run.config import RunConfig
@@ -60,7 +61,7 @@ def _check_start(config: RunConfig, options: LaunchOptions) -> None:
     if options.redis_url is not None:
         connect(options.redis_url, "check")
     if (folder := _there(options)) is not None:
-        taken_up(folder, config, options.if_exists, options)
+        taken_up(folder, config, options)
     elif options.init_from is not None:
         from rmc.deploy.run import warm_start  # imports torch
 
@@ -78,7 +79,7 @@ def _steps_made(options: LaunchOptions) -> int:
 
 
 def _table(rows: list[Need]) -> Table:
-    table = Table("what", "needs", "this machine", "", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table = plain_table(("what", "needs", "this machine", ""))
     for row in rows:
         mark = "" if row.fits is None else FITS if row.fits else NOT if row.is_needed else SLOWER
         table.add_row(row.what, row.needs, row.has, mark, style="bold" if mark == NOT else "")

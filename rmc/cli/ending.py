@@ -5,12 +5,11 @@ from typing import Any
 from rich.console import Console
 
 from rmc.analysis.doctor import examine
-from rmc.common.errors import RoleDied
+from rmc.common.errors import STOPPED_STATUS, RoleDied
 from rmc.deploy.local.launcher import saved_steps
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
 from rmc.deploy.run.starts import resume_command
-from rmc.deploy.run.state import STOPPED
 
 
 def print_end(folder: RunFolder, console: Console) -> int:
@@ -18,7 +17,7 @@ def print_end(folder: RunFolder, console: Console) -> int:
     status = folder.lock.ended()
     if status == 0:
         return print_result(folder, console)
-    if status == STOPPED:
+    if status == STOPPED_STATUS:
         return print_stopped(folder, saved_steps(folder), console)
     if status is None:
         raise RoleDied(f"the launcher of {folder.path} was killed; to go on: {resume_command(folder)}")
@@ -50,7 +49,7 @@ def print_stopped(folder: RunFolder, env_steps: int, console: Console) -> int:
     console.print(f"stopped at environment step {env_steps:,}; to go on:")
     console.print(f"  {resume_command(folder)}", soft_wrap=True)
     print_findings(folder, console)
-    return STOPPED
+    return STOPPED_STATUS
 
 
 def print_result(folder: RunFolder, console: Console) -> int:

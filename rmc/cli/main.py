@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 
+from rmc.common.errors import CONFIG_STATUS, STOPPED_STATUS, ConfigError, RmcError
 from rmc.common.process import descendants, watchdog
 from rmc.common.process.parent_death import PARENT_VARIABLE, exit_with_parent
 from rmc.common.whole_file import NO_ROOM
@@ -20,7 +21,7 @@ SHARED_MEMORY = "/dev/shm"
 UNREADABLE = {  # of a path that a user has given
     errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP,
 }  # fmt: skip
-CONFIG_STATUS, FAILED_STATUS, INTERRUPTED_STATUS = 2, 1, 130
+FAILED_STATUS = 1
 
 
 def main() -> None:
@@ -53,14 +54,12 @@ def run(words: list[str]) -> int:
     _prepare_process(words, parent)
     if not _extend_import_path() and parent is None:  # a role is given whole paths
         return _complain("the working folder is gone; cd to one that is there", CONFIG_STATUS)
-    from rmc.common.errors import ConfigError, RmcError
-
     try:
         return _parse_and_run(words)
     except ConfigError as error:
         return _complain(str(error), CONFIG_STATUS)
     except KeyboardInterrupt:  # before the command took the signal over
-        return INTERRUPTED_STATUS
+        return STOPPED_STATUS
     except SystemExit as ended:  # of a role that was ended before it began
         if not isinstance(ended.code, int):
             raise

@@ -13,15 +13,16 @@ from typing import Annotated, Any, get_args, get_type_hints
 import tyro
 
 from rmc.cli import hub_options, role_options, run_options, sweep_options, train_options
-from rmc.cli.config_file import KWARGS, RENAMED, values_of, with_file
+from rmc.cli.config_file import KWARGS, RENAMED, option_values, with_file
 from rmc.cli.help_text import ALL_OPTIONS, BASIC, only_basic
 from rmc.cli.primitives import PRIMITIVES
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import Preset, RunConfig, flat
+from rmc.deploy.run.config import Preset, RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import MAY_CHANGE
+from rmc.deploy.run.option_names import flat
 from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.starts import last_launch
 
@@ -58,7 +59,7 @@ COMMANDS: dict[str, tuple[type, Action]] = {
     "baseline": (run_options.Baseline, Action("analysis_commands", "baseline")),
     "plot": (run_options.Plot, Action("analysis_commands", "plot")),
     "hub": (hub_options.Hub, Action("hub_commands", "run_hub")),
-    "report": (run_options.Report, Action("report_command", "report")),
+    "report": (run_options.Report, Action("analysis_commands", "report")),
     "doctor": (run_options.Doctor, Action("commands", "doctor")),
     "stats": (run_options.Stats, Action("commands", "stats")),
     "list": (run_options.List, Action("commands", "list_runs")),
@@ -80,7 +81,7 @@ def parse(words: list[str]) -> Any:
     words, env = with_file(words, option_names(train_options.Train)) if words[:1] == ["train"] else (words, "")
     for option in (KWARGS, *(("--grid", "--search") if words[:1] == ["sweep"] else ())):
         _check_once(option, words)
-    defaults = _defaults(preset_config(_named_preset(words), EnvConfig(env)), LaunchOptions(None))
+    defaults = _defaults(preset_config(_named_preset(words), EnvConfig(env)), LaunchOptions())
     without_help = [word for word in words if word not in HELP]
     if without_help != words and words[0] in defaults:
         with suppress(ConfigError, SystemExit):  # with the preset's, where nothing else can be found out
@@ -186,5 +187,5 @@ def _check_once(option: str, words: list[str]) -> None:
 
 def _named_preset(words: list[str]) -> Preset:
     """The preset must be known before the options, whose defaults it gives; a wrong one is refused later."""
-    newest = values_of("--preset", words)[-1:]
+    newest = option_values("--preset", words)[-1:]
     return next((name for name in get_args(Preset) if name in newest), "robust")

@@ -18,10 +18,11 @@ from rmc.deploy.ray import launcher, placement
 from rmc.deploy.redis.socket_folder import place_for_sockets
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.host import cores
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.memory_reach import reach_note
 from rmc.deploy.run.opening import open_run
-from rmc.deploy.run.preflight import check_machine, cores
+from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.validation import validate, validate_launch
 
 
@@ -52,7 +53,7 @@ def _watched(
     validate(config)  # again: the cluster may have changed the number of actors
     check_machine(config, options)
     place_for_sockets()
-    folder = open_run(config, options.run_dir, options.if_exists, options, launcher.check_not_there)
+    folder = open_run(config, options, launcher.check_not_there)
     launcher.launch(config, folder, options)
     console.print(f"run folder {folder.path}", soft_wrap=True)
     if note := reach_note(config):

@@ -7,8 +7,8 @@ import signal
 import sys
 
 from rmc.cli import training
-from rmc.cli.redis_password import warn_of_password
 from rmc.cli.role_options import ActorRole, EvaluatorRole, LauncherRole, ReplayRole, Role
+from rmc.common.bus.redis_url import warn_of_password
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.role_environment import SECRET_VARIABLE, URL_VARIABLE
 from rmc.deploy.local.role_process import RunConnection

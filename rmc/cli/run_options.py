@@ -9,7 +9,7 @@ from tyro.conf import Positional, Suppress, arg
 from rmc.analysis import baseline_settings
 from rmc.analysis.baseline_settings import Algorithm, BaselineConfig
 from rmc.analysis.curves import Axis
-from rmc.cli.train_options import EnvOptions, KnownEnvOptions, KnownRunDir, known_run, values_of
+from rmc.cli.train_options import EnvOptions, KnownEnvOptions, KnownRunDir, field_values, known_run
 from rmc.deploy.run.folder import RunFolder
 
 Checkpoint = Annotated[
@@ -81,7 +81,7 @@ class Baseline(BaselineConfig):
 
     def config(self) -> BaselineConfig:
         """The run's config."""
-        return BaselineConfig(**values_of(BaselineConfig, self) | {"env": self.env.config()})
+        return BaselineConfig(**field_values(BaselineConfig, self) | {"env": self.env.config()})
 
 
 @dataclass(frozen=True)
@@ -95,13 +95,13 @@ class ResumeBaseline(Baseline):
 
 def known_baseline(folder: RunFolder) -> Baseline:
     """The command that would say all of such a run. Raises ConfigError."""
-    config = baseline_settings.read(folder)
+    config = baseline_settings.read_config(folder)
     return Baseline(**vars(config) | {"env": EnvOptions(**asdict(config.env))})
 
 
 def resuming_baseline(folder: RunFolder) -> ResumeBaseline:
     """The command that continues such a run, and changes nothing. Raises ConfigError."""
-    config = baseline_settings.read(folder)
+    config = baseline_settings.read_config(folder)
     return ResumeBaseline(**vars(config) | known_run(config.env))
 
 
@@ -154,7 +154,7 @@ class Report:
     """Write one file about runs, for a browser without a network: curves, tables, videos, waits, differences."""
 
     runs: Positional[tuple[Path, ...]]
-    """Folders of runs, also of baselines."""
+    """Runs, also of baselines, folders that hold some at any depth, or quoted patterns."""
     out: Path = Path("report.html")
     """The file to write."""
     video: bool = True

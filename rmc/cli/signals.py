@@ -21,19 +21,29 @@ def signals_interrupt() -> Iterator[None]:
 
 def interrupt() -> dict[signal.Signals, Any]:
     """The same from now on; the handlers before."""
-    numbers = [signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup ignores it
-        numbers.append(signal.SIGHUP)
-    return {number: signal.signal(number, signal.default_int_handler) for number in numbers}
+    before = handlers()
+    before.pop(signal.SIGINT, None)
+    if before.get(signal.SIGHUP) == signal.SIG_IGN:  # nohup does so
+        del before[signal.SIGHUP]
+    for number in before:
+        signal.signal(number, signal.default_int_handler)
+    return before
+
+
+def handlers() -> dict[signal.Signals, Any]:
+    """Of signals that stop a run, but for those that a program around Python has taken for itself."""
+    found = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    return {number: handler for number, handler in found.items() if handler is not None}
 
 
 @contextmanager
 def signals_caught(hangup: bool = True) -> Iterator[StopSignal]:
     """SIGTERM, SIGINT and a closed terminal only set the signal, for as long as this lasts."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    before = handlers()
     stop = StopSignal()
     stop.install()
-    if hangup and before[signal.SIGHUP] != signal.SIG_IGN:  # nohup ignores it: the terminal may close
+    ignored = before.get(signal.SIGHUP, signal.SIG_IGN) == signal.SIG_IGN  # nohup does so: the terminal may close
+    if hangup and not ignored:
         signal.signal(signal.SIGHUP, lambda *_: stop.request())
     try:
         yield stop

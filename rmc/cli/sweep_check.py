@@ -11,8 +11,9 @@ from rmc.cli import complaint, parser
 from rmc.cli.train_options import Train
 from rmc.common.bus.redis_url import value_without_passwords, without_passwords
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig, flat, option, option_words
+from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.option_names import flat, option, option_words
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.tracking import choose_tracking
 from rmc.deploy.run.validation import validate, validate_launch, validate_windows
@@ -86,7 +87,7 @@ def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:
     return checked
 
 
-def read(job: Job) -> tuple[RunConfig, LaunchOptions]:
+def read_job(job: Job) -> tuple[RunConfig, LaunchOptions]:
     """A run's words, which can be read. What they do not say is the preset's, whatever its folder has."""
     command = parser.parse(list(job.words))
     return command.config(), command.launch_options()
@@ -131,7 +132,7 @@ def _check_file(command: Train) -> None:
     check_name(option("launcher"), "launcher", command.launcher)
 
 
-def is_whole(name: str, config: RunConfig) -> bool:
+def is_integer(name: str, config: RunConfig) -> bool:
     """Whether an option's values are whole numbers. Raises ConfigError where they are no numbers."""
     (value,) = [value for path, value in flat(config).items() if path.rpartition(".")[2] == name] or [None]
     if isinstance(value, bool) or not isinstance(value, int | float):

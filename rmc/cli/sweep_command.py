@@ -11,15 +11,15 @@ from rmc.cli import sweep_check
 from rmc.cli.signals import signals_caught
 from rmc.cli.sweep_check import Checked
 from rmc.cli.sweep_options import Sweep
-from rmc.common.errors import ConfigError
+from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.common.user_path import user_path
 from rmc.deploy.monitor.view import terminal
-from rmc.deploy.run.config import RunConfig, option
+from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.host import cores as cores_here
 from rmc.deploy.run.opening import plain_name
-from rmc.deploy.run.preflight import cores as cores_here
+from rmc.deploy.run.option_names import option
 from rmc.deploy.run.preflight import ring_bytes
-from rmc.deploy.run.state import STOPPED
 from rmc.sweep import room
 from rmc.sweep.grid import Grid, grid_jobs, is_finished, make_job
 from rmc.sweep.index import NAME, Index
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 def sweep(command: Sweep) -> int:
     """Run what is missing of a sweep; 130 where it was stopped, 1 where a run has failed or was stopped."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
-    spec, folder = read(command), command.sweep_dir or default_folder(command.what)
+    spec, folder = read_sweep(command), command.sweep_dir or default_folder(command.what)
     if (folder / "config.json").exists():
         raise ConfigError("--sweep-dir", str(folder), "is a run's folder; give another")
     if command.jobs < 0:
@@ -55,7 +55,7 @@ def sweep(command: Sweep) -> int:
         return _conduct(command, work, checked, index)
 
 
-def read(command: Sweep) -> Spec:
+def read_sweep(command: Sweep) -> Spec:
     """What is asked for, on the command line or in a file. Raises ConfigError."""
     if command.what.endswith(".toml"):
         names = ("seeds", "grid", "search", "trials", "sampler_seed", "prune")
@@ -120,16 +120,16 @@ def search_work(spec: Spec, search: Search, config: RunConfig, index: Index, fol
     from rmc.sweep.search import SearchPlan, distribution  # an extra
 
     distributions = {
-        name: distribution(values, isinstance(values, Range) and sweep_check.is_whole(name, config))
+        name: distribution(values, isinstance(values, Range) and sweep_check.is_integer(name, config))
         for name, values in search.ranges.items()
     }
 
     def make(name: str, values: dict[str, Any]) -> Job:
         job = make_job(spec, folder / name, values, spec.seeds[0])
-        return sweep_check.with_length(job, sweep_check.read(job)[0])
+        return sweep_check.with_length(job, sweep_check.read_job(job)[0])
 
     def finished(job: Job) -> bool:
-        return is_finished(job, *sweep_check.read(job))
+        return is_finished(job, *sweep_check.read_job(job))
 
     plan = SearchPlan(search, distributions, index, make, finished, config.learner.checkpoint_steps)
     for job in plan.todo:
@@ -170,7 +170,7 @@ def _conduct(command: Sweep, work: Work, checked: list[Checked], index: Index) -
         console.print(
             f"{remaining} not over; the same command goes on; {folder / NAME} has their words", soft_wrap=True
         )
-    return STOPPED if stop.requested else int(remaining > 0)
+    return STOPPED_STATUS if stop.requested else int(remaining > 0)
 
 
 def _warn_of_empty_rings(todo: list[Job]) -> None:

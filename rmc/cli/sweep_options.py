@@ -34,7 +34,7 @@ class Sweep:
     jobs: int = 0
     """Runs at once; 0 for as many as cores and memory hold, or one where the device is cuda."""
     drop_replay: bool = False
-    """Remove a run's replay ring once it is finished: evaluate, plot and export need none."""
+    """Remove the replay ring of a run that is finished or pruned: evaluate, plot and export need none."""
     launcher: Literal["local", "ray"] = "local"
     """Whole runs on this machine, or spread over a Ray cluster, each on one node."""
     ray_address: str = "auto"

@@ -11,10 +11,9 @@ from rich.console import Console
 from rmc.cli.ending import format_evaluation, print_result, print_stopped
 from rmc.cli.signals import signals_caught, signals_interrupt
 from rmc.common.checkpoint import POLICY, CheckpointFolder
-from rmc.common.errors import ConfigError, RmcError
+from rmc.common.errors import CONFIG_STATUS, STOPPED_STATUS, ConfigError, RmcError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local import launcher
-from rmc.deploy.local.supervisor import EXIT_CONFIG
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.monitor.output import Output
 from rmc.deploy.monitor.recorded import Callback, empty_status
@@ -28,7 +27,6 @@ from rmc.deploy.run.memory_reach import reach_note
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.starts import resume_command
-from rmc.deploy.run.state import STOPPED
 from rmc.deploy.run.validation import validate, validate_launch
 
 
@@ -61,7 +59,7 @@ def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
         place_for_sockets()
     if options.redis_url is not None:
         connect(options.redis_url, "check")
-    return open_run(config, options.run_dir, options.if_exists, options)
+    return open_run(config, options)
 
 
 def conduct(
@@ -104,10 +102,10 @@ def _conduct(
         if tracker is not None:
             end["video"] = _video(config, folder, console)
     except ConfigError:
-        status = EXIT_CONFIG
+        status = CONFIG_STATUS
         raise
     except KeyboardInterrupt:  # also amid the first evaluation, or the last
-        status, end = STOPPED, {"state": "stopped"}
+        status, end = STOPPED_STATUS, {"state": "stopped"}
         return print_stopped(folder, (monitor.status if monitor else empty_status(folder)).env_steps, console)
     finally:
         try:

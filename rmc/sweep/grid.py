@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig, flat, option, option_words
+from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import SAME_AGENT
+from rmc.deploy.run.option_names import flat, option, option_words
 from rmc.deploy.run.starts import begun_with
 from rmc.sweep.job import Job, run_name
 from rmc.sweep.pool import Ending

@@ -80,7 +80,7 @@ def newest_return(job: Job) -> tuple[float | None, int]:
     return last.return_mean, steps or last.env_steps
 
 
-def values_of(line: dict[str, Any]) -> dict[str, Any]:
+def trial_values(line: dict[str, Any]) -> dict[str, Any]:
     """A line's values. Raises ConfigError where it has none."""
     values = line["values"]
     if not isinstance(values, dict):

@@ -30,7 +30,7 @@ class Job:
     def title(self) -> str:
         """What it is, for a line."""
         last = self.name if self.name.startswith(TRIAL) else f"seed {self.seed}"
-        return ", ".join([*(f"{name} {shown(value)}" for name, value in self.values.items()), last])
+        return ", ".join([*(f"{name} {value_text(value)}" for name, value in self.values.items()), last])
 
     @property
     def log(self) -> Path:
@@ -42,7 +42,7 @@ class Job:
         return [*self.words, "--run-dir", str(folder)]
 
 
-def shown(value: Any) -> str:
+def value_text(value: Any) -> str:
     """A value in a table and in a name."""
     if isinstance(value, list | dict):
         return "x".join(map(str, value)) if isinstance(value, list) else " ".join(write_kwargs(value))
@@ -51,7 +51,7 @@ def shown(value: Any) -> str:
 
 def run_name(values: dict[str, Any], seed: int) -> str:
     """The folder's name of a grid's run."""
-    whole = ",".join(f"{name}={shown(value)}" for name, value in {**values, "seed": seed}.items())
+    whole = ",".join(f"{name}={value_text(value)}" for name, value in {**values, "seed": seed}.items())
     plain = re.sub(r"[^\w.,=+-]", "-", whole)
     if plain == whole and len(plain) <= LONGEST_NAME:
         return plain

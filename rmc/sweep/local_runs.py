@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rmc.common.process.parent_death import PARENT_VARIABLE
 from rmc.deploy.local.role_environment import command_line
-from rmc.deploy.run.preflight import cores
+from rmc.deploy.run.host import cores
 from rmc.sweep.job import Job
 
 

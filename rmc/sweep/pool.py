@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import STOPPED_STATUS
 from rmc.common.process.role import StopSignal
 from rmc.deploy.monitor.attach import STOP_SECONDS
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.state import STOPPED
 from rmc.sweep.job import Job
 
 LOOK_SECONDS = 0.2
@@ -88,7 +88,7 @@ class _AtWork:
             return Ending("finished", seconds)
         if self.hopeless and self.deadline is not None:  # killed, too: it may have been asked before it could hear it
             return Ending("pruned", seconds)
-        if status == STOPPED or self.deadline is not None:
+        if status == STOPPED_STATUS or self.deadline is not None:
             return Ending("stopped", seconds)
         how = f"killed by signal {-status}" if status < 0 else f"ended with {status}: {self.run.last_words()}"
         return Ending("failed", seconds, f"{how}; see {self.job.log}")

@@ -9,7 +9,8 @@ from rich.filesize import decimal as size_text
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.preflight import DISK_RESERVE, cores, existing_parent, free_memory, ring_bytes
+from rmc.deploy.run.host import cores, existing_parent, free_memory
+from rmc.deploy.run.preflight import DISK_RESERVE, ring_bytes
 from rmc.sweep.job import Job
 
 PROCESS_BYTES = 400 << 20  # of one with torch and MuJoCo; measured in docs/performance.md: 203 to 498 MB

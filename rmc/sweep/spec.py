@@ -5,7 +5,6 @@ SPEC.toml: ``env``, ``seeds``, ``[options]`` that every run has, and ``[grid]`` 
 
 import json
 import re
-import tomllib
 from collections.abc import Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.redis_url import value_without_passwords
 from rmc.common.env.config import EnvConfig, check_kwargs
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import flat, meant, plain_names
+from rmc.deploy.run.option_names import did_you_mean, flat, plain_names, read_toml
 from rmc.deploy.run.presets import robust
 
 KEYS = ("env", "seeds", "options", "grid", "search")
@@ -112,7 +111,7 @@ def check_name(place: str, name: str, value: Any, names: Set[str] = NAMES) -> No
     if name in OWN:
         raise ConfigError(place, told, "every run has its own; give env and seeds")
     if name not in names:
-        hint = meant(name, names, "; rmc train --help lists them")
+        hint = did_you_mean(name, names, "; rmc train --help lists them")
         raise ConfigError(place, told, f"no option that a sweep's runs take{hint}")
     for one in value if isinstance(value, list) else [value]:
         if name == "env_kwargs" and isinstance(one, dict):
@@ -123,12 +122,7 @@ def check_name(place: str, name: str, value: Any, names: Set[str] = NAMES) -> No
 
 def read_spec(path: Path, words: Sequence[str]) -> Spec:
     """A sweep from its file. Raises ConfigError, which names the key."""
-    try:
-        raw = tomllib.loads(path.read_text())
-    except OSError as error:
-        raise ConfigError("SPEC", str(path), f"{error.strerror}; give a .toml file or an environment") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError("SPEC", str(path), f"not TOML ({error}); fix it") from None
+    raw = read_toml("SPEC", path, "give a .toml file or an environment")
     _check_keys("", raw, KEYS)
     if not isinstance(raw.get("env"), str):
         raise ConfigError("env", raw.get("env"), f'write an environment into {path}, like env = "HalfCheetah-v5"')
@@ -144,7 +138,7 @@ def read_spec(path: Path, words: Sequence[str]) -> Spec:
 def _check_keys(place: str, raw: dict[str, Any], names: Sequence[str]) -> None:
     for name, value in raw.items():
         if name not in names:
-            hint = meant(name, names, f"; use {', '.join(names)}")
+            hint = did_you_mean(name, names, f"; use {', '.join(names)}")
             raise ConfigError(f"{place}{name}", value, f"no such key{hint}")
 
 

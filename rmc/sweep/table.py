@@ -6,7 +6,7 @@ import numpy as np
 from rich.table import Table
 
 from rmc.sweep.index import Index
-from rmc.sweep.job import TRIAL, Job, shown
+from rmc.sweep.job import TRIAL, Job, value_text
 
 
 def result_table(jobs: Sequence[Job], index: Index) -> Table:
@@ -37,7 +37,7 @@ def _row(runs: list[Job], index: Index, names: list[str]) -> tuple[float, list[s
     counts = ", ".join(f"{others.count(state)} {state}" for state in dict.fromkeys(others))
     is_trial = runs[0].name.startswith(TRIAL)  # whose values were drawn, with all their digits
     drawn = (runs[0].values[name] for name in names)  # trials of another command may have another order
-    values = (f"{one:.4g}" if is_trial and isinstance(one, float) else shown(one) for one in drawn)
+    values = (f"{one:.4g}" if is_trial and isinstance(one, float) else value_text(one) for one in drawn)
     text = f"{mean:,.1f}{deviation}" if returns else "-"
     return mean, [runs[0].name.removeprefix(TRIAL), *values, str(len(returns)), text, counts]
 

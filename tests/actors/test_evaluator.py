@@ -10,12 +10,12 @@ import pytest
 from safetensors.torch import save
 
 from rmc.actors.config import EvaluatorConfig
-from rmc.actors.evaluator import Evaluator, Rollout, evaluation_metrics, first_start, play_episodes
+from rmc.actors.evaluator import Evaluator, Rollout, evaluation_record, first_start, play_episodes
 from rmc.actors.policy_runner import PolicyRunner
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.memory_bus import MemoryBus
-from rmc.common.bus.metrics_record import is_whole
+from rmc.common.bus.metrics_record import is_complete
 from rmc.common.bus.protocol import Bus, Version
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
@@ -188,7 +188,7 @@ def test_an_episode_that_breaks_is_left_out_and_its_environment_made_anew() -> N
     counter = itertools.count()
     some = play_episodes(runner, lambda: Dead(counting()) if next(counter) == 0 else counting(), 3, seed=4)
     assert (some.returns, some.broken) == (sound[1:], 1)
-    assert not is_whole(evaluation_metrics(some))
+    assert not is_complete(evaluation_record(some))
     with pytest.raises(RmcError, match="broke in each of 2 episodes"):
         play_episodes(runner, lambda: Dead(counting()), 2, seed=4)
 
@@ -220,3 +220,77 @@ def test_the_evaluator_counts_them_and_makes_new_environments() -> None:
         records.append(evaluator.metrics())
     assert [(record["eval_broken_episodes"], record["eval_episodes"]) for record in records] == [(1, 2), (0, 3)]
     evaluator.close()
+
+
+class Scripted:
+    """Acts by its own count, and notes what it is given."""
+
+    def __init__(self) -> None:
+        self.given: list[tuple[np.ndarray, ...]] = []
+
+    def start(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((1, 1), np.float32), np.zeros((1, 1), np.float32)
+
+    def act(self, *given: Any) -> tuple[np.ndarray, np.ndarray]:
+        *arrays, noise = given
+        assert noise is None
+        self.given.append(tuple(array.copy() for array in arrays))
+        state = arrays[3] + 1.0
+        return 0.01 * state, state
+
+
+class Noting(gym.Wrapper[Any, Any, Any, Any]):
+    """Notes what an environment gives and is given."""
+
+    def __init__(self, env: Env) -> None:
+        super().__init__(env)
+        self.seen: list[tuple[np.ndarray, np.ndarray]] = []
+        self.actions: list[float] = []
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(**options)
+        self.seen.append((observation, info["missing"]))
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self.actions.append(float(action[0]))
+        observation, *rest, info = self.env.step(action)
+        self.seen.append((observation, info["missing"]))
+        return observation, *rest, info
+
+
+def test_a_policy_reads_what_is_seen_what_is_missing_and_what_it_did_before() -> None:
+    policy, env = Scripted(), Noting(make_env(EnvConfig("tests.partial_env:Partial-v0")))
+    play_episodes(policy, lambda: env, 2, seed=3)
+    steps = len(env.actions) // 2
+    assert len(policy.given) == len(env.actions) == 2 * steps
+    for at, (observation, previous, missing, state) in enumerate(policy.given):
+        episode, t = divmod(at, steps)
+        seen, flags = env.seen[episode * (steps + 1) + t]
+        np.testing.assert_array_equal(observation, [seen])
+        np.testing.assert_array_equal(missing, [flags])
+        assert (previous.item(), state.item()) == (pytest.approx(0.01 * t), t)
+        assert env.actions[at] == pytest.approx(0.01 * (t + 1))
+    assert any(flags.any() for _, flags in env.seen)
+
+
+def test_an_evaluation_is_told_by_mean_and_standard_deviation() -> None:
+    rollout = play_episodes(runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT)), counting, 4, seed=4)
+    mean = sum(rollout.returns) / 4
+    deviation = (sum((one - mean) ** 2 for one in rollout.returns) / 4) ** 0.5
+    told = evaluation_record(rollout)
+    assert (told["eval_return_mean"], told["eval_return_std"]) == (pytest.approx(mean), pytest.approx(deviation))
+    assert 0 < deviation != pytest.approx(deviation**2)
+
+
+@pytest.mark.parametrize("reward", [np.nan, np.inf])
+def test_an_episode_whose_reward_is_not_finite_is_left_out(reward: float) -> None:
+    class Explodes(gym.Wrapper[Any, Any, Any, Any]):
+        def step(self, action: Any) -> Any:
+            observation, _, *rest = self.env.step(action)
+            return observation, reward, *rest
+
+    runner, counter = runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT)), itertools.count()
+    sound = play_episodes(runner, counting, 3, seed=4).returns
+    some = play_episodes(runner, lambda: Explodes(counting()) if next(counter) == 0 else counting(), 3, seed=4)
+    assert (some.returns, some.broken) == (sound[1:], 1)

@@ -199,3 +199,17 @@ def test_begin_forgets_an_open_window() -> None:
     assert not builder.open
     builder.cut()
     assert builder.count == 0
+
+
+def test_a_step_that_must_not_be_trusted_is_in_no_window() -> None:
+    """Also where it alone would fill a trained block."""
+    spec = WindowSpec(OBS_DIM, ACTION_DIM, HIDDEN, burn_in=0, train=1)
+    builder = WindowBuilder(spec, 1, envs=1, capacity=2)
+    zeros, no, seen = np.zeros((1, 3), np.float32), np.zeros(1, np.bool_), np.zeros((1, 1), np.bool_)
+    builder.begin(0, name(0, 0, 0), missing=False)
+    for k in (1, 2):
+        if k == 2:
+            builder.end_before(0)
+        builder.add(zeros, zeros, 0, Transition(zeros[:, 0], name(0, 0, k)[None], seen, no, no, zeros[:, :0]))
+    builder.begin(0, name(0, 1, 0), missing=False)
+    assert builder.take()["observation"][..., 2].tolist() == [[0, 1]]

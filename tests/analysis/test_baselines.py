@@ -14,15 +14,17 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rmc import api
 from rmc.analysis import baselines
 from rmc.analysis.baseline_model import BaselineModel
-from rmc.analysis.baseline_settings import Algorithm, BaselineConfig, Settings, choose, read
+from rmc.analysis.baseline_settings import Algorithm, BaselineConfig, Settings, choose, read_config
 from rmc.analysis.baselines import evaluate, train
 from rmc.analysis.history import of_run
 from rmc.cli.main import run as rmc
 from rmc.common.env.config import EnvConfig
+from rmc.common.env.process_state import _random_state
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.run.folder import RunFolder
@@ -95,6 +97,14 @@ def test_it_speaks_while_it_plays(tmp_path, monkeypatch):
     assert wall_seconds(folder.metrics) <= result["wall_s"]  # without the last evaluation
 
 
+def test_tensorboard_draws_its_evaluations(tmp_path):
+    assert run(config(total_steps=200), tmp_path / "run") == 0
+    events = EventAccumulator(str(tmp_path / "run")).Reload().Scalars("Main/evaluation_return")
+    records = [record for record in RunFolder(tmp_path / "run").records() if record["role"] == "evaluator"]
+    assert [event.step for event in events] == [record["eval_env_steps"] for record in records] == [100, 200]
+    assert [event.value for event in events] == pytest.approx([record["eval_return_mean"] for record in records])
+
+
 def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):
     run(config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=600), tmp_path / "run")
     torch.set_num_threads(2)  # as a process has it that has trained nothing
@@ -105,7 +115,9 @@ def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):
     assert seen["eval_return_mean"] == result["eval_return_mean"]
     assert (blind["eval_flicker"], blind["env_steps"]) == (1.0, result["env_steps"])
     assert rmc(["evaluate", str(tmp_path / "run"), "--checkpoint", "best"]) == 2
+    before = _random_state()
     assert api.evaluate(tmp_path / "run", flicker=0.0)["eval_return_mean"] == result["eval_return_mean"]
+    assert _random_state() == before  # the caller's generators are left alone
     with pytest.raises(ConfigError, match="a baseline keeps its last state only"):
         api.evaluate(tmp_path / "run", checkpoint="best")
     with pytest.raises(ConfigError, match="is a baseline's run; rmc resume continues it"):
@@ -153,7 +165,7 @@ def test_rmc_resume_goes_on_with_it(tmp_path, capsys):
     assert rmc([*printed.split(), "--total-steps", "250", "--episodes", "2"]) == 0
     result = RunFolder(folder).result()
     assert (result["env_steps"], result["eval_flicker"]) == (250, 0.5)
-    assert read(RunFolder(folder)) == dataclasses.replace(settings, total_steps=250, episodes=2)
+    assert read_config(RunFolder(folder)) == dataclasses.replace(settings, total_steps=250, episodes=2)
     (start,) = starts(RunFolder(folder))
     assert (start.env_steps, start.changes) == (1, {"total_steps": [300, 250], "episodes": [5, 2]})
     assert json.loads((folder / "config.json").read_bytes())["format"] == FORMAT
@@ -282,7 +294,7 @@ def test_it_is_played_with_the_time_limit_that_is_given(tmp_path, monkeypatch):
 def test_the_environments_keywords_and_sizes_are_kept(tmp_path, monkeypatch, capsys):
     env = EnvConfig("tests.habits:Wants-v0", time_limit=20, env_kwargs={"size": 4, "goal": 1.5})
     assert run(config(env=env, total_steps=150), tmp_path / "run") == 0
-    assert read(RunFolder(tmp_path / "run")).env == env
+    assert read_config(RunFolder(tmp_path / "run")).env == env
     assert of_run(RunFolder(tmp_path / "run")).env == "tests.habits:Wants-v0, goal=1.5, size=4, time limit 20"
     grown = Box(-99.0, 99.0, (5,), np.float32)
     monkeypatch.setattr(

@@ -55,7 +55,7 @@ def test_a_run_is_read_from_its_folder(tmp_path):
         {"role": "launcher", "time": 910.0, "wall_s": 20.0},
     ]
     (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, records)) + '\n{"role": "evalu')
-    (past,) = history.read(tmp_path)
+    (past,) = history.read_histories(tmp_path)
     assert past.agent == "RMC --heads 5 6 --head-input hidden"
     assert past.env == "Hopper-v5, flicker 0.5"
     assert (past.seed, past.finished, past.initial_return) == (3, False, None)
@@ -63,11 +63,11 @@ def test_a_run_is_read_from_its_folder(tmp_path):
     result = {"updates": 100, "env_steps": 1000, "wall_s": 21.0, "eval_return_mean": 11.0, "eval_return_std": 2.0}
     result["eval_episodes"] = 10
     (tmp_path / "result.json").write_text(json.dumps({**result, "initial_return_mean": -1.0}))
-    (past,) = history.read(tmp_path)
+    (past,) = history.read_histories(tmp_path)
     assert past.evaluations[-1] == Evaluation(1000, 100, 21.0, 11.0, 2.0)
     assert (past.finished, past.initial_return) == (True, -1.0)
     (tmp_path / "result.json").write_text(json.dumps({**result, "updates": 90, "initial_return_mean": -1.0}))
-    (past,) = history.read(tmp_path)  # the evaluator has played that checkpoint before
+    (past,) = history.read_histories(tmp_path)  # the evaluator has played that checkpoint before
     assert [one.env_steps for one in past.evaluations] == [500, 1000]
 
 
@@ -80,7 +80,7 @@ def test_an_evaluation_that_was_cut_is_compared_with_no_other(tmp_path: Path) ->
     ends = {"updates": 100, "env_steps": 1000, "wall_s": 2.0, "eval_episodes": 10, "initial_return_mean": -5.0}
     (tmp_path / "result.json").write_text(json.dumps(ends | played | cut))
     (tmp_path / "initial.json").write_text(json.dumps(ends | played | cut))
-    (past,) = history.read(tmp_path)
+    (past,) = history.read_histories(tmp_path)
     assert [one.return_mean for one in past.evaluations] == [-210.0]
     assert (past.finished, past.initial_return) == (True, None)
 
@@ -118,7 +118,7 @@ def test_what_a_long_run_has_said_is_not_kept(tmp_path):
     played = {"role": "evaluator", "time": 2.0, "eval_update": 9, "eval_return_mean": 7.0, "eval_return_std": 1.0}
     (tmp_path / "metrics.jsonl").write_text(f"{json.dumps(said)}\n" * 2_000 + f"{json.dumps(played)}\n")
     tracemalloc.start()
-    (past,) = history.read(tmp_path)
+    (past,) = history.read_histories(tmp_path)
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(past.evaluations) == 1
@@ -155,7 +155,7 @@ def test_what_is_no_history_is_refused_where_it_is(text, tmp_path):
     line = text if isinstance(text, bytes) else text.encode()
     (tmp_path / "file.jsonl").write_bytes(history_of().to_line().encode() + b"\n\n" + line)
     with pytest.raises(ConfigError, match=r"RUNS='.*file\.jsonl:3'"):
-        history.read(tmp_path / "file.jsonl")
+        history.read_histories(tmp_path / "file.jsonl")
 
 
 def test_a_run_that_cannot_be_read_is_told_and_left_out(tmp_path, capsys):
@@ -170,7 +170,7 @@ def test_a_run_that_cannot_be_read_is_told_and_left_out(tmp_path, capsys):
     for names, fault in {("foreign",): "an object", ("foreign", "new"): "no history", ("empty",): "no history"}.items():
         assert fault in complaint(["plot", *map(paths.get, names), "--out", str(tmp_path / "out.png")], capsys)
     with pytest.raises(ConfigError, match=str(tmp_path / "foreign")):
-        history.read(tmp_path / "foreign")
+        history.read_histories(tmp_path / "foreign")
     assert run(["plot", paths["lines"], "--out", "/proc/out.png"]) == 2
     captured = capsys.readouterr()
     assert "100 (100)" in captured.out
@@ -250,7 +250,7 @@ def test_a_folder_of_runs_may_hold_another_programs_config(tmp_path):
 def test_a_run_without_an_evaluation_is_refused(tmp_path):
     (tmp_path / "config.json").write_text(to_json(robust(EnvConfig("Hopper-v5"))))
     with pytest.raises(ConfigError, match="no evaluation yet"):
-        history.read(tmp_path)
+        history.read_histories(tmp_path)
 
 
 def test_few_seeds_are_lines_and_many_a_band(tmp_path):

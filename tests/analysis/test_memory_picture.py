@@ -13,9 +13,9 @@ import torch
 from rich.console import Console
 
 from rmc.analysis import memory_picture
-from rmc.analysis.episodes import Episode, HiddenPart, Player, hidden_parts, recorded, remembered
+from rmc.analysis.episodes import Episode, HiddenPart, Player, hidden_parts, recorded, unroll_episode
 from rmc.analysis.influence import ReplayedEpisode, _changes, influence
-from rmc.analysis.memory_picture import Remembered, remember, tables
+from rmc.analysis.memory_picture import MemoryInsight, examine_memory, tables
 from rmc.analysis.memory_probe import Samples, _of_part, explained, probes, samples
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
@@ -106,7 +106,7 @@ def test_differences_are_those_of_two_whole_passes(agent: str, tmp_path: Path) -
 
 def at_step(agent: Agent, episode: Episode, t: int) -> tuple[torch.Tensor, ...]:
     """h (H,), Q (1,) and the mean action (A,) there."""
-    memory, _ = remembered(agent, episode)
+    memory, _ = unroll_episode(agent, episode)
     z = agent.features(memory)[:, t : t + 1]
     q = agent.critic(z, episode.action[:, t : t + 1]).mean(0)
     return memory.hidden[0, t], q[0], torch.tanh(agent.policy(z)[0])[0, 0]
@@ -175,7 +175,7 @@ def test_rows_are_the_memory_beside_what_was_seen_last(tmp_path: Path) -> None:
     episodes, parts = played(config, agent, tmp_path / "run")
     rows, at = samples(agent, episodes), 0
     for index, episode in enumerate(episodes):
-        newest, memory = np.zeros(3), remembered(agent, episode)[0].hidden[0]
+        newest, memory = np.zeros(3), unroll_episode(agent, episode)[0].hidden[0]
         for t in range(41):
             if not episode.missing[0, t]:
                 newest = episode.observation[0, t].numpy()
@@ -307,12 +307,12 @@ def test_a_probe_with_other_names_in_each_episode_is_named(tmp_path: Path) -> No
 def test_both_are_shown_in_panels_and_tables(of_memory_env: list[Episode]) -> None:
     from matplotlib.figure import Figure
 
-    memory = remember(built(ASLEEP), of_memory_env, [])
+    memory = examine_memory(built(ASLEEP), of_memory_env, [])
     axes = list(Figure().subplots(memory.panels, 1))
     memory_picture.draw(memory, axes)
     assert {line.get_label() for line in axes[0].lines} >= {"h, first observation", "action, later observation"}
     assert axes[1].get_yticklabels()[0].get_text() == "cue"
-    assert Remembered(memory.first, memory.later, []).panels == 1
+    assert MemoryInsight(memory.first, memory.later, []).panels == 1
     output = io.StringIO()
     Console(file=output, width=memory_picture.WIDTH).print(*tables(memory), sep="\n")
     lines = output.getvalue().splitlines()
@@ -321,3 +321,9 @@ def test_both_are_shown_in_panels_and_tables(of_memory_env: list[Episode]) -> No
         [a, b] for a in ("first", "later") for b in ("h", "Q", "action")
     ]
     assert lines[9].split()[0] == "cue"
+
+
+def test_what_is_read_is_told_of_episodes_that_nothing_was_fitted_to() -> None:
+    x, quarter = np.random.default_rng(0).standard_normal((400, 1)), np.arange(400) % 4
+    y = np.where(quarter[:, None] == 3, -x, x)
+    assert explained(x, y, quarter) == pytest.approx(-3.0, abs=0.3)

@@ -4,6 +4,9 @@ import dataclasses
 import importlib.util
 import io
 import json
+import pickle
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,6 +32,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from tests.cli.test_main import complaint
@@ -67,7 +71,7 @@ def make_run(
 
 def run_of(path: Path, config: RunConfig, header: bool = True) -> RunFolder:
     """A run's folder with one checkpoint of an agent that was never trained; without ``header`` as of RMC 0.1.0."""
-    folder, spec = open_run(config, path, "fail"), config.window_spec()
+    folder, spec = open_run(config, LaunchOptions(path, "fail")), config.window_spec()
     folder.lock.release()
     torch.manual_seed(0)
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
@@ -123,6 +127,46 @@ def test_a_program_with_other_defaults_of_torch_keeps_them(tmp_path: Path) -> No
         assert api.evaluate(folder.path, episodes=1)["eval_episodes"] == 1
         config = dataclasses.replace(debug(EnvConfig("Pendulum-v1")), total_steps=600)
         assert api.train(config, tmp_path / "new", launcher="lockstep")["eval_episodes"] == 10
+
+
+def test_a_pickled_policy_goes_on_as_the_first_does(run: RunFolder) -> None:
+    policy, frames = load_policy(run.path), np.random.default_rng(0).normal(size=(5, 2, 3))
+    for frame in frames[:2]:
+        policy.act(frame)
+    other = pickle.loads(pickle.dumps(policy))
+    for frame in frames[2:]:
+        assert (policy.act(frame) == other.act(frame)).all()
+
+
+def test_a_policy_that_began_in_inference_mode_acts_outside_of_it(run: RunFolder) -> None:
+    policy = load_policy(run.path)
+    with torch.inference_mode():
+        policy.act(np.zeros(3))
+    assert policy.act(np.zeros(3)).shape == (1,)
+
+
+FORKS = """
+import multiprocessing, sys
+import numpy as np, torch
+from rmc.analysis.policy import load_policy
+
+def act():
+    load_policy(sys.argv[1]).act(np.zeros((64, 17)))
+
+torch.set_num_threads(2)
+act()
+child = multiprocessing.get_context("fork").Process(target=act)
+child.start()
+child.join(20)
+child.kill()
+sys.exit(child.exitcode)
+"""
+
+
+def test_a_process_that_has_a_policy_can_fork(tmp_path: Path) -> None:
+    """Torch's threads do not: where any have begun, the child waits for them without end."""
+    folder = make_run(tmp_path / "run", AgentConfig(normalize_observations=True), "HalfCheetah-v5").path
+    assert subprocess.run([sys.executable, "-W", "ignore", "-c", FORKS, folder], check=False).returncode == 0
 
 
 def test_an_observation_in_the_environments_own_shape_is_one(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from rmc.analysis.run_list import RunSummary, runs, summary, table
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 
@@ -22,7 +23,7 @@ RESULT = {
 
 
 def run_in(path: Path, status: int | None, scores: tuple[float, ...] = ()) -> RunFolder:
-    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), path, "fail")
+    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(path, "fail"))
     records = [
         {"role": "replay", "time": time.time(), "env_steps": 700},
         {"role": "launcher", "time": time.time(), "wall_s": 9.0},

@@ -49,3 +49,10 @@ def test_environments_are_resampled_each_for_itself():
     alike = np.tile(np.arange(6.0)[:, None], 2)
     low, high = interval(lambda x: float(x[:, 0].mean() - x[:, 1].mean()), alike, resamples=200)
     assert low < -0.5 < 0.5 < high
+
+
+def test_an_interval_holds_19_of_20_estimates():
+    """Of a normal's mean: 1.96 standard errors to either side."""
+    scores = np.random.default_rng(2).normal(size=(100, 1))
+    low, high = interval(lambda x: float(x.mean()), scores)
+    assert (high - low) / 2 == pytest.approx(1.96 * scores.std() / 10, rel=0.07)

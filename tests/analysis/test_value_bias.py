@@ -9,7 +9,7 @@ import torch
 from rmc.analysis.episodes import Episode
 from rmc.analysis.influence import ReplayedEpisode
 from rmc.analysis.value_bias import value_bias
-from rmc.common.agent import Agent
+from rmc.common.agent import Agent, squashed_sample
 from rmc.common.agent_config import AgentConfig
 
 STEPS = 6
@@ -61,3 +61,25 @@ def test_entropy_counts_from_the_next_step_on(agent: Agent, episode: Episode) ->
     assert narrow is not None
     assert narrow.came < without.came - 1.0
     assert value_bias(agent, [episode], gamma=0.0).came == pytest.approx(3.5)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(("terminated", "known"), [(True, STEPS), (False, STEPS - 4)])
+def test_returns_and_bonuses_are_those_of_a_plain_loop(
+    agent: Agent, episode: Episode, terminated: bool, known: int
+) -> None:
+    """To a cut's last step belongs what the critics expect; a step's bonus counts in the return of the one before."""
+    gamma, episode = 0.25, dataclasses.replace(episode, terminated=terminated)
+    with torch.no_grad():
+        agent.log_alpha.fill_(0.5)
+        replay = ReplayedEpisode(agent, episode)
+        noise = torch.randn(1, STEPS, 2, generator=torch.Generator().manual_seed(0))
+        log_pi = squashed_sample(*agent.policy(replay.features), noise)[1][0].tolist()
+        q = replay.outputs[1][0, :, 0].tolist()
+    came = [float(episode.reward[-1]) if terminated else q[-1]]
+    for t in range(STEPS - 2, -1, -1):
+        came.insert(0, float(episode.reward[t]) + gamma * (came[0] - np.exp(0.5) * log_pi[t + 1]))
+    found = value_bias(agent, [episode], gamma)
+    assert found is not None
+    assert found.steps == known
+    assert found.came == pytest.approx(np.mean(came[:known]), rel=1e-4)
+    assert found.expected == pytest.approx(np.mean(q[:known]), rel=1e-4)

@@ -68,7 +68,7 @@ def serve() -> Iterator[Serve]:
 @pytest.fixture
 def folder(tmp_path: Path) -> Iterator[RunFolder]:
     """A run that begins to train: nothing is written yet."""
-    begun = open_run(CONFIG, tmp_path / "<b>run", "fail")
+    begun = open_run(CONFIG, LaunchOptions(tmp_path / "<b>run", "fail"))
     yield begun
     begun.lock.release()
 
@@ -111,7 +111,7 @@ def test_a_browser_shows_each_new_line_the_end_and_a_resume(serve: Serve, folder
         folder.write_result(RESULT)
         folder.lock.release(0)
         assert shows("finished") + shows("11.5 ± 0.5") < SHOWN_SECONDS
-        again = open_run(dataclasses.replace(CONFIG, total_steps=9000), folder.path, "resume")
+        again = open_run(dataclasses.replace(CONFIG, total_steps=9000), LaunchOptions(folder.path))
         say(folder, "learner", env_steps=1600, updates_per_s=88.5)
         assert shows("88.5 /s") + shows("1,600 of 9,000") + shows("training") < SHOWN_SECONDS
         assert shows("start 2 from step 700 --total-steps 2000 to 9000") < SHOWN_SECONDS
@@ -142,7 +142,7 @@ def test_a_page_of_other_runs_than_before_shows_nothing_of_those(
     serve: Serve, folder: RunFolder, tmp_path: Path
 ) -> None:
     """Another rmc watch at the same port."""
-    other = open_run(CONFIG, tmp_path / "other", "fail")
+    other = open_run(CONFIG, LaunchOptions(tmp_path / "other", "fail"))
     say(folder, "learner", env_steps=700, updates_per_s=77.25, model_loss=0.5)
     url, server = serve(str(folder.path), str(other.path))
     with opened(url, tmp_path) as page:
@@ -164,7 +164,7 @@ def test_a_run_made_anew_in_its_folder_shows_nothing_of_the_old_one(folder: RunF
     assert (live.look() or {})["best_evaluation"] is not None
     folder.lock.release()
     shutil.rmtree(folder.path)
-    anew = open_run(dataclasses.replace(CONFIG, seed=7), folder.path, "fail")
+    anew = open_run(dataclasses.replace(CONFIG, seed=7), LaunchOptions(folder.path, "fail"))
     say(anew, "learner", env_steps=10, updates_per_s=9.0)
     found = live.look() or {}
     anew.lock.release()
@@ -172,14 +172,14 @@ def test_a_run_made_anew_in_its_folder_shows_nothing_of_the_old_one(folder: RunF
     assert found["curves"] == {"updates_per_s": (0, [(10, 9.0)])}
     say(anew, "learner", env_steps=20, updates_per_s=9.0)
     assert "whole" not in (live.look() or {})
-    assert b'"whole":true' in watch_server.Broadcast([live])._everything()  # a page may have missed it
+    assert b'"whole":true' in watch_server.EventStream([live])._everything()  # a page may have missed it
 
 
 def test_a_page_without_news_is_told_that_its_server_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watch_server, "PING_SECONDS", 0.01)
 
     async def first(count: int) -> list[bytes]:
-        stream = watch_server.Broadcast([]).stream()
+        stream = watch_server.EventStream([]).stream()
         return [await anext(stream) for _ in range(count)]
 
     assert asyncio.run(first(3)) == [b"", watch_server.PING, watch_server.PING]
@@ -187,7 +187,7 @@ def test_a_page_without_news_is_told_that_its_server_is_there(monkeypatch: pytes
 
 def test_runs_stand_side_by_side_with_their_newest_picture_and_video(serve: Serve, tmp_path: Path) -> None:
     for name in ("one", "two"):
-        open_run(CONFIG, tmp_path / "runs" / name, "fail").lock.release(130)
+        open_run(CONFIG, LaunchOptions(tmp_path / "runs" / name, "fail")).lock.release(130)
     one = tmp_path / "runs" / "one"
     (one / "videos").mkdir()
     imsave(one / "inspect.png", np.zeros((8, 12)))
@@ -381,10 +381,11 @@ def test_counters_make_events_that_do_not_repeat(folder: RunFolder) -> None:
     [
         ([], "RUNS='': give folders of runs"),
         (["nowhere"], "no config.json there; give the folder of a run"),
-        (["RUN", "--port", "70000"], "--port='70000': must be between 0 and 65535"),
-        (["RUN", "--port", "TAKEN"], "Address already in use; give another, or 0 for a free one"),
+        (["RUN", "--port", "70000"], "--port=70000: take a port from 0 to 65535"),
+        (["RUN", "--port", "TAKEN"], "Address already in use on 127.0.0.1; take another, or 0 for a free one"),
         (["RUN", "--host", "no host"], "--host='no host': "),
         (["RUN", "--host", ".."], "--host='..': is no address"),
+        (["RUN", "--host", "203.0.113.1"], "--host='203.0.113.1': is no address"),
     ],
 )
 def test_what_it_cannot_do_is_one_line(
@@ -404,7 +405,7 @@ def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch, capsys:
 def test_a_run_that_cannot_be_read_is_told_and_the_others_are_shown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    open_run(CONFIG, tmp_path / "runs" / "good", "fail").lock.release(130)
+    open_run(CONFIG, LaunchOptions(tmp_path / "runs" / "good", "fail")).lock.release(130)
     (tmp_path / "runs" / "newer" / "checkpoints").mkdir(parents=True)
     (tmp_path / "runs" / "newer" / "config.json").write_text('{"format": 999}')
     shown: list[LiveRun] = []

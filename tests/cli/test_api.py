@@ -4,6 +4,8 @@ import dataclasses
 import errno
 import json
 import os
+import pickle
+import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -16,11 +18,12 @@ import pytest
 import torch
 
 import rmc
+from rmc.cli.signals import signals_caught, signals_interrupt
+from rmc.common.errors import STOPPED_STATUS
 from rmc.deploy.run.config import checked, to_json
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import PATH_VARIABLE
+from rmc.deploy.run.launch_options import PATH_VARIABLE, LaunchOptions
 from rmc.deploy.run.opening import open_run
-from rmc.deploy.run.state import STOPPED
 
 CONFIG = rmc.presets.debug("InvertedPendulum-v5")
 
@@ -107,7 +110,7 @@ def test_a_choice_that_there_is_none_of_is_refused(options: dict[str, Any], line
 
 def test_a_tilde_is_the_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
-    open_run(CONFIG, tmp_path / "run", "fail").lock.release()
+    open_run(CONFIG, LaunchOptions(tmp_path / "run", "fail")).lock.release()
     with pytest.raises(rmc.ConfigError, match=rf"^--run-dir='{tmp_path}/run': is there already"):
         rmc.train(CONFIG, "~/run", if_exists="fail")
     with pytest.raises(rmc.ConfigError, match=f"^RUN='{tmp_path}/none': no config.json there"):
@@ -151,6 +154,35 @@ def test_an_id_that_only_this_process_knows_is_refused(tmp_path: Path) -> None:
             rmc.train(rmc.presets.debug("Mine-v1"), tmp_path / "run")
     finally:
         del gymnasium.registry["Mine-v1"]
+
+
+@pytest.mark.parametrize("name", ["Mine-v2", "Pendulum-v1"])
+def test_gymnasiums_classes_under_an_id_or_a_limit_of_ones_own_are_refused(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
+    monkeypatch.setattr(gymnasium, "registry", gymnasium.envs.registration.registry)
+    monkeypatch.delitem(gymnasium.registry, name, raising=False)
+    pendulum = "gymnasium.envs.classic_control.pendulum:PendulumEnv"
+    gymnasium.register(name, entry_point=pendulum, max_episode_steps=1000)
+    with pytest.raises(rmc.ConfigError, match=rf"^ENV='{name}': is registered in this process"):
+        rmc.train(rmc.presets.debug(name), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_error_reaches_another_process_whole() -> None:
+    error = rmc.ConfigError("--seed", -1, "must be 0 or more")
+    copy = pickle.loads(pickle.dumps(error))
+    assert (str(copy), copy.field, copy.value, copy.fix) == (str(error), "--seed", -1, "must be 0 or more")
+
+
+def test_a_signal_that_a_program_around_python_has_taken_stays_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python then knows of no handler, and could not put it back."""
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    with signals_caught(), signals_interrupt():
+        monkeypatch.undo()
+        assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_a_thread_is_refused_before_there_is_a_folder(tmp_path: Path) -> None:
@@ -226,7 +258,7 @@ def test_a_callback_hears_each_record_and_its_error_ends_a_run_that_goes_on(laun
     written = [json.loads(line) for line in folder.metrics.read_text().splitlines()]
     assert heard.pop() == {}
     assert [record for record in written if record in heard] == heard
-    assert folder.lock.ended() == STOPPED
+    assert folder.lock.ended() == STOPPED_STATUS
     steps = written[len(heard)]["env_steps"]
     heard.clear()
     result = rmc.resume(tmp_path / "run", total_steps=steps + 300, callback=heard.append)

@@ -18,6 +18,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import from_json, to_json
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from tests import habits
@@ -69,7 +70,7 @@ def test_a_run_goes_on_with_its_own_keywords_only(tmp_path: Path) -> None:
     was = run.config()
     other = dataclasses.replace(was, env=dataclasses.replace(was.env, env_kwargs={"goal": 2.5, "size": 4}))
     with pytest.raises(ConfigError, match=r"--env-kwargs=\{'goal': 2.5, 'size': 4\}: the run in .* has \{'goal': 1.5"):
-        open_run(other, run.path, "resume")
+        open_run(other, LaunchOptions(run.path))
 
 
 def test_an_environment_that_has_gained_an_observation_is_named_by_every_command(
@@ -86,7 +87,7 @@ def test_an_environment_that_has_gained_an_observation_is_named_by_every_command
         assert says in complaint(words, capsys)
     assert says in complaint(["inspect", str(run.path), "--out", f"{out}png"], capsys)
     for resume in (
-        lambda: open_run(run.config(), run.path, "resume"),
+        lambda: open_run(run.config(), LaunchOptions(run.path)),
         load_policy(run.path).make_env,
         lambda: load_policy(older.path),
     ):
@@ -106,29 +107,29 @@ def test_an_environment_whose_actions_have_other_bounds_is_named(
         assert f"{says}; undo that, or train another run" in complaint([*words, str(run.path)], capsys)
     with pytest.raises(ConfigError, match="now has the highest actions"):
         load_policy(kept.path).make_env()
-    open_run(kept.config(), kept.path, "resume").lock.release()
+    open_run(kept.config(), LaunchOptions(kept.path)).lock.release()
     monkeypatch.undo()
     with pytest.raises(ConfigError, match=r"the highest actions \[1.0, 1.0\], the run was trained with \[1.0, 5.0\]"):
-        open_run(kept.config(), kept.path, "resume")
+        open_run(kept.config(), LaunchOptions(kept.path))
 
 
 def test_a_run_keeps_its_number_of_flags(tmp_path: Path) -> None:
     config = debug(EnvConfig("Pendulum-v1", drop_sensors=0.2))
-    run = open_run(config, tmp_path / "run", "fail")
+    run = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
     run.lock.release()
     run.write_sizes({"observations": 3, "flags of what is missing": 1})  # and nothing of actions, as an older version
     with pytest.raises(ConfigError, match="now has 3 flags of what is missing, the run was trained with 1"):
-        open_run(config, run.path, "resume")
+        open_run(config, LaunchOptions(run.path))
 
 
 def test_a_run_of_whole_episodes_keeps_their_length(tmp_path: Path) -> None:
     config = debug(EnvConfig("InvertedPendulum-v5"))
     config = dataclasses.replace(config, actor=dataclasses.replace(config.actor, state_strategy="episode"))
-    run = open_run(config, tmp_path / "run", "fail")
+    run = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
     run.lock.release()
     run.write_sizes(config.sizes() | {"steps an episode": 500})
     with pytest.raises(ConfigError, match="now has 1000 steps an episode, the run was trained with 500"):
-        open_run(config, run.path, "resume")
+        open_run(config, LaunchOptions(run.path))
 
 
 @pytest.mark.parametrize(

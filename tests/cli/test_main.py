@@ -248,7 +248,7 @@ def test_a_password_on_the_command_line_is_warned_of_once(words: list[str], logi
 
 def test_a_redis_beside_ray_is_refused_without_its_password() -> None:
     """Where the check is made: to get there from the command line takes a cluster."""
-    placement = LaunchOptions(None, "fail", "ray", "cpu", "redis://user:hush@localhost:1")
+    placement = LaunchOptions(None, "fail", launcher="ray", redis_url="redis://user:hush@localhost:1")
     with pytest.raises(ConfigError, match="--redis-url='redis://localhost:1': a run on Ray"):
         open_folder(debug(EnvConfig(PENDULUM)), placement)
 
@@ -323,7 +323,7 @@ def test_without_a_temporary_folder_nothing_starts(
 
 
 def opened_run(folder: Path) -> RunFolder:
-    run = open_run(debug(EnvConfig(PENDULUM)), folder, "fail")
+    run = open_run(debug(EnvConfig(PENDULUM)), LaunchOptions(folder, "fail"))
     run.lock.release()
     return run
 
@@ -348,7 +348,7 @@ def test_a_folder_that_is_no_runs_is_refused(capsys: pytest.CaptureFixture[str],
 
 
 def test_a_folder_in_use_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    run = open_run(debug(EnvConfig(PENDULUM)), tmp_path / "run", "fail")
+    run = open_run(debug(EnvConfig(PENDULUM)), LaunchOptions(tmp_path / "run", "fail"))
     assert "stop it first" in complaint([*DEBUG, "--run-dir", str(tmp_path / "run")], capsys)
     run.lock.release()
 
@@ -419,7 +419,7 @@ def test_a_role_needs_its_runs_secret(
 def test_new_takes_a_folder_beside(tmp_path: Path) -> None:
     config = debug(EnvConfig(PENDULUM))
     opened_run(tmp_path / "run")
-    beside = open_run(config, tmp_path / "run", "new")
+    beside = open_run(config, LaunchOptions(tmp_path / "run", "new"))
     beside.lock.release()
     assert beside.path == tmp_path / "run-2"
 
@@ -429,7 +429,7 @@ def test_a_runs_folder_is_its_owners_alone_until_they_open_it(tmp_path: Path) ->
     run = opened_run(tmp_path / "run")
     assert [stat.S_IMODE(path.stat().st_mode) for path in (run.path, run.secret_file)] == [0o700, 0o600]
     run.path.chmod(0o750)
-    open_run(run.config(), run.path, "resume").lock.release()
+    open_run(run.config(), LaunchOptions(run.path)).lock.release()
     assert stat.S_IMODE(run.path.stat().st_mode) == 0o750
 
 

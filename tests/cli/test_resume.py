@@ -10,10 +10,11 @@ import pytest
 from rmc.analysis.baseline_settings import BaselineConfig
 from rmc.cli import main, parser, run_options, train_options
 from rmc.common.env.config import EnvConfig
-from rmc.deploy.run.config import Preset, RunConfig, flat
+from rmc.deploy.run.config import Preset, RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.option_names import flat
 from rmc.deploy.run.preflight import check_port
 from rmc.deploy.run.presets import debug, preset_config
 from tests.cli.test_main import complaint
@@ -29,7 +30,7 @@ def run(tmp_path: Path) -> RunFolder:
         config, seed=3, total_steps=12_345, agent=dataclasses.replace(config.agent, heads=(7, 5), missing_flag=True),
         update=dataclasses.replace(config.update, learning_rate=0.1 + 0.2),
     )  # fmt: skip
-    folder = open_run(config, tmp_path / "run", "fail", LaunchOptions(tmp_path / "run", "fail", "lockstep", "cuda"))
+    folder = open_run(config, LaunchOptions(tmp_path / "run", "fail", launcher="lockstep", device="cuda"))
     folder.lock.release()
     return folder
 
@@ -41,7 +42,7 @@ def parsed(*words: object) -> tuple[RunConfig, LaunchOptions]:
 
 
 def test_what_is_not_said_is_as_it_was(run: RunFolder) -> None:
-    options = LaunchOptions(run.path, "resume", "lockstep", "cuda")
+    options = LaunchOptions(run.path, launcher="lockstep", device="cuda")
     for words in (["resume"], ["train", "--run-dir"], ["train", PENDULUM, "--preset", "debug", "--run-dir"]):
         config, launch = parsed(*words, run.path)
         assert config == run.config()
@@ -79,17 +80,19 @@ def test_what_is_said_is_all_that_changes(run: RunFolder) -> None:
 
 def test_another_launcher_takes_the_device_alone_along(tmp_path: Path) -> None:
     path, config = tmp_path / "run", debug(EnvConfig(PENDULUM))
-    last = LaunchOptions(path, "resume", "ray", "cuda", None, "local", all_cpus=True, tls=True, metrics_port=9464)
-    open_run(config, path, "fail", last).lock.release()
+    last = LaunchOptions(
+        path, launcher="ray", device="cuda", ray_address="local", all_cpus=True, tls=True, metrics_port=9464
+    )
+    open_run(config, last).lock.release()
     assert parsed("resume", path)[1] == last
-    assert parsed("resume", path, "--launcher", "local")[1] == LaunchOptions(path, "resume", "local", "cuda")
+    assert parsed("resume", path, "--launcher", "local")[1] == LaunchOptions(path, device="cuda")
     assert parsed("resume", path, "--launcher", "ray", "--no-tls")[1] == dataclasses.replace(last, tls=False)
     assert parsed("resume", path, "--metrics-port", "None")[1] == dataclasses.replace(last, metrics_port=None)
 
 
 def test_a_run_that_was_served_goes_on_without(run: RunFolder) -> None:
     last = LaunchOptions(run.path, metrics_port=9464, metrics_host="0.0.0.0")
-    open_run(run.config(), run.path, "resume", last).lock.release()
+    open_run(run.config(), last).lock.release()
     launch = parsed("resume", run.path, "--metrics-port", "None")[1]
     assert launch.metrics_port is None
     check_port(launch)

@@ -17,10 +17,9 @@ from rmc.cli import main, training
 from rmc.cli.ending import print_end
 from rmc.cli.training import conduct
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.errors import RoleDied
+from rmc.common.errors import STOPPED_STATUS, RoleDied
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.state import STOPPED
 from tests.analysis.test_policy import AGENTS, make_run
 from tests.counting_env import CountingEnv
 
@@ -105,7 +104,7 @@ def test_an_evaluation_without_end_shows_that_it_goes_on_and_is_cut(tmp_path, mo
     config, output, began = folder.config(), io.StringIO(), time.monotonic()
     config = replace(config, evaluator=replace(config.evaluator, evaluation_seconds=0.5))
     folder.lock.take()
-    placement = LaunchOptions(folder.path, "resume", "local", "cpu", None)
+    placement = LaunchOptions(folder.path)
     assert conduct(config, folder, placement, Console(file=output, width=200)) == 0
     assert 1.0 < time.monotonic() - began < 60
     for when in ("before training:", "after training:"):
@@ -150,8 +149,8 @@ def test_a_stop_signal_amid_the_evaluations_stops_the_run(folder, monkeypatch):
     for amid in ("_before", "_result"):
         with monkeypatch.context() as patch:
             patch.setattr(training, amid, lambda *_: signal.raise_signal(signal.SIGTERM))
-            assert conducted(folder) == STOPPED
-        assert folder.lock.ended() == STOPPED
+            assert conducted(folder) == STOPPED_STATUS
+        assert folder.lock.ended() == STOPPED_STATUS
     assert signal.getsignal(signal.SIGTERM) == before
 
 
@@ -161,7 +160,7 @@ def test_a_run_that_goes_on_knows_its_steps_before_a_role_speaks(folder, monkeyp
     for amid in ("_before", "_result"):
         with monkeypatch.context() as patch:
             patch.setattr(training, amid, lambda *_: signal.raise_signal(signal.SIGTERM))
-            assert conducted(folder, Console(file=output, width=200)) == STOPPED
+            assert conducted(folder, Console(file=output, width=200)) == STOPPED_STATUS
     assert output.getvalue().count("stopped at environment step 1,400; to go on:") == 2
 
 
@@ -184,7 +183,7 @@ def test_a_second_ctrl_c_amid_the_upload_leaves_no_lock(folder, monkeypatch):
     monkeypatch.setattr(training, "_launch", lambda *_: False)
     with pytest.raises(KeyboardInterrupt):
         conducted(folder)
-    assert folder.lock.ended() == STOPPED
+    assert folder.lock.ended() == STOPPED_STATUS
     RunFolder(folder.path).lock.take()
 
 

@@ -15,7 +15,6 @@ from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import (
     MAX_EPOCH_GAP,
     METRICS_KEPT,
-    PIECE_BYTES,
     Ack,
     Bus,
     Entry,
@@ -25,7 +24,7 @@ from rmc.common.bus.protocol import (
     Version,
 )
 from rmc.common.bus.redis_bus import RECORDS_READ, RedisBus
-from rmc.common.bus.weight_store import UNPUBLISHED_SECONDS
+from rmc.common.bus.weight_store import PIECE_BYTES, UNPUBLISHED_SECONDS
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local.role_process import until_taken
@@ -310,8 +309,9 @@ def test_the_memory_bus_forgets_old_records():
 def test_a_full_redis_is_emptied_by_commits():
     folder = Path(tempfile.mkdtemp(prefix="rmc-full-"))  # short: a socket path may have 107 bytes
     try:
-        with RedisServer(folder, maxmemory=8 << 20) as server:
+        with RedisServer(folder) as server:
             bus = RedisBus(server.url(), "full")
+            bus.redis.config_set("maxmemory", 8 << 20)
             owner, seq = ReplayOwner("replay", bus.take_epoch("replay")), fill(bus)
             assert seq > 10
             bus.commit(owner, {0: Ack(EntryId(1, seq - 1), 5)})

@@ -12,7 +12,7 @@ import pytest
 
 import rmc
 from rmc.common.extra import how_to_install
-from rmc.deploy.run.tracking import Tracker
+from rmc.deploy.run.tracking import TrackerName
 
 ROOT = Path(__file__).parents[2]
 SOURCES = ("actors", "analysis", "common", "deploy", "learner", "replay_server", "rmc", "Makefile")
@@ -48,4 +48,4 @@ def test_every_hint_asks_for_it_and_names_an_extra() -> None:
     assert not [str(path) for path, text in texts.items() if re.search(r"""install ['"]?rmc\\?\[""", text)]
     asks = re.compile(r"""(?:how_to_install|check_installed)\(['"]([^'"]*)['"]""")
     asked = {name for text in texts.values() for name in asks.findall(text)}
-    assert asked | {*get_args(Tracker)} == extras.keys() - {"dev"}
+    assert asked | {*get_args(TrackerName)} == extras.keys() - {"dev"}

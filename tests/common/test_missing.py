@@ -202,3 +202,13 @@ def test_a_bad_value_is_one_line(config: EnvConfig, says: str) -> None:
         make_env(config)
     assert str(caught.value).startswith(says)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", [Flicker, DropSensors])
+def test_what_is_missing_of_an_episode_follows_from_its_seed_alone(kind: Any) -> None:
+    """Not from whether the episode before ended amid a burst."""
+    env = kind(Ones(), 0.5, 20.0)
+    expected = flags(env, 30, seed=7)
+    for before in range(2, 12):
+        flags(env, before, seed=before)
+        np.testing.assert_array_equal(flags(env, 30, seed=7), expected)

@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gymnasium as gym
@@ -56,6 +57,43 @@ def test_a_callers_rounding_stays_where_no_gpu_learns() -> None:
         assert torch.get_float32_matmul_precision() == "medium"
     finally:
         torch.set_float32_matmul_precision("highest")
+
+
+def test_a_callers_rounding_comes_back_where_a_gpu_learned() -> None:
+    for precision in ("highest", "medium"):
+        torch.set_float32_matmul_precision(precision)
+        try:
+            with torch_as_imported():
+                set_precision("auto", torch.device("cuda"))
+                assert torch.backends.cuda.matmul.allow_tf32
+            assert torch.get_float32_matmul_precision() == precision
+        finally:
+            torch.set_float32_matmul_precision("highest")
+
+
+def test_what_other_threads_change_meanwhile_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(".")  # back at the end
+    with torch_as_imported(), ThreadPoolExecutor(1) as other:
+        other.submit(os.chdir, tmp_path).result()
+        other.submit(torch.set_default_dtype, torch.float64).result()
+    try:
+        assert (os.getcwd(), torch.get_default_dtype()) == (str(tmp_path), torch.float64)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_of_two_at_once_the_last_gives_the_callers_dtype_back() -> None:
+    torch.set_default_dtype(torch.float64)
+    try:
+        first, second = torch_as_imported(), torch_as_imported()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert torch.get_default_dtype() == torch.float32
+        second.__exit__(None, None, None)
+        assert torch.get_default_dtype() == torch.float64
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 class Homeless(CountingEnv):

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from rmc.common.bus.redis_bus import RedisBus
-from rmc.common.bus.redis_url import has_password, shown, without_passwords
+from rmc.common.bus.redis_url import has_password, redacted, without_passwords
 from rmc.common.errors import BusUnavailable, ConfigError
 
 SHOWN = {
@@ -41,7 +41,7 @@ OTHERS = {"hunter2": "…", "hunter2:x@host:1": "…", "": "…", "hunter2://hos
 
 @pytest.mark.parametrize(("url", "expected"), [*SHOWN.items(), *UNPARSED.items(), *SUSPICIOUS.items(), *OTHERS.items()])
 def test_a_url_is_shown_without_its_password(url: str, expected: str) -> None:
-    assert shown(url) == expected
+    assert redacted(url) == expected
     assert without_passwords(f"--redis-ulr={url}") == f"--redis-ulr={expected}" or "://" not in url
 
 

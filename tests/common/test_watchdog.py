@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from rmc.common.process.watchdog import HUNG_STATUS
+from rmc.common.process.watchdog import HUNG_STATUS, EnvCall
 
 IMPORTS = "import ctypes, os, time\nfrom rmc.common.process.watchdog import *\n"
 LINE = "rmc: ENV='Mine-v0': step has not returned for 0.5 s (<string>, line 5); fix it, or raise --env-timeout\n"
@@ -68,6 +68,18 @@ def test_in_a_users_own_process_it_is_a_warning_once_and_nothing_ends() -> None:
     assert run(f"warn()\n{threads}")[:2] == (0, "")
     quick = "for _ in range(12):\n    with EnvCall('', 'reset', 0.5): time.sleep(0.1)"
     assert run(f"warn()\n{quick}")[:2] == (0, "")
+
+
+def test_calls_of_two_threads_leave_no_chain_behind_them() -> None:
+    for _ in range(100):
+        first, second = EnvCall("Mine-v0", "step", 1.0), EnvCall("Mine-v0", "step", 1.0)
+        first.__enter__()
+        second.__enter__()
+        first.__exit__()
+        second.__exit__()
+    assert EnvCall.current is first
+    assert first._outer is None
+    EnvCall.current = None
 
 
 def test_a_process_that_does_not_start_it_is_not_watched() -> None:

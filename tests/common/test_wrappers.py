@@ -216,3 +216,23 @@ def test_the_old_name_of_a_missing_frame_is_understood_with_one_warning(caplog: 
     assert [record.message for record in caplog.records if "info" in record.message] == [
         'the environment gives info["blank"]; call it info["missing"], the old name goes in the next version'
     ]
+
+
+def test_a_stack_begins_anew_with_every_episode() -> None:
+    env = make_env(EnvConfig("Reused-v0", frame_stack=3))
+    for _ in range(2):
+        assert env.reset(seed=0)[0].tolist() == [0, 0, 0]
+        assert env.step(np.zeros(1, np.float32))[0].tolist() == [0, 0, 1]
+
+
+@pytest.mark.parametrize("ends", [(False, False), (True, False), (False, True), (True, True)])
+def test_how_an_episode_ends_is_passed_on(ends: tuple[bool, bool]) -> None:
+    """A time limit of the environment's own is no termination."""
+
+    class Ends(Reused):
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            return self._seen, 0.0, *ends, {}
+
+    env = RescaledEnv(Ends())
+    env.reset(seed=0)
+    assert env.step(np.zeros(1, np.float32))[2:4] == ends

@@ -8,6 +8,7 @@ import pytest
 
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 
@@ -24,6 +25,6 @@ def handlers() -> Iterator[None]:
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
     """A run's that nobody trains."""
-    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
     run.lock.release()
     return run

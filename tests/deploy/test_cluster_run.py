@@ -114,7 +114,7 @@ def test_a_port_that_a_run_has_is_not_written_again(folder: RunFolder, monkeypat
 @pytest.fixture
 def hosts(tmp_path: Path) -> Hosts:
     """Of a run that has none yet."""
-    folder: RunFolder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    folder: RunFolder = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
     folder.lock.release()
     return Hosts(folder, "cpu", False, lambda role: f"redis://{role}")
 
@@ -160,7 +160,7 @@ def test_a_second_start_is_told_that_the_run_is_trained(folder: RunFolder, monke
     monkeypatch.setattr(ray_launcher.ray, "remote", lambda _: options)
     folder.lock.take()
     with pytest.raises(ConfigError, match=r"^--run-dir=.*: this run is being trained; rmc attach watches it$"):
-        ray_launcher.launch(folder.config(), folder, LaunchOptions(folder.path, "resume", "ray"))
+        ray_launcher.launch(folder.config(), folder, LaunchOptions(folder.path, launcher="ray"))
     assert (held, folder.lock.trainer()) == ([True], None)
 
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from rmc.common.agent_config import HeadInput
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import Preset, RunConfig, flat, from_json, option, to_json
+from rmc.deploy.run.config import Preset, RunConfig, from_json, to_json
+from rmc.deploy.run.option_names import flat, option
 from rmc.deploy.run.presets import debug, memory, paper, preset_config, robust
 from rmc.deploy.run.validation import validate, validate_windows
 

@@ -27,7 +27,7 @@ from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.run import folder as run_folder
 from rmc.deploy.run.config import to_json
 from rmc.deploy.run.folder import RESULT, RunFolder
-from rmc.deploy.run.launch_options import IfExists
+from rmc.deploy.run.launch_options import IfExists, LaunchOptions
 from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.opening import make, open_run
 from rmc.deploy.run.presets import debug
@@ -147,7 +147,7 @@ def test_a_disk_without_locks_is_one_line_before_there_is_a_run(
 ) -> None:
     monkeypatch.setattr("fcntl.flock", raising(fault))
     with pytest.raises(ConfigError, match=r"^lock='.*/run/.lock': its disk locks no files \(.+\); take a folder on an"):
-        open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+        open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
     assert not (tmp_path / "run" / "config.json").exists()
 
 
@@ -155,7 +155,7 @@ def test_a_disk_without_locks_is_one_line_before_there_is_a_run(
 def test_a_copy_on_a_disk_without_locks_can_be_read(
     fault: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
     shutil.copytree(folder.path, tmp_path / "copy")
     folder.lock.release()
     monkeypatch.setattr("fcntl.flock", raising(fault))
@@ -210,7 +210,7 @@ def test_a_run_that_is_made_longer_has_no_result_until_it_ends(folder: RunFolder
     folder.write_result(dict.fromkeys(RESULT, config.total_steps))
     for more, there in ((0, True), (1, False)):
         open_run(
-            dataclasses.replace(config, total_steps=config.total_steps + more), folder.path, "resume"
+            dataclasses.replace(config, total_steps=config.total_steps + more), LaunchOptions(folder.path)
         ).lock.release()
         assert (folder.result() is not None) == there
 
@@ -224,7 +224,7 @@ def test_a_start_that_fails_takes_no_result_along(folder: RunFolder, monkeypatch
 
     monkeypatch.setattr("rmc.deploy.run.opening.note_start", full)
     with pytest.raises(OSError, match="no room"):
-        open_run(dataclasses.replace(config, total_steps=config.total_steps + 1), folder.path, "resume")
+        open_run(dataclasses.replace(config, total_steps=config.total_steps + 1), LaunchOptions(folder.path))
     assert folder.result() is not None
 
 
@@ -238,7 +238,7 @@ def test_starts_in_the_same_second_get_a_folder_each(
 
     def start(_: int) -> RunFolder:
         barrier.wait()
-        return open_run(debug(EnvConfig("InvertedPendulum-v5")), None, if_exists)
+        return open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(None, if_exists))
 
     with ThreadPoolExecutor(4) as pool:
         runs = list(pool.map(start, range(4)))
@@ -253,7 +253,7 @@ def test_a_place_for_runs_that_is_none_is_one_line(tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").touch()
     with pytest.raises(ConfigError, match=r"--run-dir='.*runs.*cannot be made \(.+\); give another"):
-        open_run(debug(EnvConfig("InvertedPendulum-v5")), None, "resume")
+        open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions())
 
 
 def test_a_folder_that_turns_read_only_is_waited_for(
@@ -262,7 +262,7 @@ def test_a_folder_that_turns_read_only_is_waited_for(
     """It is said once each way, and the result comes when there is a place for it."""
     monkeypatch.setattr("rmc.deploy.monitor.monitor.RECORD_SECONDS", 0.0)
     config = debug(EnvConfig("InvertedPendulum-v5"))
-    folder = open_run(config, tmp_path / "run", "fail")
+    folder = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
     for path in (tmp_path, *tmp_path.parents):  # for who is not root, whom no mode keeps from writing
         if not path.stat().st_mode & 0o001:
             path.chmod(0o711)
@@ -301,8 +301,9 @@ def as_nobody() -> Iterator[None]:
 
 def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
     """It stands in keys, and in what roles are started with."""
+    no_text = tmp_path / os.fsdecode(b"\xff")
     with pytest.raises(ConfigError, match=r"--run-dir='.*\\udcff/run': is no UTF-8; give another"):
-        open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / os.fsdecode(b"\xff") / "run", "fail")
+        open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(no_text / "run", "fail"))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -378,17 +379,15 @@ def test_a_newer_damaged_checkpoint_is_told_where_the_run_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     config = debug(EnvConfig("Pendulum-v1"))
-    folder = open_run(config, tmp_path / "run", "fail")
+    folder = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
     folder.lock.release()
     checkpoints = CheckpointFolder(folder.checkpoints)
     for update in (10, 20, 30):
         checkpoints.save(update, {"state": b"x"})
     for update in (20, 30):
         (checkpoints.path(update) / "state").write_bytes(b"y")
-    open_run(config, tmp_path / "run", "resume").lock.release()
+    open_run(config, LaunchOptions(tmp_path / "run")).lock.release()
     messages = [record.getMessage() for record in caplog.records]
     assert len(messages) == 2
-    assert all(
-        "does not match its manifest; the run goes on from the checkpoint of update 10" in text for text in messages
-    )
+    assert all("does not match its manifest; falling back to an older one" in text for text in messages)
     assert "000000030" in messages[0]

@@ -24,7 +24,7 @@ PINS = (FOLDER.parents[1] / "constraints.txt").read_text()
 
 @pytest.fixture(params=FILES, ids=lambda path: path.stem)
 def config(request: pytest.FixtureRequest) -> dict[str, Any]:
-    return machines.read(request.param)
+    return machines.read_cluster_file(request.param)
 
 
 def test_there_is_one_for_each_provider() -> None:
@@ -60,9 +60,9 @@ def test_every_cloud_machine_says_its_image(config: dict[str, Any]) -> None:
 
 
 def test_the_nodes_that_there_must_be() -> None:
-    nodes = {path.stem: machines.expected_nodes(machines.read(path)) for path in FILES}
+    nodes = {path.stem: machines.expected_nodes(machines.read_cluster_file(path)) for path in FILES}
     assert nodes == {"aws": 3, "gcp": 3, "on-premise": 3}
-    local = machines.read(FOLDER / "on-premise.yaml")
+    local = machines.read_cluster_file(FOLDER / "on-premise.yaml")
     assert [machines.expected_nodes(local | {"min_workers": number}) for number in (0, 1, 9)] == [1, 2, 3]
 
 
@@ -106,11 +106,11 @@ def test_a_file_that_is_none_is_named(tmp_path: Path) -> None:
     ]:
         odd.write_text(text)
         with pytest.raises(ConfigError, match=message):
-            machines.read(odd)
+            machines.read_cluster_file(odd)
     odd.write_bytes(b"\xff\xfe\x00")
     for file in (odd, tmp_path / "absent.yaml"):
         with pytest.raises(ConfigError, match="cannot be read"):
-            machines.read(file)
+            machines.read_cluster_file(file)
 
 
 def test_the_token_is_made_and_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,6 +33,7 @@ from rmc.deploy.monitor.view import terminal
 from rmc.deploy.redis.server import RedisServer
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
@@ -47,7 +48,7 @@ def config() -> RunConfig:
 
 @pytest.fixture
 def monitor(config: RunConfig, tmp_path: Path) -> Monitor:
-    folder = open_run(config, tmp_path / "run", "fail")
+    folder = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
     folder.lock.release()
     return Monitor(folder, config, Console(quiet=True, force_terminal=False))
 
@@ -186,7 +187,7 @@ def test_tensorboard_has_the_main_metrics_and_the_options_under_the_runs_name(
 
 
 def test_events_of_earlier_versions_join_the_runs_own(config: RunConfig, tmp_path: Path) -> None:
-    folder = open_run(config, tmp_path / "run", "fail")
+    folder = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
     folder.lock.release()
     (folder.path / "events").mkdir()
     (folder.path / "events" / "events.out.tfevents.1.host").write_bytes(b"")
@@ -196,7 +197,7 @@ def test_events_of_earlier_versions_join_the_runs_own(config: RunConfig, tmp_pat
 
 
 def test_evaluations_of_earlier_starts_are_known(config: RunConfig, tmp_path: Path) -> None:
-    folder = open_run(config, tmp_path / "run", "fail")
+    folder = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
     folder.lock.release()
     scores = (3.0, 9.0, 5.0)
     evaluations = [{"role": "evaluator", "time": 1.0, "eval_return_mean": score, "eval_update": 3} for score in scores]
@@ -398,7 +399,7 @@ def test_a_redis_that_stands_still_is_said_while_it_lasts_and_frames_go_on(
     monkeypatch.setattr(redis_connection, "TIMEOUT_SECONDS", 1.0)
     monkeypatch.setattr(view, "LINE_SECONDS", 0.1)
     monkeypatch.setattr(view, "REFRESH_SECONDS", 0.05)
-    folder, printed = open_run(config, tmp_path / "run", "fail"), io.StringIO()
+    folder, printed = open_run(config, LaunchOptions(tmp_path / "run", "fail")), io.StringIO()
     folder.lock.release()
     with tempfile.TemporaryDirectory() as short, RedisServer(Path(short)) as server:
         bus, monitor = RedisBus(server.url(), "run"), Monitor(folder, config, Console(file=printed, width=500))

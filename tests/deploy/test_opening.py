@@ -9,10 +9,11 @@ import pytest
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run import metrics_tail
-from rmc.deploy.run.config import RunConfig, flat
+from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import MAY_CHANGE, open_run
+from rmc.deploy.run.option_names import flat
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.starts import format_starts, last_launch, starts
 from tests.deploy.test_config import with_value
@@ -44,13 +45,13 @@ def test_every_option_may_change_or_is_refused_with_the_reason(path: str, folder
     was = flat(CONFIG)[path]
     changed = with_value(CONFIG, path, another(path, was))
     if path in MAY_CHANGE:
-        open_run(changed, folder.path, "resume").lock.release()
+        open_run(changed, LaunchOptions(folder.path)).lock.release()
         assert folder.config() == changed
         assert starts(folder)[-1].changes == {path: [was, flat(changed)[path]]}
     else:
         message = r": the run in .*run has .*, and .+; use that, or another --run-dir"
         with pytest.raises(ConfigError, match=message) as no:
-            open_run(changed, folder.path, "resume")
+            open_run(changed, LaunchOptions(folder.path))
         assert repr(flat(changed)[path]) in str(no.value)
         assert folder.config() == CONFIG
         assert len(starts(folder)) == 1
@@ -64,7 +65,7 @@ def test_a_start_that_is_refused_once_it_has_the_lock_writes_nothing(folder: Run
         raise ConfigError("--run-dir", str(locked.path), "this run is being trained")
 
     with pytest.raises(ConfigError, match="is being trained"):
-        open_run(dataclasses.replace(CONFIG, total_steps=9_000), folder.path, "resume", check=refuse)
+        open_run(dataclasses.replace(CONFIG, total_steps=9_000), LaunchOptions(folder.path), check=refuse)
     assert (folder.config(), len(starts(folder)), folder.lock.trainer()) == (CONFIG, 1, None)
 
 
@@ -74,8 +75,8 @@ def test_the_history_is_a_line_a_start(folder: RunFolder) -> None:
     folder.history_file.write_bytes(folder.history_file.read_bytes() + b'{"time": 1.0, "vers')  # torn by a crash
     replay = dataclasses.replace(CONFIG.replay, replay_ratio=8.0)
     longer = dataclasses.replace(CONFIG, total_steps=9_000, replay=replay)
-    open_run(longer, folder.path, "resume").lock.release()
-    open_run(longer, folder.path, "resume").lock.release()
+    open_run(longer, LaunchOptions(folder.path)).lock.release()
+    open_run(longer, LaunchOptions(folder.path)).lock.release()
     assert [start.env_steps for start in starts(folder)] == [0, 1_230, 1_230]
     assert starts(folder)[-1].changes == {}
     assert format_starts(folder) == "3 starts; from step 1,230 --total-steps 4000 to 9000, --replay-ratio 32 to 8"
@@ -89,7 +90,7 @@ def test_of_a_run_of_weeks_a_start_parses_what_was_said_last(
     folder.metrics.write_text(line * 20_000 + '{"role": "replay", "env_steps": 9000}\n')
     parsed, parse = [], metrics_tail.parse_record
     monkeypatch.setattr(metrics_tail, "parse_record", lambda line: parsed.append(len(line)) or parse(line))
-    open_run(CONFIG, folder.path, "resume").lock.release()
+    open_run(CONFIG, LaunchOptions(folder.path)).lock.release()
     assert starts(folder)[-1].env_steps == 9_000
     assert 0 < sum(parsed) < 1.1 * metrics_tail.LISTED_BYTES
 
@@ -102,7 +103,7 @@ def test_a_folder_that_shows_what_another_run_has_is_left_alone(link: str, tmp_p
     (tmp_path / "new").mkdir()
     (tmp_path / "new" / link).symlink_to(tmp_path / "old" / link)
     with pytest.raises(ConfigError, match="is there and is no run's folder"):
-        open_run(CONFIG, tmp_path / "new", "resume")
+        open_run(CONFIG, LaunchOptions(tmp_path / "new"))
     assert kept.read_text() == "of value"
 
 
@@ -118,8 +119,8 @@ def test_how_it_was_started_is_kept_but_no_password(
     url: str | None, kept: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir("/")
-    options = LaunchOptions(tmp_path / "run", "fail", "manual", "cuda:1", url, all_cpus=True)
-    folder = open_run(CONFIG, tmp_path / "run", "fail", options)
+    options = LaunchOptions(tmp_path / "run", launcher="manual", device="cuda:1", redis_url=url, all_cpus=True)
+    folder = open_run(CONFIG, options)
     folder.lock.release()
-    assert last_launch(folder) == LaunchOptions(folder.path, "resume", "manual", "cuda:1", kept, all_cpus=True)
+    assert last_launch(folder) == dataclasses.replace(options, redis_url=kept)
     assert "hush" not in folder.history_file.read_text()

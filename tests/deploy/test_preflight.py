@@ -14,9 +14,9 @@ import torch
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run import preflight
+from rmc.deploy.run import host, preflight
 from rmc.deploy.run.config import RunConfig, WindowConfig
-from rmc.deploy.run.host import this_machine
+from rmc.deploy.run.host import cores, this_machine
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.preflight import (
     DISK_RESERVE,
@@ -24,7 +24,6 @@ from rmc.deploy.run.preflight import (
     check_device,
     check_machine,
     check_ring_fits,
-    cores,
     ring_bytes,
 )
 from rmc.deploy.run.presets import robust
@@ -71,7 +70,7 @@ def test_a_run_that_goes_on_is_offered_no_capacity_that_it_would_refuse(memory: 
 
 def test_a_containers_memory_is_what_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     limit = tmp_path / "memory.max"
-    monkeypatch.setattr(preflight, "CONTAINER_LIMITS", (limit, tmp_path / "none"))
+    monkeypatch.setattr(host, "CONTAINER_LIMITS", (limit, tmp_path / "none"))
     for text in (None, "max\n", str(1 << 62)):
         if text is not None:
             limit.write_text(text)
@@ -101,7 +100,7 @@ def test_so_is_its_share_of_the_cores(
     for file, text in zip(files, texts, strict=False):
         file.write_text(text)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(64)))
-    monkeypatch.setattr(preflight, "CPU_LIMITS", ((tmp_path / "none",), tuple(files)))
+    monkeypatch.setattr(host, "CPU_LIMITS", ((tmp_path / "none",), tuple(files)))
     assert cores() == (most or 64)
 
 
@@ -119,7 +118,7 @@ def test_a_gpu_that_is_not_there_is_refused_with_those_that_are(monkeypatch: pyt
 
 def test_a_run_is_refused_so_before_it_starts_but_on_a_gpu(memory: int, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(preflight, "check_device", lambda _: None)
-    options = LaunchOptions(tmp_path / "run", "fail", "local", "cpu", None)
+    options = LaunchOptions(tmp_path / "run", "fail")
     with pytest.raises(ConfigError, match="--batch-size=64"):
         check_machine(run(990, 64), options)
     check_machine(run(990, 64), dataclasses.replace(options, device="cuda"))
@@ -157,7 +156,7 @@ def test_a_ring_on_another_machine_is_not_judged_by_this_ones_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
-    options = LaunchOptions(tmp_path / "run", "fail", "local", "cpu", None)
+    options = LaunchOptions(tmp_path / "run", "fail")
     with pytest.raises(ConfigError, match=r"^--capacity=100: takes .*; make room$"):
         check_machine(run(15, 8), options)
     check_machine(run(15, 8), dataclasses.replace(options, launcher="ray"))

@@ -30,7 +30,7 @@ from rmc.replay_server.commit_record import Progress
 from tests import habits
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
-COUNTED = Progress(3, env_steps=7).publish()
+COUNTED = Progress(3, 1, env_steps=7).publish()
 
 
 @pytest.fixture(autouse=True)

@@ -7,6 +7,7 @@ import pytest
 
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.state import run_state
@@ -16,7 +17,7 @@ RESULT = ("env_steps", "updates", "wall_s", "eval_return_mean", "eval_return_std
 
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
-    return open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    return open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
 
 
 def test_a_run_is_trained_until_it_ends(folder: RunFolder) -> None:

@@ -24,6 +24,7 @@ from rmc.deploy.monitor import tracker as tracker_module
 from rmc.deploy.monitor.films import Film, Films
 from rmc.deploy.monitor.tracker import Tracker, start_tracker
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.tracking import Tracking, keep_tracking, kept_tracking
@@ -42,7 +43,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
     monkeypatch.setenv("WANDB_BASE_URL", CLOSED)
     monkeypatch.setenv("HOME", str(tmp_path))  # where a login would be
     monkeypatch.delenv("WANDB_API_KEY", raising=False)
-    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "first", "fail")
+    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "first", "fail"))
     run.lock.release()
     return run
 

@@ -15,7 +15,7 @@ NEGATIVE = '{"tracker": "wandb", "project": "x", "tags": [], "id": "y", "video_e
 
 
 def chosen(folder: RunFolder, **options: Any) -> Tracking | None:
-    return choose_tracking(dataclasses.replace(LaunchOptions(folder.path, "resume", "local", "cpu", None), **options))
+    return choose_tracking(dataclasses.replace(LaunchOptions(folder.path), **options))
 
 
 def test_a_new_run_is_in_no_tracker_unless_asked(folder: RunFolder) -> None:

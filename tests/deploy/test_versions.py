@@ -21,9 +21,10 @@ from rmc.cli import main
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import flat, from_json, to_json
+from rmc.deploy.run.config import from_json, to_json
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.migrations import FORMAT
+from rmc.deploy.run.option_names import flat
 from rmc.deploy.run.presets import debug, robust
 from rmc.deploy.run.starts import starts
 from rmc.replay_server.recovery import open_store

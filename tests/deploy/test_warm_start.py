@@ -39,7 +39,7 @@ OTHER = dataclasses.replace(CONFIG, seed=7)
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """A run that has learnt something, in lockstep."""
-    folder = open_run(CONFIG, tmp_path_factory.mktemp("source") / "run", "fail")
+    folder = open_run(CONFIG, LaunchOptions(tmp_path_factory.mktemp("source") / "run", "fail"))
     trained(CONFIG, folder.path)
     folder.lock.release()
     return folder
@@ -54,7 +54,7 @@ def state(folder: RunFolder) -> dict[str, dict[str, torch.Tensor]]:
 
 def begin(config: RunConfig, path: Path, source: RunFolder, parts: InitParts = "all", which: str = "") -> RunFolder:
     options = LaunchOptions(path, init_from=f"{source.path}{which}", init_parts=parts)
-    folder = open_run(config, path, "resume", options)
+    folder = open_run(config, options)
     folder.lock.release()
     return folder
 
@@ -210,7 +210,7 @@ def test_grounding_says_nothing_of_a_policy(source: RunFolder, tmp_path: Path) -
 
 
 def test_a_state_that_is_cut_is_one_line(source: RunFolder, tmp_path: Path) -> None:
-    copied = open_run(CONFIG, tmp_path / "copied", "fail")
+    copied = open_run(CONFIG, LaunchOptions(tmp_path / "copied", "fail"))
     copied.lock.release()
     progress = json.dumps({"updates": 5, "env_steps": 50}).encode()
     CheckpointFolder(copied.checkpoints).save(5, {"learner.pt": b"PK", "progress.json": progress})

@@ -12,10 +12,10 @@ import pytest
 import rmc
 from rmc import presets
 from rmc.analysis.baselines import MAY_CHANGE as BASELINES_MAY_CHANGE
-from rmc.deploy.run.config import option
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import InitParts
 from rmc.deploy.run.opening import MAY_CHANGE
+from rmc.deploy.run.option_names import option
 from rmc.deploy.run.starts import format_starts, starts
 from tests.docs.running import DOCS, LOCKSTEP, commands, ran
 

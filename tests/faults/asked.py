@@ -35,7 +35,7 @@ class Asked:
         while server.step():
             pass
         self._path = str(folder / "asked.sock")
-        self._server = SocketServer(server, SPEC, f"unix:{self._path}", SECRET, BATCH)
+        self._server = SocketServer(server, f"unix:{self._path}", SECRET, BATCH)
         self._client = socket.socket(socket.AF_UNIX)
         self.known = False
 

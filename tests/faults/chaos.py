@@ -17,8 +17,8 @@ import psutil
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import STOPPED_STATUS
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.state import STOPPED
 from tests.faults.broken_checkpoints import spoil
 from tests.faults.disk_full import filled, is_whole
 from tests.faults.kill_redis import LoggedRedis
@@ -109,7 +109,7 @@ class Chaos:
         run = self._there()
         run.interrupt()
         self._killed = True
-        if run.process.returncode != STOPPED:
+        if run.process.returncode != STOPPED_STATUS:
             self.unexpected.append(f"Ctrl-C: status {run.process.returncode}: {self._last_words()}")
 
     def end(self, more: float) -> int:

@@ -22,7 +22,7 @@ from rmc.actors.policy_runner import PolicyRunner
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.metrics_record import decode_record, encode_record
-from rmc.common.bus.protocol import join_pieces
+from rmc.common.bus.weight_store import join_pieces
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError, MessageError
 from rmc.common.wire import HEADER, Kind, decode_header, decode_meta, encode_frame, encode_windows
@@ -117,7 +117,7 @@ def request(raw: bytes) -> None:
 
 def published(raw: bytes) -> None:
     """Counters that a replay server begins with."""
-    decode_published(raw, SPEC.obs_dim)
+    decode_published(raw, SPEC.obs_dim, 1)
 
 
 def _request(kind: Kind, meta: dict[str, int]) -> bytes:
@@ -145,7 +145,7 @@ KINDS: dict[str, tuple[bytes, Reader]] = {
     "record": (encode_record({"time": 1.5, "updates": 7, "waiting_for": "credit"}), decode_record),
     "config": (to_json(robust(EnvConfig("HalfCheetah-v5"))).encode(), from_json),
     "registration": (to_registration(robust(EnvConfig("HalfCheetah-v5"))), from_registration),
-    "counters": (Progress(SPEC.obs_dim).publish(), published),
+    "counters": (Progress(SPEC.obs_dim, 1).publish(), published),
 }
 
 

@@ -148,7 +148,7 @@ def listed(run: Path) -> None:
 
 def plotted(run: Path) -> None:
     """Its table, without the picture."""
-    groups = curves.grouped(history.read(run))
+    groups = curves.grouped(history.read_histories(run))
     terminal().print(*curves.tables(groups, None))
 
 

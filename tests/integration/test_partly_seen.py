@@ -18,6 +18,7 @@ from rmc.common.errors import ConfigError
 from rmc.common.window import Rows
 from rmc.deploy.local.lockstep import Lockstep
 from rmc.deploy.run.config import RunConfig
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from tests.deploy.test_warm_start import begin, state
 from tests.integration.test_lockstep import assert_same, trained
@@ -81,7 +82,7 @@ def test_a_run_that_goes_on_has_the_same_bits(tmp_path: Path) -> None:
 def test_its_policy_knows_what_is_missing_and_nothing_of_what_critics_see(tmp_path: Path) -> None:
     """Its file, an evaluation, a loop of one's own and ONNX; sent to actors are the networks that act alone."""
     settings = partial(checkpoint_steps=200)
-    folder = open_run(settings, tmp_path / "run", "fail")
+    folder = open_run(settings, LaunchOptions(tmp_path / "run", "fail"))
     lockstep = trained(settings, folder.path)
     folder.lock.release()
     sent = lockstep.bus.weights()
@@ -123,7 +124,7 @@ def test_its_policy_knows_what_is_missing_and_nothing_of_what_critics_see(tmp_pa
 def test_a_run_whose_critics_see_more_begins_with_another(tmp_path: Path) -> None:
     """All of it, its normaliser included; or, without what critics see, what remembers and predicts."""
     settings = partial(checkpoint_steps=200)
-    source = open_run(settings, tmp_path / "source", "fail")
+    source = open_run(settings, LaunchOptions(tmp_path / "source", "fail"))
     trained(settings, source.path)
     source.lock.release()
     theirs, other = state(source)["agent"], dataclasses.replace(settings, seed=9)

@@ -219,3 +219,10 @@ def test_a_whole_run_with_two_shards(tmp_path: Path) -> None:
     assert (folder / "replay-1" / "ring").exists()
     roles = {json.loads(line)["role"] for line in (folder / "metrics.jsonl").read_text().splitlines()}
     assert {"replay-0", "replay-1"} <= roles
+
+
+def test_no_shard_draws_as_another_does(wholes: list[Whole]) -> None:
+    whole = wholes[1]
+    whole.send([20] * ACTORS)
+    draws = [[server.sample(8).rows["serial"].tolist() for _ in range(5)] for server in whole.servers]  # type: ignore[index]
+    assert not any(map(list.__eq__, *draws))

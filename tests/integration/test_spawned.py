@@ -12,9 +12,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from rmc.common.errors import STOPPED_STATUS
 from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.redis.socket_folder import sweep
-from rmc.deploy.run.state import STOPPED
 from tests.integration.running import Training
 from tests.integration.spawning_env import SPAWNED
 from tests.processes import alive
@@ -148,5 +148,5 @@ def test_they_end_with_a_command_in_which_a_call_hangs(tmp_path: Path) -> None:
 def test_they_end_with_a_command_that_is_told_to(tmp_path: Path) -> None:
     process, theirs = checked(tmp_path)
     process.send_signal(signal.SIGTERM)
-    assert process.wait(60.0) == STOPPED
+    assert process.wait(60.0) == STOPPED_STATUS
     assert alive(theirs) == []

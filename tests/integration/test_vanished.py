@@ -12,6 +12,7 @@ import pytest
 
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from tests.integration.running import Training
@@ -49,7 +50,7 @@ def emptied(folder: Path) -> None:
 
 @pytest.mark.parametrize("vanish", [shutil.rmtree, replaced, emptied])
 def test_each_way_is_seen(vanish: Callable[[Path], None], tmp_path: Path) -> None:
-    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
     assert folder.secret()
     folder.lock.check_there()
     vanish(folder.path)
@@ -62,7 +63,7 @@ def test_each_way_is_seen(vanish: Callable[[Path], None], tmp_path: Path) -> Non
 def test_a_network_disk_that_is_away_for_a_moment_is_no_folder_gone(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), tmp_path / "run", "fail")
+    folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
 
     def away(*_: object, **__: object) -> None:
         raise OSError(number, os.strerror(number))

@@ -9,7 +9,7 @@ import torch
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.window import Rows, WindowSpec
-from rmc.learner.diagnostics import measurable, staleness
+from rmc.learner.diagnostics import Trace, measurable, staleness, value_metrics
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=5)
 UNBURNED = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=0, train=5)
@@ -127,3 +127,23 @@ def test_a_state_of_zeros_is_wholly_stale() -> None:
     _, rows = play(agent, UNBURNED)
     rows["state"] = 0.0
     assert staleness(agent, UNBURNED, rows[:3])["stale_state_stored"] == pytest.approx(1.0)
+
+
+def test_what_is_said_of_values_is_of_real_steps_alone() -> None:
+    m = torch.tensor([[1.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    log_pi, td_error, i, reward, first, second = torch.randn(6, 2, 3, generator=torch.Generator().manual_seed(0))
+    q, i = torch.stack([first, second]), i.abs() * m
+    trace = Trace({"q_loss": torch.tensor(3.0)}, torch.tensor(0.2), log_pi, q, td_error, i, reward, m)
+    said = {name: value.item() for name, value in value_metrics(trace, torch.tensor(0.3)).items()}
+    real = [(0, 0), (0, 1), (1, 0)]
+    curious, earned = (sum(float(x[at].abs()) for at in real) for x in (i, reward))
+    assert said == pytest.approx(
+        {
+            "q_loss": 3.0,
+            "alpha": 0.2,
+            "entropy": -np.mean([log_pi[at] for at in real]),
+            "q_mean": np.mean([(first[at] + second[at]) / 2 for at in real]),
+            "td_error": np.mean([td_error[at] for at in real]),
+            "curiosity_share": 0.3 * curious / (0.3 * curious + earned),
+        }
+    )

@@ -8,9 +8,10 @@ import safetensors.torch
 import torch
 
 from rmc.analysis.evaluation import initial_policy
-from rmc.common.agent import Memory
+from rmc.common.agent import Memory, initial_agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig
+from rmc.common.window import WindowSpec
 from rmc.deploy.local.lockstep import Lockstep
 from rmc.deploy.run.presets import debug
 
@@ -49,3 +50,11 @@ def test_the_policy_before_training_is_the_one_that_the_learner_starts_from(tmp_
     ours, theirs = safetensors.torch.load(initial_policy(config)), run.learner.agent.policy_weights()
     assert {name for name, value in theirs.items() if not torch.equal(ours[name], value)} == set()
     run.close()
+
+
+def test_an_agent_is_made_without_a_draw_from_torchs_own_random_numbers() -> None:
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    initial_agent(WindowSpec(3, 2, 8, 4, 5), AgentConfig(hidden=8, heads=(5, 5)), seed=1)
+    assert torch.equal(torch.rand(3), expected)

@@ -25,7 +25,7 @@ from rmc.learner.policy_average import MOVE_UPDATES
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.server import ReplayServer
 from tests.hostile import hostile_state
-from tests.learner.rows import SPEC, random_rows
+from tests.learner.rows import SPEC, observation_valid, random_rows, step_valid
 
 AGENT = AgentConfig(hidden=SPEC.state, embedding=7, heads=(10, 9), normalize_observations=True)
 CONFIG = LearnerConfig(batch_size=8, publish_updates=4, checkpoint_steps=2_000, precision="fp32")
@@ -268,7 +268,8 @@ def test_a_newer_checkpoint_that_is_damaged_is_passed_over_and_told(setting):
     setting.learner.close()
     checkpoints = setting.learner.checkpoints
     number, files = checkpoints.latest()
-    (checkpoints.save(number + 1, files) / "learner.pt").write_bytes(b"damaged")
+    checkpoints.save(number + 1, files)
+    (checkpoints.path(number + 1) / "learner.pt").write_bytes(b"damaged")
     resumed = setting.learner = setting.start()
     assert (resumed.updates, resumed.metrics()["damaged_checkpoints"]) == (number, 1)
 
@@ -526,3 +527,63 @@ def test_how_long_a_save_takes_is_noted(setting, monkeypatch):
     monkeypatch.setattr(setting.learner.checkpoints, "save", lambda *given: (time.sleep(0.5), whole(*given))[1])
     assert setting.learner.checkpoint()
     assert setting.learner.checkpoints.patience(0.0) > 3 * 0.5
+
+
+def test_an_update_gets_its_windows_importance_and_beta_of_the_environments_steps(setting, monkeypatch):
+    learner, drawn, handed = setting.learner, [], []
+    learner.update.config = dataclasses.replace(learner.update.config, curiosity=0.5, curiosity_steps=2_000)
+    sample, update = setting.server.sample, type(learner._updated).__call__
+
+    def draws(*args):
+        drawn.append(sample(*args))
+        return drawn[-1]
+
+    def updates(self, raw, importance, beta, number):
+        handed.append((importance.clone().numpy(), beta))
+        return update(self, raw, importance, beta, number)
+
+    monkeypatch.setattr(setting.server, "sample", draws)
+    monkeypatch.setattr(type(learner._updated), "__call__", updates)
+    for _ in range(4):
+        setting.update()
+    for (importance, beta), batch in zip(handed, drawn, strict=True):
+        np.testing.assert_allclose(importance, (batch.weights / batch.weights.min()) ** -0.4, rtol=1e-5)
+        assert beta == pytest.approx(0.5 * (1.0 - batch.env_steps / 2_000))
+    assert handed[-1][0].min() < 0.99
+    assert 0.0 < handed[-1][1] < handed[0][1] < 0.5
+
+
+def test_every_broadcast_has_the_statistics_of_its_time(setting):
+    for _ in range(3):
+        setting.feed(60)
+        while setting.learner.step():
+            pass
+        mean = setting.learner.agent.normalizer.mean.clone()
+        setting.feed(60)
+        setting.learner.publish()
+        weights, statistics = safetensors.torch.load(setting.bus.weights()[1]), setting.server.statistics()
+        told = torch.from_numpy(statistics.total / statistics.count).float()
+        torch.testing.assert_close(weights["normalizer.mean"], told)
+        assert not torch.equal(told, mean)
+
+
+def test_padding_is_zero_in_what_is_learnt_from(setting, monkeypatch):
+    """Whatever an actor has sent there."""
+    rows, learnt = random_rows(60), []
+    rows["observation"][~observation_valid(rows)] = 7.0
+    rows["reward"][~step_valid(rows)] = 7.0
+    rows["new_steps"] = rows["new_observations"] = rows["last"] - SPEC.burn_in
+    update = type(setting.learner._updated).__call__
+
+    def updates(self, raw, *rest):
+        learnt.append(raw.numpy().view(SPEC.dtype).reshape(-1).copy())
+        return update(self, raw, *rest)
+
+    monkeypatch.setattr(type(setting.learner._updated), "__call__", updates)
+    setting.bus.append(0, EntryId(1, 1), encode_windows(rows, SPEC))
+    while setting.server.step():
+        pass
+    assert setting.learner.step()
+    (seen,) = learnt
+    assert not seen["observation"][~observation_valid(seen)].any()
+    assert not seen["reward"][~step_valid(seen)].any()

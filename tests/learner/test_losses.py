@@ -181,3 +181,11 @@ def test_squashed_log_density_against_change_of_variables(rng):
 def test_squashed_log_density_is_finite_where_tanh_saturates():
     _, log_pi = squashed_sample(torch.full((1, 1), 40.0), torch.zeros(1, 1), torch.zeros(1, 1))
     assert torch.isfinite(log_pi).all()
+
+
+def test_a_temperature_trains_nothing_but_itself():
+    """Where alpha is 1, as at the start, log alpha is 0 and so is any other gradient: it is not, here."""
+    log_alpha, log_pi = torch.tensor(-2.0, requires_grad=True), torch.randn(B, T, requires_grad=True)
+    losses.temperature_loss(log_alpha, log_pi, -1.0, torch.ones(B, T)).backward()
+    assert log_alpha.grad is not None
+    assert log_pi.grad is None

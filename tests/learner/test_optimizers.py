@@ -12,7 +12,7 @@ from rmc.learner.config import UpdateConfig
 from rmc.learner.fused import fuse
 from rmc.learner.fused_heads import FusedHead
 from rmc.learner.kernels import BLOCK
-from rmc.learner.optimizers import CompiledAdam, adam, begin_moments, polyak_update
+from rmc.learner.optimizers import CompiledAdam, begin_moments, make_adam, polyak_update
 from rmc.learner.rounded import Rounded, rounded_weights
 from rmc.learner.update_order import make_update
 from tests.learner.rows import SPEC, random_rows, to_batch
@@ -114,7 +114,7 @@ def test_a_nan_reaches_the_weight_and_no_other():
 
 @pytest.mark.parametrize("part", ["memory", "world_model", "next_frame", "critic", "policy"])
 def test_weights_are_rounded_by_the_step(part):
-    optimizer, module = adam(network := agent(), UpdateConfig(), part), getattr(network, part)
+    optimizer, module = make_adam(network := agent(), UpdateConfig(), part), getattr(network, part)
     weights = rounded_weights([module])
     assert len(weights) == (3 if part in ("world_model", "next_frame") else 2)
     for _ in range(3):

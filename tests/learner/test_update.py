@@ -7,7 +7,7 @@ import io
 import pytest
 import torch
 
-from rmc.common.agent import Agent
+from rmc.common.agent import Agent, Normalizer
 from rmc.common.agent_config import AgentConfig
 from rmc.learner import losses
 from rmc.learner.batch import clear_padding, view_batch
@@ -328,3 +328,28 @@ def test_an_update_without_the_policys_turn_is_the_update_without_its_loss():
         update(view_batch(raw, torch.ones(8), SPEC, update.plan(raw, SPEC, 1)), BETA)
     for name, value in whole.agent.named_parameters():
         assert torch.equal(value, dict(without.agent.named_parameters())[name]) == (not name.startswith("policy."))
+
+
+def test_both_targets_come_back_as_they_were():
+    before, after = (make(ROBUST, latent_target="ema", target_memory="ema", polyak=0.9) for _ in range(2))
+    for seed in range(3):
+        before(to_batch(random_rows(8, seed)), BETA)
+    after.load_state_dict(copy.deepcopy(before.state_dict()))
+    for part in ("target_critic", "target_memory"):
+        ours, theirs = getattr(after, part).state_dict(), getattr(before, part).state_dict()
+        assert all(torch.equal(ours[name], value) for name, value in theirs.items()), part
+    a, b = (update(to_batch(random_rows(8, 3)), BETA) for update in (before, after))
+    assert torch.equal(a.priorities, b.priorities)
+
+
+def test_the_gradients_norm_is_told_as_it_was_before_the_clip():
+    clipped, free = (make(ROBUST, clip_norm=norm)(to_batch(random_rows(8)), BETA) for norm in (0.1, 0.0))
+    assert clipped.metrics["grad_norm"] == free.metrics["grad_norm"] > 0.2
+
+
+def test_a_number_that_hardly_changes_is_not_blown_up():
+    """Its deviation counts as 0.01 at least (``docs/algorithm.md``)."""
+    normalizer, mean, std = Normalizer(3, enabled=True), torch.tensor([1.0, 0.0, 2.0]), torch.tensor([1e-3, 0.0, 0.5])
+    normalizer.freeze(torch.tensor(100), 100.0 * mean.double(), 100.0 * (mean.double() ** 2 + std.double() ** 2))
+    torch.testing.assert_close(normalizer.std, torch.tensor([0.01, 0.01, 0.5]))
+    torch.testing.assert_close(normalizer.scaled(mean + 0.005), torch.tensor([0.5, 0.5, 0.01]), rtol=1e-4, atol=1e-4)

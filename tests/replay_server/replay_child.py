@@ -22,7 +22,7 @@ def main(url: str, run: str, folder: Path, capacity: int) -> None:
     bus = RedisBus(url, run)
     config = ReplayConfig(capacity=capacity, replay_ratio=1e6, warmup_steps=0)
     server = ReplayServer(SPEC, config, folder / "replay", 1, 10**9, ACTORS, 10**6, bus)
-    sockets = SocketServer(server, SPEC, f"unix:{folder}/r.sock", SECRET, 64)
+    sockets = SocketServer(server, f"unix:{folder}/r.sock", SECRET, 64)
     stop = StopSignal()
     stop.install()
     run_role(ReplayProcess(server, sockets), bus, stop, idle_seconds=0.0)

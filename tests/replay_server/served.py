@@ -32,7 +32,7 @@ class Served:
         self.sender.send(windows)
         while self.replay.step():
             pass
-        self.sockets = SocketServer(self.replay, SPEC, address, secret, MAX_BATCH, tls)
+        self.sockets = SocketServer(self.replay, address, secret, MAX_BATCH, tls)
         self.address = self.sockets.address
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._loop)

@@ -34,7 +34,7 @@ class Running:
     def __init__(self, folder: Path, bus: RedisBus) -> None:
         config = ReplayConfig(capacity=1000, replay_ratio=1e6, warmup_steps=0)
         self.server = ReplayServer(SPEC, config, folder / "replay", 1, 10**9, 1, 1000, bus)
-        sockets = SocketServer(self.server, SPEC, f"unix:{folder}/r.sock", SECRET, 64)
+        sockets = SocketServer(self.server, f"unix:{folder}/r.sock", SECRET, 64)
         self.process, self.stop = ReplayProcess(self.server, sockets), StopSignal()
         self.thread = threading.Thread(target=partial(run_role, self.process, bus, self.stop, idle_seconds=0.0))
         self.thread.start()

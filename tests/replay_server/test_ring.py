@@ -78,7 +78,7 @@ def test_killed_anywhere(capacity: int, appends: list[tuple[int, str]]) -> None:
 def tear_newest_record(path: Path) -> None:
     """As if the process had been killed amid the record's last bytes."""
     raw = bytearray(path.read_bytes())
-    half = record_bytes(SPEC.obs_dim)
+    half = record_bytes(SPEC.obs_dim, 1)
     newest = max(range(2), key=lambda copy: struct.unpack_from("<Q", raw, RECORDS_START + copy * half)[0])
     raw[RECORDS_START + newest * half + 30] ^= 0xFF
     with path.open("r+b") as file:  # in place: the map of the living ring sees it, too
@@ -100,19 +100,19 @@ def test_progress_survives_the_round_trip(numbers: list[int], streams: dict[int,
     progress.total += [1.0, 2.0, 3.0]
     progress.replay_ratio = 0.1
     progress.streams = {actor: StreamPosition(EntryId(e, s), n) for actor, (e, s, n) in streams.items()}
-    again = decode_progress(progress.encode(), SPEC.obs_dim)
+    again = decode_progress(progress.encode(), SPEC.obs_dim, 1)
     assert again.encode() == progress.encode()
     assert again.streams == progress.streams
     assert again.total.tolist() == [1.0, 2.0, 3.0]
     assert again.replay_ratio == 0.1
-    assert decode_progress(progress.encode()[:-8], SPEC.obs_dim).replay_ratio == 0.0  # as of config format 1
+    assert decode_progress(progress.encode()[:-8], SPEC.obs_dim, 1).replay_ratio == 0.0  # as of config format 1
 
 
 @pytest.mark.parametrize("obs_dim", [1, 3, 248, 249, 376])
 def test_most_streams_and_the_ratio_fit_into_a_record(obs_dim: int) -> None:
-    progress = Progress(obs_dim, replay_ratio=4.0)
+    progress = Progress(obs_dim, 1, replay_ratio=4.0)
     progress.streams = {actor: StreamPosition(EntryId(1, 0), 0) for actor in range(4096)}
-    records = RecordPair(np.zeros(2 * record_bytes(obs_dim), np.uint8), obs_dim)
+    records = RecordPair(np.zeros(2 * record_bytes(obs_dim, 1), np.uint8), obs_dim, 1)
     records.write(progress)
     read = records.read()
     assert read is not None
@@ -120,7 +120,7 @@ def test_most_streams_and_the_ratio_fit_into_a_record(obs_dim: int) -> None:
 
 
 def test_too_many_streams() -> None:
-    progress = Progress(SPEC.obs_dim)
+    progress = Progress(SPEC.obs_dim, 1)
     progress.streams = {actor: StreamPosition(EntryId(1, 0), 0) for actor in range(4097)}
     with pytest.raises(ConfigError, match="--actors=4097"):
         progress.encode()
@@ -142,7 +142,8 @@ def test_damage_is_named(tmp_path: Path, damage: str) -> None:
     if damage == "identity":
         raw[3] ^= 1
     if damage == "records":
-        raw[RECORDS_START : RECORDS_START + 2 * record_bytes(SPEC.obs_dim)] = bytes(2 * record_bytes(SPEC.obs_dim))
+        size = 2 * record_bytes(SPEC.obs_dim, 1)
+        raw[RECORDS_START : RECORDS_START + size] = bytes(size)
     (tmp_path / "ring").write_bytes(raw[:-1] if damage == "short" else raw)
     with pytest.raises(ConfigError, match=r"--run-dir=.*delete"):
         Ring(tmp_path / "ring", SPEC, 10)
@@ -181,8 +182,8 @@ def test_counts_by_number_survive_the_round_trip_and_fit_into_a_record() -> None
         assert read.encode() == many.encode()
         assert read.observations.tolist() == list(range(dims))
     assert decode_published(progress.publish(), size, counts) is not None
-    assert decode_published(progress.publish(), size) is None  # of other windows
-    assert decode_published(Progress(size).publish(), size, counts) is None
+    assert decode_published(progress.publish(), size, 1) is None  # of other windows
+    assert decode_published(Progress(size, 1).publish(), size, counts) is None
 
 
 @pytest.mark.parametrize("missing", ["missing", "blank"])
@@ -238,7 +239,19 @@ def write_former_ring(path: Path, missing: str, rows: np.ndarray, capacity: int)
         slot["serial"] = serial
     identity = struct.pack("<8s16sQQ", b"RMCRING3", fingerprint(SPEC, dtype).encode(), capacity, dtype.itemsize)
     identity += struct.pack("<I", zlib.crc32(identity))
-    records = np.zeros(2 * record_bytes(SPEC.obs_dim), np.uint8)
-    progress = Progress(SPEC.obs_dim, next_serial=len(rows), valid_from=max(0, len(rows) - capacity), env_steps=77)
-    RecordPair(records, SPEC.obs_dim).write(progress)
+    records = np.zeros(2 * record_bytes(SPEC.obs_dim, 1), np.uint8)
+    progress = Progress(SPEC.obs_dim, 1, next_serial=len(rows), valid_from=max(0, len(rows) - capacity), env_steps=77)
+    RecordPair(records, SPEC.obs_dim, 1).write(progress)
     path.write_bytes(identity.ljust(RECORDS_START, b"\0") + records.tobytes() + kept.tobytes())
+
+
+def test_a_whole_row_that_is_not_its_slots_window_is_none(tmp_path: Path) -> None:
+    """As after a write that went elsewhere, or never reached the disk: its checksum is right."""
+    ring, out = Ring(tmp_path / "ring", SPEC, 4), np.zeros(4, SPEC.dtype)
+    for first in (0, 4):
+        before = ring.rows.copy()
+        ring.write(make_rows(4, first))
+        ring.commit()
+    ring.rows[1] = ring.rows[0]
+    ring.rows[2] = before[2]
+    assert ring.gather(np.arange(4), out).tolist() == [True, False, False, True]

@@ -635,3 +635,37 @@ def test_a_ring_that_does_not_say_its_ratio_counts_from_where_it_is_opened(make:
     while server.sample(4).status is SampleStatus.BATCH:
         drawn += 4 * SPEC.train
     assert drawn <= 16 * 8.0 + 4 * SPEC.train
+
+
+def test_a_priority_of_nothing_keeps_a_chance(make: Make, bus: MemoryBus) -> None:
+    server, _ = filled(make(), bus, 3)
+    server.update_priorities(np.array([0, 1]), np.array([0.0, 1e-30], np.float32))
+    assert server.stats()["refused_priorities"] == 0
+    assert server._store.priorities[:3].tolist() == pytest.approx([1e-6, 1e-6, 1.0])
+    assert (server._store.tree.values(np.arange(3)) > 0).all()
+
+
+def test_only_real_trained_steps_count_as_drawn(make: Make, bus: MemoryBus) -> None:
+    """Else the ratio would not be held where episodes end within a window."""
+    server, sender = make(), Sender(bus)
+    rows = make_rows(6)
+    rows["last"] = SPEC.burn_in + np.array([1, 2, 3, 4, 1, 2])
+    rows["new_steps"] = rows["last"] - SPEC.burn_in
+    rows["new_observations"] = rows["new_steps"] + 1
+    for name in ("observation", "reward"):
+        rows[name] *= 0.0
+    sender.send_rows(rows)
+    drain(server)
+    sample = server.sample(16)
+    assert sample.rows is not None
+    assert sample.drawn_steps == server.stats()["drawn_steps"] == (sample.rows["last"] - SPEC.burn_in).sum() < 16 * 4
+
+
+def test_every_draw_has_its_own_random_numbers(make: Make, bus: MemoryBus) -> None:
+    server, _ = filled(make(), bus, 100)
+    draws = []
+    for _ in range(5):
+        rows = server.sample(8).rows
+        assert rows is not None
+        draws.append(tuple(rows["serial"].tolist()))
+    assert len(set(draws)) == 5

@@ -504,18 +504,18 @@ def test_it_listens_on_the_interface_named_alone(serve: Serve) -> None:
 )
 def test_an_address_that_cannot_be_listened_on(address: str) -> None:
     with pytest.raises(ConfigError, match="replay address"):
-        SocketServer(None, SPEC, address, SECRET, 1)  # type: ignore[arg-type]
+        SocketServer(None, address, SECRET, 1)  # type: ignore[arg-type]
 
 
 def test_a_taken_port_an_old_file_and_an_empty_secret(serve: Serve, tmp_path: Path) -> None:
     served = serve(address="tcp:127.0.0.1:0")
     with pytest.raises(ConfigError, match="the port is taken"):
-        SocketServer(served.replay, SPEC, served.address, SECRET, 1)
+        SocketServer(served.replay, served.address, SECRET, 1)
     with pytest.raises(ConfigError, match="secret"):
-        SocketServer(served.replay, SPEC, served.address, b"", 1)
+        SocketServer(served.replay, served.address, b"", 1)
     path = tmp_path / "r.sock"
     path.touch()  # as a killed server leaves it
-    again = SocketServer(served.replay, SPEC, f"unix:{path}", SECRET, 1)
+    again = SocketServer(served.replay, f"unix:{path}", SECRET, 1)
     assert path.stat().st_mode & 0o777 == 0o600
     again.close()
     assert not path.exists()

@@ -59,7 +59,7 @@ def test_a_study_runs_once_and_its_lines_can_be_plotted(tmp_path, monkeypatch):
     assert [job.values["agent"] for job in jobs] == ["ours", "theirs"]
     tiny.run("smoke", jobs, at_once=2)
     lines = tmp_path / "tiny-smoke.jsonl"
-    histories = history.read(lines)
+    histories = history.read_histories(lines)
     assert {one.agent for one in histories} == {"ours", "theirs"}
     assert {one.env for one in histories} == {"InvertedPendulum-v5, flicker 0.1"}
     assert all(one.finished and one.env_steps >= 1200 and one.commit for one in histories)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rmc.cli import sweep_check
-from rmc.cli.sweep_check import read
+from rmc.cli.sweep_check import read_job
 from rmc.cli.sweep_command import search_work
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
@@ -39,12 +39,12 @@ def spec_of(trials: int = 20, **kwargs: Any) -> Spec:
 def work_of(folder: Path, index: Index, spec: Spec) -> Any:
     assert spec.search is not None
     corner = make_job(spec, folder / "trial-0", {}, 0)
-    return search_work(spec, spec.search, read(corner)[0], index, folder)
+    return search_work(spec, spec.search, read_job(corner)[0], index, folder)
 
 
 def pretend(job: Job, returns: list[float], finished: bool, steps: int = 1000) -> None:
     """The folder of a run that was evaluated every so many steps."""
-    config, folder = read(job)[0], RunFolder(job.folder)
+    config, folder = read_job(job)[0], RunFolder(job.folder)
     job.folder.mkdir(parents=True, exist_ok=True)
     folder.write_config(config)
     records: list[dict[str, Any]] = []
@@ -107,9 +107,9 @@ def test_values_are_drawn_from_the_ranges_and_a_search_that_goes_on_draws_what_i
 
 def test_trials_to_come_are_not_parsed(tmp_path: Path, index: Index, monkeypatch: pytest.MonkeyPatch) -> None:
     """That takes 80 ms each, and of those to come the folders alone are known."""
-    spec, parsed, whole = spec_of(50), [], sweep_check.read
-    corner = read(make_job(spec, tmp_path / "trial-0", {}, 0))[0]
-    monkeypatch.setattr(sweep_check, "read", lambda job: parsed.append(job) or whole(job))
+    spec, parsed, whole = spec_of(50), [], sweep_check.read_job
+    corner = read_job(make_job(spec, tmp_path / "trial-0", {}, 0))[0]
+    monkeypatch.setattr(sweep_check, "read_job", lambda job: parsed.append(job) or whole(job))
     assert spec.search is not None
     assert len(search_work(spec, spec.search, corner, index, tmp_path).todo) == 50
     assert not parsed

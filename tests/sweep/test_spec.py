@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from rmc.cli import main, parser, sweep_check
-from rmc.cli.sweep_command import default_folder, read
+from rmc.cli.sweep_command import default_folder, read_sweep
 from rmc.common.errors import ConfigError
 from rmc.sweep.grid import grid_jobs
 from rmc.sweep.job import run_name
@@ -16,7 +16,7 @@ PENDULUM = "InvertedPendulum-v5"
 
 
 def spec_of(*words: str) -> Spec:
-    return read(parser.parse(["sweep", *words]))
+    return read_sweep(parser.parse(["sweep", *words]))
 
 
 def test_words_and_file_say_the_same(tmp_path: Path) -> None:
@@ -31,8 +31,8 @@ def test_words_and_file_say_the_same(tmp_path: Path) -> None:
     assert len(ours) == 24
     assert [(job.name, job.seed, job.values) for job in ours] == [(job.name, job.seed, job.values) for job in theirs]
     assert [job.seed for job in ours] == [1] * 8 + [2] * 8 + [3] * 8  # what is compared goes on side by side
-    configs = [sweep_check.read(job)[0] for job in ours]
-    assert configs == [sweep_check.read(job)[0] for job in theirs]
+    configs = [sweep_check.read_job(job)[0] for job in ours]
+    assert configs == [sweep_check.read_job(job)[0] for job in theirs]
     last = configs[-1]
     assert (last.update.learning_rate, last.agent.heads, last.agent.grounding) == (1e-3, (32, 32), False)
     assert (last.seed, last.preset) == (3, "debug")
@@ -43,7 +43,7 @@ def test_options_of_train_come_after_the_environment_or_the_file(tmp_path: Path)
     for what in (PENDULUM, str(tmp_path / "spec.toml")):
         spec = spec_of(what, "--preset", "debug", "--heads", "8", "8", "--env-kwargs", "a=1", "b=2", "--jobs", "1")
         (job,) = grid_jobs(spec, tmp_path)
-        config = sweep_check.read(job)[0]
+        config = sweep_check.read_job(job)[0]
         assert (config.agent.heads, config.env.env_kwargs, config.preset) == ((8, 8), {"a": 1, "b": 2}, "debug")
 
 
@@ -86,7 +86,7 @@ def test_a_tracker_is_of_every_run(tmp_path: Path) -> None:
     path = tmp_path / "spec.toml"
     path.write_text('env = "InvertedPendulum-v5"\n[options]\ntrack = "off"\ntrack_tags = ["a", "b"]\nvideo_every = 2\n')
     (job,) = grid_jobs(spec_of(str(path)), tmp_path)
-    options = sweep_check.read(job)[1]
+    options = sweep_check.read_job(job)[1]
     assert (options.track, options.track_tags, options.video_every) == ("off", ("a", "b"), 2)
 
 
@@ -164,7 +164,7 @@ def test_an_option_that_a_table_names_twice_is_refused(table: str, tmp_path: Pat
     ("words", "message"),
     [
         ([], "ENV|SPEC.toml"),
-        (["nowhere.toml"], "SPEC='nowhere.toml': No such file"),
+        (["nowhere.toml"], "SPEC='nowhere.toml': cannot be read (No such file"),
         (["Nope-v5"], "no such environment"),
         ([PENDULUM, "--sede", "1"], "options of rmc train='--sede 1': Unrecognized options: --sede"),
         ([PENDULUM, "other"], "options of rmc train='other': Unrecognized options: other"),

@@ -16,12 +16,13 @@ import pytest
 from rich.console import Console
 
 from rmc.cli.main import run
-from rmc.cli.sweep_check import Checked, check_jobs, read
+from rmc.cli.sweep_check import Checked, check_jobs, read_job
 from rmc.cli.sweep_command import grid_work
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.run import config as run_config
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.sweep import local_runs, pool, room
 from rmc.sweep.grid import is_finished
@@ -187,7 +188,7 @@ def test_a_full_disk_ends_a_sweep_but_its_runs_save_first(tmp_path: Path, monkey
     assert at_work[1].done == []
 
 
-@pytest.mark.parametrize("status", [pool.STOPPED, -signal.SIGTERM, 1])
+@pytest.mark.parametrize("status", [pool.STOPPED_STATUS, -signal.SIGTERM, 1])
 def test_what_is_stopped_as_hopeless_is_over_however_early_that_was(tmp_path: Path, status: int) -> None:
     """Asked while it still imports, a run cannot save, and would be started and stopped for ever."""
     one = pool._AtWork(Job(tmp_path / "trial-0", (), 0), cast(Any, Saving()), 0.0, hopeless=True)
@@ -198,7 +199,7 @@ def test_what_is_stopped_as_hopeless_is_over_however_early_that_was(tmp_path: Pa
 
 def test_runs_that_began_with_nothing_are_no_results_of_a_warm_start(tmp_path: Path, capsys) -> None:
     job = made(tmp_path / "sweep" / "seed=0")
-    config, options = read(job)
+    config, options = read_job(job)
     assert is_finished(job, config, options)
     with pytest.raises(ConfigError, match=r"^--init-from='x': the run in .*seed=0 began with nothing of another; use"):
         is_finished(job, config, dataclasses.replace(options, init_from="x"))
@@ -209,7 +210,7 @@ def test_a_killed_sweeps_runs_are_not_told_as_running_and_tables_are_not_cut(tmp
         jobs = [made(tmp_path / "sweep" / f"{at}", gamma) for at, gamma in enumerate((0.99991, 0.99992))]
         index.put(jobs[0], "running")
         jobs[0].folder.joinpath("result.json").unlink()
-        grid_work([Checked(job, *read(job)) for job in jobs], index)
+        grid_work([Checked(job, *read_job(job)) for job in jobs], index)
         assert [index.state(job) for job in jobs] == ["waiting", "finished"]
         console = Console(file=io.StringIO(), width=1_000)
         console.print(result_table(jobs, index))
@@ -244,8 +245,8 @@ def made(folder: Path, gamma: float = 0.99) -> Job:
     """A run that is over."""
     words = ("train", "InvertedPendulum-v5", "--preset", "debug", "--gamma", str(gamma), "--seed", "0")
     job = Job(folder, words, 0, {"gamma": gamma})
-    config = read(job)[0]
-    run_folder = open_run(config, folder, "fail")
+    config = read_job(job)[0]
+    run_folder = open_run(config, LaunchOptions(folder, "fail"))
     run_folder.lock.release()
     result = {"updates": 1, "wall_s": 1.0, "eval_return_mean": 12_345.6, "eval_return_std": 0.0, "eval_episodes": 1}
     run_folder.write_result({**result, "env_steps": config.total_steps, "initial_return_mean": 0.0})
