@@ -5,6 +5,7 @@ Float32 throughout; agrees with ``rmc.common.agent`` (its modules are the refere
 """
 
 import math
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -41,15 +42,21 @@ def _check_finite(weights: dict[str, Tensor]) -> None:
 PLAIN: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}  # whatever the caller's program has as default
 
 
+_count_lock = threading.Lock()
+_callers_counts: list[int] = []  # of those that are inside: the same for all, as the first has found it
+
+
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Torch's, for a policy's products: their last bits depend on it, and a process that has begun more cannot fork."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    with _count_lock:
+        _callers_counts.append(_callers_counts[0] if _callers_counts else torch.get_num_threads())
+        torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        with _count_lock:  # also while others are inside: it is this thread's own, which they keep theirs of
+            torch.set_num_threads(_callers_counts.pop())
 
 
 class _Linear:

@@ -139,7 +139,7 @@ class SB3Adapter:
 
 def saved_player(config: BaselineConfig, saved: Path, env: EnvConfig) -> SB3Adapter:
     """What was saved, to be played in ``env``. Raises ConfigError where it cannot be read."""
-    with reading(saved):
+    with reading(saved), torch.random.fork_rng(devices=[]):
         unseeded = {"seed": None}  # the generators that all share are the caller's
         model = CLASSES[config.algorithm].load(saved / MODEL, device="cpu", custom_objects=unseeded)
         return SB3Adapter(model, _kept_scaling(saved / SCALES, env))

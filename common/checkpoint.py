@@ -158,7 +158,7 @@ class CheckpointFolder:
             try:
                 return number, self.load(number)
             except CheckpointError as error:
-                log.warning("%s; falling back to an older one", error)
+                log.warning("%s; it is passed over", error)
                 self.damaged[number] = str(error)
         return None
 

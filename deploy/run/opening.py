@@ -1,5 +1,6 @@
 """Opens a run's folder: a new one, or one that goes on, with what may be other then."""
 
+import logging
 import os
 import shutil
 import time
@@ -53,6 +54,7 @@ MAY_CHANGE = SAME_AGENT | {  # that, and what is read afresh at every start: no 
     "learner.publish_updates",
     "learner.precision",
 }
+log = logging.getLogger(__name__)
 LEFT = {".lock", "checkpoints", "logs", "history.jsonl", ".config.json"}  # by a start that is killed before its config
 WHY_NOT = {  # by the part of the config, and then by the option
     "env": "its experience is from that environment",
@@ -215,6 +217,9 @@ def _check_begun(folder: RunFolder, options: LaunchOptions) -> None:
 def check_checkpoints(folder: RunFolder) -> None:
     """Raises ConfigError where there are checkpoints but none is whole; damaged newer ones are told."""
     checkpoints = CheckpointFolder(folder.checkpoints)
-    if checkpoints.latest() is None and checkpoints.damaged:
+    newest = checkpoints.latest()
+    if newest is None and checkpoints.damaged:
         fault = checkpoints.damaged[max(checkpoints.damaged)]
         raise ConfigError("--run-dir", str(folder.path), f"{fault}; none is whole, so use another --run-dir")
+    if newest is not None and checkpoints.damaged:
+        log.warning("the run goes on from the checkpoint of update %d", newest[0])

@@ -115,9 +115,9 @@ def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):
     assert seen["eval_return_mean"] == result["eval_return_mean"]
     assert (blind["eval_flicker"], blind["env_steps"]) == (1.0, result["env_steps"])
     assert rmc(["evaluate", str(tmp_path / "run"), "--checkpoint", "best"]) == 2
-    before = _random_state()
+    before = _random_state(), torch.get_rng_state().tolist()
     assert api.evaluate(tmp_path / "run", flicker=0.0)["eval_return_mean"] == result["eval_return_mean"]
-    assert _random_state() == before  # the caller's generators are left alone
+    assert (_random_state(), torch.get_rng_state().tolist()) == before  # the caller's generators are left alone
     with pytest.raises(ConfigError, match="a baseline keeps its last state only"):
         api.evaluate(tmp_path / "run", checkpoint="best")
     with pytest.raises(ConfigError, match="is a baseline's run; rmc resume continues it"):

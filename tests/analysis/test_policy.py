@@ -8,6 +8,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from safetensors.torch import load, save
 
 from rmc import api
 from rmc.actors.evaluator import first_start
+from rmc.actors.policy_runner import one_thread
 from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.policy import load_policy
 from rmc.analysis.policy_file import read_policy
@@ -159,7 +161,8 @@ child = multiprocessing.get_context("fork").Process(target=act)
 child.start()
 child.join(20)
 child.kill()
-sys.exit(child.exitcode)
+child.join()
+sys.exit(child.exitcode != 0)
 """
 
 
@@ -167,6 +170,21 @@ def test_a_process_that_has_a_policy_can_fork(tmp_path: Path) -> None:
     """Torch's threads do not: where any have begun, the child waits for them without end."""
     folder = make_run(tmp_path / "run", AgentConfig(normalize_observations=True), "HalfCheetah-v5").path
     assert subprocess.run([sys.executable, "-W", "ignore", "-c", FORKS, folder], check=False).returncode == 0
+
+
+def test_two_that_act_at_once_leave_the_callers_threads_as_they_were() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(4)
+    try:
+        first, second = one_thread(), one_thread()
+        with ThreadPoolExecutor(1) as other:
+            other.submit(first.__enter__).result()
+            second.__enter__()
+            other.submit(first.__exit__, None, None, None).result()
+            second.__exit__(None, None, None)
+            assert (torch.get_num_threads(), other.submit(torch.get_num_threads).result()) == (4, 4)
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_an_observation_in_the_environments_own_shape_is_one(tmp_path: Path) -> None:

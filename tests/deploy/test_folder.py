@@ -388,6 +388,7 @@ def test_a_newer_damaged_checkpoint_is_told_where_the_run_goes_on(
         (checkpoints.path(update) / "state").write_bytes(b"y")
     open_run(config, LaunchOptions(tmp_path / "run")).lock.release()
     messages = [record.getMessage() for record in caplog.records]
-    assert len(messages) == 2
-    assert all("does not match its manifest; falling back to an older one" in text for text in messages)
+    assert len(messages) == 3
+    assert all("does not match its manifest; it is passed over" in text for text in messages[:2])
     assert "000000030" in messages[0]
+    assert messages[2] == "the run goes on from the checkpoint of update 10"

@@ -79,7 +79,7 @@ def is_held(one: Chaos, ratio: float) -> bool:
 def noticed(folder: Path) -> dict[str, int]:
     """Of damage to files."""
     seen = [record["damaged_windows"] for record in RunFolder(folder).records() if "damaged_windows" in record]
-    older = (folder / "logs" / "learner.log").read_text().count("falling back to an older one")
+    older = (folder / "logs" / "learner.log").read_text().count("it is passed over")
     more = sum(max(0, later - earlier) for earlier, later in pairwise([0, *seen]))  # each server counts from 0
     return {"damaged windows noticed": more, "damaged checkpoints noticed": older}
 
