@@ -17,6 +17,7 @@ from safetensors.torch import save
 
 from rmc.actors.actor import Actor, environment_seed
 from rmc.actors.config import ActorConfig
+from rmc.actors.env_pool import EnvPool
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.memory_bus import MemoryBus
@@ -541,6 +542,36 @@ def test_a_reward_that_the_scale_makes_infinite_breaks_the_episode() -> None:
     play(actor, reader, 1000)
     assert actor.metrics()["broken_episodes"] > 0
     assert np.isfinite(reader.rows()["reward"]).all()
+
+
+def test_returns_are_the_environments_own_whatever_scales_its_rewards() -> None:
+    records = []
+    for scale in (1.0, 0.5):
+        config = dataclasses.replace(CONFIG, reward_scale=scale)
+        actor, reader = begun(MemoryBus(), config=config)
+        play(actor, reader, 1000)
+        records.append((actor.metrics()["episode_return_mean"], float(reader.rows()["reward"].max())))
+    assert records[0][0] == records[1][0]
+    assert records[0][1] == 2 * records[1][1]
+
+
+def test_environments_made_anew_begin_by_seeds_that_no_other_has() -> None:
+    seeds = []
+
+    class Noted(gym.Wrapper[Any, Any, Any, Any]):
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            seeds.extend([] if seed is None else [seed])
+            return self.env.reset(seed=seed, options=options)
+
+    pool = EnvPool(lambda: Noted(make_env(COUNTING)), 3, SPEC, "actor-0")
+    pool.restart(int)
+    for i in range(3):
+        pool.begin(i)
+    for i in (0, 1, 0, 2):
+        pool.replace(i, EnvFault("it is broken"), step=5)
+        pool.begin(i)
+    pool.close()
+    assert len(set(seeds)) == len(seeds) == 7
 
 
 @pytest.mark.parametrize("known", [False, True])

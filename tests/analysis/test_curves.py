@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from rmc.analysis import curves, history
@@ -83,6 +84,15 @@ def test_an_evaluation_that_was_cut_is_compared_with_no_other(tmp_path: Path) ->
     (past,) = history.read_histories(tmp_path)
     assert [one.return_mean for one in past.evaluations] == [-210.0]
     assert (past.finished, past.initial_return) == (True, None)
+
+
+def test_of_a_checkpoint_that_was_played_twice_the_last_counts(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(to_json(robust("Hopper-v5")))
+    played = {"role": "evaluator", "eval_update": 50, "eval_env_steps": 500, "eval_return_std": 1.0}
+    lines = [played | {"time": 1.0 + score, "eval_return_mean": score} for score in (9.0, 7.0)]
+    (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    (past,) = history.read_histories(tmp_path)
+    assert [one.return_mean for one in past.evaluations] == [7.0]
 
 
 def test_a_warm_start_is_another_agent(tmp_path: Path) -> None:
@@ -197,6 +207,13 @@ def test_a_run_counts_once_and_what_differs_is_told_apart(tmp_path):
     assert curves._named("RMC, 3,000 steps", groups) == "RMC, 3,000 steps (4 seeds, each a line)"
 
 
+def test_runs_a_little_longer_are_as_long():
+    runs = [
+        dataclasses.replace(history_of(seed=seed), env_steps=steps) for seed, steps in enumerate((3000, 3140, 3170))
+    ]
+    assert [len(same) for same in curves.grouped(runs)["HalfCheetah-v5"].values()] == [2, 1]
+
+
 def test_runs_that_are_all_alike_keep_their_name():
     groups = curves.grouped([history_of(seed=seed) for seed in (1, 2)])
     assert list(groups["HalfCheetah-v5"]) == ["RMC"]
@@ -277,6 +294,12 @@ def test_few_seeds_are_lines_and_many_a_band(tmp_path):
     assert (tmp_path / "curves.png").stat().st_size > 10_000
 
 
+def test_a_band_is_drawn_where_all_runs_have_been():
+    lines = [(np.array([start, end]), np.array([1.0, 2.0])) for start, end in ((0, 9), (2, 10), (1, 8), (0, 9), (0, 9))]
+    line = curves.draw_agent(Figure().subplots(), lines, "C0")
+    assert [line.get_xdata()[at] for at in (0, -1)] == [2.0, 8.0]
+
+
 def test_panels_without_an_environment_are_empty(tmp_path, monkeypatch):
     from matplotlib.figure import Figure
 
@@ -304,6 +327,18 @@ def test_the_table_compares_with_a_reference():
     assert ours.split()[-2:] == ["3.00", "1.00"]
     with pytest.raises(ConfigError, match="--reference"):
         curves.tables(curves.grouped(runs), "PPO")
+
+
+def test_an_untrained_agents_return_is_the_mean_over_the_references_seeds():
+    runs = [history_of(last=175.0), *(history_of("SAC", seed=s, last=100.0, initial=50.0 * s) for s in range(2))]
+    ours = next(line for line in shown(curves.tables(curves.grouped(runs), "SAC")).splitlines() if "RMC" in line)
+    assert ours.split()[-2] == "2.00"
+
+
+def test_the_worst_is_of_the_last_evaluations():
+    returns = [-90.0, 5.0, 40.0, 30.0, 10.0, 20.0, 60.0]
+    evaluations = [Evaluation(i, i, float(i), score, 0.0) for i, score in enumerate(returns)]
+    assert curves.cells([dataclasses.replace(history_of(), evaluations=evaluations)])[2] == "10"
 
 
 def test_returns_below_one_are_told_apart():

@@ -84,6 +84,12 @@ def test_the_replay_server_holds_both_back() -> None:
     assert "--replay-shards 2 with --actors 2 in a new run, or" in finding.advice
 
 
+def test_a_replay_server_that_is_busy_holds_no_learner_back_that_never_waits() -> None:
+    finding = bottleneck(vitals(learner=shares(0.99), actor_0=shares(0.3, "credit"), replay=shares(0.95)), CONFIG)
+    assert finding is not None
+    assert finding.name == "learner-bound"
+
+
 @pytest.mark.parametrize(
     ("learner", "actor", "name"),
     [
@@ -115,15 +121,22 @@ def test_only_the_newest_start_counts() -> None:
     assert Vitals([*before, *records(actor_0=shares(0.1, "credit"))]).busy("actor") == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize("seconds", [90, 2])
-def test_a_resume_within_the_minute_is_another_start(seconds: int) -> None:
+@pytest.mark.parametrize(("seconds", "pause"), [(90, 20.0), (2, 20.0), (90, 5.0)])
+def test_a_resume_within_the_minute_is_another_start(seconds: int, pause: float) -> None:
     """What the start before said does not count: not the actors that it had more, nor that it came to its end."""
     before = records(seconds, learner={"finished": 1}, actor_1=shares(1.0), launcher={"start_s": lambda s: 0.1 + s})
     after = records(120, learner={"updates": 5}, replay={"env_steps": 7}, launcher={"start_s": lambda s: 0.2 + s})
-    newest = Vitals([*before, *(one | {"time": one["time"] + seconds + 20.0} for one in after)])
+    newest = Vitals([*before, *(one | {"time": one["time"] + seconds + pause} for one in after)])
     assert newest.roles == ["actor-0", "launcher", "learner", "replay"]
     assert run_faults.silent(newest, CONFIG) is None
     assert run_faults.stalled(newest, CONFIG) is not None
+
+
+def test_of_a_long_start_only_the_newest_counts() -> None:
+    """A stage that held the run back an hour ago does so no more."""
+    assert (
+        vitals(2_000, actor_0=shares(0.0) | {"busy_share": lambda second: float(second > 1_300)}).busy("actor") == 1.0
+    )
 
 
 def test_after_the_clock_was_set_back_the_newest_is_judged() -> None:

@@ -87,6 +87,14 @@ def test_a_run_of_many_actors_has_its_time(tmp_path: Path) -> None:
     assert summary(folder.path).elapsed_s is None
 
 
+def test_a_result_is_the_return_and_not_the_best_where_it_was_cut(tmp_path: Path) -> None:
+    folder = run_in(tmp_path / "run", 0, (20.0, 10.0))
+    for result in (RESULT, RESULT | {"eval_return_mean": 99.0, "eval_cut": 1}):
+        folder.write_result(result)
+        one = summary(folder.path)
+        assert (one.eval_return, one.best_return) == (result["eval_return_mean"], 20.0)
+
+
 @pytest.mark.parametrize("width", [40, 80, 120, 250])
 def test_the_table_fits_and_says_state_steps_and_return(root: Path, width: int) -> None:
     console = Console(file=io.StringIO(), width=width)

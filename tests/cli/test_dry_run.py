@@ -59,6 +59,13 @@ def test_the_speed_is_that_at_which_the_ratio_holds() -> None:
         speed(CONFIG, [])
 
 
+def test_a_warm_up_says_nothing_of_the_speed() -> None:
+    before: list[dict[str, Any]] = [{"role": "learner", "time": 80.0 + second, "updates": 0} for second in range(20)]
+    before += [{"role": "replay", "time": 80.0 + second, "drawn_steps": 0.0} for second in range(20)]
+    before.sort(key=lambda one: one["time"])
+    assert speed(CONFIG, [*before, *records()]).steps_per_s == pytest.approx(60.0)
+
+
 def test_each_need_stands_beside_what_there_is() -> None:
     table = rows(**{"actor-1": RoleUse(50 << 20, 10, 2)})
     row = CONFIG.window_spec().dtype.itemsize
@@ -90,6 +97,11 @@ def test_what_does_not_fit_is_marked(less: dict[str, Any], what: list[str], is_n
     assert [(row.what, row.is_needed) for row in table.values() if row.fits is False] == [
         (one, is_needed) for one in what
     ]
+
+
+def test_a_short_run_keeps_no_more_checkpoints_than_it_makes() -> None:
+    short = dataclasses.replace(CONFIG, total_steps=CONFIG.learner.checkpoint_steps)
+    assert rows(short)["disk, 2 checkpoints"].needs == "4.0 MB"
 
 
 def test_a_run_that_goes_on_needs_what_is_to_come() -> None:

@@ -81,6 +81,14 @@ def test_a_redis_that_lost_its_data_hears_of_the_learners_epoch_again(redis_url)
     assert bus.take_epoch("learner") == epoch + 1
 
 
+def test_a_redis_that_lost_its_data_hears_of_the_replay_servers_epoch_again(bus):
+    """Else the next server would begin below it, and both would write."""
+    bus.commit(ReplayOwner("replay", 7), {0: Ack(EntryId(1, 0), 0)})
+    assert bus.current_epoch("replay") == 7
+    with pytest.raises(FencedError):
+        bus.commit(ReplayOwner("replay", 6), {0: Ack(EntryId(1, 1), 0)})
+
+
 def test_an_older_epoch_is_fenced(bus):
     bus.append(0, EntryId(1, 0), b"")
     bus.append(0, EntryId(2, 0), b"")

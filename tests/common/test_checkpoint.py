@@ -123,6 +123,20 @@ def test_a_half_written_checkpoint_is_not_seen(tmp_path):
     assert not (tmp_path / ".tmp-000000005").exists()
 
 
+def test_it_is_on_the_disk_before_it_has_its_name_and_then_its_name_is(tmp_path, monkeypatch):
+    """Else after a power cut there is one that is not whole, or none though an older one was dropped for it."""
+    folder, synchronised, fsync = CheckpointFolder(tmp_path), [], os.fsync
+
+    def watched(handle: int) -> None:
+        fsync(handle)
+        synchronised.append((Path(f"/proc/self/fd/{handle}").readlink().name, folder.path(1).exists()))
+
+    monkeypatch.setattr(os, "fsync", watched)
+    folder.save(1, FILES)
+    before = [(name, False) for name in (*FILES, "manifest.json", ".tmp-000000001")]
+    assert synchronised == [*before, (tmp_path.name, True)]
+
+
 def test_two_writers_exclude_each_other(tmp_path, monkeypatch):
     monkeypatch.setattr("rmc.common.process.file_lock.LOCK_SECONDS", 0.2)
     first, second = CheckpointFolder(tmp_path / "c"), CheckpointFolder(tmp_path / "c")

@@ -6,6 +6,7 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run import metrics_tail
@@ -55,6 +56,18 @@ def test_every_option_may_change_or_is_refused_with_the_reason(path: str, folder
         assert repr(flat(changed)[path]) in str(no.value)
         assert folder.config() == CONFIG
         assert len(starts(folder)) == 1
+
+
+def test_a_run_goes_on_from_an_older_checkpoint_and_is_refused_where_none_is_whole(folder: RunFolder) -> None:
+    checkpoints = CheckpointFolder(folder.checkpoints)
+    for number in (1, 2):
+        checkpoints.save(number, {"learner.pt": b"whole"})
+    (checkpoints.path(2) / "learner.pt").write_bytes(b"other")
+    open_run(CONFIG, LaunchOptions(folder.path)).lock.release()
+    (checkpoints.path(1) / "learner.pt").write_bytes(b"other")
+    message = "000000002: learner.pt does not match its manifest; none is whole, so use another"
+    with pytest.raises(ConfigError, match=message):
+        open_run(CONFIG, LaunchOptions(folder.path))
 
 
 def test_a_start_that_is_refused_once_it_has_the_lock_writes_nothing(folder: RunFolder) -> None:

@@ -5,8 +5,10 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import psutil
 import pytest
 
 from rmc.common.errors import RoleDied
@@ -98,6 +100,37 @@ def test_the_interpreters_words_of_a_hang_are_its_last(quick: Path) -> None:
     role = RoleProcess(RoleCommand("actor-0", ("actor",)), {}, quick)
     role.log.write_text("before\nTimeout (0:01:06)!\n" + "Thread\n" * 30)
     assert role.last_words().startswith("Timeout (0:01:06)!\nThread")
+
+
+def test_an_earlier_starts_words_are_not_its_last(quick: Path) -> None:
+    Path(supervisor.sys.executable).write_text("#!/bin/sh\necho new\n")
+    role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {}, quick)
+    role.log.write_text("Traceback (most recent call last)\nold\n")
+    role.start()
+    tend_until(role)
+    assert role.last_words() == "new"
+
+
+def test_each_quick_death_doubles_the_wait(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not so one that others have ended."""
+    monkeypatch.setattr(supervisor, "FIRST_BACKOFF", 0.25)
+    monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic=lambda: 100.0))
+    role, waits = RoleProcess(RoleCommand("actor-0", ("actor",)), {}, quick), []
+    role._started_at = 99.0
+    for status in (1, 1, -9, 1):
+        role._note_death(status)
+        waits.append(role._start_at - 100.0)
+    assert waits == [0.5, 1.0, 0.25, 0.5]
+
+
+def test_what_a_role_has_started_goes_before_it_is_started_again(quick: Path) -> None:
+    """Else two of its environments' simulators would have one port, or one display."""
+    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\nsleep 60 &\necho $! >> {quick}/pids\nexit 0\n")
+    role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {}, quick)
+    role.start()
+    tend_until(role)
+    pid = int((quick / "pids").read_text())
+    wait_until(lambda: not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE, 5.0)
 
 
 @pytest.mark.parametrize("end", ["kill -9 $$", "kill -15 $$", f"exit {TERMINATED_STATUS}"])

@@ -5,6 +5,7 @@ import io
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
@@ -15,6 +16,7 @@ from rmc.common.agent_config import POLICY_PARTS
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.common.replay import ObservationStatistics
 from rmc.deploy.local.lockstep import Lockstep
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
@@ -124,6 +126,18 @@ def test_the_normaliser_goes_on_from_the_sources(source: RunFolder, tmp_path: Pa
         mean = (theirs * 1_200 + torch.from_numpy(own.total)) / (1_200 + int(own.count[0]))
         run.close()
         torch.testing.assert_close(published(run)["normalizer.mean"], mean.float(), atol=1e-3, rtol=1e-3)
+
+
+def test_the_sums_behind_the_normaliser_are_of_the_sources_mean_and_deviation(
+    source: RunFolder, tmp_path: Path
+) -> None:
+    theirs = state(source)["agent"]
+    newest = CheckpointFolder(begin(OTHER, tmp_path / "run", source).checkpoints).latest()
+    assert newest is not None
+    observed = ObservationStatistics.from_json(json.loads(newest[1]["progress.json"])["observed_before"])
+    mean, std = (theirs[f"normalizer.{name}"].double().numpy() for name in ("mean", "std"))
+    np.testing.assert_allclose(observed.total / observed.count, mean, rtol=1e-9)
+    np.testing.assert_allclose(observed.total_square / observed.count, std**2 + mean**2, rtol=1e-9)
 
 
 def test_the_normaliser_of_a_source_that_has_not_begun_is_its_own_sources(source: RunFolder, tmp_path: Path) -> None:

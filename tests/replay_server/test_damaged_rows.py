@@ -121,6 +121,16 @@ def test_a_fault_has_its_name(name: str, value: float, fault: str) -> None:
     assert [FAULTS[code] for code in row_faults(rows, SPEC)] == ["", "", fault, "", ""]
 
 
+def test_the_first_and_the_last_that_can_be_are_taken() -> None:
+    rows = make_rows(10)
+    rows["first"][:2], rows["episode_step"][:2] = 0, [SPEC.burn_in - 1, SPEC.burn_in]
+    rows["new_steps"] = rows["new_observations"] = [1] * 4 + [3, 2, 2, 2, 2, 2]
+    rows["last"][2:6] = [SPEC.burn_in, SPEC.burn_in + 1, SPEC.burn_in + 2, SPEC.burn_in + 2]
+    rows["new_observations"][6:] = [1, 2, 3, 4]
+    assert [FAULTS[fault] for fault in row_faults(rows, SPEC)] == slow_faults(rows)
+    assert np.flatnonzero(row_faults(rows, SPEC)).tolist() == [0, 2, 4, 6, 9]
+
+
 @pytest.mark.parametrize("value", [3e38, np.nan, np.inf, -1.0, 0.0, 9.0])
 def test_a_priority_beyond_the_largest_seen_is_not_believed_after_a_restart(
     make: Make, bus: MemoryBus, value: float

@@ -119,6 +119,21 @@ def test_most_streams_and_the_ratio_fit_into_a_record(obs_dim: int) -> None:
     assert (len(read.streams), read.replay_ratio) == (4096, 4.0)
 
 
+@pytest.mark.parametrize("commits", [3, 4])
+def test_after_a_restart_the_older_record_is_replaced(commits: int) -> None:
+    """Were it the newer one, a crash before the next commit would take the ring back by some."""
+    region = np.zeros(2 * record_bytes(SPEC.obs_dim, 1), np.uint8)
+    records = RecordPair(region, SPEC.obs_dim, 1)
+    for number in range(1, commits + 1):
+        records.write(Progress(SPEC.obs_dim, 1, draws=number))
+    for number in (commits, commits + 1):
+        again = RecordPair(region, SPEC.obs_dim, 1)
+        read = again.read()
+        assert read is not None
+        assert read.draws == number
+        again.write(Progress(SPEC.obs_dim, 1, draws=number + 1))
+
+
 def test_too_many_streams() -> None:
     progress = Progress(SPEC.obs_dim, 1)
     progress.streams = {actor: StreamPosition(EntryId(1, 0), 0) for actor in range(4097)}

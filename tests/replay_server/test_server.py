@@ -11,7 +11,7 @@ import pytest
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import Bus, EntryId, Version
 from rmc.common.bus.redis_bus import RedisBus
-from rmc.common.errors import BusUnavailable, FencedError
+from rmc.common.errors import BusFull, BusUnavailable, FencedError
 from rmc.common.replay import ObservationStatistics, SampleStatus
 from rmc.common.window import WindowSpec
 from rmc.common.wire import encode_windows
@@ -71,6 +71,15 @@ def test_new_windows_enter_with_their_own_or_the_largest_priority(make: Make, bu
     sender.send_rows(rows)
     drain(server)
     assert server._store.priorities[:5].tolist() == [0.5, 6.0, 6.0, 2.0, 6.0]
+
+
+def test_slots_that_hold_no_window_raise_no_new_windows_priority(make: Make, bus: MemoryBus) -> None:
+    """They hold 1 from the start, while temporal differences may all be far below."""
+    server, sender = filled(make(), bus, 2)
+    server.update_priorities(np.array([0, 1]), np.array([0.5, 0.25], np.float32))
+    sender.send(1)
+    drain(server)
+    assert server._store.priorities[:3].tolist() == [0.5, 0.25, 0.5]
 
 
 def test_a_priority_that_was_corrected_is_no_new_windows(make: Make, bus: MemoryBus) -> None:
@@ -271,6 +280,18 @@ def test_small_credit_is_published_late_but_at_once_where_the_learner_waits(make
     assert sender.granted() < draws * 256 // 100 + 800
     server.step()
     assert sender.granted() == draws * 256 // 100 + 800
+
+
+def test_the_clock_repeats_what_was_published_and_no_more(make: Make, bus: MemoryBus) -> None:
+    """Or in lockstep it would decide when an actor may step."""
+    config = ReplayConfig(capacity=1000, replay_ratio=100.0, warmup_steps=0)
+    server, sender = filled(make(config, actors=1, slack=800), bus, 2)
+    server.sample(64)
+    before = sender.granted()
+    for _ in range(2):
+        server._credit._republish_at = 0.0
+        server.step()
+        assert sender.granted() == before
 
 
 def test_the_end_is_announced_and_reached(make: Make, bus: MemoryBus) -> None:
@@ -537,6 +558,19 @@ def test_what_is_refused_is_refused_once_though_redis_goes_away(make: Make) -> N
         drain(server)
     drain(server)
     assert server.stats()["dead_letters"] == len(bus.dead_letters) == 1
+
+
+def test_what_is_refused_while_redis_is_full_keeps_nobody_waiting(
+    make: Make, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only the commit after it makes room."""
+    server, sender = make(), Sender(bus)
+    monkeypatch.setattr(bus, "dead_letter", Mock(side_effect=BusFull("full")))
+    sender.send_raw(b"junk")
+    sender.send(2)
+    drain(server)
+    assert (server.stats()["dead_letters"], len(stored(server))) == (1, 2)
+    assert bus.read({0: EntryId(0, -1)}, 10) == []
 
 
 @pytest.mark.parametrize("bad", [EntryId(2**64 - 1, 2**64 - 1), EntryId(1, 2**63), EntryId(2**31, 0)])

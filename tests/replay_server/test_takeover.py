@@ -13,7 +13,7 @@ from rmc.common.errors import ConfigError, FencedError
 from rmc.common.replay import SampleStatus
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.recovery import valid_leaves
-from tests.replay_server.support import Make, Sender, close, drain, filled, make_rows, stored
+from tests.replay_server.support import SPEC, Make, Sender, close, drain, filled, make_rows, stored
 
 
 def test_an_empty_ring_goes_on_amid_a_life(make: Make, bus: MemoryBus) -> None:
@@ -79,6 +79,13 @@ def test_a_ring_that_is_ahead_of_what_was_published_stays(make: Make, bus: Memor
     close(server)
     bus._progress["replay"] = published
     assert stored(make())["reward"][:, 0].tolist() == list(range(6))
+
+
+def test_draws_after_what_was_published_stay(make: Make, bus: MemoryBus) -> None:
+    server, _ = filled(make(), bus, 4)
+    server.sample(4)
+    close(server)
+    assert make().stats()["drawn_steps"] == 4 * SPEC.train
 
 
 @pytest.mark.parametrize("published", [b"x", b"\0" * 200, b"\xff" * 128])
@@ -224,6 +231,17 @@ def test_a_power_cut_loses_the_end_of_a_ring_alone(
     assert server._store.ring.holds(np.arange(48, 56)).tolist() == [True] * 2 + [False] * 3 + [True] * 2 + [False]
 
 
+def test_draws_that_a_power_cut_has_lost_count(make: Make, bus: MemoryBus, tmp_path: Path) -> None:
+    """Though nothing came in after them."""
+    server, _ = filled(make(actors=1), bus, 50)
+    shutil.copytree(tmp_path / "replay", tmp_path / "on disk")
+    server.sample(4)
+    server._credit._republish_at = 0.0
+    server.step()
+    after = make(folder="on disk", actors=1).stats()
+    assert (after["draws"], after["drawn_steps"]) == (1, 4 * SPEC.train)
+
+
 def test_a_ring_of_which_nothing_is_left_begins_empty(make: Make, bus: MemoryBus) -> None:
     config = ReplayConfig(capacity=100, replay_ratio=2.0, warmup_steps=20)
     server, sender = filled(make(config, actors=1), bus, 12)
@@ -252,6 +270,7 @@ def test_a_ring_that_is_ahead_of_another_that_came_after_it_goes(make: Make, bus
     close(old)
     close(new)
     again = make(folder="old")
+    assert again._store.tree.total == 0.0  # so that a warm-up is collected once more
     drain(again)
     ack = bus.ack(1)
     assert ack is not None

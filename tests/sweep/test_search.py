@@ -152,6 +152,7 @@ def test_an_evaluation_that_was_cut_is_not_what_a_search_looks_for(tmp_path: Pat
     index.end(job, Ending("finished", 1.0))
     assert [trial.value for trial in work.plan._study.trials] == [-800.0]
     assert index.lines[job.name]["return"] == -800.0
+    assert index.lines[job.name]["env_steps"] == read_job(job)[0].total_steps
     assert [trial.value for trial in work_of(tmp_path, index, spec_of()).plan._study.trials] == [-800.0]
     lost = work.plan.next()
     pretend(lost, [-20.0], finished=False)

@@ -188,6 +188,17 @@ def test_a_full_disk_ends_a_sweep_but_its_runs_save_first(tmp_path: Path, monkey
     assert at_work[1].done == []
 
 
+def test_one_that_does_not_end_in_time_is_killed(tmp_path: Path) -> None:
+    run = Saving()
+    one = pool._AtWork(Job(tmp_path / "trial-0", (), 0), cast(Any, run), 0.0)
+    one.stop()
+    one.stop()
+    assert run.done == ["stop"]
+    one.deadline = 0.0
+    one.stop()
+    assert run.done == ["stop", "kill"]
+
+
 @pytest.mark.parametrize("status", [pool.STOPPED_STATUS, -signal.SIGTERM, 1])
 def test_what_is_stopped_as_hopeless_is_over_however_early_that_was(tmp_path: Path, status: int) -> None:
     """Asked while it still imports, a run cannot save, and would be started and stopped for ever."""
@@ -217,6 +228,16 @@ def test_a_killed_sweeps_runs_are_not_told_as_running_and_tables_are_not_cut(tmp
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "0.99991" in text
     assert "0.99992" in text
+
+
+def test_a_runs_seconds_are_of_all_its_starts(tmp_path: Path) -> None:
+    job = made(tmp_path / "sweep" / "0")
+    for state, seconds in (("stopped", 1.5), ("finished", 2.0)):
+        with closing(Index(tmp_path / "sweep")) as index:
+            index.begin(job)
+            index.end(job, pool.Ending(cast(Any, state), seconds))
+            total = index.lines[job.name]["seconds"]
+    assert total == 3.5
 
 
 def test_a_trials_values_stand_under_their_names(tmp_path: Path) -> None:
