@@ -18,6 +18,7 @@ import pytest
 import torch
 
 import rmc
+from rmc import api
 from rmc.cli.signals import signals_caught, signals_interrupt
 from rmc.common.errors import STOPPED_STATUS
 from rmc.deploy.run.config import checked, to_json
@@ -168,6 +169,24 @@ def test_gymnasiums_classes_under_an_id_or_a_limit_of_ones_own_are_refused(
     with pytest.raises(rmc.ConfigError, match=rf"^ENV='{name}': is registered in this process"):
         rmc.train(rmc.presets.debug(name), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_what_gymnasium_registers_by_a_function_is_known_to_all() -> None:
+    """Its text has an address, which is another in each process."""
+    functions = [spec for spec in gymnasium.registry.values() if not isinstance(spec.entry_point, str)]
+    assert api._is_known_to_all(functions[0])
+
+
+def test_a_callbacks_error_is_raised_at_once_where_a_program_around_python_hears_ctrl_c(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It would reach that program, not the run."""
+    callback = api._Callback(lambda record: record["none"])
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    monkeypatch.setattr(signal, "raise_signal", lambda number: pytest.fail("it was sent to the program"))
+    with pytest.raises(KeyError):
+        callback({})
+    assert isinstance(callback.error, KeyError)
 
 
 def test_an_error_reaches_another_process_whole() -> None:
