@@ -28,6 +28,7 @@ from rmc.replay_server.socket_server import SocketServer
 from tests.replay_server import served as served_module
 from tests.replay_server.served import BIG, MAX_BATCH, SECRET, Served
 from tests.replay_server.support import SPEC, make_rows, write_steps
+from tests.waiting import wait_until
 
 Serve = Callable[..., Served]
 Frame = Callable[[bytes], tuple[Kind, dict[str, Any]]]  # of a client's nonce
@@ -110,6 +111,8 @@ def test_memory_is_shared_once_and_with_this_machine_alone(serve: Serve) -> None
     near, far = serve(), serve(address="tcp:127.0.0.1:0")
     twice, remote = near.connect(), far.connect()
     assert (twice.share(SPEC, 8) is not None) == hasattr(os, "memfd_create")
+    kind, rows, _ = draw(twice, 16)  # of another size than is shared
+    assert (kind, len(rows)) == (Kind.BATCH, 16)
     for served, connection in ((near, twice), (far, remote)):
         connection.send(Kind.SHARE, {"batch_size": 8})
         served.refused("kind")
@@ -374,17 +377,22 @@ def test_half_a_header_or_half_a_body_keeps_nobody_waiting(serve: Serve) -> None
 
 
 def test_a_client_that_does_not_read_keeps_nobody_waiting_and_gets_its_own_batch(serve: Serve) -> None:
-    served = serve(ReplayConfig(capacity=60_000, replay_ratio=1e9, warmup_steps=0), windows=3000)
+    config = ReplayConfig(capacity=60_000, replay_ratio=1e9, warmup_steps=0, priority_exponent=1.0)
+    served = serve(config, windows=3000)
     silent, busy = served.connect(), served.connect()
+    serials = np.arange(3000)
+    priorities = 1.0 + serials.astype(np.float32)
+    silent.send(Kind.PRIORITIES, {"count": 3000}, (serials.tobytes(), priorities.tobytes()))
     silent._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     for _ in range(30):  # more than the kernel's buffers take
         silent.send(Kind.SAMPLE, {"batch_size": MAX_BATCH, "elsewhere": 0})
     for _ in range(20):
         assert draw(busy, MAX_BATCH)[0] is Kind.BATCH  # each takes the buffer that a batch unsent may lie in
     for _ in range(30):
-        kind, rows, _ = receive(silent, MAX_BATCH)  # its CRC is checked there
+        kind, rows, weights = receive(silent, MAX_BATCH)
         assert kind is Kind.BATCH
         assert (rows["reward"][:, 0] == rows["serial"]).all()
+        assert np.array_equal(weights, 1.0 + rows["serial"])  # all whole rows have one CRC: these are the draw's own
     silent.close()
     busy.close()
 
@@ -472,8 +480,10 @@ def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> Non
         draws = [client.sample(16) for _ in range(6)]
         assert [sample.status for sample in draws[2:]] == [SampleStatus.BATCH] * 4
         assert draws[-1].env_steps == 200 * SPEC.train
+        wait_until(lambda: served.replay.stats()["drawn_steps"] > draws[-1].drawn_steps, 5.0)  # one ahead
         client.update_priorities(np.arange(16), np.full(16, 3.0, np.float32))
         assert client.statistics().count == 200 * SPEC.train
+        wait_until(lambda: served.replay._store.priorities[15] == 3.0, 5.0)  # went out before the question
         episode = client.episode(7)  # every window here is an episode of its own
         assert episode is not None
         assert episode["serial"].tolist() == [7]

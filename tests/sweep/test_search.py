@@ -136,6 +136,7 @@ def test_a_run_below_the_median_is_pruned_once_enough_are_finished(tmp_path: Pat
     again = work_of(tmp_path, index, spec_of(7))  # what is pruned stays so, the others go on
     assert [job.name for job in again.todo] == [poor.name, good.name]
     assert [again.plan.next().values for _ in range(2)] == [poor.values, good.values]
+    assert again.plan.is_hopeless(poor)  # by what those of before made on the way
     assert again.plan.next() is None
     assert not work_of(tmp_path, index, spec_of(prune=False)).plan.is_hopeless(good)
 
