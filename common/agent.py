@@ -1,7 +1,7 @@
 """The agent's networks: memory, world model, imputer, policy, temperature; critics are in ``common/critic.py``.
 
-Shapes: B batch, T time, O observation, A action, H hidden, E embedding, Z = H (+ E) head input, M flags of what is
-missing (1 for a whole frame, or O), P privileged numbers, which critics alone read.
+Shapes: B batch, T time, O observation, A action, H hidden, E embedding, Z = H, O or H + O head input, M flags of what
+is missing (1 for a whole frame, or O), P privileged numbers, which critics alone read.
 Equations are in ``learner/losses.py``; here is only what maps inputs to outputs.
 """
 

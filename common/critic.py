@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from rmc.common.agent_config import AgentConfig
 
-VARIANCE_FLOOR = 1e-3  # added, so that a unit that hardly moves is not blown up
-STATISTICS_SHARE = 0.01  # of a batch in the running statistics
+VARIANCE_EPS = 1e-3  # added, so that a unit that hardly moves is not blown up
+MOMENTUM = 0.01  # of the running statistics: a batch's share in them
 
 
 class StackedLinear(nn.Module):
@@ -52,9 +52,9 @@ class BatchNorm(nn.Module):
             weight = share.unsqueeze(-1)
             mean = (weight * x).sum(1, keepdim=True)
             variance = (weight * (x - mean).square()).sum(1, keepdim=True)
-            self.mean.lerp_(mean.detach(), STATISTICS_SHARE)
-            self.variance.lerp_(variance.detach(), STATISTICS_SHARE)
-        normed = (x - mean) * (variance + VARIANCE_FLOOR).rsqrt()
+            self.mean.lerp_(mean.detach(), MOMENTUM)
+            self.variance.lerp_(variance.detach(), MOMENTUM)
+        normed = (x - mean) * (variance + VARIANCE_EPS).rsqrt()
         return normed if self.gain is None or self.offset is None else normed * self.gain + self.offset
 
 

@@ -68,11 +68,6 @@ def _places(spec: WindowSpec) -> dict[str, tuple[tuple[int, ...], tuple[int, ...
     return places
 
 
-@cache
-def _times(count: int, device: torch.device) -> Tensor:
-    return torch.arange(count, dtype=torch.int32, device=device).unsqueeze(0)
-
-
 def _real(first: Any, last: Any, t: Any) -> tuple[Any, Any]:
     """Which observations and steps of windows are no padding: (B, 1), (B, 1), (1, T + 1) -> (B, T + 1), (B, T)."""
     observed = (first <= t) & (t <= last)
@@ -135,7 +130,7 @@ def view_batch(raw: Tensor, importance: Tensor, spec: WindowSpec, plan: Plan | N
     action, prev = field(floats, "action")[:, :steps], field(floats, "prev_action")
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action], dim=1)
     prev_action.scatter_(1, first.long().view(-1, 1, 1).expand(-1, 1, prev.shape[1]), prev.unsqueeze(1))
-    t = _times(steps + 1, raw.device)
+    t = torch.arange(steps + 1, dtype=torch.int32, device=raw.device).unsqueeze(0)
     observation_valid, step_valid = _real(first.unsqueeze(1), last, t)
     ends = (t[:, :-1] == last - 1) & (field(integers, "terminated").unsqueeze(1) > 0)
     return Batch(

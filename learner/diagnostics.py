@@ -6,7 +6,7 @@ Staleness is R2D2's (Kapturowski et al., 2019, section 3), with Q of the actions
 """
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,19 +18,6 @@ from rmc.common.window import BoolArray, Floats, Rows, WindowSpec
 from rmc.learner import losses
 
 SLICE = 4  # windows of a batch that are looked at
-
-
-class Trace(NamedTuple):
-    """What critics, policy and temperature computed on their way, without gradient, to be measured."""
-
-    losses: dict[str, Tensor]  # scalars
-    alpha: Tensor  # scalar
-    log_pi: Tensor  # (B, L_t)
-    q: Tensor  # (2, B, L_t)
-    td_error: Tensor  # (B, L_t)
-    curiosity: Tensor  # (B, L_t)
-    reward: Tensor  # (B, L_t)
-    m: Tensor  # (B, L_t), which steps are real
 
 
 def model_metrics(
@@ -46,15 +33,20 @@ def model_metrics(
     }
 
 
-def value_metrics(trace: Trace, beta: Tensor) -> dict[str, Tensor]:
-    """Scalars of the critics' and the policy's pass."""
-    m, i = trace.m, trace.curiosity
-    return trace.losses | {
-        "alpha": trace.alpha,
-        "entropy": -losses.masked_mean(trace.log_pi, m),
-        "q_mean": losses.masked_mean(trace.q.mean(0), m),
-        "td_error": losses.masked_mean(trace.td_error, m),
-        "curiosity_share": beta * i.sum() / (beta * i.sum() + (m * trace.reward.abs()).sum()).clamp(min=1e-8),
+def value_metrics(
+    of_losses: dict[str, Tensor], alpha: Tensor, log_pi: Tensor, q: Tensor, td_error: Tensor, i: Tensor, r: Tensor,
+    m: Tensor, beta: Tensor,
+) -> dict[str, Tensor]:  # fmt: skip
+    """Scalars of the critics' and the policy's pass, from what it computed without gradient.
+
+    ``alpha`` and ``beta`` are scalars, q (2, B, L_t), curiosity i and the others (B, L_t).
+    """
+    return of_losses | {
+        "alpha": alpha,
+        "entropy": -losses.masked_mean(log_pi, m),
+        "q_mean": losses.masked_mean(q.mean(0), m),
+        "td_error": losses.masked_mean(td_error, m),
+        "curiosity_share": beta * i.sum() / (beta * i.sum() + (m * r.abs()).sum()).clamp(min=1e-8),
     }
 
 

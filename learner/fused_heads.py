@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from rmc.common.agent import Float32Linear
-from rmc.common.critic import STATISTICS_SHARE, VARIANCE_FLOOR, BatchNorm, StackedLinear, TwinQ, shares
+from rmc.common.critic import MOMENTUM, VARIANCE_EPS, BatchNorm, StackedLinear, TwinQ, shares
 from rmc.learner import kernels
 from rmc.learner.rounded import BF16, Rounded, applies, bits
 
@@ -63,8 +63,8 @@ class _Norm(NamedTuple):
             mean, variance = torch.empty_like(mean), torch.empty_like(variance)
             kernels.statistics(bits(x), self.share.numpy(), mean.numpy(), variance.numpy())
             for old, new in zip(running, (mean, variance), strict=True):
-                old.lerp_(new, STATISTICS_SHARE)
-        scale, normed = (variance + VARIANCE_FLOOR).rsqrt(), torch.empty_like(x)
+                old.lerp_(new, MOMENTUM)
+        scale, normed = (variance + VARIANCE_EPS).rsqrt(), torch.empty_like(x)
         if layer.gain is None or layer.offset is None:
             kernels.normalize(bits(x), mean.numpy(), scale.numpy(), bits(normed))
             return _Normed(normed, normed, scale)

@@ -1,7 +1,8 @@
 """The priority that a window enters the replay with, by the networks of the actor that made it.
 
-The learner's own TD error (one-step or n-step, ``learner/losses.py``) and eta-mix, with the critics as they were
-last broadcast in the place of the targets, and without curiosity. Handed to actors by ``deploy/``.
+The learner's own TD error (one-step or n-step, ``learner/losses.py``) and eta-mix, a' sampled from the policy at every
+step. The critics as they were last broadcast take the targets' place; curiosity is left out. Handed to actors by
+``deploy/``.
 """
 
 import numpy as np
@@ -30,7 +31,7 @@ class InitialPriority:
         self._generator = torch.Generator()
 
     def reseed(self, seed: int) -> None:
-        """Of the actions that the policy is asked for."""
+        """Of a' at every step."""
         self._generator.manual_seed(seed)
 
     def load(self, blob: bytes) -> None:

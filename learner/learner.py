@@ -80,7 +80,7 @@ class Learner:
         self._save_at, self._checkpoint_error = 0.0, ""
         self._slowest, self._save_seconds = 0.0, checkpoints.last_save()  # of an update, of the last save
         self._make_networks(agent, update, seed, two_processes)
-        self._threads, self._processes = ThreadTrial(threads, self._updated.use_threads), 1 + two_processes
+        self._threads, self._processes = ThreadTrial(threads, self._runner.use_threads), 1 + two_processes
         self._drawn: deque[Drawn] = deque()  # what is being learnt from
         self._metrics = LearnerMetrics(self.agent, spec, replay)
         self._returning: deque[tuple[NDArray[np.int64], HostCopy]] = deque()  # priorities, and of which windows
@@ -92,8 +92,8 @@ class Learner:
         self.agent = initial_agent(self.spec, agent, seed).to(self.device)
         bf16 = set_precision(self.config.precision, self.device)
         self.update = make_update(self.agent, update, seed, bf16)
-        updated = PipelinedUpdate if two_processes else DeviceUpdate
-        self._updated: DeviceUpdate | PipelinedUpdate = updated(self.update, self.spec, self.config.batch_size)
+        runner = PipelinedUpdate if two_processes else DeviceUpdate
+        self._runner: DeviceUpdate | PipelinedUpdate = runner(self.update, self.spec, self.config.batch_size)
 
     def _begin(self) -> None:
         """Lock the checkpoints, go on from the newest, and become the run's one learner, in an epoch of its own.
@@ -145,7 +145,7 @@ class Learner:
         began = time.perf_counter()
         self._learn(sample)
         self._note_pace(time.perf_counter() - began)
-        if self.env_steps >= self._next_checkpoint:
+        if self.env_steps >= self._next_checkpoint and time.monotonic() >= self._save_at:
             self._flush()
             self.checkpoint()
         return True
@@ -161,7 +161,7 @@ class Learner:
         self._drawn.append(Drawn.of(rows, self.spec))
         number = self.updates + len(self._drawn)
         beta = self.update.config.beta(self.env_steps)
-        for updated in self._updated(raw, torch.from_numpy(weights), beta, number):
+        for updated in self._runner(raw, torch.from_numpy(weights), beta, number):
             self._finish(updated)
         if number % self.config.publish_updates == 0 or needs_weights(number):
             self._finish_pending()
@@ -174,7 +174,7 @@ class Learner:
             self.checkpoints.note_save(self._save_seconds + seconds)
 
     def _finish_pending(self) -> None:
-        for updated in self._updated.drain():
+        for updated in self._runner.drain():
             self._finish(updated)
 
     def _finish(self, updated: UpdateResult) -> None:
@@ -182,7 +182,7 @@ class Learner:
         self.updates += 1
         drawn = self._drawn.popleft()
         self._returning.append((drawn.serial, HostCopy(updated.priorities)))
-        self._return_priorities(leave=self._updated.in_flight)
+        self._return_priorities(leave=self._runner.in_flight)
         self._metrics.measure(self.updates, updated, drawn)
         if self.updates % self.config.publish_updates == 0:
             self.publish()
@@ -242,24 +242,21 @@ class Learner:
             return False
         self._freeze_statistics()
         try:
-            self.save()
+            policy = self.save()
         except CheckpointError as error:
             log.warning("%s; trying again in %.0f s", error, SAVE_AGAIN_SECONDS)
             self._save_at = time.monotonic() + SAVE_AGAIN_SECONDS
             self._checkpoint_error = error.reason
             return False
-        self._checkpoint_error = ""
-        self.last_checkpoint, self._checkpoint_steps = self.updates, self.env_steps
         self._next_checkpoint = self._after(self.env_steps)
-        averaged = self._serialize_finite(self.update.average.policy_weights())
         try:
             self.publish()
         finally:  # an outage between the two costs neither
-            self._evaluated.publish(Version(self.epoch, self.updates), averaged)
+            self._evaluated.publish(Version(self.epoch, self.updates), policy)
         return True
 
-    def save(self) -> None:
-        """Write everything that a resumed learner needs.
+    def save(self) -> bytes:
+        """Write everything that a resumed learner needs; returns the policy's file.
 
         Raises CheckpointError where that cannot be, RmcError where any of it is not finite.
         """
@@ -273,6 +270,8 @@ class Learner:
         self.checkpoints.save(self.updates, pack(state, policy, progress))
         self._save_seconds = time.monotonic() - began
         self.checkpoints.note_save(self._save_seconds + self._slowest)
+        self.last_checkpoint, self._checkpoint_steps, self._checkpoint_error = self.updates, self.env_steps, ""
+        return policy
 
     def _after(self, env_steps: int) -> int:
         return (env_steps // self.config.checkpoint_steps + 1) * self.config.checkpoint_steps
@@ -328,5 +327,5 @@ class Learner:
                     self.save()
         except RmcError as error:  # diverged since the last look, or no room: the checkpoint before is kept
             log.warning("%s; the checkpoint of update %d is the last", error, self.last_checkpoint)
-        self._updated.close()
+        self._runner.close()
         self.checkpoints.unlock()

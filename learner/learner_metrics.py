@@ -3,7 +3,8 @@
 Shapes: B batch.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from rmc.learner.update import UpdateResult
 
 METRICS_UPDATES = 20  # updates between looks at the update's metrics: each look waits for the device
 INSIGHT_UPDATES = 500  # updates between looks at what takes longer: the latent's rank and the states' staleness
+OF_MEMORY = {"model_unexplained", "latent_rank", "latent_deviation"}  # metrics of h
 
 
 class Drawn(NamedTuple):
@@ -49,14 +51,11 @@ class LearnerMetrics:
     def measure(self, update: int, updated: UpdateResult, drawn: Drawn) -> None:
         """After an update."""
         if update % METRICS_UPDATES == 0:
-            age = update - drawn.weights_update
-            means = {"sample_age_mean": age.mean(), "sample_age_max": age.max(), **updated.metrics}
-            for name, value in means.items():
-                self._means.add(name, float(value))
+            age = np.maximum(update - drawn.weights_update, 0)  # below 0 is of updates that a kill undid
+            self._add({"sample_age_mean": age.mean(), "sample_age_max": age.max(), **updated.metrics})
         if needs_weights(update):
             rank, deviation = latent_rank(updated.hidden[updated.observed])
-            self._means.add("latent_rank", rank)
-            self._means.add("latent_deviation", deviation)
+            self._add({"latent_rank": rank, "latent_deviation": deviation})
             self._unexplained = [round(share, 4) for share in updated.observation_unexplained.tolist()]
             self._measure_staleness(drawn)
 
@@ -64,8 +63,14 @@ class LearnerMetrics:
         """How far stored states are from what today's weights would remember."""
         for serial in drawn.serial[drawn.measurable][:SLICE].tolist():
             episode = self._replay.episode(serial)
-            for name, value in (staleness(self._agent, self._spec, episode) if episode is not None else {}).items():
-                self._means.add(name, value)
+            if episode is not None:
+                self._add(staleness(self._agent, self._spec, episode))
+
+    def _add(self, values: Mapping[str, SupportsFloat]) -> None:
+        """To the means; without a memory, h is zeros and there is nothing to say of it."""
+        for name, value in values.items():
+            if self._agent.config.head_input != "observation" or name not in OF_MEMORY:
+                self._means.add(name, float(value))
 
     def take(self, updates: int) -> dict[str, Any]:
         """The metrics since the last call."""

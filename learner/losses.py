@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-NORM_FLOOR = 1e-12  # keeps the root's gradient finite at zero
+NORM_EPS = 1e-12  # keeps the root's gradient finite at zero
 
 
 def masked_mean(x: Tensor, m: Tensor) -> Tensor:
@@ -30,7 +30,7 @@ def model_error(predicted_change: Tensor, change: Tensor, norm: Literal["l1", "l
     difference = predicted_change - change.detach()
     if norm == "l1":
         return difference.abs().mean(-1)
-    return (difference.square().mean(-1) + NORM_FLOOR).sqrt()
+    return (difference.square().mean(-1) + NORM_EPS).sqrt()
 
 
 def model_loss(error: Tensor, d: Tensor, m: Tensor) -> Tensor:

@@ -32,7 +32,6 @@ from rmc.learner.update import MODEL_PARTS, VALUE_PARTS, JointUpdate, ModelPass,
 
 AHEAD = 2  # batches that the model's half may be ahead
 REQUEST = struct.Struct("qqq???")  # an update's number, the threads that it takes, its plan
-ENDED = "the process of memory and world model has ended; the lines above say why"
 ALIGNMENT = 64  # bytes, a cache line
 
 
@@ -74,6 +73,7 @@ class PipelinedUpdate:
         self._pending: deque[tuple[Slot, int, Plan]] = deque()
         self._slots: list[Slot] = []
         self._child = 0
+        self._exit_code: int | None = None  # its, once it has ended
         self._pipe: socket.socket | None = None
 
     def __call__(self, raw: Tensor, importance: Tensor, beta: float, number: int) -> list[UpdateResult]:
@@ -107,15 +107,28 @@ class PipelinedUpdate:
         """End the other process."""
         if self._pipe is not None:
             self._pipe.close()
-            os.waitpid(self._child, 0)
+            self._reap()
             self._pipe = None
+
+    def _reap(self) -> int:
+        """Exit code of the other process, once it has ended; below 0 a signal's."""
+        if self._exit_code is None:
+            self._exit_code = os.waitstatus_to_exitcode(os.waitpid(self._child, 0)[1])
+        return self._exit_code
+
+    def _fail(self) -> NoReturn:
+        """Raises RmcError with how the other process has ended."""
+        code = self._reap()
+        how = f"was killed by signal {-code}" if code < 0 else "has ended; the lines above say why"
+        hint = "; is memory short?" if code == -signal.SIGKILL else ""
+        raise RmcError(f"the process of memory and world model {how}{hint}") from None
 
     def _send(self, number: int, plan: Plan) -> None:
         assert self._pipe is not None
         try:
             self._pipe.sendall(REQUEST.pack(number, self._threads, *plan))
         except OSError:
-            raise RmcError(ENDED) from None
+            self._fail()
 
     def _await_answer(self) -> None:
         assert self._pipe is not None
@@ -124,7 +137,7 @@ class PipelinedUpdate:
         except OSError:
             answered = b""
         if not answered:
-            raise RmcError(ENDED)
+            self._fail()
 
     def _finish(self) -> UpdateResult:
         self._await_answer()
@@ -156,11 +169,17 @@ class PipelinedUpdate:
         )
         self._slots = [self._make_slot() for _ in range(AHEAD + 1)]
         ours, theirs = socket.socketpair()
-        parent, self._pipe = os.getpid(), ours
-        self._child = os.fork()
-        if self._child == 0:
+        parent = os.getpid()
+        try:
+            child = os.fork()
+        except OSError:
+            ours.close()
+            theirs.close()
+            raise
+        if child == 0:
             self._run_child(parent, theirs)
         theirs.close()
+        self._child, self._pipe = child, ours
         torch.set_num_threads(self._threads)
 
     def _make_slot(self) -> Slot:
@@ -190,9 +209,11 @@ class PipelinedUpdate:
         except ConnectionError:  # closed, with answers unread
             pass
         except BaseException:
-            traceback.print_exc()
-            sys.stderr.flush()
-            os._exit(1)
+            try:
+                traceback.print_exc()
+                sys.stderr.flush()
+            finally:  # also where that fails, as on a full disk: else this would go on as the other one
+                os._exit(1)
         os._exit(0)
 
     def _model_half(self, slot: Slot, number: int, plan: Plan) -> None:

@@ -1,4 +1,7 @@
-"""Theta-bar of algorithm 1: what acts, an exponential moving average; checkpoints hold it and evaluations play it."""
+"""Theta-bar of algorithm 1: the exponential moving average of the parameters of what acts.
+
+It is saved and evaluated, and never sent to actors.
+"""
 
 from collections.abc import Iterator, Mapping
 
@@ -11,7 +14,7 @@ MOVE_UPDATES = 10  # updates between moves, which read and write all that acts
 
 
 class PolicyAverage:
-    """Its time constant is so many updates, early on a tenth of those made; with 0 it is what acts."""
+    """Its time constant is so many updates, early on a tenth of those made; with 0 it is the newest parameters."""
 
     def __init__(self, agent: Agent, updates: int) -> None:
         self._agent, self._updates = agent, updates
@@ -20,7 +23,7 @@ class PolicyAverage:
 
     @torch.no_grad()
     def update(self, updates: int, parts: tuple[str, ...] = ("",)) -> None:
-        """After so many updates, those of what acts whose names begin so; every ``MOVE_UPDATES``."""
+        """After so many updates, the average of parameters whose names begin so; every ``MOVE_UPDATES``."""
         if self._values and updates % MOVE_UPDATES == 0:
             over, acting = min(self._updates, updates / 10) / MOVE_UPDATES, self._agent.acting()
             names = [name for name in self._values if name.startswith(parts)]

@@ -21,7 +21,7 @@ from rmc.common.window import WindowSpec
 from rmc.learner import losses
 from rmc.learner.batch import Batch, Plan, has_missing, update_steps
 from rmc.learner.config import UpdateConfig
-from rmc.learner.diagnostics import Trace, model_metrics, unexplained_change, value_metrics
+from rmc.learner.diagnostics import model_metrics, unexplained_change, value_metrics
 from rmc.learner.fused import fuse
 from rmc.learner.optimizers import by_optimizer, make_adam, polyak_update
 from rmc.learner.policy_average import PolicyAverage
@@ -167,8 +167,8 @@ class JointUpdate:
         if batch.plan.trains_policy:
             loss_values["policy_loss"] = losses.policy_loss(log_pi, self._frozen_q(*proposed), alpha, m)
         reported = {"policy_loss": self.policy_loss.clone()} | detached(loss_values)
-        trace = Trace(reported, alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m)
-        return loss_values, ValuePass(losses.priority(td_error, c.eta, m), value_metrics(trace, beta))
+        metrics = value_metrics(reported, alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m, beta)
+        return loss_values, ValuePass(losses.priority(td_error, c.eta, m), metrics)
 
     def _values(
         self, taken: tuple[Tensor, Tensor], following: tuple[Tensor, Tensor], m: Tensor

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
-from rmc.common.critic import VARIANCE_FLOOR, BatchNorm, TwinQ
+from rmc.common.critic import MOMENTUM, VARIANCE_EPS, BatchNorm, TwinQ
 from rmc.learner.config import UpdateConfig
 from rmc.learner.fused import fuse
 from rmc.learner.update_order import make_update
@@ -62,7 +62,7 @@ def test_where_all_rows_are_real_it_is_torchs_batch_norm() -> None:
     x = torch.randn(1, 30, 4).mul(3.0).add(1.0).requires_grad_()
     ours, theirs = (
         BatchNorm(1, 4, affine=False),
-        torch.nn.BatchNorm1d(4, eps=VARIANCE_FLOOR, momentum=0.01, affine=False),
+        torch.nn.BatchNorm1d(4, eps=VARIANCE_EPS, momentum=MOMENTUM, affine=False),
     )
     expected, actual = theirs(x[0]), ours(x, torch.full((30,), 1 / 30))
     torch.testing.assert_close(actual[0], expected)

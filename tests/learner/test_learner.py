@@ -374,6 +374,37 @@ def test_a_checkpoint_without_room_is_tried_again_and_training_goes_on(setting, 
     assert setting.learner.checkpoints.numbers()[-1] == updates + 1
 
 
+def test_while_there_is_no_room_updates_stay_in_flight(setting, monkeypatch):
+    """Else two processes would wait for each other at each."""
+
+    def full(number, files):
+        raise CheckpointError("as told", "as told")
+
+    learner, drained = setting.learner, []
+    monkeypatch.setattr(learner.checkpoints, "save", full)
+    monkeypatch.setattr(learner, "_next_checkpoint", 0)
+    monkeypatch.setattr(learner._runner, "drain", lambda: drained.append(learner.updates) or [])
+    setting.feed(60)
+    for _ in range(3):
+        assert learner.step()
+    assert set(drained) == {1}  # the save that failed
+
+
+def test_the_last_record_names_what_was_saved_at_the_end(setting, monkeypatch):
+    def full(number, files):
+        raise CheckpointError("as told", "as told")
+
+    setting.update()
+    with monkeypatch.context() as patch:
+        patch.setattr(setting.learner.checkpoints, "save", full)
+        assert not setting.learner.checkpoint()
+    setting.learner.close()
+    said = setting.learner.metrics()
+    assert setting.learner.checkpoints.numbers() == [said["checkpoint_update"]] == [1]
+    assert said["checkpoint_env_steps"] == setting.learner.env_steps > 0
+    assert said["checkpoint_error"] == ""
+
+
 def test_the_end_waits_for_room(tmp_path, monkeypatch):
     setting = Setting(tmp_path, total_steps=100)
     setting.feed(60)
@@ -487,7 +518,7 @@ def test_latent_rank_sees_a_collapse():
 
 def test_priorities_of_what_a_gpu_still_works_on_come_later_but_come(setting, monkeypatch):
     setting.feed(60)
-    setting.learner._updated.in_flight = 1  # as on a GPU
+    setting.learner._runner.in_flight = 1  # as on a GPU
     returned = []
     monkeypatch.setattr(setting.server, "update_priorities", lambda serials, _: returned.append(serials))
     assert setting.learner.step()
@@ -502,7 +533,7 @@ def test_priorities_of_what_a_gpu_still_works_on_come_later_but_come(setting, mo
 def test_how_long_an_update_takes_is_noted_before_there_is_a_checkpoint(setting, monkeypatch):
     """Ctrl-C waits for it."""
     setting.feed(60)
-    updated = setting.learner._updated
+    updated = setting.learner._runner
     whole = type(updated).__call__
     monkeypatch.setattr(type(updated), "__call__", lambda *given: (time.sleep(0.5), whole(*given))[1])
     setting.learner.step()
@@ -532,7 +563,7 @@ def test_how_long_a_save_takes_is_noted(setting, monkeypatch):
 def test_an_update_gets_its_windows_importance_and_beta_of_the_environments_steps(setting, monkeypatch):
     learner, drawn, handed = setting.learner, [], []
     learner.update.config = dataclasses.replace(learner.update.config, curiosity=0.5, curiosity_steps=2_000)
-    sample, update = setting.server.sample, type(learner._updated).__call__
+    sample, update = setting.server.sample, type(learner._runner).__call__
 
     def draws(*args):
         drawn.append(sample(*args))
@@ -543,7 +574,7 @@ def test_an_update_gets_its_windows_importance_and_beta_of_the_environments_step
         return update(self, raw, importance, beta, number)
 
     monkeypatch.setattr(setting.server, "sample", draws)
-    monkeypatch.setattr(type(learner._updated), "__call__", updates)
+    monkeypatch.setattr(type(learner._runner), "__call__", updates)
     for _ in range(4):
         setting.update()
     for (importance, beta), batch in zip(handed, drawn, strict=True):
@@ -573,13 +604,13 @@ def test_padding_is_zero_in_what_is_learnt_from(setting, monkeypatch):
     rows["observation"][~observation_valid(rows)] = 7.0
     rows["reward"][~step_valid(rows)] = 7.0
     rows["new_steps"] = rows["new_observations"] = rows["last"] - SPEC.burn_in
-    update = type(setting.learner._updated).__call__
+    update = type(setting.learner._runner).__call__
 
     def updates(self, raw, *rest):
         learnt.append(raw.numpy().view(SPEC.dtype).reshape(-1).copy())
         return update(self, raw, *rest)
 
-    monkeypatch.setattr(type(setting.learner._updated), "__call__", updates)
+    monkeypatch.setattr(type(setting.learner._runner), "__call__", updates)
     setting.bus.append(0, EntryId(1, 1), encode_windows(rows, SPEC))
     while setting.server.step():
         pass

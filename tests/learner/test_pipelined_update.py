@@ -1,7 +1,9 @@
 """An update whose halves run in two processes is the update, bit for bit; its process ends with it."""
 
 import copy
+import errno
 import os
+import re
 import signal
 from dataclasses import replace
 
@@ -104,12 +106,38 @@ def test_a_checkpoint_holds_what_the_plain_updates_does():
     assert len(again[STATE]) == pytest.approx(len(expected[STATE]), rel=0.01)
 
 
-def test_a_process_that_ends_is_told():
+@pytest.mark.parametrize(
+    ("number", "how"),
+    [(signal.SIGKILL, "was killed by signal 9; is memory short?"), (signal.SIGUSR1, "was killed by signal 10")],
+)
+def test_a_process_that_is_killed_is_told(number, how):
     apart = PipelinedUpdate(make("robust", False), SPEC, BATCH)
     apart(*host_batch(1), 0.1, 1)
-    os.kill(apart._child, signal.SIGKILL)
-    with pytest.raises(RmcError, match="memory and world model has ended"):
-        [apart(*host_batch(step), 0.1, step) for step in range(2, 5)]
+    os.kill(apart._child, number)
+    for _ in range(2):  # as one that saves at its end
+        with pytest.raises(RmcError, match=f"^the process of memory and world model {re.escape(how)}$"):
+            [apart(*host_batch(step), 0.1, step) for step in range(2, 5)]
+    apart.close()
+
+
+def test_a_process_that_fails_ends_where_it_cannot_even_print_why(monkeypatch):
+    """Its sys.stderr is pytest's, which it has closed."""
+    apart = PipelinedUpdate(make("robust", False), SPEC, BATCH)
+    monkeypatch.setattr(apart, "_model_half", lambda *_: 1 / 0)
+    with pytest.raises(RmcError, match=r"memory and world model has ended; the lines above say why$"):
+        [apart(*host_batch(step), 0.1, step) for step in range(1, 5)]
+    apart.close()
+
+
+def test_where_no_process_can_be_made_there_is_none_to_end(monkeypatch):
+    def full():
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(os, "fork", full)
+    apart, before = PipelinedUpdate(make("robust", False), SPEC, BATCH), len(os.listdir("/proc/self/fd"))
+    with pytest.raises(BlockingIOError):
+        apart(*host_batch(1), 0.1, 1)
+    assert len(os.listdir("/proc/self/fd")) == before
     apart.close()
 
 
