@@ -83,6 +83,7 @@ class Actor:
         self._envs = EnvPool(make_env, config.envs_per_actor, spec, self.name, config.reward_scale)
         self._means, self._rate, self._episodes, self._resends = Means(), Rate(), 0, 0
         self._refused_weights = 0
+        self._refused: Version | None = None  # the last policy that was
         self._total_steps = 0
         try:
             self._start_epoch()
@@ -188,7 +189,7 @@ class Actor:
     def _refresh_weights(self) -> None:
         newest = self._bus.latest_version()
         self._refresh_at = self._steps + self._config.refresh_steps
-        if newest is None or newest == self._version:
+        if newest is None or newest in (self._version, self._refused):
             return
         if self._version is not None and newest.epoch == self._version.epoch:
             self._means.add("policy_lag", newest.update - self._version.update)
@@ -196,7 +197,7 @@ class Actor:
             self._take_weights(self._bus.weights())
 
     def _take_weights(self, newest: tuple[Version, bytes] | None) -> None:
-        """A policy that cannot be read is refused, and the one before goes on."""
+        """A policy that cannot be read is refused, once, and the one before goes on."""
         if newest is None:
             return
         try:
@@ -205,6 +206,7 @@ class Actor:
                 self._priority_fn.load(newest[1])
         except MessageError as error:
             self._refused_weights += 1
+            self._refused = newest[0]
             log.warning("%s: refused %s: %s", self.name, newest[0], error)
         else:
             self._version = newest[0]

@@ -32,8 +32,6 @@ class EnvPool:
         self._make_env, self._spec, self._name = make_env, spec, name
         self._largest_reward = np.float32(np.finfo(np.float32).max / max(1.0, reward_scale))  # finite, scaled, too
         self.broken = 0  # episodes that a fault ended
-        self._seeds_due: dict[int, int] = {}  # by environment, which of the seeds its next episode begins by
-        self._broken_starts: dict[int, int] = {}  # by environment, in a row
         self._envs: list[Env] = []
         try:
             for _ in range(n):
@@ -57,11 +55,11 @@ class EnvPool:
     def restart(self, seed_of: Callable[[int], int]) -> None:
         """Every environment's next episode begins by a seed: ``seed_of(0)`` to ``seed_of(N - 1)``, later ones after."""
         self._seed_of, self._remade = seed_of, 0
-        self._seeds_due = {i: i for i in range(len(self._envs))}
-        self._broken_starts = dict.fromkeys(self._seeds_due, 0)
+        self._seeds_due = {i: i for i in range(len(self._envs))}  # which of the seeds its next episode begins by
+        self._broken_starts = dict.fromkeys(self._seeds_due, 0)  # by environment, in a row
 
     def step(self, action: Floats) -> tuple[Transition, dict[int, Exception]]:
-        """(N, A) in [-1, 1] -> what came of it, and who broke: those have zeros, and no end of an episode."""
+        """(N, A) in [-1, 1] -> what came of it, and who broke: those have zero observation and reward, and no end."""
         faults: dict[int, Exception] = {}
         for i in range(len(self._envs)):
             try:

@@ -164,7 +164,7 @@ def play_episodes(
 
 
 class Evaluator:
-    """A role: plays every policy that the learner asks to have played, the newest first.
+    """A role: plays the newest policy that the learner asks to have played, whenever it is free.
 
     One ``step`` is one of an episode's. Every evaluation starts from the same seeds, so that two policies are
     compared on the same starts.

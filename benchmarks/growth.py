@@ -77,7 +77,7 @@ def _filled(folder: Path, capacity: int) -> Callable[[], int]:
     store, rng = open_store(folder, SMALL, capacity, exponent=0.6), np.random.default_rng(0)
     rows = random_rows(SMALL, capacity)
     store.set_priorities(store.ring.write(rows), rng.uniform(0.1, 1.0, capacity).astype(np.float32))
-    store.ring.commit()
+    store.ring.commit(capacity)
     out, priorities = np.zeros(DRAWN, SMALL.dtype), rng.uniform(0.1, 1.0, DRAWN).astype(np.float32)
 
     def draw() -> int:

@@ -16,7 +16,7 @@ class Credit:
     def __init__(self, bus: Bus, owner: ReplayOwner, limiter: RateLimiter, own_actors: list[int]) -> None:
         self._bus, self._owner, self._limiter, self._own_actors = bus, owner, limiter, own_actors
         self._published: dict[int, Ack] = {}
-        self._republish_at = 0.0
+        self._republish_at = time.monotonic() + REPUBLISH_PERIOD
 
     def publish(self, progress: Progress, at_once: bool) -> None:
         """Publish acks that changed. Small changes wait, unless ``at_once``: then actors need all there is.
@@ -24,11 +24,12 @@ class Credit:
         The clock only ever repeats what was published, so that in lockstep it decides nothing.
         Raises BusUnavailable, BusFull, FencedError.
         """
-        if not self._published or time.monotonic() >= self._republish_at:
-            self._bus.commit(self._owner, self._published or self._acks(progress), progress.publish())
+        if self._published and time.monotonic() >= self._republish_at:
+            self._bus.commit(self._owner, self._published, progress.publish())
             self._republish_at = time.monotonic() + REPUBLISH_PERIOD  # sooner where that failed
         acks = {actor: ack for actor, ack in self._acks(progress).items() if self._published.get(actor) != ack}
         quantum = max(1, self._limiter.slack_steps // (8 * len(self._own_actors)))
+        at_once |= not self._published
         if acks and (at_once or any(self._grown(actor, ack) >= quantum for actor, ack in acks.items())):
             self._published.update(acks)  # before they are heard: Redis may take a commit whose answer never comes
             try:

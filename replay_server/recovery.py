@@ -42,8 +42,10 @@ class ReplayStore:
 
     def largest_priority(self) -> float:
         """Of the windows that are there, with which a new one enters; the last known where that cannot be told."""
+        if not self.exponent:  # of no effect
+            return self.ring.progress.max_priority
         there = self.tree.leaves() > 0.0
-        if not self.exponent or not there.any():
+        if not there.any():
             return self.ring.progress.max_priority
         return float(self.priorities[there[: len(self.priorities)]].max())
 

@@ -53,7 +53,6 @@ class Ring:
         self._blocks = self._map.view(np.ndarray)  # whole rows, copied as such
         self.rows: Rows = self._blocks.view(spec.dtype)
         self._records = _records(self._head, spec)
-        self._written = 0
         progress = self._records.read()
         if progress is None:
             raise _unusable(path, "both commit records are damaged")
@@ -78,13 +77,11 @@ class Ring:
         fits = min(len(blocks), self.capacity - start)
         self._blocks[start : start + fits] = blocks[:fits]
         self._blocks[: len(blocks) - fits] = blocks[fits:]
-        self._written = len(rows)
         return slots
 
-    def commit(self) -> None:
-        """Step (c): make the rows written and everything in ``progress`` durable at once."""
-        self.progress.next_serial += self._written
-        self._written = 0
+    def commit(self, rows: int = 0) -> None:
+        """Step (c): make so many ``rows`` just written and everything in ``progress`` durable at once."""
+        self.progress.next_serial += rows
         self.progress.valid_from = max(self.progress.valid_from, self.progress.next_serial - self.capacity)
         self._records.write(self.progress)
 

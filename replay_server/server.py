@@ -4,6 +4,7 @@ Shapes: B batch, O observation. One thread does it all; ``step`` takes in one bo
 """
 
 import logging
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,7 @@ class ReplayServer:
         self._refused_priorities = self._damaged_windows = 0
         self._newest: Version | None = None  # of the weights, when last looked at
         self._look_at = 0.0
+        self._largest_lag = -math.inf  # of what was inserted since the last metrics
         self._means, self._rates = Means(), {name: Rate() for name in ("env_steps", "windows", "draws")}
 
     def _open(self, folder: Path, config: ReplayConfig, warmup_steps: int) -> int:
@@ -113,7 +115,7 @@ class ReplayServer:
         progress.total += sums.total
         progress.total_square += sums.total_square
         progress.streams = batch.positions
-        ring.commit()
+        ring.commit(len(rows))
         self._measure_lag(rows)
 
     def _measure_lag(self, rows: Rows) -> None:
@@ -124,7 +126,7 @@ class ReplayServer:
         if len(rows) and self._newest is not None:
             lag = self._newest.update - rows["weights_update"]
             self._means.add("policy_lag_mean", float(lag.mean()))
-            self._means.add("policy_lag_max", float(lag.max()))
+            self._largest_lag = max(self._largest_lag, float(lag.max()))
 
     # -- out --------------------------------------------------------------------------------------------
 
@@ -196,8 +198,10 @@ class ReplayServer:
         progress.evicted_priorities += int((~present).sum())
         self._refused_priorities += int((present & ~usable).sum())
         kept = np.maximum(priorities[present & usable], PRIORITY_FLOOR, dtype=np.float32)
+        if (largest := float(kept.max(initial=0.0))) > progress.max_priority:
+            progress.max_priority = largest
+            self._store.ring.commit()  # a restart believes no priority beyond it
         self._store.set_priorities(serials[present & usable] % self._store.ring.capacity, kept)
-        progress.max_priority = max(progress.max_priority, float(kept.max(initial=0.0)))
 
     def statistics(self) -> ObservationStatistics:
         """Running sums over all observations inserted so far."""
@@ -244,7 +248,10 @@ class ReplayServer:
         """``stats`` with rates a second and the policy lag of what was inserted since the last call."""
         stats = self.stats()
         rates = {f"{name}_per_s": rate.take(stats[name]) for name, rate in self._rates.items()}
-        return {**stats, **rates, **self._means.take()}
+        lags = self._means.take()
+        if lags:
+            lags["policy_lag_max"], self._largest_lag = self._largest_lag, -math.inf
+        return {**stats, **rates, **lags}
 
     def waiting_for(self) -> str:
         """``windows`` from the actors where nothing may be drawn before more come, else ``draws`` by the learner."""

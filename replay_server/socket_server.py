@@ -4,7 +4,7 @@ Non-blocking throughout: a client that is silent, slow or lies costs at most its
 sides prove that they know the run's secret before anything else is said:
 
     server -> CHALLENGE {nonce: c}
-    client -> PROOF {nonce: n, proof: HMAC(secret, "client" + c + n)}
+    client -> PROOF {nonce: n, proof: HMAC(secret, "client" + c + n), epoch: the learner's}
     server -> WELCOME {proof: HMAC(secret, "server" + n + c), fingerprint}
     server -> ERROR {fenced: HMAC(secret, "fenced" + n + c)} in its place or later, where a newer learner has come
 
@@ -62,7 +62,7 @@ class SocketServer:
         self._listener, self._path, self.address = _listen(address)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, READ)
-        self._connections: dict[ClientConnection, int] = {}  # and the events each is registered for
+        self._connections: set[ClientConnection] = set()
         self._learner = 0  # the newest epoch that has introduced itself, or that the bus knows
         self.refused: Counter[str] = Counter()  # connections ended for a fault of theirs, by reason
 
@@ -96,7 +96,7 @@ class SocketServer:
             accepted.close()
             return
         connection = ClientConnection(accepted, os.urandom(NONCE_BYTES))
-        self._connections[connection] = READ
+        self._connections.add(connection)
         self._selector.register(accepted, READ, connection)
         if connection.encrypted:
             try:
@@ -153,8 +153,7 @@ class SocketServer:
                 self._authenticate(connection, frame)
 
     def _await(self, connection: ClientConnection, events: int) -> None:
-        if self._connections[connection] != events:
-            self._connections[connection] = events
+        if self._selector.get_key(connection.socket).events != events:
             self._selector.modify(connection.socket, events, connection)
 
     def _authenticate(self, connection: ClientConnection, frame: Frame) -> None:
@@ -270,7 +269,8 @@ class SocketServer:
                 self._refuse(connection, "silent", "no proof came in time")
 
     def _end(self, connection: ClientConnection) -> None:
-        if self._connections.pop(connection, None) is not None:
+        if connection in self._connections:
+            self._connections.remove(connection)
             self._selector.unregister(connection.socket)
             connection.close()
 

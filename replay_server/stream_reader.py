@@ -39,7 +39,8 @@ class StreamReader:
     def __init__(self, spec: WindowSpec, bus: Bus, actors: int, shard: Shard) -> None:
         self.spec, self.bus, self._shard = spec, bus, shard
         self.refused: Counter[str] = Counter()  # dead letters by reason
-        self.gaps = 0  # entries whose number does not follow their predecessor's
+        self.gaps = 0  # places where an entry's number does not follow its predecessor's
+        self._gaps_after: dict[int, EntryId] = {}  # past which entry an actor's last one was found
         self._resends: dict[int, EntryId] = {}  # past which entry an actor was asked to send again
         self._actors = {actor for actor in range(actors) if shard.owns(actor)}
         self._rounds = 0
@@ -59,7 +60,6 @@ class StreamReader:
     def sends_again(self, actor: int, before: EntryId) -> None:
         """An actor's stream was dropped, so that it sends again what came after that entry."""
         self._resends[actor] = before
-        self.gaps += 1
 
     def _cursors(self, positions: Mapping[int, StreamPosition]) -> dict[int, EntryId]:
         return {actor: positions[actor].id if actor in positions else BEFORE_ALL for actor in self._actors}
@@ -122,10 +122,10 @@ class StreamReader:
         same_epoch = entry.id.epoch == before.epoch
         if entry.id.seq == (before.seq + 1 if same_epoch else 0):
             return False
-        if same_epoch and self._resends.get(entry.actor) != before:
-            return True
-        self.gaps += 1
-        return False
+        if self._gaps_after.get(entry.actor) != before:  # else it is still open
+            self._gaps_after[entry.actor] = before
+            self.gaps += 1
+        return same_epoch and self._resends.get(entry.actor) != before
 
     def _decode(self, entry: Entry) -> Rows | None:
         try:

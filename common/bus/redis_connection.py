@@ -75,7 +75,10 @@ class RedisConnection:
         try:
             return action(*args)
         except redis.exceptions.ResponseError as error:
-            raise refusal(error, self.url) from None
+            refused = refusal(error, self.url)
+            if isinstance(refused, BusUnavailable):  # a failover may have led the name to another server
+                self.redis.connection_pool.disconnect()
+            raise refused from None
         except redis.exceptions.TimeoutError as error:
             self._rests_until = time.monotonic() + TIMEOUT_SECONDS  # half of the time is for what needs no Redis
             raise BusUnavailable(str(error)) from None

@@ -39,7 +39,7 @@ def take_in(store: ReplayStore, seq: int, ledger: Ledger | None = None) -> None:
     store.ring.write(rows)
     if ledger is not None:
         ledger.look()
-    store.ring.commit()
+    store.ring.commit(ENTRY)
 
 
 def test_it_has_all_windows_of_a_ring_that_wraps(run: RunFolder, store: ReplayStore) -> None:

@@ -53,7 +53,7 @@ def test_every_episode_is_found_whole_or_not_at_all(
         patch.setattr(episode, "CHUNK", chunk)
         ring = Ring(Path(folder) / "ring", SPEC, capacity)
         ring.write(rows)
-        ring.commit()
+        ring.commit(len(rows))
         for serial, chain in enumerate(chains):
             slots = find_episode(ring, serial, most=6)
             whole = chain[0] >= ring.progress.valid_from
@@ -67,7 +67,7 @@ def ring_of(folder: Path, episode_steps: list[int], seen: float = 1.0) -> Ring:
     write_steps(rows, np.cumsum(np.array(episode_steps) == 0).tolist())
     rows["observation"] *= seen
     ring.write(rows)
-    ring.commit()
+    ring.commit(len(rows))
     return ring
 
 

@@ -135,7 +135,7 @@ def test_rows_torn_by_a_power_cut_hold_no_window(tmp_path: Path, caplog: pytest.
     with opened(tmp_path, 10) as store:
         store.set_priorities(store.ring.write(make_rows(14)), np.full(10, 2.0, np.float32))
         store.ring.progress.max_priority = 2.0
-        store.ring.commit()
+        store.ring.commit(14)
         store.ring.rows["serial"][[5, 7]] = 0
     with opened(tmp_path, 10) as store:
         assert (store.ring.progress.valid_from, store.ring.progress.next_serial) == (4, 14)
@@ -154,7 +154,7 @@ def test_damaged_priorities_only_cost_their_values(tmp_path: Path, damage: str) 
     with opened(tmp_path, 10) as store:
         store.set_priorities(store.ring.write(make_rows(6)), np.full(6, 0.25, np.float32))
         store.ring.progress.max_priority = 3.0
-        store.ring.commit()
+        store.ring.commit(6)
     path = tmp_path / "priorities"
     if damage == "gone":
         path.unlink()

@@ -58,7 +58,7 @@ def test_killed_anywhere(capacity: int, appends: list[tuple[int, str]]) -> None:
             before = ring.progress.valid_from
             ring.write(make_rows(count, committed))
             if fate != "after rows":
-                ring.commit()
+                ring.commit(count)
             if fate == "torn record":
                 tear_newest_record(path)
             if fate == "whole":
@@ -266,7 +266,7 @@ def test_a_whole_row_that_is_not_its_slots_window_is_none(tmp_path: Path) -> Non
     for first in (0, 4):
         before = ring.rows.copy()
         ring.write(make_rows(4, first))
-        ring.commit()
+        ring.commit(4)
     ring.rows[1] = ring.rows[0]
     ring.rows[2] = before[2]
     assert ring.gather(np.arange(4), out).tolist() == [True, False, False, True]

@@ -1,5 +1,7 @@
 """The replay server without its socket: intake, credit, draws, statistics."""
 
+import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,8 +20,9 @@ from rmc.common.wire import encode_windows
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.observation_sums import observation_sums
 from rmc.replay_server.server import ReplayServer
+from rmc.replay_server.sum_tree import SumTree
 from tests.learner.rows import observation_valid
-from tests.replay_server.support import SPEC, Make, Sender, close, drain, filled, make_rows, stored
+from tests.replay_server.support import OPEN, SPEC, Make, Sender, close, drain, filled, make_rows, stored
 
 
 def test_origin_and_serial_come_from_the_entry_id(make: Make, bus: MemoryBus) -> None:
@@ -95,6 +98,15 @@ def test_a_priority_that_was_corrected_is_no_new_windows(make: Make, bus: Memory
     assert server.stats()["max_priority"] == 2.0
 
 
+def test_a_priority_that_came_back_before_a_kill_is_kept(make: Make, bus: MemoryBus) -> None:
+    """Though nothing was drawn or taken in between."""
+    server, _ = filled(make(), bus, 5)
+    server.update_priorities(np.arange(5), np.array([0.5, 50.0, 7.0, 3.0, 0.25], np.float32))
+    os.close(server._store.lock)
+    server._store.lock = -1
+    assert make()._store.priorities[:5].tolist() == [0.5, 50.0, 7.0, 3.0, 0.25]
+
+
 def test_values_are_what_windows_are_drawn_by(make: Make, bus: MemoryBus) -> None:
     server, _ = filled(make(), bus, 20)
     priorities = np.random.default_rng(0).exponential(size=20).astype(np.float32)
@@ -118,6 +130,13 @@ def test_exponent_zero_is_uniform(make: Make, bus: MemoryBus) -> None:
         assert (sample.weights == 1).all()
         counts += np.bincount(sample.rows["serial"], minlength=50)
     assert (counts == 40).all()  # 50 strata over 50 equal windows
+
+
+def test_uniform_replay_looks_for_no_largest_priority(
+    make: Make, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SumTree, "leaves", Mock(side_effect=AssertionError))
+    filled(make(dataclasses.replace(OPEN, priority_exponent=0.0)), bus, 2)
 
 
 def test_statistics_against_a_loop_and_padding_changes_nothing() -> None:
@@ -282,6 +301,14 @@ def test_small_credit_is_published_late_but_at_once_where_the_learner_waits(make
     assert sender.granted() == draws * 256 // 100 + 800
 
 
+def test_the_first_credit_is_said_once(make: Make, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus, "commit", commit := Mock(wraps=bus.commit))
+    server, _ = make(), Sender(bus)
+    server.step()
+    assert commit.call_count == 1
+    assert bus.ack(0) is not None
+
+
 def test_the_clock_repeats_what_was_published_and_no_more(make: Make, bus: MemoryBus) -> None:
     """Or in lockstep it would decide when an actor may step."""
     config = ReplayConfig(capacity=1000, replay_ratio=100.0, warmup_steps=0)
@@ -440,7 +467,7 @@ def test_an_id_that_no_life_can_have_reached_is_refused_and_the_actor_goes_on(
         sender.send(1)  # what was sent since is kept, and sent again
     drain(server)
     stats = server.stats()
-    assert stats["dead_letters_id"] == 2
+    assert (stats["dead_letters_id"], stats["entry_gaps"]) == (2, 0)
     assert stored(server)["reward"][:, 0].tolist() == [0, 1, 2, 3]
     assert bus.ack(0) is not None
     close(server)
@@ -504,6 +531,21 @@ def test_what_redis_did_not_hear_is_said_when_it_is_back(make: Make, away: str) 
     assert ack is not None
     assert ack.id == EntryId(1, 1)
     assert bus.read({0: EntryId(0, -1)}, 10) == []
+
+
+def test_what_an_error_left_half_inserted_is_taken_in_once(
+    make: Make, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server, sender = filled(make(), bus, 3)
+    sender.send(2)
+    monkeypatch.setattr(server._store, "set_priorities", Mock(side_effect=MemoryError))
+    with pytest.raises(MemoryError):
+        server.step()
+    close(server)  # as the role's loop does
+    again = make()
+    drain(again)
+    assert stored(again)["reward"][:, 0].tolist() == list(range(5))
+    assert again.stats()["env_steps"] == 5 * SPEC.train
 
 
 class Late(MemoryBus):
@@ -600,20 +642,29 @@ def test_what_its_actor_lacks_too_is_given_up(make: Make, bus: MemoryBus) -> Non
         sender.send_rows(make_rows(1, 5))
         drain(server)
     assert stored(server)["reward"][:, 0].tolist() == [0, 1, 5]
+    assert server.stats()["entry_gaps"] == 1
+    sender.seq += 1  # and lacks another one
+    sender.send_rows(make_rows(1, 7))
+    drain(server)
     assert server.stats()["entry_gaps"] == 2
 
 
 def test_policy_lag_is_measured(make: Make, bus: MemoryBus) -> None:
     server, sender = make(), Sender(bus)
     bus.publish_weights(Version(1, 50), b"")
-    rows = make_rows(2)
-    rows["weights_update"] = [20, 40]
+    for updates in ([20, 40], [30, 50]):
+        rows = make_rows(2)
+        rows["weights_update"] = updates
+        sender.send_rows(rows)
+        drain(server)
+    metrics = server.metrics()
+    assert metrics["policy_lag_mean"] == 15
+    assert metrics["policy_lag_max"] == 30
+    assert metrics["windows"] == 4
+    assert "policy_lag_max" not in server.metrics()
     sender.send_rows(rows)
     drain(server)
-    metrics = server.metrics()
-    assert metrics["policy_lag_mean"] == 20
-    assert metrics["policy_lag_max"] == 30
-    assert metrics["windows"] == 2
+    assert server.metrics()["policy_lag_max"] == 20
 
 
 @pytest.mark.parametrize("ratio", [1.0, 64.0])

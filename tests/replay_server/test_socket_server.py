@@ -477,21 +477,28 @@ def test_the_learners_client_finds_a_restarted_server_again(serve: Serve) -> Non
     for _ in range(2):
         served = serve()
         addresses.append(served.address)
-        draws = [client.sample(16) for _ in range(6)]
-        assert [sample.status for sample in draws[2:]] == [SampleStatus.BATCH] * 4
-        assert draws[-1].env_steps == 200 * SPEC.train
-        wait_until(lambda: served.replay.stats()["drawn_steps"] > draws[-1].drawn_steps, 5.0)  # one ahead
-        client.update_priorities(np.arange(16), np.full(16, 3.0, np.float32))
-        assert client.statistics().count == 200 * SPEC.train
-        wait_until(lambda: served.replay._store.priorities[15] == 3.0, 5.0)  # went out before the question
-        episode = client.episode(7)  # every window here is an episode of its own
-        assert episode is not None
-        assert episode["serial"].tolist() == [7]
-        assert client.episode(999) is None
+        all_works(client, served)
         served.close()
         served.close = lambda: None  # type: ignore[method-assign]
     assert client.sample(16).status in (SampleStatus.WAIT, SampleStatus.BATCH)
     client.close()
+
+
+def all_works(client: ReplayClient, served: Served) -> None:
+    """Draws, one of them ahead, priorities, statistics and episodes, once the client has found it."""
+    draws = [client.sample(16) for _ in range(6)]
+    assert [sample.status for sample in draws[2:]] == [SampleStatus.BATCH] * 4
+    assert draws[-1].env_steps == 200 * SPEC.train
+    wait_until(lambda: served.replay.stats()["drawn_steps"] > draws[-1].drawn_steps, 5.0)
+    client.update_priorities(np.arange(16), np.full(16, 3.0, np.float32))
+    statistics = client.statistics()
+    assert statistics is not None
+    assert statistics.count == 200 * SPEC.train
+    wait_until(lambda: served.replay._store.priorities[15] == 3.0, 5.0)  # went out before the question
+    episode = client.episode(7)  # every window here is an episode of its own
+    assert episode is not None
+    assert episode["serial"].tolist() == [7]
+    assert client.episode(999) is None
 
 
 def test_it_listens_on_the_interface_named_alone(serve: Serve) -> None:

@@ -81,9 +81,9 @@ def replay_server() -> None:
             die()
         return slots
 
-    def committed(self: Any) -> None:
-        taking_in[0] = "committed" if self._written else ""
-        commit(self)
+    def committed(self: Any, rows: int = 0) -> None:
+        taking_in[0] = "committed" if rows else ""
+        commit(self, rows)
         if taking_in[0] and strikes("committed"):
             die()
         taking_in[0] = ""
@@ -107,9 +107,9 @@ def replay_server() -> None:
 
     def compared(self: Any) -> bool:
         if strikes("compare-tree"):
-            recreate_env = SumTree(self._store.ring.capacity)
-            recreate_env.rebuild(valid_leaves(self._store))
-            say("tree", same=bool((recreate_env._nodes == self._store.tree._nodes).all()))
+            rebuilt = SumTree(self._store.ring.capacity)
+            rebuilt.rebuild(valid_leaves(self._store))
+            say("tree", same=bool((rebuilt._nodes == self._store.tree._nodes).all()))
         return bool(step(self))
 
     Ring.write, Ring.commit, RecordPair.write = half_the_rows, committed, half_a_record  # type: ignore[method-assign]
