@@ -76,7 +76,7 @@ def _conduct(
         steps = run.steps
         result = None if stop.requested else run.result()
     if result is None:
-        console.print(f"stopped at environment step {steps:,}; to go on:")
+        console.print(f"stopped at step {steps:,}; to go on:")
         console.print(f"  {resume_command(folder)}", soft_wrap=True)
         return STOPPED_STATUS
     folder.write_result(result)

@@ -21,7 +21,7 @@ from rmc.common.extra import check_installed
 from rmc.deploy.monitor.figures import return_text
 
 Axis = Literal["env_steps", "updates", "wall_s"]
-LABELS = {"env_steps": "environment steps", "updates": "updates", "wall_s": "wall time (s)"}
+LABELS = {"env_steps": "agent steps", "updates": "updates", "wall_s": "wall time (s)"}
 LEGEND_WIDTH, LEGEND_LINE = 55, 0.22  # characters under a panel, inches
 SAME_LENGTH = 1.05  # runs overshoot their end a little
 POINTS, CURVE_RESAMPLES, COLUMNS, LAST, WIDTH = 100, 300, 3, 5, 120
@@ -166,8 +166,9 @@ def _returns(runs: list[History]) -> str:
 def _beside(runs: list[History], reference: list[History]) -> list[str]:
     """The mean return scaled so that the reference's is 1 and an untrained agent's 0; the chance to beat it."""
     initial = [run.initial_return for run in reference if run.initial_return is not None]
-    if not reference or not initial:
+    if not reference:
         return ["", ""]
-    low, high = np.array([np.mean(initial)]), last_returns(reference).mean(0)
-    share = "" if high == low else f"{((last_returns(runs) - low) / (high - low)).mean():.2f}"
-    return [share, f"{probability_of_improvement(last_returns(runs), last_returns(reference)):.2f}"]
+    scores, others = last_returns(runs), last_returns(reference)
+    low, high = (np.mean(initial) if initial else np.nan), others.mean()
+    share = f"{((scores - low) / (high - low)).mean():.2f}" if initial and high != low else ""
+    return [share, f"{probability_of_improvement(scores, others):.2f}"]

@@ -51,7 +51,7 @@ class History:
     wall_s: float
     initial_return: float | None
     evaluations: list[Evaluation] = field(default_factory=list)
-    finished: bool = False  # then the last evaluation is the result's
+    finished: bool = False  # then the last evaluation is the result's, unless that was cut
     commit: str = field(default="", compare=False)
 
     def to_line(self) -> str:
@@ -111,7 +111,7 @@ def of_run(folder: RunFolder) -> History:
     evaluations = _evaluations(filter(is_complete, folder.records()))
     result, initial = folder.result() or {}, folder.initial() or {}
     if result and is_complete(result):
-        ours = not folder.is_baseline()  # of its last checkpoint's own evaluation only the update is known
+        ours = not folder.is_baseline()  # whose last checkpoint was also played while it trained
         below = result["env_steps"], result["updates"] if ours else math.inf
         evaluations = [one for one in evaluations if one.env_steps < below[0] and one.updates < below[1]]
         mean, std = result["eval_return_mean"], result["eval_return_std"]
@@ -119,14 +119,14 @@ def of_run(folder: RunFolder) -> History:
     if not evaluations:
         fix = "it has no evaluation yet that was played to its end; train it for longer"
         raise ConfigError("RUNS", str(folder.path), fix)
-    last = evaluations[-1]
+    last = dataclasses.asdict(evaluations[-1]) | result
     return History(
         about.agent,
         about.env,
         about.seed,
-        last.env_steps,
-        last.updates,
-        last.wall_s,
+        last["env_steps"],
+        last["updates"],
+        last["wall_s"],
         result.get("initial_return_mean", initial.get("eval_return_mean")) if is_complete(initial) else None,
         evaluations,
         bool(result),
@@ -204,7 +204,7 @@ def _env_label(env: EnvConfig) -> str:
 
 
 def _evaluations(records: Iterable[dict[str, Any]]) -> list[Evaluation]:
-    """In order of environment steps; of a checkpoint played twice, what came last."""
+    """In order of environment steps. A run that went back to an earlier checkpoint has lost what it made after it."""
     steps, walls, played = {}, {}, []  # all that is kept of what a long run has said
     for record in records:
         if _says(record, "learner", "updates", "env_steps"):
@@ -213,13 +213,15 @@ def _evaluations(records: Iterable[dict[str, Any]]) -> list[Evaluation]:
             walls[record["time"]] = record["wall_s"]
         elif _says(record, "evaluator", "time", "eval_update", "eval_return_mean", "eval_return_std"):
             played.append(record)
-    evaluations = {}
+    evaluations: list[Evaluation] = []
     for record in played:
         updates, own = record["eval_update"], _says(record, "evaluator", "eval_env_steps")
-        at = int(record["eval_env_steps"] if own else _between(updates, steps))  # of ours only the update is known
+        at = int(record["eval_env_steps"] if own else _between(updates, steps))  # older runs say the update alone
+        while evaluations and evaluations[-1].env_steps >= at:
+            evaluations.pop()
         wall, mean, std = _between(record["time"], walls), record["eval_return_mean"], record["eval_return_std"]
-        evaluations[at] = Evaluation(at, updates, wall, mean, std)
-    return [evaluations[at] for at in sorted(evaluations)]
+        evaluations.append(Evaluation(at, updates, wall, mean, std))
+    return evaluations
 
 
 def _says(record: dict[str, Any], role: str, *names: str) -> bool:

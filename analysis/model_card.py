@@ -15,7 +15,7 @@ A recurrent policy for `{env}`, trained with [RMC](https://arxiv.org/abs/1908.11
 | | |
 |---|---|
 | return, mean ± deviation | {judged} |
-| environment steps | {steps:,} |
+| agent steps | {steps:,} |
 | observation, action, state | {sizes} |
 | written by RMC | {rmc} |
 

@@ -11,6 +11,7 @@ Shapes: N episodes side by side, O observation, A action, S state, M flags of wh
 """
 
 import reprlib
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Literal, overload
 
@@ -20,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from rmc.actors.policy_runner import PolicyRunner, one_thread
 from rmc.analysis.evaluation import policy_env
 from rmc.analysis.policy_file import PolicyFile, policy_runner, read_policy
+from rmc.common.env.config import check_range
 from rmc.common.env.layout import ActionScale
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
@@ -37,6 +39,7 @@ def load_policy(source: str | Path, checkpoint: str = "latest", seed: int = 0) -
     A file is all that it takes: neither its run nor the module of its environment need be there. ``seed`` is for
     actions that explore. Raises ConfigError.
     """
+    check_range("seed", seed, (0, 2**63 - 1), Integral)
     return Policy(read_policy(source, checkpoint), seed)
 
 
@@ -52,6 +55,7 @@ class Policy:
         layout = file.header.layout
         self._scale = ActionScale(np.array(layout.action_low), np.array(layout.action_high))
         self._runner: PolicyRunner | None = None
+        self._has_begun = False  # whether its episodes have had a step since ``reset``
         self._prev_action = self._state = np.zeros((0, 0), np.float32)  # (N, A), (N, S), once it acts
 
     @property
@@ -70,8 +74,11 @@ class Policy:
     def reset(self, index: int | None = None) -> None:
         """Forget: a new episode begins, in all of them or in that of one row. Raises ConfigError."""
         if index is None:
-            self._runner = None
-        elif self._runner is not None:
+            self._has_begun = False
+            return
+        if isinstance(index, bool) or not isinstance(index, Integral):  # ``reset(done)`` is not what it seems
+            raise ConfigError("index", index, "give the number of an episode, or nothing for all")
+        if self._has_begun:
             rows = len(self._state)
             if not -rows <= index < rows:
                 raise ConfigError("index", index, f"the policy acts in {rows} episodes, from 0 on")
@@ -114,9 +121,11 @@ class Policy:
 
     def _begin(self, rows: int) -> PolicyRunner:
         """What acts in so many episodes; new ones begin after ``reset``."""
-        if self._runner is None:
+        if self._runner is None or rows != len(self._state):
             self._runner = policy_runner(self.header, self._file.blob, rows)
+        if not self._has_begun:
             self._prev_action, self._state = self._runner.start()
+            self._has_begun = True
         return self._runner
 
     def __getstate__(self) -> dict[str, Any]:
@@ -180,7 +189,7 @@ class Policy:
             fix = f"the policy reads shape {(size,)}, or (N, {size}) of N episodes"
             raise ConfigError("observation", f"of shape {raw.shape}", fix)
         rows = raw.reshape(-1, size)
-        if self._runner is not None and len(rows) != len(self._state):
+        if self._has_begun and len(rows) != len(self._state):
             fix = f"the policy acts in {len(self._state)} episodes; reset() it before there are others"
             raise ConfigError("observation", f"of shape {raw.shape}", fix)
         return rows

@@ -1,5 +1,6 @@
 """What ``rmc evaluate`` and ``rmc.evaluate`` do: a policy's file, a run or a baseline's run, played."""
 
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def evaluate_run(
 
     Raises ConfigError; RmcError where the environment breaks in every episode.
     """
-    check_range("--episodes", episodes, (1, MOST_EPISODES))
+    check_range("--episodes", episodes, (1, MOST_EPISODES), Integral)
     if flicker is not None:
         check_range("--flicker", flicker, (0.0, 1.0))
     if isinstance(source, PolicyFile) or not is_baseline(source):

@@ -9,7 +9,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -77,25 +77,23 @@ def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest:
     """
     from imageio_ffmpeg import count_frames_and_secs, write_frames  # an extra
 
-    env = make_env(env_config, render=True)
-    _follow(env)
-    observation, info = env.reset(seed=first_start(seed, final=True))
-    frame = _frame(env)
-    rate = (env.metadata.get("render_fps") or FRAMES_PER_SECOND) / env_config.action_repeat  # a frame for each action
     total = 0.0
-    with written_whole(out) as path, _told(out):
-        video = write_frames(str(path), (frame.shape[1], frame.shape[0]), fps=rate, macro_block_size=1)
-        video.send(None)  # the generator's start
-        for _ in range(min(longest, longest_episode(env))):
-            video.send(_frame(env, frame.shape).tobytes())
-            action = policy.act(observation, info.get("missing", False))
-            observation, reward, terminated, truncated, info = env.step(action)
-            total += float(reward)
-            if terminated or truncated:
-                break
-        video.close()
-        count_frames_and_secs(str(path))  # ffmpeg does not say that it could not write the end
-    env.close()
+    with closing(make_env(env_config, render=True)) as env:
+        _follow(env)
+        observation, info = env.reset(seed=first_start(seed, final=True))
+        size = _frame(env).shape
+        rate = (env.metadata.get("render_fps") or FRAMES_PER_SECOND) / env_config.action_repeat  # a frame an action
+        with written_whole(out) as path, _told(out):
+            with closing(write_frames(str(path), (size[1], size[0]), fps=rate, macro_block_size=1)) as video:
+                video.send(None)  # the generator's start
+                for _ in range(min(longest, longest_episode(env))):
+                    video.send(_frame(env, size).tobytes())
+                    action = policy.act(observation, info.get("missing", False))
+                    observation, reward, terminated, truncated, info = env.step(action)
+                    total += float(reward)
+                    if terminated or truncated:
+                        break
+            count_frames_and_secs(str(path))  # ffmpeg does not say that it could not write the end
     return total
 
 

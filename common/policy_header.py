@@ -58,7 +58,7 @@ class PolicyHeader:
         """Where it comes from and how good it is, in a line."""
         returns = self.returns()
         judged = f"return {returns}" if returns else "not evaluated"
-        return f"{self.env.id} after {self.env_steps:,} environment steps, {judged}"
+        return f"{self.env.id} after {self.env_steps:,} steps, {judged}"
 
     def returns(self) -> str:
         """Its evaluation in words; empty where there was none."""

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -24,7 +24,7 @@ from rmc.common.process import watchdog
 from rmc.common.user_path import user_path
 from rmc.deploy.monitor.recorded import Callback
 from rmc.deploy.monitor.view import terminal
-from rmc.deploy.run.config import RunConfig, checked
+from rmc.deploy.run.config import RunConfig, checked, value_of_kind
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import PATH_VARIABLE, IfExists, InitParts, Launcher, LaunchOptions, TrackerName
 from rmc.deploy.run.starts import last_launch
@@ -63,7 +63,7 @@ def train(
     Raises ConfigError for options that cannot work, before anything starts; RoleDied where a role keeps dying;
     KeyboardInterrupt where the run was stopped, which ``resume`` continues.
     """
-    if isinstance(track_tags, str):
+    if isinstance(track_tags, str) or not isinstance(track_tags, Sequence):
         raise ConfigError("track_tags", track_tags, "take a list of texts")
     options = LaunchOptions(
         run_dir=None if run_dir is None else user_path(run_dir),
@@ -160,11 +160,12 @@ def _train(config: RunConfig, options: LaunchOptions, callback: Callback | None)
 def _check_call(options: LaunchOptions) -> None:
     """Raises ConfigError for what a command line could not say."""
     if threading.current_thread() is not threading.main_thread():
-        raise ConfigError("train", threading.current_thread().name, "is no main thread, which alone hears Ctrl-C")
-    for name in ("video_every", "metrics_port"):
-        value = getattr(options, name)
-        if value is not None and type(value) is not int:
-            raise ConfigError(name, value, "take a whole number")
+        fix = "is no main thread, which alone hears Ctrl-C; call it there, or start rmc train as a process"
+        raise ConfigError("train", threading.current_thread().name, fix)
+    kinds = get_type_hints(LaunchOptions)
+    for name, value in vars(options).items():
+        if name != "run_dir":  # a path already
+            value_of_kind(kinds[name], list(value) if isinstance(value, tuple) else value, name)
 
 
 def _check_importable(env: EnvConfig) -> None:

@@ -163,18 +163,23 @@ class Study:
         target.parent.mkdir(parents=True, exist_ok=True)
         histories = history.read_histories(target) if target.exists() else []
         done = {(one.agent, one.env.partition(",")[0], one.seed) for one in histories}
+        commits: dict[str, str] = {}  # of the code that each began with, by its name
         failures: list[ConfigError] = []
+
+        def begun(job: Job) -> None:
+            print(f"{job.folder}: rmc {shlex.join(job.words)}", flush=True)
+            commits[job.name] = commit()
 
         def ended(job: Job, ending: Ending) -> None:
             if ending.state == "finished":
                 with target.open("a") as file:
-                    file.write(_line(job) + "\n")
+                    file.write(_line(job, commits[job.name]) + "\n")
             else:
                 reason = f"{ending.state}: {ending.reason}"
                 failures.append(ConfigError(job.values["agent"], shlex.join(job.words), reason))
 
         with signals_caught() as stop:
-            conduct(Grid(job for job in jobs if _key(job) not in done), LocalRuns(at_once), stop, _begun, ended)
+            conduct(Grid(job for job in jobs if _key(job) not in done), LocalRuns(at_once), stop, begun, ended)
         if stop.requested:
             raise KeyboardInterrupt
         if failures:
@@ -185,14 +190,10 @@ def _key(job: Job) -> tuple[str, str, int]:
     return job.values["agent"], job.values["env"], job.seed
 
 
-def _begun(job: Job) -> None:
-    print(f"{job.folder}: rmc {shlex.join(job.words)}", flush=True)
-
-
-def _line(job: Job) -> str:
+def _line(job: Job, commit: str) -> str:
     """A finished run's, under the name that the study has for it."""
     (past,) = history.read_histories(job.folder)
-    return dataclasses.replace(past, agent=job.values["agent"], commit=commit()).to_line()
+    return dataclasses.replace(past, agent=job.values["agent"], commit=commit).to_line()
 
 
 def commit(studies: Path = RESULTS.parent) -> str:

@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from numbers import Integral, Real
 from typing import Any, Literal
 
 import numpy as np
@@ -89,11 +90,12 @@ def check_env_config(config: EnvConfig) -> None:
     check_kwargs(config.env_kwargs)
 
 
-def check_range(option: str, value: float, limits: tuple[float, float]) -> None:
-    """Raises ConfigError where a number is not within; NaN is in no range."""
+def check_range(option: str, value: float, limits: tuple[float, float], kind: type = Real) -> None:
+    """Raises ConfigError where it is no number of that kind, Real or Integral, within the limits. NaN never is."""
     low, high = limits
-    if not low <= value <= high:
-        raise ConfigError(option, value, f"take a number from {low:,} to {high:,}".replace(",", "_"))
+    if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high:
+        number = "whole number" if kind is Integral else "number"
+        raise ConfigError(option, value, f"take a {number} from {low:,} to {high:,}".replace(",", "_"))
 
 
 def check_kwargs(kwargs: dict[str, Any]) -> None:

@@ -186,18 +186,19 @@ def from_dict(kind: type[ConfigT], raw: Any, path: str) -> ConfigT:
     for name in sorted(set(raw) ^ names):
         fix = "is missing; the run was made by another version" if name in names else "no such option in this version"
         raise ConfigError(f"{path}{name}", raw.get(name), fix)
-    return kind(**{name: _value(hints[name], value, f"{path}{name}") for name, value in raw.items()})
+    return kind(**{name: value_of_kind(hints[name], value, f"{path}{name}") for name, value in raw.items()})
 
 
-def _value(kind: Any, value: Any, path: str) -> Any:
+def value_of_kind(kind: Any, value: Any, path: str) -> Any:
+    """What JSON holds as a value of that type, called ``path``. Raises ConfigError."""
     if dataclasses.is_dataclass(kind):
         return from_dict(typing.cast(type[Any], kind), value, f"{path}.")
     if get_origin(kind) is tuple:
         parts = get_args(kind)
         if isinstance(value, list) and parts[-1] is ...:
-            return tuple(_value(parts[0], item, f"{path}[{index}]") for index, item in enumerate(value))
+            return tuple(value_of_kind(parts[0], item, f"{path}[{index}]") for index, item in enumerate(value))
         if isinstance(value, list) and len(value) == len(parts):
-            return tuple(_value(part, item, path) for part, item in zip(parts, value, strict=True))
+            return tuple(value_of_kind(part, item, path) for part, item in zip(parts, value, strict=True))
     elif _matches(kind, value):
         return float(value) if kind is float else value
     raise ConfigError(path, value, f"must be {_expected(kind)}")
@@ -207,7 +208,9 @@ def _expected(kind: Any) -> str:
     """What is asked for, in words."""
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(repr, get_args(kind)))}"
-    return kind.__name__ if isinstance(kind, type) else str(kind)
+    if get_origin(kind) in (types.UnionType, typing.Union):
+        return " or ".join(map(_expected, get_args(kind)))
+    return "None" if kind is types.NoneType else kind.__name__
 
 
 def _matches(kind: Any, value: Any) -> bool:

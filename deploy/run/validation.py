@@ -1,12 +1,12 @@
 """Which configurations make no sense; numbers of the environment are judged in ``common/env/config.py``."""
 
-from typing import Any, Literal, get_args
+from typing import Any
 
 from rmc.common.bus.redis_url import redacted
 from rmc.common.env.config import check_env_config, check_range
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, WindowConfig
-from rmc.deploy.run.launch_options import IfExists, InitParts, Launcher, LaunchOptions, TrackerName
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.option_names import option
 
 RANGES: dict[str, tuple[float, float]] = {  # both ends included
@@ -111,23 +111,9 @@ def validate_windows(config: RunConfig) -> None:
         raise ConfigError("--burn-in", window.burn_in, fix)
 
 
-def _choices(kind: Any) -> tuple[str, ...]:
-    """Of a Literal, or a union of several."""
-    parts = get_args(kind)
-    return parts if all(isinstance(part, str) for part in parts) else sum(map(_choices, parts), ())
-
-
 def validate_launch(config: RunConfig, options: LaunchOptions) -> None:
     """Raises ConfigError for options that the launcher has no use for, or lacks."""
-    launcher, track = options.launcher, options.track or "off"
-    for name, value, kind in (
-        ("--launcher", launcher, Launcher),
-        ("--if-exists", options.if_exists, IfExists),
-        ("--init-parts", options.init_parts, InitParts),
-        ("--track", track, TrackerName | Literal["off"]),
-    ):
-        if value not in (choices := _choices(kind)):
-            raise ConfigError(name, value, f"take {', '.join(choices)}")
+    launcher = options.launcher
     _validate_ray(options)
     if launcher == "lockstep" and options.redis_url is not None:
         raise ConfigError("--redis-url", redacted(options.redis_url), "a lockstep run has no use for one; leave it")

@@ -98,7 +98,7 @@ def _result_line(played: dict[str, Any]) -> str:
     missing = " and ".join(f"{share:.0%} of the {name}" for name, share in shares.items() if share)
     env = f"{played['env']} with {missing} missing" if missing else played["env"]
     text = f"{env}: return {mean:,.1f} ± {deviation:,.1f} over {episode_count(played['eval_episodes'])}"
-    return f"{text}{cut_note(played)}, after {played['env_steps']:,} environment steps"
+    return f"{text}{cut_note(played)}, after {played['env_steps']:,} steps"
 
 
 def export_policy(command: run_options.Export) -> int:

@@ -46,7 +46,7 @@ def cut_note(evaluation: dict[str, Any]) -> str:
 
 def print_stopped(folder: RunFolder, env_steps: int, console: Console) -> int:
     """Print how to go on; the exit status."""
-    console.print(f"stopped at environment step {env_steps:,}; to go on:")
+    console.print(f"stopped at step {env_steps:,}; to go on:")
     console.print(f"  {resume_command(folder)}", soft_wrap=True)
     print_findings(folder, console)
     return STOPPED_STATUS
@@ -56,7 +56,7 @@ def print_result(folder: RunFolder, console: Console) -> int:
     result = folder.result()
     assert result is not None
     console.print(f"after training:  {format_evaluation(result)}")
-    facts = f"{result['env_steps']:,} environment steps, {result['updates']:,} updates, {result['wall_s']:,.0f} s"
+    facts = f"{result['env_steps']:,} steps, {result['updates']:,} updates, {result['wall_s']:,.0f} s"
     console.print(f"{facts}; {folder.result_file}", soft_wrap=True)
     print_findings(folder, console)
     return 0

@@ -4,7 +4,6 @@ import json
 import os
 import shlex
 from pathlib import Path
-from typing import Any
 
 from rmc.analysis.history import objects, of_run
 from rmc.common.errors import ConfigError
@@ -35,6 +34,9 @@ class Index:
             raise ConfigError("--sweep-dir", str(folder), fix)
         lines = objects(self._path, *COLUMNS) if self._path.exists() else {}
         self.lines = {str(line["run"]): line for line in lines.values()}
+        for name, line in self.lines.items():
+            if not isinstance(line["values"], dict):
+                raise ConfigError(f"{NAME} {name}", line["values"], f"its values must be an object; {BY_HAND}")
 
     def close(self) -> None:
         """Let another sweep in."""
@@ -74,15 +76,7 @@ def newest_return(job: Job) -> tuple[float | None, int]:
     result = folder.result()
     steps = result["env_steps"] if result is not None else 0
     try:
-        last = of_run(folder).evaluations[-1]
+        past = of_run(folder)
     except ConfigError:  # none yet
         return None, steps
-    return last.return_mean, steps or last.env_steps
-
-
-def trial_values(line: dict[str, Any]) -> dict[str, Any]:
-    """A line's values. Raises ConfigError where it has none."""
-    values = line["values"]
-    if not isinstance(values, dict):
-        raise ConfigError(f"{NAME} {line['run']}", values, f"its values must be an object; {BY_HAND}")
-    return values
+    return past.evaluations[-1].return_mean, past.env_steps

@@ -24,7 +24,7 @@ from rmc.analysis.history import Evaluation, of_run
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
-from rmc.sweep.index import Index, trial_values
+from rmc.sweep.index import Index
 from rmc.sweep.job import TRIAL, Job
 from rmc.sweep.pool import Ending
 from rmc.sweep.spec import Range, Search
@@ -63,7 +63,7 @@ class SearchPlan:
 
     def _earlier_job(self, line: dict[str, Any]) -> Job:
         """Tell Optuna of a trial of before, or take it up again."""
-        name, values = str(line["run"]), trial_values(line)
+        name, values = str(line["run"]), line["values"]
         job = self._make(name, values)
         is_finished = self._is_finished(job)  # raises for other options, whatever its state
         over = line["state"] == "pruned" or (line["state"] == "finished" and is_finished)
@@ -80,14 +80,15 @@ class SearchPlan:
 
     def _frozen(self, job: Job, line: dict[str, Any], state: TrialState) -> optuna.trial.FrozenTrial:
         """Raises KeyError, ValueError where its values are not of these ranges."""
-        if trial_values(line).keys() != self._distributions.keys():
+        if line["values"].keys() != self._distributions.keys():
             raise KeyError
         judged = self._evaluations(job)
-        is_complete = state == TrialState.COMPLETE and bool(judged)
+        if not judged and state == TrialState.COMPLETE:
+            state = TrialState.FAIL
         return optuna.trial.create_trial(
-            state=state if is_complete or state != TrialState.COMPLETE else TrialState.FAIL,
-            value=judged[-1][1].return_mean if is_complete else None,
-            params=self._params(trial_values(line)),
+            state=state,
+            value=judged[-1][1].return_mean if state == TrialState.COMPLETE else None,
+            params=self._params(line["values"]),
             distributions=self._distributions,
             intermediate_values={step: one.return_mean for step, one in judged},
         )
@@ -114,7 +115,7 @@ class SearchPlan:
             return None
         line = self._index.lines.get(name)
         if line is not None:
-            self._study.enqueue_trial(self._params(trial_values(line)))
+            self._study.enqueue_trial(self._params(line["values"]))
         apart = np.random.SeedSequence([self._search.sampler_seed, int(name.removeprefix(TRIAL))])
         seed = int(apart.generate_state(1)[0])  # of neighbouring seeds no two draw alike
         self._study.sampler = optuna.samplers.TPESampler(seed=seed, constant_liar=True)

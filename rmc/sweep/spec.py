@@ -13,7 +13,7 @@ from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.redis_url import value_without_passwords
-from rmc.common.env.config import EnvConfig, check_kwargs
+from rmc.common.env.config import PYTHONS, EnvConfig, check_kwargs
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.option_names import did_you_mean, flat, plain_names, read_toml
 from rmc.deploy.run.presets import robust
@@ -102,7 +102,7 @@ class Spec:
 
 def _check_each_once(place: str, values: list[Any]) -> None:
     if len({repr(value) for value in values}) < len(values):
-        raise ConfigError(place, values, "has a value twice; give each once")
+        raise ConfigError(place, values, "has a value twice; give each once, and lists in brackets")
 
 
 def check_name(place: str, name: str, value: Any, names: Set[str] = NAMES) -> None:
@@ -178,7 +178,7 @@ def read_seeds(raw: Any) -> tuple[int, ...]:
         ends = [re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip()) for part in raw.split(",")]
         pairs = [(int(match[1]), int(match[2] or match[1])) for match in ends if match]
         if len(pairs) < len(ends) or any(not 0 <= high - low < MOST for low, high in pairs):
-            raise ConfigError("seeds", raw, SEEDS_FIX)
+            raise ConfigError("seeds", raw, f"{SEEDS_FIX}, {MOST:_} at most")
         seeds = [seed for low, high in pairs for seed in range(low, high + 1)]
     else:
         seeds = raw if isinstance(raw, list) else [raw]
@@ -241,4 +241,4 @@ def _value(text: str) -> Any:
     try:
         return json.loads(text)
     except ValueError:
-        return text
+        return PYTHONS.get(text, text)

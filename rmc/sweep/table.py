@@ -32,7 +32,7 @@ def _row(runs: list[Job], index: Index, names: list[str]) -> tuple[float, list[s
     finished = [index.lines[job.name] for job in runs if index.state(job) == "finished"]
     returns = [line["return"] for line in finished if line["return"] is not None]
     mean = float(np.mean(returns)) if returns else -np.inf
-    deviation = f" ± {np.std(returns):,.1f}" if len(returns) > 1 else ""
+    deviation = f" ± {np.std(returns, ddof=1):,.1f}" if len(returns) > 1 else ""
     others = [index.state(job) for job in runs if index.state(job) != "finished"]
     counts = ", ".join(f"{others.count(state)} {state}" for state in dict.fromkeys(others))
     is_trial = runs[0].name.startswith(TRIAL)  # whose values were drawn, with all their digits

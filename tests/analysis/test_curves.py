@@ -84,6 +84,7 @@ def test_an_evaluation_that_was_cut_is_compared_with_no_other(tmp_path: Path) ->
     (past,) = history.read_histories(tmp_path)
     assert [one.return_mean for one in past.evaluations] == [-210.0]
     assert (past.finished, past.initial_return) == (True, None)
+    assert (past.env_steps, past.updates, past.wall_s) == (1000, 100, 2.0)  # as long as others that finished
 
 
 def test_of_a_checkpoint_that_was_played_twice_the_last_counts(tmp_path: Path) -> None:
@@ -93,6 +94,17 @@ def test_of_a_checkpoint_that_was_played_twice_the_last_counts(tmp_path: Path) -
     (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
     (past,) = history.read_histories(tmp_path)
     assert [one.return_mean for one in past.evaluations] == [7.0]
+
+
+def test_what_was_played_of_steps_that_are_lost_does_not_count(tmp_path: Path) -> None:
+    """A run that was killed goes on from its last checkpoint, of fewer steps."""
+    (tmp_path / "config.json").write_text(to_json(robust("Hopper-v5")))
+    steps = [100, 200, 300, 150, 250]
+    played = [{"eval_env_steps": at, "eval_update": at, "eval_return_mean": place} for place, at in enumerate(steps)]
+    lines = [{"role": "evaluator", "time": 1.0, "eval_return_std": 1.0} | one for one in played]
+    (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    (past,) = history.read_histories(tmp_path)
+    assert [(one.env_steps, one.return_mean) for one in past.evaluations] == [(100, 0.0), (150, 3.0), (250, 4.0)]
 
 
 def test_a_warm_start_is_another_agent(tmp_path: Path) -> None:
@@ -314,6 +326,12 @@ def test_a_reference_that_learnt_nothing_is_no_scale():
     ours = next(line for line in shown(curves.tables(curves.grouped(runs), "SAC")).splitlines() if "RMC" in line)
     assert ours.split()[-1] == "1.00"
     assert "inf" not in ours
+
+
+def test_a_reference_whose_untrained_return_is_unknown_is_beaten_all_the_same():
+    runs = [history_of("RMC", last=5.0), dataclasses.replace(history_of("SAC", last=1.0), initial_return=None)]
+    ours = next(line for line in shown(curves.tables(curves.grouped(runs), "SAC")).splitlines() if "RMC" in line)
+    assert ours.split()[-1] == "1.00"
 
 
 def test_the_table_compares_with_a_reference():

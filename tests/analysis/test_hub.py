@@ -52,7 +52,7 @@ def test_what_is_pushed_comes_back_and_its_card_says_what_it_is(hub: Hub, call: 
     result = {"eval_return_mean": -1234.5, "eval_return_std": 9.25, "eval_episodes": 10, "initial_return_mean": 0.0}
     run.write_result(result | {"env_steps": 70, "updates": 7, "wall_s": 1.0})
     pushed = call(*RMC, "push", "run", "me/swings", "--license", "mit", "--private", folder=tmp_path)
-    summary = "Pendulum-v1 after 70 environment steps, return -1,234.5 ± 9.2 over 10 episodes\n"
+    summary = "Pendulum-v1 after 70 steps, return -1,234.5 ± 9.2 over 10 episodes\n"
     assert (pushed.returncode, pushed.stderr) == (0, ""), pushed.stderr
     assert pushed.stdout == f"{hub.url}/me/swings: {summary}"
     assert hub.private == {"me/swings"}
@@ -65,7 +65,7 @@ def test_what_is_pushed_comes_back_and_its_card_says_what_it_is(hub: Hub, call: 
     assert (data["license"], data["library_name"], data["pipeline_tag"]) == ("mit", "rmc", "reinforcement-learning")
     (entry,) = data["model-index"][0]["results"]
     assert entry["metrics"][0]["value"] == "-1234.50 +/- 9.25"
-    for row in ("return, mean ± deviation | -1,234.5 ± 9.2 over 10 episodes", "environment steps | 70"):
+    for row in ("return, mean ± deviation | -1,234.5 ± 9.2 over 10 episodes", "agent steps | 70"):
         assert f"| {row} |" in text
     pulled = call(*RMC, "pull", "me/swings", "--out", "back.safetensors", folder=tmp_path, token="")
     assert (pulled.returncode, pulled.stderr, pulled.stdout) == (0, "", f"back.safetensors: {summary}")

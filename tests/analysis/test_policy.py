@@ -22,6 +22,7 @@ from safetensors.torch import load, save
 from rmc import api
 from rmc.actors.evaluator import first_start
 from rmc.actors.policy_runner import one_thread
+from rmc.analysis import policy as policy_module
 from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.policy import load_policy
 from rmc.analysis.policy_file import read_policy
@@ -193,6 +194,25 @@ def test_an_observation_in_the_environments_own_shape_is_one(tmp_path: Path) -> 
     assert policy.act(own).shape == (1,)
     policy.reset()
     assert policy.act(np.zeros(2)).shape == (1,)
+
+
+def test_a_reset_forgets_and_keeps_the_networks(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, frames = load_policy(run.path), np.random.default_rng(0).normal(size=(3, 3))
+    first = [policy.act(frame) for frame in frames]
+    with monkeypatch.context() as within:
+        within.setattr(policy_module, "policy_runner", None)
+        policy.reset()
+        assert np.array_equal([policy.act(frame) for frame in frames], first)
+    policy.reset()
+    assert np.array_equal(policy.act(frames[:2]), load_policy(run.path).act(frames[:2]))  # of another number, too
+
+
+@pytest.mark.parametrize("index", [True, False, np.True_, np.array([True]), [0], 1.0, "1"])
+def test_a_reset_of_no_number_is_refused(run: RunFolder, index: Any) -> None:
+    """What says that an episode is over, taken for a number, would be another one's."""
+    policy = load_policy(run.path)
+    with pytest.raises(ConfigError, match=r"^index=.*: give the number of an episode, or nothing for all$"):
+        policy.reset(index)
 
 
 def test_all_probabilities_are_played_by_one_policy(

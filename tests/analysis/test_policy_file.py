@@ -128,6 +128,15 @@ def test_the_return_is_that_of_the_checkpoint(tmp_path: Path, result: bool) -> N
     assert evaluation == ((-4.0, 0.25, 10) if result else (-2.0, 0.5, 5))
 
 
+def test_the_last_evaluation_does_not_count_where_it_was_cut(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
+    played = {"eval_return_mean": -3.0, "eval_return_std": 0.5, "eval_episodes": 5}
+    run.metrics.write_text(json.dumps({"role": "evaluator", "eval_update": 7} | played) + "\n")
+    cut = played | {"eval_return_mean": -4.0, "eval_episodes": 1, "eval_cut": 1}
+    run.write_result(cut | {"env_steps": 70, "updates": 7, "wall_s": 1.0, "initial_return_mean": 0.0})
+    assert read_policy(run.path).header.eval_return_mean == -3.0
+
+
 def test_an_evaluation_that_was_cut_is_no_return(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
     record = {"role": "evaluator", "eval_update": 7, "eval_return_mean": -3.0, "eval_return_std": 0.0}
@@ -327,7 +336,7 @@ def test_a_file_is_played_and_exported_as_its_run_is(
     out = tmp_path / "again.safetensors"
     assert main.run(["export", str(file), "--out", str(out)]) == 0
     assert out.read_bytes() == file.read_bytes()
-    assert "Joints-v0 after 70 environment steps, not evaluated" in capsys.readouterr().out.replace("\n", "")
+    assert "Joints-v0 after 70 steps, not evaluated" in capsys.readouterr().out.replace("\n", "")
 
 
 def test_a_resume_with_more_time_for_the_environment_reaches_older_checkpoints(tmp_path: Path) -> None:

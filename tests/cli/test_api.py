@@ -94,19 +94,37 @@ def test_keywords_that_json_would_change_are_refused(kwargs: dict[Any, Any], tmp
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        ({"launcher": "locla"}, "--launcher='locla': take local, ray, lockstep, manual"),
-        ({"if_exists": "overwrite"}, "--if-exists='overwrite': take resume, fail, new"),
-        ({"track": "neptune"}, "--track='neptune': take wandb, trackio, mlflow, off"),
-        ({"init_parts": "half"}, r"--init-parts='half': take all, memory\+world-model, policy"),
-        ({"metrics_port": "9000"}, "metrics_port='9000': take a whole number"),
-        ({"video_every": 1.0}, "video_every=1.0: take a whole number"),
+        ({"launcher": "locla"}, "launcher='locla': must be one of 'local', 'ray', 'lockstep', 'manual'"),
+        ({"if_exists": "overwrite"}, "if_exists='overwrite': must be one of 'resume', 'fail', 'new'"),
+        ({"track": "neptune"}, "track='neptune': must be one of 'wandb', 'trackio', 'mlflow' or one of 'off' or None"),
+        ({"init_parts": "half"}, r"init_parts='half': must be one of 'all', 'memory\+world-model', 'policy'"),
+        ({"metrics_port": "9000"}, "metrics_port='9000': must be int or None"),
+        ({"video_every": 1.0}, "video_every=1.0: must be int or None"),
+        ({"redis_url": 5}, "redis_url=5: must be str or None"),
+        ({"all_cpus": 1}, "all_cpus=1: must be bool"),
         ({"track_tags": "abc"}, "track_tags='abc': take a list of texts"),
+        ({"track_tags": 5}, "track_tags=5: take a list of texts"),
+        ({"track_tags": [5]}, r"track_tags\[0\]=5: must be str"),
     ],
 )
 def test_a_choice_that_there_is_none_of_is_refused(options: dict[str, Any], line: str, tmp_path: Path) -> None:
     with pytest.raises(rmc.ConfigError, match=f"^{line}$"):
         rmc.train(CONFIG, tmp_path / "run", **options)
     assert not (tmp_path / "run").exists()
+
+
+def test_arguments_of_another_kind_are_refused() -> None:
+    for episodes in (2.5, True, "3", None, 0):
+        with pytest.raises(rmc.ConfigError, match=r"^--episodes=.*: take a whole number from 1 to 10_000$"):
+            rmc.evaluate("runs/none", episodes)
+    for flicker in (True, "x", 1.5):
+        with pytest.raises(rmc.ConfigError, match=r"^--flicker=.*: take a number from 0.0 to 1.0$"):
+            rmc.evaluate("runs/none", flicker=flicker)
+    for call in (rmc.evaluate, rmc.load_policy, rmc.resume, lambda path: rmc.train(CONFIG, path)):
+        with pytest.raises(rmc.ConfigError, match=r"^path=5: take text or a Path$"):
+            call(5)
+    with pytest.raises(rmc.ConfigError, match=r"^seed=-1: take a whole number from 0"):
+        rmc.load_policy("runs/none", seed=-1)
 
 
 def test_a_tilde_is_the_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,7 +224,7 @@ def test_a_signal_that_a_program_around_python_has_taken_stays_its_own(monkeypat
 
 def test_a_thread_is_refused_before_there_is_a_folder(tmp_path: Path) -> None:
     """Only the main thread hears Ctrl-C."""
-    with ThreadPoolExecutor(1) as pool, pytest.raises(rmc.ConfigError, match="is no main thread"):
+    with ThreadPoolExecutor(1) as pool, pytest.raises(rmc.ConfigError, match=r"is no main thread.*; call it there"):
         pool.submit(rmc.train, CONFIG, tmp_path / "run", launcher="lockstep").result()
     assert not (tmp_path / "run").exists()
 

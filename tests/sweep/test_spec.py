@@ -64,6 +64,7 @@ def test_values() -> None:
     assert read_values("1,2.5,1e-3") == [1, 2.5, 1e-3]
     assert read_values("l1,l2") == ["l1", "l2"]
     assert read_values("true,l2,3") == [True, "l2", 3]
+    assert read_values("False,True") == [False, True]
     assert read_values("[64,64],[8]") == [[64, 64], [8]]
 
 
@@ -130,7 +131,7 @@ FILES = {
     "[search.ranges]\nlearning_rate = {low = 0, high = 1, log = true}": "search.learning_rate=0: a logarithmic range",
     "[search.ranges]\nlearning_rate = {low = 0, high = 1, lag = 1}": "search.learning_rate.lag=1: no such key",
     "[search.ranges]\nlearning_rate = {low = 1e-4, high = 2.0}": "--learning-rate=2.0: take a number from",
-    "[search.ranges]\nhide = {low = 1, high = 2}": "search.hide=1: invalid choice",
+    "[search.ranges]\nhide = {low = 1, high = 2}": "search.hide='nothing': only numbers have a range",
     "[search.ranges]\nscheme = [1, 9]": "search.scheme=9: invalid choice",
     "[search.ranges]\ngrounding = {low = 0, high = 1}": "search.grounding=",
     "[grid]\nscheme = [1]\n[search.ranges]\nn_step = [1]": "grid=['scheme']: a sweep has a grid or a search",
@@ -179,6 +180,14 @@ def test_an_option_that_a_table_names_twice_is_refused(table: str, tmp_path: Pat
         ([PENDULUM, "--grid", "scheme=1,3", "--grid", "n_step=1,2"], "--grid='--grid --grid': is there twice"),
         ([PENDULUM, "--search", "scheme=1,3", "--search=n_step=1..2"], "is there twice; give all of NAME=VALUE"),
         ([PENDULUM, "--search", "scheme=1,1,3"], "search.scheme=[1, 1, 3]: has a value twice"),
+        (
+            [PENDULUM, "--grid", "heads=64,64"],
+            "grid.heads=[64, 64]: has a value twice; give each once, and lists in",
+        ),
+        ([PENDULUM, "--grid", "n_step=1,1.0"], "grid='n_step=1 and n_step=1.0': are the same run"),
+        ([PENDULUM, "--search", "n_step=1,1.0"], "n_step=1 and n_step=1.0': are the same run"),
+        ([PENDULUM, "--search", "grounding=0..1"], "search.grounding=True: only numbers have a range"),
+        ([PENDULUM, "--seeds", "1-1000000000"], 'like [1, 2, 3] or "1-5", 1_000_000 at most'),
         ([PENDULUM, "--search", "n_step=1..3,5"], "search.n_step='1..3': "),
         ([PENDULUM, "--init-from", "runs/none"], "--init-from='runs/none': no such run"),
         ([PENDULUM, "--grid", "track=wandb,off"], "grid.track=['wandb', 'off']: no option that a sweep's runs take"),

@@ -240,6 +240,26 @@ def test_a_runs_seconds_are_of_all_its_starts(tmp_path: Path) -> None:
     assert total == 3.5
 
 
+def test_an_index_whose_values_are_none_is_refused(tmp_path: Path) -> None:
+    with closing(Index(tmp_path)) as index:
+        index.put(Job(tmp_path / "trial-0", (), 0, {"gamma": 0.99}), "waiting")
+        index.write()
+    lines = tmp_path / "sweep.jsonl"
+    lines.write_text(lines.read_text().replace('{"gamma": 0.99}', "5"))
+    with pytest.raises(ConfigError, match=r"^sweep.jsonl trial-0=5: its values must be an object; fix or remove its"):
+        Index(tmp_path)
+
+
+def test_seeds_deviate_as_a_sample_does(tmp_path: Path) -> None:
+    jobs = [Job(tmp_path / str(seed), (), seed, {"gamma": 0.99}) for seed in range(2)]
+    with closing(Index(tmp_path)) as index:
+        for job in jobs:
+            index.put(job, "finished")
+            index.lines[job.name]["return"] = 10.0 * job.seed
+        (cell,) = next(column.cells for column in result_table(jobs, index).columns if column.header == "return")
+    assert cell == "5.0 ± 7.1"
+
+
 def test_a_trials_values_stand_under_their_names(tmp_path: Path) -> None:
     """In whatever order its command gave them."""
     jobs = [
