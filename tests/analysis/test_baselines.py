@@ -5,7 +5,6 @@ import json
 import pickle
 import re
 import subprocess
-import sys
 from pathlib import Path
 from typing import get_args
 
@@ -32,6 +31,7 @@ from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.starts import starts
 from tests import habits
+from tests.command import COMMAND
 
 ENV = EnvConfig("InvertedPendulum-v5")
 ALGORITHMS = get_args(Algorithm)
@@ -233,7 +233,7 @@ def test_the_zoos_ppo_trains_and_keeps_its_scales(tmp_path):
 
 def test_one_in_use_is_left_as_it_is_and_can_be_stopped(tmp_path, capsys):
     words = ["baseline", "sac", ENV.id, "--total-steps", "1000000", "--checkpoint-steps", "100", "--run-dir"]
-    command = [sys.executable, "-m", "rmc.cli.main", *words, str(tmp_path / "run")]
+    command = [*COMMAND, *words, str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         while "environment step" not in (line := process.stdout.readline()):

@@ -1,6 +1,5 @@
 """rmc report: one page that a real browser shows without a network, of every kind of run."""
 
-import importlib.util
 import json
 import re
 import shutil
@@ -12,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rmc.analysis import report, video
+from rmc.analysis import doctor, report, video
 from rmc.analysis.curves import HEADINGS
-from rmc.analysis.doctor import examine
 from rmc.analysis.history import Evaluation, History
 from rmc.analysis.report_run import DRAWN, ReportRun
 from rmc.cli.main import run
@@ -24,8 +22,10 @@ from rmc.deploy.run.folder import RunFolder
 from tests.analysis import browser
 from tests.command import rmc
 from tests.docs.running import DOCS, commands, ran
+from tests.hiding import hide
 
 BROWSER_SECONDS = 60
+LEARNT_SECONDS = 0.5  # that the short run has, however fast the machine
 PROBE = """<script>
 const say = (name, value) => document.documentElement.setAttribute("data-" + name, value);
 const videos = [...document.querySelectorAll("video")];
@@ -62,6 +62,7 @@ def test_the_commands_of_its_page_and_of_the_doctors_run(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As docs/report.md and docs/doctor.md print them."""
+    monkeypatch.setattr(doctor, "LEAST_SECONDS", LEARNT_SECONDS)
     monkeypatch.setattr(trial, "TRAINED_SECONDS", 2.0)
     for name in ("first", "second"):
         shutil.copytree(trained, tmp_path / "runs" / name)
@@ -113,7 +114,10 @@ def opened(page: Path, width: int, tmp_path: Path) -> dict[str, int]:
     return {name: int(value) for name, value in re.findall(r'data-(\w+)="(-?\d+)"', head)}
 
 
-def test_a_browser_shows_it_without_a_network(trained: Path, other: Path, tmp_path: Path) -> None:
+def test_a_browser_shows_it_without_a_network(
+    trained: Path, other: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "LEAST_SECONDS", LEARNT_SECONDS)
     page = tmp_path / "report.html"
     text = written(page, str(trained), str(other))
     links = Links(text).targets
@@ -148,7 +152,7 @@ def test_of_a_record_what_is_drawn_is_kept_and_findings_are_the_doctors(trained:
     read = ReportRun.read(trained)
     assert set().union(*read.records) <= DRAWN
     assert {metric for _, _, lines in report.CHARTS for _, metric in lines.values()} <= DRAWN
-    assert read.findings == [str(one) for one in examine(list(read.folder.records()), read.folder.config())]
+    assert read.findings == [str(one) for one in doctor.examine(list(read.folder.records()), read.folder.config())]
 
 
 def test_all_replay_servers_count_in_the_throughput(trained: Path, tmp_path: Path) -> None:
@@ -311,8 +315,7 @@ def test_a_folder_that_is_no_run_is_left_out(trained: Path, tmp_path: Path, capl
 def test_what_is_not_installed_is_named(
     package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    there = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else there(name))
+    hide(package, monkeypatch)
     assert run(["report", "nowhere", "--out", str(tmp_path / "report.html")]) == 2
     err = capsys.readouterr().err
     assert f"{package} is missing; pip install" in err

@@ -175,7 +175,7 @@ def test_a_grid_of_flicker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert main.run(["evaluate", folder, "--episodes", "2", "--flicker", "0", "0.5", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 3
-    assert "blank" not in lines[0]
+    assert "missing" not in lines[0]
     assert "with 50% of the frames missing: return" in lines[1]
     assert "with 100% of the frames missing: return" in lines[2]
     assert "--flicker=2.0" in complaint(["evaluate", folder, "--flicker", "0", "2"], capsys)

@@ -18,7 +18,7 @@ def test_a_bare_pass_trains_steps() -> None:
     [
         (["/usr/bin/valkey-server unixsocket:/tmp/x.sock"], "redis"),
         ([f"{MODEL_PROCESS}   "], MODEL_PROCESS),
-        (["python", "-P", "-m", "rmc.deploy.local.role_process", "actor", "0"], "actor"),
+        (["python", "-P", "-m", "rmc.cli.main", "role", "actor", "--run", "x", "--index", "0"], "actor"),
     ],
 )
 def test_memory_is_that_of_the_right_role(words: list[str], role: str, monkeypatch: pytest.MonkeyPatch) -> None:

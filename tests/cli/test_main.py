@@ -12,6 +12,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from rmc.cli import main, parser, train_options
@@ -431,6 +432,24 @@ def test_a_runs_folder_is_its_owners_alone_until_they_open_it(tmp_path: Path) ->
     run.path.chmod(0o750)
     open_run(run.config(), LaunchOptions(run.path)).lock.release()
     assert stat.S_IMODE(run.path.stat().st_mode) == 0o750
+
+
+FAILS = """
+import subprocess
+from rmc.cli import main
+def fail(words):
+    main.descendants.adopt_orphans()
+    print(subprocess.Popen(["sleep", "60"], start_new_session=True, stdout=subprocess.DEVNULL).pid, flush=True)
+    raise RuntimeError("unforeseen")
+main.run = fail
+main.main()
+"""
+
+
+def test_what_an_environment_started_ends_with_a_command_that_fails_of_a_bug() -> None:
+    ended = subprocess.run([sys.executable, "-c", FAILS], capture_output=True, text=True, check=False)
+    assert (ended.returncode, "RuntimeError: unforeseen" in ended.stderr) == (1, True)
+    assert not psutil.pid_exists(int(ended.stdout))
 
 
 def test_options_become_the_config() -> None:

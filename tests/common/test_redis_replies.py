@@ -13,10 +13,12 @@ from typing import Any
 import psutil
 import pytest
 import redis
+from redis.exceptions import ResponseError
 
+from rmc.common.bus import redis_connection
 from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner, Version
 from rmc.common.bus.redis_bus import RedisBus
-from rmc.common.bus.redis_connection import TIMEOUT_SECONDS
+from rmc.common.bus.redis_client import refusal
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.redis.connect import Deadline, connect
@@ -49,6 +51,12 @@ WRITES: dict[str, Call] = {
     "replay": lambda bus: bus.announce_replay(ReplayOwner("replay", 1), "unix:x"),
     "run": lambda bus: bus.expire(60),
 }
+FAQ = (Path(__file__).parents[2] / "docs" / "faq.md").read_text()
+TABLE = FAQ.split("## What a Redis of my own answers")[1].split("\n## ")[0]
+ROWS = re.findall(r"^\| (`[A-Z].*?) \|", TABLE, re.MULTILINE)
+MEANS = BusUnavailable, BusFull, ConfigError, ConfigError, ConfigError  # of each row of the docs' table
+ANSWERS = {code: means for row, means in zip(ROWS, MEANS, strict=True) for code in re.findall(r"[A-Z]+", row)}
+del ANSWERS["LOADING"]  # for redis-py a lost connection
 OF_ANOTHER_TYPE = {  # a key that somebody made a list, and who stumbles over it
     **{key: call for key, call in READS.items() if key != "weights:1:1:0"},
     "weights:1:1:0": READS["weights:1:1:0"],
@@ -108,7 +116,10 @@ def _is_busy(client: redis.Redis) -> bool:
     return False
 
 
-def test_one_that_hangs_amid_a_transaction_costs_one_wait_and_no_connection(tmp_path: Path) -> None:
+def test_one_that_hangs_amid_a_transaction_costs_one_wait_and_no_connection(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(redis_connection, "TIMEOUT_SECONDS", 2.0)
     with RedisServer(tmp_path) as server:
         bus = RedisBus(server.url(), "run")
         assert server.process is not None
@@ -122,10 +133,10 @@ def test_one_that_hangs_amid_a_transaction_costs_one_wait_and_no_connection(tmp_
         began = time.monotonic()
         with pytest.raises(BusUnavailable):
             bus.call(lambda: bus.redis.transaction(freeze, "watched"))
-        assert time.monotonic() - began < TIMEOUT_SECONDS + 2.0
+        assert time.monotonic() - began < 2 * redis_connection.TIMEOUT_SECONDS
         process.resume()
         assert not bus.redis.connection_pool._in_use_connections
-        time.sleep(TIMEOUT_SECONDS)
+        bus._rests_until = 0.0  # as once it has been left alone for as long as it took
         bus.ping()
 
 
@@ -159,6 +170,22 @@ def test_masterdown(server: RedisServer, bus: RedisBus, call: Call) -> None:
         call(bus)
 
 
+def test_after_a_failover_the_name_leads_to_the_new_master(tmp_path: Path) -> None:
+    for folder in ("old", "new"):
+        (tmp_path / folder).mkdir(mode=0o700)
+    with RedisServer(tmp_path / "old") as old, RedisServer(tmp_path / "new") as new:
+        (name := tmp_path / "name").symlink_to(old.socket)
+        bus = RedisBus(f"unix://{name}", "run")
+        bus.set_config(b"old")
+        with replica(old, "yes"):
+            name.unlink()
+            name.symlink_to(new.socket)
+            with pytest.raises(BusUnavailable, match="READONLY"):
+                bus.set_config(b"new")
+            bus.set_config(b"new")
+        assert RedisBus(new.url(), "run").config() == b"new"
+
+
 @pytest.mark.parametrize("call", WRITES.values(), ids=WRITES)
 def test_too_few_replicas(server: RedisServer, bus: RedisBus, call: Call) -> None:
     client = redis.Redis.from_url(server.url())
@@ -168,6 +195,11 @@ def test_too_few_replicas(server: RedisServer, bus: RedisBus, call: Call) -> Non
             call(bus)
     finally:
         client.config_set("min-replicas-to-write", 0)
+
+
+@pytest.mark.parametrize(("code", "means"), ANSWERS.items(), ids=ANSWERS)
+def test_each_answer_means_what_the_docs_say(code: str, means: type[Exception]) -> None:
+    assert type(refusal(ResponseError(f"{code} x"), "redis://x")) is means
 
 
 @pytest.mark.parametrize(("key", "call"), OF_ANOTHER_TYPE.items(), ids=OF_ANOTHER_TYPE)
@@ -202,7 +234,7 @@ def test_an_epoch_that_none_can_be_is_mended(bus: RedisBus, value: str | int) ->
     assert bus.current_epoch("replay") == 1
 
 
-def test_a_cluster_is_waited_for_while_it_is_down_and_refused_where_keys_are_elsewhere() -> None:
+def test_a_cluster_is_waited_for_while_it_is_down() -> None:
     with tempfile.TemporaryDirectory(prefix="rmc-cluster-") as folder:
         words = ["--port", "0", "--unixsocket", f"{folder}/r", "--cluster-enabled", "yes", "--dir", folder]
         with subprocess.Popen([server_binary(), *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as node:

@@ -25,6 +25,8 @@ def test_a_file_of_options_trains(tmp_path: Path) -> None:
 
 
 def test_every_shell_of_the_page_has_a_script(capsys: pytest.CaptureFixture[str]) -> None:
-    for shell in re.findall(r"^\| \w+ \| `rmc completion (\w+) >", PAGE, re.MULTILINE):
+    shells = re.findall(r"^\| \w+ \| `rmc completion (\w+) >", PAGE, re.MULTILINE)
+    assert shells == ["bash", "zsh", "fish"]
+    for shell in shells:
         assert main.run(["completion", shell]) == 0
         assert "check-env" in capsys.readouterr().out

@@ -2,24 +2,30 @@
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from docs import fault_table, results_page
-from docs.generate import page
+from docs import fault_table, generate, results_page
 from rmc.cli import main
-from rmc.cli.parser import COMMANDS
+from rmc.cli.parser import COMMANDS, parse
+from rmc.cli.sweep_options import Sweep
 from rmc.common import agent, critic
 from rmc.common.env import missing
+from rmc.common.env.config import EnvConfig
+from rmc.deploy.run import presets
+from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.opening import open_run
 from rmc.learner import diagnostics, losses, update, update_order
 from tests.command import rmc
 from tests.docs.running import LOCKSTEP
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SHORT = ("--total-steps", "700", *LOCKSTEP)
 
 
@@ -164,20 +170,31 @@ def test_the_docs_name_options_that_exist(capsys: pytest.CaptureFixture[str]) ->
         assert main.run([*command.split(), "--help-all"]) == 0
     there = set(re.findall(r"--[a-z][a-z-]*[a-z]", capsys.readouterr().out))
     there |= {
-        "--no-restart",
-        "--node-ip-address",
-        "--generate",
-        "--logdir",
-        "--user",
-        "--shm-size",
-        "--exclude",
-    }  # of others
+        "--cap-drop", "--exclude", "--generate", "--logdir", "--network", "--no-restart", "--node-ip-address",
+        "--read-only", "--rm", "--shm-size", "--user",
+    }  # fmt: skip  # of others
     there.add("--version")  # alone
-    there |= {"--alone", "--scale", "--seeds", "--only", "--env", "--play", "--draw"}  # of benchmarks and studies
-    for text in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
-        named = set(re.findall(r"`[^`\n]*?(--[a-z][a-z-]*[a-z])", text.read_text()))
-        assert named <= there, (text, named - there)
+    there |= {"--alone", "--first-rate", "--only", "--env", "--play"}  # of benchmarks and studies
+    for page in PAGES:
+        named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*[a-z]", page.read_text()))
+        assert named <= there, (page, named - there)
+
+
+def test_the_commands_of_all_pages_can_be_parsed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those in blocks, whatever stands before and after them in their line."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("first", "week"):  # that are resumed
+        open_run(presets.debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(Path("runs", name))).lock.release()
+    text = "".join(page.read_text() for page in PAGES)
+    Path("agent.toml").write_text(text.split("```toml\n")[1].split("```")[0])
+    blocks = "\n".join(re.findall(r"```\w*\n(.*?)```", text, re.DOTALL)).replace("\\\n", "")
+    printed = re.findall(rf"\brmc ((?:{'|'.join(COMMANDS)})\b[^&|;>\n]*)", blocks)
+    assert len(printed) > 50
+    for line in printed:
+        command = parse(shlex.split(line, comments=True))
+        if isinstance(command, Sweep):  # whose other options are those of rmc train
+            parse(["train", "InvertedPendulum-v5", *command.train_words])
 
 
 def test_the_page_of_options_is_up_to_date() -> None:
-    assert page() == (ROOT / "docs" / "configuration.md").read_text(), "run make docs"
+    assert generate.page() == (ROOT / "docs" / "configuration.md").read_text(), "run make docs"

@@ -3,7 +3,6 @@
 import re
 import shlex
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -13,11 +12,11 @@ import yaml
 from rmc import deploy
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.starts import starts
+from tests.command import COMMAND
 from tests.docs.running import DOCS, LOCKSTEP, commands, ran
 from tests.integration.running import free_port
 
 PAGE = (DOCS / "operating.md").read_text()
-RMC = [sys.executable, "-m", "rmc.cli.main"]
 LOOKED_AT_SECONDS = 8.0  # the doctor wants 5 of training
 
 
@@ -36,7 +35,7 @@ def test_a_run_is_operated_for_a_week(tmp_path: Path) -> None:
     train, stats, doctor, stop, resume, export = commands(PAGE)
     archive = re.findall(r"```sh\n(tar .*)\n```", PAGE)[0]
     run = RunFolder(tmp_path / "runs" / "week")
-    words = [*RMC, *train[:-1], str(free_port())]
+    words = [*COMMAND, *train[:-1], str(free_port())]
     with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as trained:
         try:
             while trained_seconds(run) < LOOKED_AT_SECONDS:

@@ -14,7 +14,9 @@ import pytest
 
 from rmc.analysis.run_list import DAMAGED
 from rmc.deploy.run.state import State
+from tests.command import COMMAND
 from tests.docs.running import DOCS, LOCKSTEP, commands, ran
+from tests.integration.running import free_port
 
 WATCHING, TRACKERS = ((DOCS / f"{name}.md").read_text() for name in ("watching", "trackers"))
 SHORT = (*LOCKSTEP, "--total-steps", "600")
@@ -22,8 +24,10 @@ SHORT = (*LOCKSTEP, "--total-steps", "600")
 
 def test_a_run_is_watched(tmp_path: Path) -> None:
     *looks, watch, served = commands(WATCHING)
-    trained = ran(tmp_path, *served, *SHORT)
-    assert "metrics on 127.0.0.1, port 9464\n" in trained
+    assert served[-2:] == ["--metrics-port", "9464"]
+    port = str(free_port())  # another run may have the page's
+    trained = ran(tmp_path, *served[:-1], port, *SHORT)
+    assert f"metrics on 127.0.0.1, port {port}\n" in trained
     assert re.search(r"^\d+% \| \d+ of 600 steps \| .* updates/s \| eval .* \| 0:00:\d\d$", trained, re.MULTILINE)
     stats, as_json, listed = (ran(tmp_path, *words) for words in looks)
     assert "InvertedPendulum-v5 · debug · seed 0 · finished" in stats
@@ -33,8 +37,7 @@ def test_a_run_is_watched(tmp_path: Path) -> None:
     assert re.search(r"^first +finished +600 .* 100%$", listed, re.MULTILINE)
     (one,) = json.loads(ran(tmp_path, "list", "runs", "--json"))
     assert (one["state"], one["env_steps"]) == ("finished", 600)
-    words = [sys.executable, "-m", "rmc.cli.main", *watch, "--port", "0"]
-    with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as server:
+    with subprocess.Popen([*COMMAND, *watch, "--port", "0"], cwd=tmp_path, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         with urlopen(f"{server.stdout.readline().strip()}events", timeout=20) as events:
             state: dict[str, Any] = {}

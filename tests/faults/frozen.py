@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from pathlib import Path
 import psutil
 
 from rmc.deploy.local.role_environment import URL_VARIABLE
+from tests.command import COMMAND
 from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.row import Row, at_length
 from tests.faults.witness import went_back
@@ -76,7 +76,7 @@ def _runs(process: psutil.Process) -> bool:
 @contextmanager
 def _in_its_place(run: Loaded, role: str) -> Iterator[None]:
     """The same role once more; ends of itself when it is replaced in turn."""
-    words = [sys.executable, "-m", "rmc.cli.main", *_words(run, role)]
+    words = [*COMMAND, *_words(run, role)]
     environment = {**os.environ, URL_VARIABLE: run.url_of(role)}
     with (run.folder.parent / f"other-{role}.log").open("ab") as log:
         other = subprocess.Popen(words, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log)

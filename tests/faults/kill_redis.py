@@ -14,6 +14,7 @@ from rmc.deploy.redis.server import server_binary
 from tests.faults.loaded import Loaded
 from tests.faults.row import Row, at_length
 from tests.faults.witness import went_back
+from tests.waiting import wait_until
 
 RECOVERY_S = 5.0
 
@@ -41,16 +42,8 @@ class LoggedRedis:
     def start(self) -> None:
         """The same; returns once it answers."""
         self.launch()
-        client = redis.Redis.from_url(self.url)
-        deadline = time.monotonic() + 20.0
-        while True:
-            try:
-                client.ping()
-                client.close()
-                return
-            except redis.exceptions.ConnectionError:
-                assert time.monotonic() < deadline, self._log.read_text()
-                time.sleep(0.01)
+        with redis.Redis.from_url(self.url) as client:
+            wait_until(lambda: _answers(client), 20.0, self.log_text, 0.01)
 
     def log_text(self) -> str:
         """What it told."""
@@ -64,6 +57,13 @@ class LoggedRedis:
         """kill -9."""
         self.process.kill()
         self.process.wait()
+
+
+def _answers(client: redis.Redis) -> bool:
+    try:
+        return bool(client.ping())
+    except redis.exceptions.ConnectionError:
+        return False
 
 
 @contextmanager

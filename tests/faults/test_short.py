@@ -40,7 +40,7 @@ def leaves_nothing_behind() -> None:
     """Not after each of these tests, which share a run."""
 
 
-class RunConnection:
+class Place:
     """Where it happens: a folder, a small disk for the run and one for the log of its Redis."""
 
     def __init__(self, folder: Path, leave: ExitStack) -> None:
@@ -66,20 +66,20 @@ class RunConnection:
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunConnection]:
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     with ExitStack() as leave:
-        yield RunConnection(tmp_path_factory.mktemp("faults"), leave)
+        yield Place(tmp_path_factory.mktemp("faults"), leave)
 
 
 @pytest.fixture(scope="module")
-def run(place: RunConnection) -> Iterator[Loaded]:
+def run(place: Place) -> Iterator[Loaded]:
     with place.start() as run:
         run.begin()
         yield run
 
 
 @pytest.fixture(scope="module")
-def full(place: RunConnection) -> Iterator[Loaded]:
+def full(place: Place) -> Iterator[Loaded]:
     with place.start_full() as run:
         run.begin()
         run.until(lambda: run.newest("replay", "ring_fill") == 1.0)
@@ -114,7 +114,7 @@ def test_a_loss_is_no_number(run: Loaded) -> None:
     assert "training has diverged, weights are not finite" in (run.folder / "logs" / "learner.log").read_text()
 
 
-def test_redis_is_killed(place: RunConnection, run: Loaded) -> None:
+def test_redis_is_killed(place: Place, run: Loaded) -> None:
     place.redis.kill()
     place.redis.start()
     run.until_all_go_on()
@@ -122,7 +122,7 @@ def test_redis_is_killed(place: RunConnection, run: Loaded) -> None:
 
 
 @compiler
-def test_the_clock_is_moved(place: RunConnection, run: Loaded) -> None:
+def test_the_clock_is_moved(place: Place, run: Loaded) -> None:
     now = time.time()
     run.until(lambda: run.newest("launcher", "time") > now)  # its metrics may be late after what killed Redis
     restarts = run.newest("launcher", "restarts")
@@ -140,7 +140,7 @@ def test_an_actor_stands_still_and_is_replaced(run: Loaded) -> None:
 
 @root
 @pytest.mark.long  # chaos at length has it, too
-def test_the_log_of_redis_has_no_room(place: RunConnection, run: Loaded) -> None:
+def test_the_log_of_redis_has_no_room(place: Place, run: Loaded) -> None:
     with filled(place.disks["log"]):
         cannot_log(run, place.redis)
     run.until_all_go_on()
@@ -148,7 +148,7 @@ def test_the_log_of_redis_has_no_room(place: RunConnection, run: Loaded) -> None
 
 @root
 @pytest.mark.long
-def test_a_checkpoint_has_no_room(place: RunConnection, run: Loaded) -> None:
+def test_a_checkpoint_has_no_room(place: Place, run: Loaded) -> None:
     checkpoints = CheckpointFolder(run.folder / "checkpoints")
     with filled(place.disks["run"]):
         goes_on_unsaved(run)  # one that was being written when the disk filled may still have made room for the next
@@ -174,7 +174,7 @@ def test_the_learner_stands_still_and_is_replaced(run: Loaded) -> None:
     assert row.passed, row
 
 
-def test_all_are_killed_at_once_and_nothing_was_ever_lost(place: RunConnection, run: Loaded) -> None:
+def test_all_are_killed_at_once_and_nothing_was_ever_lost(place: Place, run: Loaded) -> None:
     run.kill_all()
     reported = {name: run.newest("replay", name) for name in ("env_steps", "windows", "drawn_steps", "draws")}
     with place.start() as again:

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import subprocess
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 import redis
 
 from rmc.analysis.policy_file import decode
+from tests.command import COMMAND
 from tests.docs.running import ran
 from tests.integration.running import Training
 
@@ -101,7 +101,7 @@ def test_roles_by_hand_over_tcp(redis_url: str, run_name: str, tmp_path: Path) -
             for word, place in places.items():
                 words = words.replace(word, place)
             log = stack.enter_context((tmp_path / f"{words.split()[1]}.log").open("wb"))
-            line = [sys.executable, "-m", "rmc.cli.main", *words.split()]
+            line = [*COMMAND, *words.split()]
             roles.append(subprocess.Popen(line, env=environment, stdout=subprocess.DEVNULL, stderr=log))
         for role in roles:
             stack.callback(role.wait)

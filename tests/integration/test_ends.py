@@ -62,7 +62,7 @@ def test_who_stops_it_amid_its_first_or_last_evaluation_is_told_how_to_go_on(whe
         training.interrupt()
         assert training.process.returncode == 130
     steps_made = 400 * (when == "after")
-    how = f"stopped at environment step {steps_made}; to go on:\n  rmc resume {tmp_path / 'run'}\n"
+    how = f"stopped at step {steps_made}; to go on:\n  rmc resume {tmp_path / 'run'}\n"
     assert how in training.text()
     assert RunFolder(tmp_path / "run").lock.ended() == 130
 

@@ -6,7 +6,6 @@ The test is the learner: it publishes the weights and draws until it has every w
 import dataclasses
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +23,7 @@ from rmc.deploy.run.config import to_registration
 from rmc.deploy.run.presets import debug
 from rmc.learner.replay_client import ReplayClient
 from rmc.replay_server.config import ReplayConfig
+from tests.command import COMMAND
 from tests.counting_env import Step, audit
 
 SECONDS = 90.0
@@ -63,7 +63,7 @@ def client(bus: RedisBus, redis_url: str, run_name: str, tmp_path: Path) -> Iter
         ["role", "replay", *place, *listen],
         *(["role", "actor", *place, "--index", str(index)] for index in range(CONFIG.actors)),
     ]
-    processes = [subprocess.Popen([sys.executable, "-m", "rmc.cli.main", *words], env=os.environ) for words in roles]
+    processes = [subprocess.Popen([*COMMAND, *words], env=os.environ) for words in roles]
     replay = ReplayClient(lambda: f"unix:{tmp_path}/s", b"every hop", CONFIG.window_spec(), BATCH)
     replay.register_learner(bus.current_epoch("learner"))  # only the newest learner is served
     yield replay

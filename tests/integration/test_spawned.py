@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,9 +14,11 @@ import pytest
 from rmc.common.errors import STOPPED_STATUS
 from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.redis.socket_folder import sweep
+from tests.command import COMMAND
 from tests.integration.running import Training
 from tests.integration.spawning_env import SPAWNED
 from tests.processes import alive
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere, those of its process group do")
 ENDLESS = ("--total-steps", "100000000", "--env-timeout", "3")
@@ -67,13 +68,11 @@ def training(tmp_path: Path) -> Iterator[Spawner]:
 
 
 def end_all(run: Spawner) -> None:
-    deadline = time.monotonic() + 5.0
-    while left := run.simulators():
-        if time.monotonic() > deadline:
-            for one in left:
-                one.kill()
-            raise AssertionError(f"left: {left}")
-        time.sleep(0.05)
+    try:
+        wait_until(lambda: not run.simulators(), 5.0, lambda: f"left: {run.simulators()}")
+    finally:
+        for one in run.simulators():
+            one.kill()
 
 
 def test_they_end_with_a_role_that_is_killed_or_hangs_and_with_the_run(training: Spawner) -> None:
@@ -127,12 +126,11 @@ def test_those_of_a_group_end_where_the_fork_server_is_killed(training: Spawner)
 
 def checked(tmp_path: Path, *words: str) -> tuple[subprocess.Popen[bytes], list[psutil.Process]]:
     """A command that plays without end, and what its environment has started."""
-    command = [sys.executable, "-m", "rmc.cli.main", "check-env", SPAWNING, "--steps", "1000000", *words]
+    command = [*COMMAND, "check-env", SPAWNING, "--steps", "1000000", *words]
     process = subprocess.Popen(command, env={**os.environ, SPAWNED: str(tmp_path)}, stderr=subprocess.DEVNULL)
     note = tmp_path / str(process.pid)
-    while not note.exists():
-        assert process.poll() is None
-        time.sleep(0.05)
+    wait_until(lambda: note.exists() or process.poll() is not None, 60.0)
+    assert process.poll() is None
     theirs = alive([psutil.Process(int(pid)) for pid in note.read_text().split()])
     assert len(theirs) == 3
     return process, theirs

@@ -4,7 +4,6 @@ import errno
 import os
 import shutil
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -85,9 +84,7 @@ def test_a_runs_folder_that_vanishes_ends_it_in_one_line(vanish: Callable[[Path]
         assert actor is not None
         vanish(training.folder)
         actor.kill()
-        began = time.monotonic()
         assert training.finish(30) == 2
-        assert time.monotonic() - began < 15.0
         assert not alive(processes)
     last = training.text().splitlines()[-1]
     assert last.startswith(f"rmc: --run-dir='{training.folder}': was deleted or moved while it was trained")
