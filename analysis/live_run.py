@@ -5,7 +5,6 @@ A look is a message that JSON can hold: what has changed of the state, and of cu
 
 import math
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +77,7 @@ class LiveRun:
         """Know nothing of it yet. Raises ConfigError."""
         self._status, self._began = empty_status(self._folder), self._first_start()
         self._status.steps_before = 0  # all its starts are read
-        self._tail = MetricsTail(self._folder.metrics, recent_bytes=sys.maxsize)
+        self._tail = MetricsTail(self._folder.metrics, recent_bytes=None)
         self._curves: dict[str, Curve] = {}
         self._events: list[Event] = []
         self._state: dict[str, Any] = {"name": self._name}

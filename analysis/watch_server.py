@@ -26,6 +26,7 @@ LOOK_SECONDS = 0.5  # between looks at the runs
 PING_SECONDS = 15.0  # without news, after which a page is told that we are there
 PING = b"event: ping\ndata: -\n\n"
 BACKLOG = 64  # looks that a page may be behind; beyond, it is told everything again
+END_SECONDS = 1  # that a page has to take what it asked for, once we end
 LOOPBACK = ["127.0.0.1", "localhost", "[::1]"]  # no other name: it could be a web page's that leads here
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
@@ -111,6 +112,7 @@ class TokenGuard:
 def application(runs: Sequence[LiveRun], broadcast: EventStream, host: str, token: str) -> Starlette:
     """The page of these runs, at ``host``; without a ``token`` for browsers of this machine alone."""
     page = files("rmc.analysis").joinpath("watch.html").read_text(encoding="utf-8")
+    by_place = {str(place): run for place, run in enumerate(runs)}
 
     async def show(_: Request) -> Response:
         return HTMLResponse(page)
@@ -119,25 +121,29 @@ def application(runs: Sequence[LiveRun], broadcast: EventStream, host: str, toke
         return StreamingResponse(broadcast.stream(), media_type="text/event-stream")
 
     async def media(request: Request) -> Response:
-        at, kind = request.path_params["run"], request.path_params["kind"]
-        path = runs[at].media.get(kind) if at < len(runs) else None
+        run, kind = by_place.get(request.path_params["run"]), request.path_params["kind"]
+        path = run.media.get(kind) if run is not None else None
         if path is None or not path.is_file():
             raise HTTPException(404)
         return FileResponse(path)
 
     guard = Middleware(TokenGuard, token) if token else Middleware(TrustedHostMiddleware, [*LOOPBACK, host])
-    routes = [Route("/", show), Route("/events", stream), Route("/media/{run:int}/{kind}", media)]
+    routes = [Route("/", show), Route("/events", stream), Route("/media/{run}/{kind}", media)]
     return Starlette(routes=routes, middleware=[guard])
 
 
 def serve(runs: Sequence[LiveRun], listener: socket.socket, host: str, token: str) -> None:
-    """Serve the page on a socket until Ctrl-C, which is a KeyboardInterrupt."""
+    """Serve the page on a socket until Ctrl-C, which is a KeyboardInterrupt.
+
+    By h11, which reads no more than 64 KiB of a request's headers; what strangers send wrongly is not shown.
+    """
 
     async def run() -> None:
         broadcast = EventStream(runs)
         config = uvicorn.Config(
             application(runs, broadcast, host, token), lifespan="off", ws="none", log_config=None, access_log=False,
-            proxy_headers=False, server_header=False, headers=list(HEADERS.items()),
+            proxy_headers=False, server_header=False, headers=list(HEADERS.items()), http="h11", log_level="critical",
+            timeout_graceful_shutdown=END_SECONDS,
         )  # fmt: skip
         server = uvicorn.Server(config)
         async with asyncio.TaskGroup() as tasks:

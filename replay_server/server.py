@@ -4,7 +4,6 @@ Shapes: B batch, O observation. One thread does it all; ``step`` takes in one bo
 """
 
 import logging
-import math
 import time
 from pathlib import Path
 from typing import Any
@@ -71,7 +70,7 @@ class ReplayServer:
         self._refused_priorities = self._damaged_windows = 0
         self._newest: Version | None = None  # of the weights, when last looked at
         self._look_at = 0.0
-        self._largest_lag = -math.inf  # of what was inserted since the last metrics
+        self._largest_lag = 0.0  # of what was inserted since the last metrics
         self._means, self._rates = Means(), {name: Rate() for name in ("env_steps", "windows", "draws")}
 
     def _open(self, folder: Path, config: ReplayConfig, warmup_steps: int) -> int:
@@ -124,7 +123,7 @@ class ReplayServer:
             self._look_at = time.monotonic() + LOOK_SECONDS
             self._newest = self.bus.latest_version()
         if len(rows) and self._newest is not None:
-            lag = self._newest.update - rows["weights_update"]
+            lag = np.maximum(self._newest.update - rows["weights_update"], 0)  # below 0 is of updates that a kill undid
             self._means.add("policy_lag_mean", float(lag.mean()))
             self._largest_lag = max(self._largest_lag, float(lag.max()))
 
@@ -250,7 +249,7 @@ class ReplayServer:
         rates = {f"{name}_per_s": rate.take(stats[name]) for name, rate in self._rates.items()}
         lags = self._means.take()
         if lags:
-            lags["policy_lag_max"], self._largest_lag = self._largest_lag, -math.inf
+            lags["policy_lag_max"], self._largest_lag = self._largest_lag, 0.0
         return {**stats, **rates, **lags}
 
     def waiting_for(self) -> str:

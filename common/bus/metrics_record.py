@@ -39,7 +39,7 @@ def decode_record(packed: bytes) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise MessageError("structure", "a record is a map")
     for name, value in record.items():
-        if not _is_plain(name) or not is_metric(name, value):
+        if not is_metric(name, value):
             raise MessageError("structure", f"{name!r:.80} is no metric")
     return record
 
@@ -59,12 +59,14 @@ def is_complete(evaluation: Mapping[str, Any]) -> bool:
 
 def is_metric(name: str, value: Any) -> bool:
     """Whether a record may hold that: all who show one count with it."""
+    if not is_plain(name):
+        return False
     if name.endswith(TEXT):
-        return _is_plain(value)
+        return is_plain(value)
     return all(map(_is_number, value)) if name == LIST and isinstance(value, list) else _is_number(value)
 
 
-def _is_plain(text: Any) -> bool:
+def is_plain(text: Any) -> TypeGuard[str]:
     """Whether it can be printed as it is: no control characters, no markup."""
     return isinstance(text, str) and text.isprintable() and "[" not in text
 

@@ -53,7 +53,7 @@ def has_password(url: str) -> bool:
         parts = urlsplit(url)
     except ValueError:
         return False
-    return bool(parts.password) or "password" in parse_qs(parts.query)
+    return bool(parts.password) or any(name.endswith("password") for name in parse_qs(parts.query))
 
 
 def warn_of_password(url: str) -> None:

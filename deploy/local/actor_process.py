@@ -22,9 +22,9 @@ EVALUATOR_IDLE_SECONDS = 0.05  # and an evaluator every 0.1 s
 EVALUATOR_NICENESS = 10  # it must not take the learner's core
 
 
-def run_actor(place: RunConnection, index: int) -> int:
+def run_actor(connection: RunConnection, index: int) -> int:
     """The process of actor ``index``."""
-    process = Process(place)
+    process = Process(connection)
     config = process.config
     if not 0 <= index < config.actors:
         raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
@@ -53,9 +53,9 @@ def make_evaluator(
     return Evaluator(config.seed, make_env, config.agent, config.evaluator, bus, clock, config.layout.missing)
 
 
-def run_evaluator(place: RunConnection) -> int:
+def run_evaluator(connection: RunConnection) -> int:
     """The evaluator's process."""
-    process = Process(place)
+    process = Process(connection)
     config = process.config
     torch.set_num_threads(1)
     os.nice(EVALUATOR_NICENESS)

@@ -4,12 +4,11 @@ import json
 import logging
 import signal
 import time
-from contextlib import suppress
 from pathlib import Path
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import PROGRESS, CheckpointFolder
-from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RmcError
+from rmc.common.errors import BusFull, BusUnavailable, ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local.role_command import (
     RoleCommand,
@@ -30,7 +29,6 @@ from rmc.deploy.run.folder import RunFolder
 TICK_SECONDS = 0.2  # between looks at the roles and their metrics: a look costs 3 ms
 UNREACHABLE_SECONDS = 1.0  # without its socket, until a replay server is started again
 OUTAGE_SECONDS = 86_400.0  # of a Redis that answered once, until a role that is started amid it gives up
-KEPT_SECONDS = 3600  # in a user's Redis, after the end
 log = logging.getLogger(__name__)
 
 
@@ -52,7 +50,7 @@ class LocalRun:
         self, config: RunConfig, folder: RunFolder, redis_url: str | None, device: str, stop: StopSignal
     ) -> None:
         self._redis = RunRedis(config, folder, stop, redis_url)
-        self.bus, self._is_users = self._redis.bus, redis_url is not None
+        self.bus = self._redis.bus
         self._shards = config.shards()
         self._listening: dict[str, tuple[int | None, float]] = {}  # who listened, and when it was seen last
         self.supervisor = Supervisor(
@@ -98,17 +96,9 @@ class LocalRun:
         """End everything; nothing is left but the run's folder."""
         try:
             self.supervisor.stop()
-            self._redis.keep()
-            if self._is_users:
-                _expire(self.bus)
+            self._redis.end()
         finally:
             self._redis.close()
-
-
-def _expire(bus: RedisBus) -> None:
-    """Do not leave a user's Redis full of runs that are over; what they need to go on is in their folders."""
-    with suppress(RmcError):
-        bus.expire(KEPT_SECONDS)
 
 
 def train(
@@ -155,24 +145,33 @@ def attend(config: RunConfig, folder: RunFolder, redis_url: str, monitor: Monito
     """Register a run whose roles are started by hand, watch it and end it; whether its total was reached."""
     bus = connect(redis_url, folder.name)
     registration = tried_again(lambda: Registration(config, folder, bus), stop)
-    tried_again(lambda: monitor.skip_old(bus), stop)
-    while not stop.requested and not monitor.learner_finished():
-        registration.tend()
-        monitor.watch(bus)
-        time.sleep(TICK_SECONDS)
-    reason, asked = "stopped by its launcher" if stop.requested else "finished", False
-    deadline = time.monotonic() + CheckpointFolder(folder.checkpoints).patience(STOP_SECONDS)
-    while (stop.requested or not asked) and time.monotonic() < deadline:
-        asked = asked or asked_to_stop(bus, reason)
-        monitor.watch(bus)  # the learner saves; what it says then is still recorded
-        time.sleep(TICK_SECONDS)
-    if not asked:
-        log.warning("Redis took no request to stop; end the run's roles by hand")
-    registration.keep()
-    _expire(bus)
+    try:
+        _watched(registration, folder, bus, monitor, stop)
+    finally:
+        registration.end()
     if monitor.learner_finished():
         _check_last(folder.checkpoints, monitor.status.get("learner", "checkpoint_update"))
     return monitor.learner_finished()
+
+
+def _watched(registration: Registration, folder: RunFolder, bus: RedisBus, monitor: Monitor, stop: StopSignal) -> None:
+    """Watch a run's roles to the end, and ask them to stop, whatever the end was."""
+    reason, asked = "stopped by its launcher", False
+    try:
+        tried_again(lambda: monitor.skip_old(bus), stop)
+        while not stop.requested and not monitor.learner_finished():
+            registration.tend()
+            monitor.watch(bus)
+            time.sleep(TICK_SECONDS)
+        reason = reason if stop.requested else "finished"
+        deadline = time.monotonic() + CheckpointFolder(folder.checkpoints).patience(STOP_SECONDS)
+        while (stop.requested or not asked) and time.monotonic() < deadline:
+            asked = asked or asked_to_stop(bus, reason)
+            monitor.watch(bus)  # the learner saves; what it says then is still recorded
+            time.sleep(TICK_SECONDS)
+    finally:
+        if not (asked or asked_to_stop(bus, reason)):
+            log.warning("Redis took no request to stop; end the run's roles by hand")
 
 
 def _check_last(checkpoints: Path, update: int | None) -> None:

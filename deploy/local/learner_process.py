@@ -23,14 +23,14 @@ from rmc.learner.replay_client import ReplayClient
 from rmc.learner.sharded_replay import ShardedReplay
 
 
-def run_learner(place: RunConnection, folder: Path, device: str) -> int:
+def run_learner(connection: RunConnection, folder: Path, device: str) -> int:
     """The learner's process; checkpoints go to ``folder``. Its last record says ``finished`` where the run is."""
-    secret, process = place.secret(), Process(place)
+    secret, process = connection.secret(), Process(connection)
     config, spec, bus = process.config, process.config.window_spec(), process.bus
     torch.set_num_threads(1)  # until it is known whether the model's half has a process, and what is fastest
     check_device(device)
     pinned, batch = device.startswith("cuda"), config.learner.batch_size
-    context = tls.client_context(place.tls_folder) if place.tls_folder is not None else None
+    context = tls.client_context(connection.tls_folder) if connection.tls_folder is not None else None
     clients = replay_clients(config, bus, secret, pinned, context)
     replay = clients[0] if len(clients) == 1 else ShardedReplay(clients, spec, batch, config.seed, pinned)
     with process.starting(Learner.name):

@@ -27,13 +27,13 @@ def drop_unread(bus: Bus, shard: Shard) -> None:
         bus.drop_stream(owner, actor)
 
 
-def run_replay(place: RunConnection, folder: Path, listen: str, index: int) -> int:
+def run_replay(connection: RunConnection, folder: Path, listen: str, index: int) -> int:
     """A replay server's process; its ring lies in ``folder``, its socket at ``listen``."""
-    secret, process = place.secret(), Process(place)
+    secret, process = connection.secret(), Process(connection)
     config, shard = process.config, Shard(index, process.config.replay.replay_shards)
     if not 0 <= index < shard.count:
         raise ConfigError("--shard", index, f"the run has replay servers 0 to {shard.count - 1}")
-    context = tls.server_context(place.tls_folder) if place.tls_folder is not None else None
+    context = tls.server_context(connection.tls_folder) if connection.tls_folder is not None else None
     with process.starting(shard.role, lambda: drop_unread(process.bus, shard)):
         server = make_server(config, folder, process.bus, shard)
         sockets = SocketServer(server, listen, secret, config.learner.batch_size, context)

@@ -55,14 +55,14 @@ class RunConnection:
 class Process:
     """What every role's process has: stop signal, bus, the run's config."""
 
-    def __init__(self, place: RunConnection) -> None:
+    def __init__(self, connection: RunConnection) -> None:
         logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
         self.stop = StopSignal()
         self.stop.install()
         patience = float(os.environ.get(PATIENCE_VARIABLE, PATIENCE_SECONDS))
         with self._unless_ended():
-            self.bus = connect(place.redis_url, place.run, Deadline(patience, self.stop))
-            self.config = self._registered_config(place.run, Deadline(patience, self.stop))
+            self.bus = connect(connection.redis_url, connection.run, Deadline(patience, self.stop))
+            self.config = self._registered_config(connection.run, Deadline(patience, self.stop))
 
     @contextmanager
     def _unless_ended(self) -> Iterator[None]:

@@ -157,7 +157,10 @@ class _Handler(WSGIRequestHandler):
 
 @contextmanager
 def served(status: RunStatus, run: str, options: LaunchOptions) -> Iterator[None]:
-    """Serve a run's metrics meanwhile. Raises ConfigError where the port cannot be had."""
+    """Serve a run's metrics meanwhile.
+
+    Raises ConfigError where the port cannot be had, OSError where it was taken since that was looked at.
+    """
     assert options.metrics_port is not None
     check_port(options)
     registry = CollectorRegistry()

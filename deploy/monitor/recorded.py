@@ -73,17 +73,21 @@ def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus
     """By ``config.json`` and the steps that the run had at its newest start. Raises ConfigError."""
     settings = folder.settings()
     env = _part(settings, "env").get("id")
-    preset = settings.get("preset") or f"{settings.get('algorithm')}-{settings.get('settings')}"
+    preset = str(settings.get("preset") or f"{settings.get('algorithm')}-{settings.get('settings')}")
     seed, total = settings.get("seed"), settings.get("total_steps")
     ratio = _part(settings, "replay").get("replay_ratio", 0.0)
-    if not (isinstance(env, str) and _is_int(seed) and _is_int(total) and is_finite(ratio)):
+    if not (_is_shown(env) and _is_shown(preset) and _is_int(seed) and _is_int(total) and is_finite(ratio)):
         fix = "config.json has no env, seed or total_steps; restore it, or take another run"
         raise ConfigError("RUN", str(folder.path), fix)
-    status = RunStatus(env, str(preset), seed, total, ratio, expected)
+    status = RunStatus(env, preset, seed, total, ratio, expected)
     status.steps_before = max((start.env_steps for start in starts(folder)[-1:]), default=0)
     if folder.is_baseline():
         status.heard = "launcher"
     return status
+
+
+def _is_shown(value: Any) -> TypeGuard[str]:
+    return isinstance(value, str) and value.isprintable()
 
 
 def _is_int(value: Any) -> TypeGuard[int]:

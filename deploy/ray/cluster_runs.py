@@ -16,14 +16,26 @@ LOOK_SECONDS = 0.5
 
 
 def summaries() -> dict[str, ClusterRunSummary | None]:
-    """Of every run by its name; None where its launcher does not answer."""
-    return {name: _asked(launcher.summary, ANSWER_SECONDS) for name, launcher in sorted(_launchers().items())}
+    """Of every run by its name; None where its launcher does not answer, or cannot."""
+    found: dict[str, ClusterRunSummary | None] = {}
+    for name, launcher in sorted(_launchers().items()):
+        found[name] = None
+        with suppress(ConfigError):  # its folder is damaged
+            found[name] = _asked(launcher.summary, ANSWER_SECONDS)
+    return found
 
 
 def stop(run: str) -> ClusterRunSummary:
-    """End a run cleanly, and wait until it has; how far it was. Raises ConfigError."""
+    """End a run cleanly, and wait until it has; how far it was.
+
+    Raises ConfigError, also of a run that it has asked to end where the run's folder is damaged.
+    """
     name, launcher = _found(run)
-    summary: ClusterRunSummary | None = _asked(launcher.summary, AWAY_SECONDS)
+    try:
+        summary: ClusterRunSummary | None = _asked(launcher.summary, AWAY_SECONDS)
+    except ConfigError:
+        _asked(launcher.end, AWAY_SECONDS)
+        raise
     seconds: float | None = _asked(launcher.end, AWAY_SECONDS)
     if summary is None or seconds is None:
         raise ConfigError("RUN", run, f"its launcher does not answer for {AWAY_SECONDS:.0f} s; try again")
@@ -59,13 +71,15 @@ def _found(run: str) -> tuple[str, Any]:
 
 
 def _asked(question: Any, seconds: float) -> Any:
-    """What a launcher answers to it; None where there is no answer."""
+    """What a launcher answers to it; None where there is no answer. Raises ConfigError where that is the answer."""
     deadline = time.monotonic() + seconds
     while (left := deadline - time.monotonic()) > 0:
         try:
             return ray.get(question.remote(), timeout=left)
         except ray.exceptions.ActorDiedError:
             return None
-        except ray.exceptions.RayError:  # it is being started again
-            time.sleep(LOOK_SECONDS)
+        except ray.exceptions.RayError as error:
+            if isinstance(cause := getattr(error, "cause", None), ConfigError):
+                raise cause from None
+            time.sleep(LOOK_SECONDS)  # it is being started again
     return None

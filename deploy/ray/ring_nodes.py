@@ -5,8 +5,9 @@ from contextlib import suppress
 
 import ray
 
+from rmc.common.errors import ConfigError
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.folder import RunFolder, read_object
 
 
 class RingLocations:
@@ -15,8 +16,8 @@ class RingLocations:
     def __init__(self, folder: RunFolder) -> None:
         self._path = folder.path / "rings-at"
         self._at: dict[str, str] = {}
-        with suppress(OSError, ValueError):  # cut short, or not there yet: Ray places them anywhere
-            self._at.update(json.loads(self._path.read_bytes()))
+        with suppress(OSError, ConfigError):  # damaged, or not there yet: Ray places them anywhere
+            self._at.update(read_object(self._path))
 
     def note(self, role: str, address: str) -> None:
         """A replay server runs there now."""

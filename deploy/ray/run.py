@@ -154,7 +154,7 @@ class ClusterRun:
         while time.monotonic() < deadline and not self.hosts.all_ended():
             asked = asked or asked_to_stop(self.bus, reason)  # a Redis that is away is asked again
             time.sleep(TICK_SECONDS)
-        self._redis.keep()
+        self._redis.end()
 
     def _patience(self, least: float) -> float:
         """The seconds that the learner has to save, which are none of those in which a small state is on the head."""
@@ -200,10 +200,9 @@ def train(
 def _port(folder: RunFolder, ip: str) -> tuple[int, bool]:
     """A port for the run's Redis, and whether it had another before, which is taken now."""
     note = folder.path / "redis-port"
-    had = None
+    ports, had = list(range(FIRST_PORT, LAST_PORT + 1)), None
     with suppress(OSError, ValueError):  # there is none, or it is damaged
-        had = int(note.read_text())
-    ports = list(range(FIRST_PORT, LAST_PORT + 1))
+        had = noted if (noted := int(note.read_text())) in ports else None
     own = zlib.crc32(folder.name.encode()) % len(ports)  # runs that begin together do not want the same
     candidates = [*([had] if had else []), *ports[own:], *ports[:own]]
     for port in candidates:

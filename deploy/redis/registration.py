@@ -10,6 +10,7 @@ from rmc.deploy.run.config import RunConfig, to_registration
 from rmc.deploy.run.folder import RunFolder
 
 LOOK_SECONDS = 1.0
+KEPT_SECONDS = 3600  # in Redis, after the end
 
 
 class Registration:
@@ -45,10 +46,14 @@ class Registration:
                     self._publish()
         self._progress_backup.keep(self._bus)
 
-    def keep(self) -> None:
-        """Copy what is counted, at once, if that can be had; a run's end must not fail for it."""
+    def end(self) -> None:
+        """Copy what is counted, at once, if that can be had; a run's end must not fail for it.
+
+        A Redis is not left full of runs that are over; what they need to go on is in their folders.
+        """
         with suppress(RmcError):
             self._progress_backup.keep(self._bus, at_once=True)
+            self._bus.expire(KEPT_SECONDS)
 
     def _publish(self) -> None:
         """The counters first: a replay server that finds the config goes on from them."""

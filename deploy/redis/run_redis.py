@@ -65,9 +65,9 @@ class RunRedis:
         self._registration.change(config)
         self.server.admit(self._users(config))
 
-    def keep(self) -> None:
-        """Copy what is counted, at once, if that can be had."""
-        self._registration.keep()
+    def end(self) -> None:
+        """Copy what is counted, at once, if that can be had; a user's Redis keeps nothing of the run for long."""
+        self._registration.end()
 
     def close(self) -> None:
         """End a server of its own; a user's stays as it is."""

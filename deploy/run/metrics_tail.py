@@ -17,8 +17,11 @@ EVALUATION, WALL = b'"eval_return_mean"', b'"wall_s"'
 class MetricsTail:
     """The records of a file: first every evaluation and what is recent, then what is new at each look."""
 
-    def __init__(self, path: Path, recent_bytes: int = RECENT_BYTES, read_from: int = 0) -> None:
-        """``read_from`` is the byte from which on records are wanted; then there are no evaluations before."""
+    def __init__(self, path: Path, recent_bytes: int | None = RECENT_BYTES, read_from: int = 0) -> None:
+        """``recent_bytes`` at the end are read whole, of None all.
+
+        ``read_from`` is the byte from which on records are wanted; then there are no evaluations before.
+        """
         self._path, self._recent_bytes, self._position = path, recent_bytes, read_from
         self.at_end = True  # whether the last look has reached the end
 
@@ -27,13 +30,15 @@ class MetricsTail:
         with suppress(FileNotFoundError), self._path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
             before: list[dict[str, Any]] = []
-            if self._position == 0 and size > self._recent_bytes:
+            if self._recent_bytes is not None and self._position == 0 and size > self._recent_bytes:
                 before, self._position = _evaluations(file, size - self._recent_bytes)
             self._position = min(self._position, size)  # it may have been cut
             file.seek(self._position)
             text = file.read(most_bytes)
             self.at_end = self._position + len(text) >= size
             whole = text[: text.rfind(b"\n") + 1]
+            if not (whole or self.at_end):  # no record is so long: it is passed over
+                whole = text
             self._position += len(whole)
             return [*before, *filter(None, map(parse_record, whole.splitlines()))]
         return []

@@ -109,7 +109,7 @@ def open_run(
         folder.secret()
         folder.reopen(config.total_steps)  # last: a start that fails before takes no result along
     except BaseException:  # a notebook lives on, and would keep the lock
-        folder.lock.release()
+        folder.lock.give_back()
         raise
     return folder
 

@@ -23,24 +23,32 @@ class RunLock:
         self._folder, self._file = folder, folder / ".lock"
         self._handle: int | None = None
         self._locked_folder: os.stat_result | None = None
+        self._before = ""  # what the last launcher has left in it
 
     def take(self) -> None:
         """Be the one launcher of this run. Raises ConfigError where another one is."""
         self._handle = take_lock(self._file, LOCK_SECONDS)
         if self._handle is None:
             raise self._is_trained()
-        self._locked_folder = self._folder.stat()
+        self._locked_folder, self._before = self._folder.stat(), self._file.read_text(errors="replace")
         try:
             self._note(" ".join(["training", str(os.getpid()), *_process_space()]))
         except BaseException:  # a full disk; a notebook would keep the lock
-            self.release()
+            self.give_back()
             raise
 
     def release(self, status: int | None = None) -> None:
         """Let another launcher in; ``status`` is how this one ended, if it trained."""
+        self._leave("" if status is None else f"ended {status}")
+
+    def give_back(self) -> None:
+        """Let another launcher in, and leave what the last one has said: this one was refused."""
+        self._leave(self._before)
+
+    def _leave(self, text: str) -> None:
         if self._handle is not None:
             with suppress(OSError):  # no room
-                self._note("" if status is None else f"ended {status}")
+                self._note(text)
             os.close(self._handle)
             self._handle = None
 

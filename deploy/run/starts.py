@@ -8,14 +8,14 @@ import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
-from typing import Any
+from typing import Any, get_type_hints
 
 from rmc.common.bus.metrics_record import is_finite
-from rmc.common.bus.redis_url import has_password
+from rmc.common.bus.redis_url import has_password, redacted
 from rmc.common.checkpoint import PROGRESS
 from rmc.common.errors import ConfigError
 from rmc.common.user_path import user_path
-from rmc.deploy.run.config import from_dict
+from rmc.deploy.run.config import from_dict, value_of_kind
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import Launcher, LaunchOptions
 from rmc.deploy.run.metrics_tail import LISTED_BYTES, MetricsTail
@@ -47,7 +47,7 @@ def note_start(
     """Add a line that is on the disk before the run goes on. Raises OSError."""
     launch = {name: getattr(options, name) for name in KEPT}
     if (url := options.redis_url) is not None and has_password(url):
-        launch["redis_url"] = None  # it must be said again
+        launch["redis_url"] = redacted(url)  # it must be said again: that Redis refuses who names no password
     elif url is not None and url.startswith("file:"):  # it may go on elsewhere
         launch["redis_url"] = f"file:{user_path(url.removeprefix('file:')).absolute()}"
     start = Start(time.time(), version("rmc-rl"), _env_steps(folder), changes, launch, init_from)
@@ -96,19 +96,28 @@ def resume_command(folder: RunFolder) -> str:
 
 def last_launch(folder: RunFolder, launcher: Launcher | None = None) -> LaunchOptions:
     """How the run was started last; with another ``launcher`` only its device is taken. As by default if not known."""
-    past_starts = starts(folder)
-    kept = {name: value for name, value in past_starts[-1].launch.items() if name in KEPT} if past_starts else {}
-    last = dataclasses.replace(LaunchOptions(folder.path), **kept)
+    last = dataclasses.replace(LaunchOptions(folder.path), **_kept(folder))
     if launcher in (None, last.launcher):
         return last
     return LaunchOptions(folder.path, launcher=launcher, device=last.device)
+
+
+def _kept(folder: RunFolder) -> dict[str, Any]:
+    """What is kept of the last start; an option that was edited to a value of another kind is not."""
+    kinds, kept = get_type_hints(LaunchOptions), {}
+    for start in starts(folder)[-1:]:
+        for name in start.launch.keys() & KEPT:
+            with suppress(ConfigError):
+                kept[name] = value_of_kind(kinds[name], start.launch[name], name)
+    return kept
 
 
 def format_starts(folder: RunFolder) -> str:
     """In a line; empty where nothing is known."""
     all_starts = starts(folder)
     words = [f"{len(all_starts)} starts" if len(all_starts) != 1 else "1 start"] if all_starts else []
-    return "; ".join([*words, *filter(None, map(format_start, all_starts))])
+    text = "; ".join([*words, *filter(None, map(format_start, all_starts))])
+    return text if text.isprintable() else repr(text)  # a stranger's
 
 
 def format_start(start: Start) -> str:

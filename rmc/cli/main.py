@@ -32,8 +32,10 @@ def main() -> None:
     """
     output.take_over()
     watchdog.start()
-    status = run(sys.argv[1:])
-    descendants.end_children()
+    try:
+        status = run(sys.argv[1:])
+    finally:
+        descendants.end_children()
     logging.shutdown()
     os._exit(status or _unwritten())
 

@@ -30,22 +30,22 @@ def run_role(command: Role) -> int:
         raise ConfigError("--redis-url", url, f"say where the run's Redis is, or set {URL_VARIABLE}")
     if isinstance(role, ActorRole | EvaluatorRole):
         return _play(role, RunConnection(role.run, url))
-    place = RunConnection(role.run, url, secret, role.secret_file, role.tls_folder)
+    connection = RunConnection(role.run, url, secret, role.secret_file, role.tls_folder)
     if isinstance(role, ReplayRole):
         from rmc.deploy.local import replay_process
 
-        return replay_process.run_replay(place, role.folder, role.listen, role.shard)
+        return replay_process.run_replay(connection, role.folder, role.listen, role.shard)
     from rmc.deploy.local import learner_process
 
-    return learner_process.run_learner(place, role.folder, role.device)
+    return learner_process.run_learner(connection, role.folder, role.device)
 
 
-def _play(role: ActorRole | EvaluatorRole, place: RunConnection) -> int:
+def _play(role: ActorRole | EvaluatorRole, connection: RunConnection) -> int:
     from rmc.deploy.local import actor_process
 
     if isinstance(role, ActorRole):
-        return actor_process.run_actor(place, role.index)
-    return actor_process.run_evaluator(place)
+        return actor_process.run_actor(connection, role.index)
+    return actor_process.run_evaluator(connection)
 
 
 def launch(command: LauncherRole) -> int:

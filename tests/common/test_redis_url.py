@@ -16,6 +16,7 @@ SHOWN = {
     "redis://:hun@ter2@host": "redis://host",
     "rediss://host:1?password=hunter2": "rediss://host:1",
     "rediss://hunter2@host:1?ssl_ca_certs=/a&password=hunter2": "rediss://host:1",
+    "rediss://host:1?ssl_certfile=/a&ssl_password=hunter2": "rediss://host:1",
     "unix://user:hunter2@/run/a.sock": "unix:///run/a.sock",
     "unix:///run/a.sock?db=1&password=hunter2": "unix:///run/a.sock",
     "unix:///home/me@lab/a.sock": "unix:///home/me@lab/a.sock",

@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusUnavailable, ConfigError, RoleDied
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local.role_command import RoleCommand
+from rmc.deploy.ray import cluster_runs
 from rmc.deploy.ray import hosts as ray_hosts
 from rmc.deploy.ray import launcher as ray_launcher
 from rmc.deploy.ray import run as ray_run
@@ -95,7 +97,7 @@ def test_a_redis_that_is_away_is_asked_again_to_stop(folder: RunFolder, monkeypa
     run._folder, run.bus = folder, SimpleNamespace(request_stop=request_stop)  # type: ignore[assignment]
     ended = iter([False] * 5 + [True])
     run.hosts = SimpleNamespace(tell_stop=lambda: None, all_ended=lambda: next(ended))  # type: ignore[assignment]
-    run._redis = SimpleNamespace(keep=lambda: None)  # type: ignore[assignment]
+    run._redis = SimpleNamespace(end=lambda: None)  # type: ignore[assignment]
     run.stop("stopped")
     assert asked == ["stopped"] * 3
 
@@ -109,6 +111,14 @@ def test_a_port_that_a_run_has_is_not_written_again(folder: RunFolder, monkeypat
 
     monkeypatch.setattr(ray_run, "write_whole", full)
     assert ray_run._port(folder, "127.0.0.1") == (port, False)
+
+
+@pytest.mark.parametrize("damaged", ["638063806380", "-1", "80", "638"])
+def test_a_note_of_a_port_that_is_damaged_is_none(folder: RunFolder, damaged: str) -> None:
+    (folder.path / "redis-port").write_text(damaged)
+    port, moved = ray_run._port(folder, "127.0.0.1")
+    assert ray_run.FIRST_PORT <= port <= ray_run.LAST_PORT
+    assert not moved
 
 
 @pytest.fixture
@@ -145,6 +155,28 @@ def test_a_host_whose_node_has_no_room_or_process_now_is_tried_again(
         lose()
     assert not hosts._handles
     assert len(caplog.messages) == (ray_hosts.QUICK_DEATHS if ends else 1)
+
+
+def test_a_run_whose_folder_is_damaged_is_told_and_can_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray gives an error of the launcher's, too, as one of its own."""
+    damaged, asked = ConfigError("RUN", "/runs/a", "config.json is damaged"), list[str]()
+
+    def get(question: str, timeout: float) -> float:
+        asked.append(question)
+        if question == "summary":
+            raise ray_run.ray.exceptions.RayTaskError("summary", "", damaged).as_instanceof_cause()
+        return timeout
+
+    asks = {name: SimpleNamespace(remote=partial(str, name)) for name in ("summary", "end")}
+    launcher = SimpleNamespace(**asks)
+    monkeypatch.setattr(cluster_runs, "_launchers", lambda: {"a-1": launcher})
+    monkeypatch.setattr(cluster_runs.ray, "get", get)
+    with pytest.raises(ConfigError) as raised:
+        cluster_runs.stop("a")
+    assert raised.value is damaged
+    assert asked == ["summary", "end"]
+    assert cluster_runs.summaries() == {"a-1": None}
+    assert asked == ["summary", "end", "summary"]
 
 
 def test_a_second_start_is_told_that_the_run_is_trained(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 from rmc.deploy.run.folder import RunFolder
 from tests.analysis.test_policy import AGENTS, make_run
 from tests.deploy.test_attach import holder
+from tests.deploy.test_folder import let_others_pass
 
 NOBODY = 65534
 COLLEAGUE = """
@@ -38,9 +38,7 @@ def folder(tmp_path: Path) -> RunFolder:
     run.metrics.write_text(json.dumps(record) + "\n")
     for path in (run.path, run.checkpoints, *run.checkpoints.glob("0*")):
         path.chmod(0o755)
-    for path in (tmp_path, *tmp_path.parents):
-        if not path.stat().st_mode & 0o001:
-            path.chmod(0o711)
+    let_others_pass(tmp_path)
     (tmp_path / "home").mkdir()
     os.chown(tmp_path / "home", NOBODY, NOBODY)
     return run
@@ -81,7 +79,8 @@ def test_they_may_look_at_it_while_it_is_trained(folder: RunFolder, training: "s
 
 def test_they_may_watch_it_to_its_end(folder: RunFolder, training: "subprocess.Popen[str]") -> None:
     with as_nobody(folder, "attach", str(folder.path)) as watching:
-        time.sleep(5.0)
+        assert watching.stdout is not None
+        assert watching.stdout.readline().startswith("0% | ")
         assert watching.poll() is None
         training.communicate("\n")
         status, out, _ = said(watching)

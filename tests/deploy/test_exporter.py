@@ -112,13 +112,16 @@ def test_every_alert_is_documented() -> None:
     assert {rule["alert"] for rule in group["rules"]} == documented("alert") == {alert for alert, *_ in CASES}
 
 
-def test_strangers_take_few_handles_and_the_end_waits_for_none(status: RunStatus, port: int) -> None:
+def test_strangers_take_few_handles_and_the_end_waits_for_none(
+    status: RunStatus, port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exporter._Handler, "timeout", 60.0)
     with exporter.served(status, "first", LaunchOptions(None, metrics_port=port)):
         strangers = [socket.create_connection((HERE, port), timeout=10) for _ in range(exporter.MOST_CLIENTS)]
         with socket.create_connection((HERE, port), timeout=10) as one_more:
             assert one_more.recv(1) == b""
         began = time.monotonic()
-    assert time.monotonic() - began < 2.0
+    assert time.monotonic() - began < 20.0
     for stranger in strangers:
         stranger.close()
 

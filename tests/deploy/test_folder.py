@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Barrier
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -164,9 +165,7 @@ def test_a_copy_on_a_disk_without_locks_can_be_read(
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can be somebody else")
 def test_a_folder_of_another_owner_that_can_be_written_is_taken(tmp_path: Path) -> None:
-    for path in (tmp_path, *tmp_path.parents):
-        if not path.stat().st_mode & 0o001:
-            path.chmod(0o711)
+    let_others_pass(tmp_path)
     (tmp_path / "run").mkdir()
     (tmp_path / "run").chmod(0o777)
     folder = RunFolder(tmp_path / "run")
@@ -263,9 +262,7 @@ def test_a_folder_that_turns_read_only_is_waited_for(
     monkeypatch.setattr("rmc.deploy.monitor.monitor.RECORD_SECONDS", 0.0)
     config = debug(EnvConfig("InvertedPendulum-v5"))
     folder = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
-    for path in (tmp_path, *tmp_path.parents):  # for who is not root, whom no mode keeps from writing
-        if not path.stat().st_mode & 0o001:
-            path.chmod(0o711)
+    let_others_pass(tmp_path)  # root, whom no mode keeps from writing, becomes another
     os.chown(folder.path, 65534, -1)
     monitor = Monitor(folder, config, Console(quiet=True))
     monitor.watch(MemoryBus())
@@ -284,6 +281,13 @@ def test_a_folder_that_turns_read_only_is_waited_for(
     assert messages == ["is read-only: training goes on, its end waits", "can be written again"]
     monitor.close()
     folder.lock.release()
+
+
+def let_others_pass(folder: Path) -> None:
+    """Into a test's folder, through those of the session alone."""
+    for path in (folder, *folder.parents):
+        if "/rmct-" in str(path):  # as tests/conftest.py names them
+            path.chmod(0o711)
 
 
 @contextmanager
@@ -336,6 +340,33 @@ def test_odd_lines_of_metrics_are_passed_over(folder: RunFolder) -> None:
     history = of_run(folder)
     assert ([one.return_mean for one in history.evaluations], history.initial_return) == ([7.0], 2.0)
     assert run(["stats", str(folder.path)]) == 0
+
+
+STRANGE = "\x1b]0;title\x07"
+
+
+def test_what_a_strangers_metrics_would_do_to_a_terminal_is_not_printed(
+    folder: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = {"role": "learner", "time": 1.0, f"{STRANGE}_loss": 0.5, "model_loss": 0.5}
+    lines = [record | {"role": f"actor-0{STRANGE}", "busy_share": 0.5}, record]
+    folder.metrics.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    assert list(folder.records()) == [{"role": "learner", "time": 1.0, "model_loss": 0.5}]
+    assert run(["stats", str(folder.path)]) == 0
+    assert "\x1b]" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("changed", [{"env": {"id": f"Ant-v5{STRANGE}"}}, {"preset": f"debug{STRANGE}"}])
+def test_a_strangers_config_that_cannot_be_shown_is_one_line(
+    folder: RunFolder, changed: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder.path / "config.json").write_text(json.dumps(json.loads(to_json(folder.config())) | changed))
+    line = complaint(["stats", str(folder.path)], capsys)
+    assert "config.json has no env, seed or total_steps" in line
+    assert run(["list", str(folder.path)]) == 0
+    listed = capsys.readouterr().out
+    assert "damaged" in listed
+    assert "\x1b" not in line + listed
 
 
 BASELINE = json.dumps({"algorithm": "sac"})

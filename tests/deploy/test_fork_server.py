@@ -57,7 +57,8 @@ def test_it_leads_a_group_has_its_title_and_dies_of_a_signal(shared: ForkServer,
     assert role.poll() is None
     with pytest.raises(subprocess.TimeoutExpired):
         role.wait(0.2)
-    assert " ".join(psutil.Process(role.pid).cmdline()).endswith("-P -m rmc.cli.main role actor --run x --index 7")
+    words = "-P -m rmc.cli.main role actor --run x --index 7"
+    wait_until(lambda: " ".join(psutil.Process(role.pid).cmdline()).endswith(words))
     os.killpg(role.pid, signal.SIGKILL)
     assert role.wait(5) == -signal.SIGKILL
 

@@ -35,6 +35,16 @@ def test_records_are_taken_in_parts(tmp_path: Path) -> None:
     assert max(map(len, parts)) == 4  # of 23 bytes or more
 
 
+def test_what_is_longer_than_a_look_is_passed_over(tmp_path: Path) -> None:
+    """A disk that has lost a block shows zeros there."""
+    path, record = tmp_path / "metrics.jsonl", json.dumps({"role": "a"}).encode()
+    path.write_bytes(record + b"\n" + bytes(1_000) + b"\n" + record + b"\n")
+    tail = MetricsTail(path, recent_bytes=None)
+    parts = [tail.take(100) for _ in range(20)]
+    assert [one for part in parts for one in part] == [{"role": "a"}] * 2
+    assert tail.at_end
+
+
 def test_records_after_a_cut_are_taken(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_text(f"{json.dumps({'role': 'a', 'x': 'long' * 99})}\n")
@@ -63,21 +73,21 @@ def long_file(path: Path, lines: int) -> tuple[list[dict[str, Any]], int]:
 def test_of_a_long_file_only_evaluations_and_its_end_are_parsed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """200 MB: what is parsed must not grow with the file."""
-    path, parsed, parse = tmp_path / "metrics.jsonl", [], metrics_tail.parse_record
+    """What is parsed must not grow with the file."""
+    path, parsed, parse, recent = tmp_path / "metrics.jsonl", [], metrics_tail.parse_record, 1 << 20
 
     def counted(line: bytes) -> dict[str, Any] | None:
         parsed.append(len(line))
         return parse(line)
 
     monkeypatch.setattr(metrics_tail, "parse_record", counted)
-    evaluations, size = long_file(path, 211_000)
-    assert size > 200e6
-    tail = MetricsTail(path)
+    evaluations, size = long_file(path, 12_000)
+    assert size > 10 * recent
+    tail = MetricsTail(path, recent)
     records = tail.take()
-    assert sum(parsed) < metrics_tail.RECENT_BYTES + 100 * len(evaluations)
+    assert sum(parsed) < recent + 100 * len(evaluations)
     assert [record for record in records if record["role"] == "evaluator"] == evaluations
-    assert records[-1]["updates"] == 210_999
+    assert records[-1]["updates"] == 11_999
     assert tail.take() == []
 
 

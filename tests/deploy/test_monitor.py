@@ -37,6 +37,7 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
+from tests.waiting import wait_until
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
 
@@ -51,6 +52,13 @@ def monitor(config: RunConfig, tmp_path: Path) -> Monitor:
     folder = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
     folder.lock.release()
     return Monitor(folder, config, Console(quiet=True, force_terminal=False))
+
+
+@pytest.fixture
+def frozen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock stands still: seconds in texts are exact."""
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now)
 
 
 NUMBERS = [0, -1, 2**63 - 1, math.nan, math.inf, -math.inf, 1e300, 1.5]
@@ -343,6 +351,7 @@ def test_a_run_that_goes_on_is_drawn_from_where_it_was(monitor: Monitor, config:
     assert steps[-2:] == [1_400, 1_500]
 
 
+@pytest.mark.usefixtures("frozen")
 def test_every_view_says_who_is_silent_and_for_how_long(monitor: Monitor) -> None:
     says(monitor, {"learner": 12.2, "actor-0": 0.5, "replay": 4.0, "evaluator": 0.0})
     for text_of in shown(monitor.status):
@@ -354,6 +363,7 @@ def test_every_view_says_who_is_silent_and_for_how_long(monitor: Monitor) -> Non
     monitor.close()
 
 
+@pytest.mark.usefixtures("frozen")
 def test_a_redis_that_is_away_is_who_is_silent(monitor: Monitor) -> None:
     says(monitor, {"learner": 40.0, "actor-0": 41.0}, redis_away_s=38.0)
     for text_of in shown(monitor.status):
@@ -363,13 +373,14 @@ def test_a_redis_that_is_away_is_who_is_silent(monitor: Monitor) -> None:
     assert not any("silent" in text for text in shown(monitor.status))  # a run that is over
 
 
+@pytest.mark.usefixtures("frozen")
 def test_a_role_that_never_spoke_is_silent_once_it_should_have(
     monitor: Monitor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     says(monitor, {"learner": 0.0, "replay": 0.0, "evaluator": 0.0})
     assert "silent" not in line(monitor.status)
-    now = time.time
-    monkeypatch.setattr(time, "time", lambda: now() + 2 * UNHEARD_SECONDS)
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 2 * UNHEARD_SECONDS)
     says(monitor, {"learner": 0.0, "replay": 0.0, "evaluator": 0.0})
     assert "silent: actor-0 for 60 s" in line(monitor.status)
     monitor.close()
@@ -387,6 +398,7 @@ def test_an_actor_that_an_earlier_start_had_is_not_silent(monitor: Monitor) -> N
     monitor.close()
 
 
+@pytest.mark.usefixtures("frozen")
 def test_many_that_are_silent_are_counted(monitor: Monitor) -> None:
     says(monitor, {f"actor-{index}": 20.0 for index in range(9)})
     assert "silent: actor-0 for 20 s, actor-1 for 20 s, actor-2 for 20 s and 6 more" in line(monitor.status)
@@ -411,16 +423,14 @@ def test_a_redis_that_stands_still_is_said_while_it_lasts_and_frames_go_on(
         process.suspend()
         before = len(printed.getvalue().splitlines())
         monitor.watch(bus)  # waits for an answer
-        assert len(printed.getvalue().splitlines()) >= before + 4
-        time.sleep(0.3)
-        assert "silent: Redis for" in printed.getvalue().splitlines()[-1]
+        assert len(printed.getvalue().splitlines()) >= before + 2
+        wait_until(lambda: "silent: Redis for" in printed.getvalue().splitlines()[-1])
         process.resume()
-        time.sleep(1.0)  # the bus lets it rest for as long as it took
+        bus._rests_until = 0.0  # as once it has been left alone for as long as it took
         for role in config.roles():
             bus.emit(role, {"time": time.time()})
         monitor.watch(bus)
-        time.sleep(0.3)
-        assert "silent" not in printed.getvalue().splitlines()[-1]
+        wait_until(lambda: "silent" not in printed.getvalue().splitlines()[-1])
         monitor.close()
     away = [record["redis_away_s"] > 0 for record in folder.records() if "redis_away_s" in record]
     assert away == [False, True, False, False]  # each change is noted at once, for those who watch the file

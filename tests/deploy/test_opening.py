@@ -1,6 +1,7 @@
 """What may be other when a run goes on: every option is one or the other, and each change is in the run's history."""
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -17,6 +18,7 @@ from rmc.deploy.run.opening import MAY_CHANGE, open_run
 from rmc.deploy.run.option_names import flat
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.starts import format_starts, last_launch, starts
+from rmc.deploy.run.state import run_state
 from tests.deploy.test_config import with_value
 
 CONFIG = debug(EnvConfig("InvertedPendulum-v5"))
@@ -82,6 +84,20 @@ def test_a_start_that_is_refused_once_it_has_the_lock_writes_nothing(folder: Run
     assert (folder.config(), len(starts(folder)), folder.lock.trainer()) == (CONFIG, 1, None)
 
 
+@pytest.mark.parametrize(("status", "state"), [(1, "failed"), (130, "stopped")])
+def test_a_start_that_is_refused_leaves_how_the_last_one_ended(folder: RunFolder, status: int, state: str) -> None:
+    folder.lock.take()
+    folder.lock.release(status)
+
+    def refuse(_: RunFolder) -> None:
+        raise ConfigError("--run-dir", "", "is being trained")
+
+    with pytest.raises(ConfigError, match="is being trained"):
+        open_run(CONFIG, LaunchOptions(folder.path), check=refuse)
+    assert run_state(folder) == state
+    assert folder.lock.ended() == status
+
+
 def test_the_history_is_a_line_a_start(folder: RunFolder) -> None:
     assert format_starts(folder) == "1 start"
     folder.metrics.write_text('{"role": "learner", "env_steps": 1200}\n{"role": "replay", "env_steps": 1230}\n{"ro')
@@ -120,13 +136,33 @@ def test_a_folder_that_shows_what_another_run_has_is_left_alone(link: str, tmp_p
     assert kept.read_text() == "of value"
 
 
+def test_what_was_edited_to_another_kind_is_as_by_default(folder: RunFolder) -> None:
+    (line,) = folder.history_file.read_text().splitlines()
+    edited = {"metrics_port": "9464", "device": 5, "launcher": "locla", "all_cpus": True, "run_dir": "elsewhere"}
+    folder.history_file.write_text(json.dumps(json.loads(line) | {"launch": edited}) + "\n")
+    assert last_launch(folder) == LaunchOptions(folder.path, all_cpus=True)
+
+
+def test_a_strangers_history_cannot_write_to_a_terminal(folder: RunFolder) -> None:
+    start = json.loads(folder.history_file.read_text())
+    strange = start | {"changes": {"learner.threads": [1, "\x1b]0;title\x07"]}}
+    folder.history_file.write_text(json.dumps(strange) + "\n")
+    assert format_starts(folder) == r"'1 start; from step 0 --threads 1 to \x1b]0;title\x07'"
+
+
 def test_an_older_run_has_no_history(folder: RunFolder) -> None:
     folder.history_file.unlink()
     assert (starts(folder), format_starts(folder), last_launch(folder)) == ([], "", LaunchOptions(folder.path))
 
 
 @pytest.mark.parametrize(
-    ("url", "kept"), [("file:redis-url", "file:/redis-url"), ("redis://:hush@localhost:1", None), (None, None)]
+    ("url", "kept"),
+    [
+        ("file:redis-url", "file:/redis-url"),
+        ("redis://:hush@localhost:1/2", "redis://localhost:1"),
+        ("rediss://localhost:1?ssl_certfile=a&ssl_password=hush", "rediss://localhost:1"),
+        (None, None),
+    ],
 )
 def test_how_it_was_started_is_kept_but_no_password(
     url: str | None, kept: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -54,7 +54,7 @@ def test_a_live_view_outlives_its_terminal(log: Path, monkeypatch: pytest.Monkey
         view.close()
         console.print("kept")
     assert log.read_text().endswith("kept\n")
-    assert "environment steps" not in log.read_text().partition("kept")[2]
+    assert "env steps" not in log.read_text().partition("kept")[2]
 
 
 def test_a_full_disk_is_over_some_day(log: Path) -> None:

@@ -1,6 +1,7 @@
 """The embedded server: private, portless, gone with its parent."""
 
 import signal
+import socket
 import stat
 import subprocess
 import sys
@@ -11,7 +12,8 @@ import pytest
 import redis
 
 from rmc.common.errors import ConfigError
-from rmc.deploy.redis.server import MAX_VALUE, RedisServer, server_binary
+from rmc.deploy.redis.server import MAX_VALUE, Port, RedisServer, server_binary
+from rmc.deploy.redis.users import RedisUsers
 from tests.processes import alive
 from tests.waiting import wait_until
 
@@ -78,6 +80,16 @@ def test_failed_start_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("rmc.deploy.redis.server.MAXMEMORY", -1)
     with pytest.raises(ConfigError, match="did not start"):
         RedisServer(tmp_path).start()
+
+
+def test_one_for_other_machines_that_does_not_start_names_no_url(tmp_path: Path) -> None:
+    """Ray takes none."""
+    why = r"Warning: Could not create server TCP .*: bind: Address already in use; Failed listening on port .*"
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = Port("127.0.0.1", taken.getsockname()[1])
+        server = RedisServer(tmp_path, port, RedisUsers("run", b"secret", ("learner",)))
+        with pytest.raises(ConfigError, match=rf"^--launcher='ray': [^#]* \({why}\); mend that, and start again$"):
+            server.start()
 
 
 def test_one_that_cannot_be_started_again_now_is_tried_again(

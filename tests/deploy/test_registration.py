@@ -42,7 +42,7 @@ def test_a_redis_that_forgot_is_told_again_what_it_must_know(tmp_path: Path, red
     bus = RedisBus(redis_url, run_name)
     registered = Registration(CONFIG, RunFolder(tmp_path), bus)
     bus.commit(ReplayOwner("replay", bus.take_epoch("replay")), {0: Ack(EntryId(1, 0), 0)}, COUNTED)
-    registered.keep()
+    registered.end()
     _forget(redis_url, run_name)
     assert bus.config() is None
     registered.tend()
@@ -88,6 +88,23 @@ def test_a_run_started_by_hand_is_told_to_stop_once_redis_takes_it(
     CheckpointFolder(folder.checkpoints).save(40, {"policy.safetensors": b"weights"})
     assert launcher.attend(config, folder, redis_url, monitor, stop)
     assert bus.stop_requested() == "finished"
+    monitor.close()
+
+
+def test_a_run_started_by_hand_whose_launcher_fails_is_stopped_and_leaves_nothing_in_redis(
+    tmp_path: Path, redis_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def moved(_: object) -> None:
+        raise ConfigError("--run-dir", "", "was deleted or moved")
+
+    folder = RunFolder(tmp_path)
+    folder.write_config(CONFIG)
+    bus, monitor = RedisBus(redis_url, folder.name), Monitor(folder, CONFIG, Console(quiet=True))
+    monkeypatch.setattr(monitor, "watch", moved)
+    with pytest.raises(ConfigError, match="was deleted or moved"):
+        launcher.attend(CONFIG, folder, redis_url, monitor, StopSignal())
+    assert bus.stop_requested() == "stopped by its launcher"
+    assert {bus.redis.ttl(bus.key(name)) > 0 for name in ("config", "stop")} == {True}
     monitor.close()
 
 

@@ -24,9 +24,9 @@ def test_a_ring_is_where_it_was_noted_while_that_node_lives(tmp_path: Path) -> N
     assert again.node("replay") is None
 
 
-@pytest.mark.parametrize("cut", [b"", b'{"replay": "10'])
-def test_a_note_that_is_cut_short_is_none(tmp_path: Path, cut: bytes) -> None:
-    (tmp_path / "rings-at").write_bytes(cut)
+@pytest.mark.parametrize("damaged", [b"", b'{"replay": "10', b"[1]", b"5"])
+def test_a_note_that_is_damaged_is_none(tmp_path: Path, damaged: bytes) -> None:
+    (tmp_path / "rings-at").write_bytes(damaged)
     noted = RingLocations(RunFolder(tmp_path))
     assert noted.node("replay") is None
     noted.note("replay", "10.0.0.b")

@@ -4,12 +4,14 @@ import errno
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import psutil
 import pytest
 
 pytest.importorskip("ray")
@@ -22,12 +24,17 @@ from rmc.deploy.ray import launcher_actor, learner_actor, role_actor
 from rmc.deploy.ray.launcher_actor import LauncherActor
 from rmc.deploy.ray.learner_actor import LearnerActor
 from rmc.deploy.ray.role_actor import RoleActor, Task
+from tests.processes import alive
+from tests.waiting import wait_until
+
+PYTHON = sys.executable
 
 
 @pytest.fixture(autouse=True)
 def _own_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A host changes its process's folder and variables: both are as before after the test."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(role_actor.descendants, "adopt_orphans", lambda: None)
     monkeypatch.setenv("OMP_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "1"))
 
 
@@ -72,23 +79,50 @@ def host(program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
     actor.clear()
 
 
-def wait_for(watched: list[int], seconds: float) -> list[int]:
-    deadline = time.monotonic() + seconds
-    while not watched and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return watched
-
-
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_role_that_is_replaced_does_not_end_its_host(host: RoleActor, ends: list[int]) -> None:
     before = host.report("", 0).pid
     host.restart()
     after = host.report("", 0)
     assert after.pid not in (None, before)
-    assert wait_for(ends, 1.5) == []  # nor does the new one, which is watched, too:
+    time.sleep(1.5)  # in which its watcher, though slow, has seen the end of the first
+    assert ends == []  # nor does the new one, which is watched, too:
     assert after.pid is not None
     os.kill(after.pid, 9)
-    assert wait_for(ends, 10.0) == [1]
+    wait_until(lambda: ends)
+    assert ends == [1]
+
+
+HOST = """
+import subprocess, sys, time
+from rmc.deploy.local.role_command import RoleCommand
+from rmc.deploy.ray.role_actor import RoleActor, Task
+print(subprocess.Popen(["sleep", "60"], stdout=subprocess.DEVNULL).pid, flush=True)
+sys.executable = sys.argv[1]
+host = RoleActor(Task("run", "run", RoleCommand("actor-0", ("actor",)), {}, {}, "."))
+time.sleep(60)
+"""
+STRAYS = """#!/bin/sh
+setsid sleep 60 &
+echo $$ $! > written
+mv written pids
+wait
+"""
+
+
+def test_what_an_environment_started_ends_with_a_role_that_is_killed(program: Path, tmp_path: Path) -> None:
+    """Also in a session of its own; what Ray has started in the host's process does not."""
+    program.write_text(STRAYS)
+    words = [PYTHON, "-c", HOST, str(program)]
+    with subprocess.Popen(words, env=os.environ | {"TMPDIR": str(tmp_path)}, stdout=subprocess.PIPE) as host:
+        assert host.stdout is not None
+        rays = psutil.Process(int(host.stdout.readline()))
+        wait_until((tmp_path / "pids").exists)
+        role, stray = map(psutil.Process, map(int, (tmp_path / "pids").read_text().split()))
+        role.kill()
+        assert host.wait(30) == 1  # for Ray to start both again
+        assert (alive([stray]), alive([rays])) == ([], [rays])
+        rays.kill()
 
 
 @pytest.mark.parametrize(
@@ -134,13 +168,14 @@ def test_a_learner_that_saves_for_long_is_not_killed(
     program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     log = tmp_path / "said"
-    program.write_text(ENDS.replace("exit 0", f"sleep 1.5; echo saved >> {log}; exit 0"))
+    ends = ENDS.replace("exit 0", f"sleep 1.5; echo saved >> {log}; exit 0")
+    program.write_text(ends.replace("while", f"echo ready > {log}\nwhile"))
     monkeypatch.setattr(learner_actor, "HELD_SECONDS", 0.5)
     host = Learner(Task("test-run", "test-run", RoleCommand("learner", ("learner",)), {}, {}, str(tmp_path)))
-    time.sleep(0.5)
+    wait_until(log.exists)
     host.close()
     host.clear()
-    assert log.read_text() == "saved\n"
+    assert log.read_text() == "ready\nsaved\n"
 
 
 def test_a_damaged_checkpoint_holds_no_newer_one_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

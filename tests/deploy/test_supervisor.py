@@ -75,14 +75,13 @@ def test_any_other_role_that_ends_unasked_is_started_again(quick: Path) -> None:
     assert role.restarts == 2
 
 
-def test_one_that_hangs_soon_after_each_start_ends_the_run(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_that_hangs_soon_after_each_start_ends_the_run(tmp_path: Path) -> None:
     """However long it hung before it was ended for that."""
-    monkeypatch.setattr(supervisor, "QUICK_SECONDS", 0.5)
-    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\nsleep 0.7\nexit {HUNG_STATUS}\n")
-    role = RoleProcess(RoleCommand("actor-0", ("actor",), env_timeout=0.6), {}, quick)
-    role.start()
+    deaths = RoleProcess(RoleCommand("actor-0", ("actor",), env_timeout=60.0), {}, tmp_path)._deaths
+    deaths.note(HUNG_STATUS, 66.5, "")
+    deaths.note(HUNG_STATUS, 66.5, "")
     with pytest.raises(RoleDied, match=rf"3 times in a row soon after its start, exit status {HUNG_STATUS}"):
-        tend_until(role)
+        deaths.note(HUNG_STATUS, 66.5, "")
 
 
 def test_one_that_hangs_in_c_soon_after_each_start_ends_the_run() -> None:
@@ -201,7 +200,8 @@ def test_where_no_process_can_be_started_now_it_is_tried_again(quick: Path, monk
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="there is no fork server elsewhere")
-def test_so_it_is_with_the_process_that_forks_roles(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_so_it_is_with_the_process_that_forks_roles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first role that it is to fork starts it."""
     refusals = iter([errno.EAGAIN])
     start = ForkServer.start
 
@@ -211,9 +211,15 @@ def test_so_it_is_with_the_process_that_forks_roles(quick: Path, monkeypatch: py
         start(self)
 
     monkeypatch.setattr(ForkServer, "start", scarce)
-    roles = Supervisor([], lambda _: {}, quick, lambda _: 0.0)
-    roles.start()
-    roles.stop()
+    waits = {"RMC_REDIS_URL": "unix:///nowhere", "RMC_PATIENCE": "99"}
+    command = RoleCommand("actor-0", ("role", "actor", "--run", "x", "--index", "0"))
+    roles = Supervisor([command], lambda _: waits, tmp_path, lambda _: 0.0)
+    try:
+        roles.start()
+        assert next(refusals, None) is None
+        assert roles.roles["actor-0"].running
+    finally:
+        roles.stop()
 
 
 def test_another_fault_of_a_start_is_told(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:

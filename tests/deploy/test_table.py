@@ -49,13 +49,17 @@ def drawn(of: RunStatus, width: int, height: int | None, **console: bool) -> lis
 @pytest.mark.parametrize("trouble", [False, True])
 @pytest.mark.parametrize("height", [14, 40, None])
 @pytest.mark.parametrize("width", WIDTHS)
-def test_what_matters_is_there_at_every_size(width: int, height: int | None, trouble: bool, actors: int) -> None:
+def test_what_matters_is_there_at_every_size(
+    width: int, height: int | None, trouble: bool, actors: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In 15 rows, too, of which the cursor takes one."""
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now)
     of = full_status(actors)
     if trouble:
-        of.take({"role": "learner", "time": time.time(), "checkpoint_error": "No space left on device"})
-        of.take({"role": "launcher", "time": time.time(), "wall_s": 1270.0, "start_s": SECONDS, "restarts": 3})
-        of.take({"role": "actor-0", "time": time.time() - 20})
+        of.take({"role": "learner", "time": now, "checkpoint_error": "No space left on device"})
+        of.take({"role": "launcher", "time": now, "wall_s": 1270.0, "start_s": SECONDS, "restarts": 3})
+        of.take({"role": "actor-0", "time": now - 20})
     rows = drawn(of, width, height)
     assert height is None or len(rows) <= height
     assert max(map(len, rows)) <= width

@@ -158,3 +158,10 @@ def test_a_redis_without_tls_is_named(folder: Path, monkeypatch: pytest.MonkeyPa
     place = Path(tempfile.mkdtemp(prefix="rmc-tls-"))
     with pytest.raises(ConfigError, match=r"--tls=None: .*needs a redis-server"):
         RedisServer(place, port=Port("127.0.0.1", free_port(), folder), users=USERS).start()
+
+
+@pytest.mark.skipif(lacks_tls(), reason="the Redis server found here was built without TLS")
+def test_a_redis_with_tls_that_does_not_start_is_not_said_to_lack_it(tmp_path: Path) -> None:
+    place = Path(tempfile.mkdtemp(prefix="rmc-tls-"))
+    with pytest.raises(ConfigError, match=r"^--launcher='ray': .*Failed to load certificate.*; mend that, and start"):
+        RedisServer(place, port=Port("127.0.0.1", free_port(), tmp_path), users=USERS).start()

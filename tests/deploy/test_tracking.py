@@ -1,7 +1,6 @@
 """Which tracker follows a run is chosen once, and stays with the run's folder."""
 
 import dataclasses
-import importlib.util
 from typing import Any
 
 import pytest
@@ -10,6 +9,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.tracking import PROJECT, Tracking, choose_tracking, keep_tracking, kept_tracking
+from tests.hiding import hide
 
 NEGATIVE = '{"tracker": "wandb", "project": "x", "tags": [], "id": "y", "video_every": -1}'
 
@@ -96,7 +96,6 @@ def test_a_damaged_note_is_named(folder: RunFolder, text: str) -> None:
 
 @pytest.mark.parametrize("tracker", ["wandb", "trackio"])
 def test_a_missing_extra_is_said(folder: RunFolder, tracker: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    there = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == tracker else there(name))
+    hide(tracker, monkeypatch)
     with pytest.raises(ConfigError, match=rf"--track='{tracker}': {tracker} is missing; pip install .*{tracker}"):
         chosen(folder, track=tracker)

@@ -665,6 +665,11 @@ def test_policy_lag_is_measured(make: Make, bus: MemoryBus) -> None:
     sender.send_rows(rows)
     drain(server)
     assert server.metrics()["policy_lag_max"] == 20
+    rows["weights_update"] = 60  # of updates that a kill undid
+    sender.send_rows(rows)
+    drain(server)
+    metrics = server.metrics()
+    assert (metrics["policy_lag_mean"], metrics["policy_lag_max"]) == (0, 0)
 
 
 @pytest.mark.parametrize("ratio", [1.0, 64.0])
