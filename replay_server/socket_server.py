@@ -13,7 +13,6 @@ answered WAIT at once, and the client asks again.
 """
 
 import contextlib
-import errno
 import logging
 import os
 import selectors
@@ -21,7 +20,6 @@ import socket
 import ssl
 import time
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +29,7 @@ from rmc.common.replay import SampleStatus
 from rmc.common.shared_batches import SharedBatches, reserve_memory, shared_bytes
 from rmc.common.wire import NONCE_BYTES, Kind, is_proof, proof
 from rmc.replay_server.connection import ClientConnection, Frame
+from rmc.replay_server.listener import listen
 from rmc.replay_server.server import ReplayServer
 
 log = logging.getLogger(__name__)
@@ -42,10 +41,9 @@ READ, WRITE = selectors.EVENT_READ, selectors.EVENT_WRITE
 
 
 class SocketServer:
-    """Serves a replay server at ``address``: ``unix:PATH`` or ``tcp:HOST:PORT`` (port 0 takes a free one).
+    """Serves a replay server at an address of ``listener.listen``; ``address`` afterwards names the port taken.
 
-    ``address`` afterwards names the port taken. With ``tls`` all is encrypted before the proofs. Raises ConfigError
-    where it cannot be listened on.
+    With ``tls`` all is encrypted before the proofs. Raises ConfigError where it cannot be listened on.
     """
 
     def __init__(
@@ -59,7 +57,7 @@ class SocketServer:
         if not secret:
             raise ConfigError("secret", "", "the run's secret must not be empty")
         self._server, self._secret, self._max_batch, self._tls = server, secret, max_batch, tls
-        self._listener, self._path, self.address = _listen(address)
+        self._listener, self._path, self.address = listen(address)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, READ)
         self._connections: set[ClientConnection] = set()
@@ -282,38 +280,3 @@ class SocketServer:
         self._listener.close()
         if self._path is not None:
             self._path.unlink(missing_ok=True)
-
-
-def _listen(address: str) -> tuple[socket.socket, Path | None, str]:
-    """A listening socket, its file if any, and its address with the port taken."""
-    scheme, _, rest = address.partition(":")
-    try:
-        if scheme == "unix":
-            return _listen_unix(Path(rest)), Path(rest), address
-        host, _, port = rest.rpartition(":")
-        if scheme == "tcp" and host and port.isdigit() and int(port) < 65536:
-            listener = socket.create_server((host, int(port)), backlog=MAX_CONNECTIONS)
-            listener.setblocking(False)
-            return listener, None, f"tcp:{host}:{listener.getsockname()[1]}"
-    except OSError as error:
-        in_use = error.errno == errno.EADDRINUSE
-        fix = "the port is taken; choose another, or 0 for a free one" if in_use else f"cannot listen there ({error})"
-        raise ConfigError("replay address", address, fix) from None
-    raise ConfigError("replay address", address, "want unix:PATH or tcp:HOST:PORT")
-
-
-def _listen_unix(path: Path) -> socket.socket:
-    path.unlink(missing_ok=True)  # a killed server's; the ring's lock keeps a living one's safe
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        mask = os.umask(0o177)
-        try:
-            listener.bind(str(path))
-        finally:
-            os.umask(mask)
-        listener.listen(MAX_CONNECTIONS)
-    except OSError:
-        listener.close()
-        raise
-    listener.setblocking(False)
-    return listener

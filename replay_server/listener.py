@@ -1,0 +1,48 @@
+"""The socket that a replay server listens at."""
+
+import errno
+import os
+import socket
+from pathlib import Path
+
+from rmc.common.errors import ConfigError
+
+BACKLOG = 32  # connections that wait to be accepted
+
+
+def listen(address: str) -> tuple[socket.socket, Path | None, str]:
+    """A non-blocking socket that listens, its file if any, and its address with the port taken.
+
+    ``address`` is ``unix:PATH`` or ``tcp:HOST:PORT``; port 0 takes a free one. Raises ConfigError.
+    """
+    scheme, _, rest = address.partition(":")
+    try:
+        if scheme == "unix":
+            return _listen_unix(Path(rest)), Path(rest), address
+        host, _, port = rest.rpartition(":")
+        if scheme == "tcp" and host and port.isdigit() and int(port) < 65536:
+            listener = socket.create_server((host, int(port)), backlog=BACKLOG)
+            listener.setblocking(False)
+            return listener, None, f"tcp:{host}:{listener.getsockname()[1]}"
+    except OSError as error:
+        in_use = error.errno == errno.EADDRINUSE
+        fix = "the port is taken; choose another, or 0 for a free one" if in_use else f"cannot listen there ({error})"
+        raise ConfigError("replay address", address, fix) from None
+    raise ConfigError("replay address", address, "want unix:PATH or tcp:HOST:PORT")
+
+
+def _listen_unix(path: Path) -> socket.socket:
+    path.unlink(missing_ok=True)  # a killed server's; the ring's lock keeps a living one's safe
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        mask = os.umask(0o177)
+        try:
+            listener.bind(str(path))
+        finally:
+            os.umask(mask)
+        listener.listen(BACKLOG)
+    except OSError:
+        listener.close()
+        raise
+    listener.setblocking(False)
+    return listener
