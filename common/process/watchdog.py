@@ -17,6 +17,8 @@ from rmc.common.process import descendants
 
 log = logging.getLogger(__name__)
 LOOK_SECONDS = 0.1
+END_SECONDS = 10.0  # that the process has to end what its environment has started
+SWITCH_SECONDS = 1e-4  # between threads, then
 WARNER = "rmc-env-warnings"  # the thread
 STDERR = 2  # an environment may have put something else in sys.stderr's place
 HUNG_STATUS = 3  # of a process that ended so
@@ -107,6 +109,8 @@ def _arm(seconds: float) -> None:
 
 
 def _end(call: EnvCall) -> None:
+    sys.setswitchinterval(SWITCH_SECONDS)  # the call may be a loop in Python, which is to be ended beside it
+    _arm(END_SECONDS)  # anew: with many processes on the machine it takes a while to find ours
     with suppress(OSError, ValueError):
         os.write(STDERR, f"rmc: {call.describe()}\n".encode())
         sys.stdout.flush()

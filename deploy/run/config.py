@@ -210,7 +210,9 @@ def _expected(kind: Any) -> str:
         return f"one of {', '.join(map(repr, get_args(kind)))}"
     if get_origin(kind) in (types.UnionType, typing.Union):
         return " or ".join(map(_expected, get_args(kind)))
-    return "None" if kind is types.NoneType else kind.__name__
+    if kind is types.NoneType:
+        return "None"
+    return kind.__name__ if isinstance(kind, type) else str(kind)
 
 
 def _matches(kind: Any, value: Any) -> bool:
