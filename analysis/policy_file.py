@@ -180,8 +180,7 @@ def _of_older_run(folder: RunFolder, files: dict[str, bytes]) -> PolicyFile:
 def _evaluated(header: PolicyHeader, folder: RunFolder) -> PolicyHeader:
     """With how this checkpoint played: when the run ended, or while it trained."""
     result = folder.result()
-    is_last = result is not None and result["updates"] == header.updates
-    records = [result] if result is not None and is_last and is_complete(result) else []
+    records = [result] if result and result["updates"] == header.updates and is_complete(result) else []
     if not records:
         records = MetricsTail(folder.metrics).take()
         records = [record for record in records if record.get("eval_update") == header.updates]

@@ -51,9 +51,9 @@ def check_values(spec: Spec, on_this_machine: bool) -> None:
         if option(name) in given:
             raise ConfigError(option(name), typed, "a sweep's runs are given none; leave it")
     _check("options of rmc train", typed, spec, list(spec.words))
-    config = read_job(Job(Path(), ("train", spec.env, *spec.words), 0))[0]
-    for name in (name for name, values in ranges.items() if isinstance(values, Range)):
-        is_integer(name, config)
+    for name, sought in ranges.items():
+        if isinstance(sought, Range):
+            is_integer(name, read_job(Job(Path(), ("train", spec.env, *spec.words), 0))[0])
     if option("config") in given and (seed := parser.parse(["train", spec.env, *spec.words]).seed):
         raise ConfigError("--seed", seed, "a sweep has several: give --seeds, and leave it out of that file")
     ends = {name: [value.low, value.high] if isinstance(value, Range) else value for name, value in ranges.items()}
@@ -90,8 +90,7 @@ def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:
             alike = by_values[repr(job.values)] = _checked(job, on_this_machine)
             run = repr((alike.config, dataclasses.replace(alike.options, run_dir=None)))
             if (other := by_run.setdefault(run, job)) is not job:
-                both = " and ".join(f"{name}={value}" for one in (other, job) for name, value in one.values.items())
-                raise ConfigError("grid", both, "are the same run; give each value once")
+                raise ConfigError("values", [other.values, job.values], "are one and the same run; give each once")
         config = dataclasses.replace(alike.config, seed=job.seed)
         config.__dict__["layout"] = alike.config.layout  # the environment is made once
         validate(config)
