@@ -23,7 +23,7 @@ class ActorConfig:
     envs_per_actor: int = 4
     """N, environments of one actor; more of them share one forward pass."""
     stride: int = 0
-    """Steps between window starts. Below --trained-steps windows overlap; 0 means --trained-steps."""
+    """Steps between window starts. Below --trained-steps windows overlap; 0 means --trained-steps, the most."""
     state_strategy: Literal["zero", "stored", "burn-in", "episode"] = "burn-in"
     """A window's first memory state. zero: zeros. stored: the actor's. burn-in: the actor's, some steps before.
     episode: zeros; the window is the whole episode, up to the time limit."""

@@ -12,7 +12,7 @@ from rmc.common.wire import MAX_ENTRY_BYTES, encode_hello, encode_windows
 class _Kept(NamedTuple):
     id: EntryId
     payload: bytes
-    steps: int  # new environment steps in it
+    steps: int  # new agent steps in it
 
 
 class UnackedEntries:
@@ -26,7 +26,7 @@ class UnackedEntries:
     def __init__(self, bus: Bus, actor: int, epoch: int, spec: WindowSpec) -> None:
         self._bus, self._actor, self._spec = bus, actor, spec
         self.epoch, self.bytes, self.resends = epoch, 0, 0
-        self.committed_steps = 0  # environment steps that acknowledged entries carried
+        self.committed_steps = 0  # agent steps that acknowledged entries carried
         self._hello = encode_hello(spec)
         self._kept: deque[_Kept] = deque()
         self._sent = 0  # entries at the front of ``_kept`` that were sent

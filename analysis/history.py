@@ -1,4 +1,4 @@
-"""What runs went through: their evaluations over environment steps, updates and wall time, read from their folders.
+"""What runs went through: their evaluations over agent steps, updates and wall time, read from their folders.
 
 A file of JSON lines holds many, one a line, so that results can be kept without their runs.
 """
@@ -204,7 +204,7 @@ def _env_label(env: EnvConfig) -> str:
 
 
 def _evaluations(records: Iterable[dict[str, Any]]) -> list[Evaluation]:
-    """In order of environment steps. A run that went back to an earlier checkpoint has lost what it made after it."""
+    """In order of agent steps. A run that went back to an earlier checkpoint has lost what it made after it."""
     steps, walls, played = {}, {}, []  # all that is kept of what a long run has said
     for record in records:
         if _says(record, "learner", "updates", "env_steps"):

@@ -34,7 +34,7 @@ Event = dict[str, Any]
 
 
 class Curve:
-    """A metric over environment steps: every point is the mean of as many values, the last of those so far."""
+    """A metric over agent steps: every point is the mean of as many values, the last of those so far."""
 
     def __init__(self) -> None:
         self.points: list[tuple[float, float]] = []

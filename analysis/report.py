@@ -18,7 +18,7 @@ from rmc.deploy.run.starts import format_starts
 
 PAGES = (".html", ".htm")
 CHARTS = (  # what is drawn over wall time: its name, its unit, and its lines by role and metric
-    ("throughput of environment steps", "steps / s", {"collected": ("replay", "env_steps_per_s")}),
+    ("throughput of agent steps", "steps / s", {"collected": ("replay", "env_steps_per_s")}),
     ("throughput of updates", "updates / s", {"learner": ("learner", "updates_per_s")}),
     (
         "staleness of policies", "updates behind",

@@ -77,7 +77,7 @@ class ReportRun:
     def series(self, kind: str, name: str) -> Series:
         """A metric over wall time (s), of the roles of a kind as each speaks; empty where nobody does.
 
-        Several replay servers each collect a share of the environment steps.
+        Several replay servers each collect a share of the agent steps.
         """
         series = self._metric(kind, name)
         shares = self.options.get("replay.replay_shards", 1) if name == "env_steps_per_s" else 1

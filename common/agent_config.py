@@ -20,7 +20,7 @@ class AgentConfig:
     embedding: int = 256
     """E, units of the Linear + ReLU before the GRU; 0 feeds the raw input (the paper)."""
     heads: tuple[int, int] = (400, 300)
-    """Hidden layers of every head."""
+    """Units of the two hidden layers of every head, like 400 300."""
     gate_init: Literal["uniform", "chrono"] = "uniform"
     """Initial bias of the GRU's update gates. uniform: PyTorch's. chrono: time constants up to a window's length."""
     head_input: HeadInput = "hidden"

@@ -33,7 +33,7 @@ class PolicyHeader:
     seed: int
     """The run's."""
     env_steps: int = 0
-    """Environment steps that it was trained for."""
+    """Agent steps that it was trained for."""
     updates: int = 0
     eval_return_mean: float | None = None
     """Of deterministic episodes; None where this checkpoint was not evaluated."""

@@ -32,7 +32,7 @@ class Sample:
     rows: Rows | None  # (B,)
     weights: NDArray[np.float64] | None  # (B,)
     total_weight: float
-    env_steps: int  # environment steps committed to the ring so far
+    env_steps: int  # agent steps committed to the ring so far
     drawn_steps: int  # trained steps drawn so far
 
 

@@ -93,7 +93,7 @@ WHEN = {
     "envs_per_actor": "up where actors are the bottleneck: they share one forward pass",
     "stride": "down for overlapping windows, which train a step more than once (an episode's last ones less often)",
     "state_strategy": "`episode` where anything since the start may count; the others to compare with the paper",
-    "reward_scale": "where a step's reward is in the hundreds, as in HumanoidStandup",
+    "reward_scale": "where a step's rewards are in the hundreds, as in HumanoidStandup, or all below 0.001",
     "refresh_steps": "rarely: how far actors lag behind is in the metrics",
     "chunk_windows": "up on a slow network",
     "chunk_seconds": "rarely",

@@ -65,7 +65,7 @@ class UpdateConfig:
         return self.scheme == 3 and self.update_order == "joint" and online and not self.clip_norm
 
     def beta(self, env_steps: int) -> float:
-        """beta after so many environment steps."""
+        """beta after so many agent steps."""
         return self.curiosity * max(0.0, 1.0 - env_steps / self.curiosity_steps)
 
 

@@ -297,7 +297,7 @@ class Learner:
         self._observed_before = progress.observed_before or self._observed_before
         self._policy_learnt = progress.policy_learnt
         self._next_checkpoint = self._after(self.env_steps)
-        log.info("resumed at update %d, environment step %d", self.updates, self.env_steps)
+        log.info("resumed at update %d, agent step %d", self.updates, self.env_steps)
         return progress.epoch
 
     def waiting_for(self) -> str:

@@ -30,7 +30,7 @@ class StreamPosition(NamedTuple):
     """How far an actor's stream is in the ring."""
 
     id: EntryId  # the last entry taken
-    settled_steps: int  # environment steps of epoch ``id.epoch`` that were inserted, or lost with a refused entry
+    settled_steps: int  # agent steps of epoch ``id.epoch`` that were inserted, or lost with a refused entry
 
 
 @dataclass
@@ -47,7 +47,7 @@ class Progress:
     replay_epoch: int = 0  # the largest that has written here
     evicted_priorities: int = 0  # priorities that came back too late
     elsewhere_steps: int = 0  # trained steps drawn from the other shards, as the learner last said
-    begun_env_steps: int = 0  # environment steps that were in before this ring began, empty
+    begun_env_steps: int = 0  # agent steps that were in before this ring began, empty
     begun_drawn_steps: int = 0  # and trained steps that were drawn, from all shards
     max_priority: float = 1.0  # a new window's
     observations: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (C,), of the statistics
@@ -69,7 +69,7 @@ class Progress:
 
     @property
     def inserted(self) -> int:
-        """Environment steps inserted since this ring began, which is where the limiter counts from."""
+        """Agent steps inserted since this ring began, which is where the limiter counts from."""
         return self.env_steps - self.begun_env_steps
 
     @property

@@ -3,7 +3,7 @@
     draw allowed:  drawn + B L_t <= (inserted - warm-up) * ratio + tolerance   and inserted >= warm-up
     actors' limit: warm-up + drawn / ratio + slack, at most the run's total; actors share what is left
 
-drawn: trained steps drawn; inserted: environment steps. The tolerance is one batch and the slack's worth of
+drawn: trained steps drawn; inserted: agent steps. The tolerance is one batch and the slack's worth of
 steps. When the learner waits, the actors' limit is at least ``slack`` above what is inserted; so nobody
 waits for the other for ever where the slack covers the steps that actors may hold back unsent
 (actors * environments * trained steps of a window: an episode's first window is sent when it is full).
@@ -16,7 +16,7 @@ from rmc.common.replay import SampleStatus
 
 @dataclass(frozen=True)
 class RateLimiter:
-    """Steps of the run, and trained steps drawn per environment step inserted."""
+    """Steps of the run, and trained steps drawn per agent step inserted."""
 
     replay_ratio: float
     warmup_steps: int
@@ -35,7 +35,7 @@ class RateLimiter:
         return SampleStatus.BATCH if inserted >= self.warmup_steps and owed + tolerance >= 0 else SampleStatus.WAIT
 
     def limit(self, drawn: int) -> int:
-        """Environment steps that all actors together may insert."""
+        """Agent steps that all actors together may insert."""
         return min(self.total_steps, self.warmup_steps + int(drawn / self.replay_ratio) + self.slack_steps)
 
     def is_final(self, drawn: int) -> bool:

@@ -165,7 +165,7 @@ class StreamReader:
 
     @staticmethod
     def _steps(bodies: list[Rows | None], new_steps: NDArray[np.int32]) -> list[int]:
-        """New environment steps of every entry."""
+        """New agent steps of every entry."""
         ends = np.cumsum([0 if body is None else len(body) for body in bodies], dtype=np.int64)
         running = np.concatenate([[0], np.cumsum(new_steps)])[ends]
         steps: list[int] = np.diff(running, prepend=0).tolist()

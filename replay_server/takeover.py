@@ -64,7 +64,7 @@ def _begin_empty(progress: Progress, name: str) -> None:
     progress.begun_drawn_steps = progress.drawn_steps + progress.elsewhere_steps
     if progress.next_serial:
         log.warning(
-            "%s: the ring of %d windows is lost; begins empty at environment step %d",
+            "%s: the ring of %d windows is lost; begins empty at agent step %d",
             name, progress.next_serial, progress.env_steps,
         )  # fmt: skip
 

@@ -52,7 +52,7 @@ class Entry(NamedTuple):
 class Ack(NamedTuple):
     """What the replay server committed of an actor's stream, and how far the actor may step.
 
-    ``granted_steps`` counts environment steps of the actor in epoch ``id.epoch``. ``final``: the run's
+    ``granted_steps`` counts agent steps of the actor in epoch ``id.epoch``. ``final``: the run's
     total is reached with them, so what is still open at that point should be sent, cut short.
     """
 

@@ -127,7 +127,7 @@ def is_over(monitor: Monitor, folder: RunFolder, ended: bool, total: int) -> boo
 
 
 def saved_steps(folder: RunFolder) -> int:
-    """Environment steps of the newest checkpoint; 0 where there is none."""
+    """Agent steps of the newest checkpoint; 0 where there is none."""
     newest = CheckpointFolder(folder.checkpoints).latest()
     return int(json.loads(newest[1][PROGRESS])["env_steps"]) if newest else 0
 

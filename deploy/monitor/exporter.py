@@ -32,14 +32,14 @@ class Exported(NamedTuple):
 GAUGES = (
     Exported("busy_share", "", "busy_share", "Share of time spent working, 0 to 1."),
     Exported("waiting_share", "", "waiting_share", "Share of time spent waiting, 0 to 1."),
-    Exported("env_steps", "replay", "env_steps", "Environment steps committed."),
-    Exported("env_steps_per_second", "replay", "env_steps_per_s", "Environment steps committed a second."),
+    Exported("env_steps", "replay", "env_steps", "Agent steps committed."),
+    Exported("env_steps_per_second", "replay", "env_steps_per_s", "Agent steps committed a second."),
     Exported("windows", "replay", "windows", "Windows committed."),
     Exported("windows_per_second", "replay", "windows_per_s", "Windows committed a second."),
     Exported("ring_windows", "replay", "ring_windows", "Windows in the ring."),
     Exported("ring_capacity_windows", "replay", "ring_capacity", "Windows that the ring holds at most."),
-    Exported("replay_ratio", "replay", "replay_ratio", "Trained steps drawn per environment step."),
-    Exported("credit_steps", "replay", "credit_steps", "Environment steps that actors may take now."),
+    Exported("replay_ratio", "replay", "replay_ratio", "Trained steps drawn per agent step."),
+    Exported("credit_steps", "replay", "credit_steps", "Agent steps that actors may take now."),
     Exported("policy_lag_updates", "replay", "policy_lag_mean", "Updates that a window's policy was behind."),
     Exported("weights_update", "actor", "weights_update", "The learner's update whose policy acts."),
     Exported("unacked_entries", "actor", "unacked_entries", "Entries sent and not yet committed."),
@@ -70,7 +70,7 @@ class RunCollector(Collector):
         about = {"run": self._run, "env": status.env, "preset": status.preset, "seed": str(status.seed)}
         yield InfoMetricFamily("rmc_run", "The run.", about)
         for name, text, value in (
-            ("total_steps", "Environment steps of the run's total.", status.total_steps),
+            ("total_steps", "Agent steps of the run's total.", status.total_steps),
             ("evaluation_return", "Mean of the last evaluation.", status.last.return_mean if status.last else None),
             ("evaluation_return_best", "Mean of the best one.", status.best.return_mean if status.best else None),
         ):

@@ -38,7 +38,7 @@ class MetricsLog:
         self._retry_at: float | None = None
 
     def write(self, record: dict[str, Any], env_steps: int, main: Mapping[str, float]) -> None:
-        """A record with its ``role``, at an environment step; ``main`` are more values for TensorBoard, by tag."""
+        """A record with its ``role``, at an agent step; ``main`` are more values for TensorBoard, by tag."""
         if self._retry_at is not None and time.monotonic() < self._retry_at:
             return
         try:

@@ -8,7 +8,7 @@ APART_SECONDS = 1.0  # between points
 
 
 class Pace:
-    """The rate of environment steps over the last minute."""
+    """The rate of agent steps over the last minute."""
 
     def __init__(self) -> None:
         self._points: deque[tuple[float, int]] = deque()

@@ -38,7 +38,7 @@ class RunStatus:
         """``expected`` are the roles that are about to speak."""
         self._since = dict.fromkeys(expected, time.time())  # of those that have not spoken
         self.began = 0.0  # the newest start, by the clock; 0 where that is not known
-        self.steps_before = 0  # environment steps that the run had then, until its roles say more
+        self.steps_before = 0  # agent steps that the run had then, until its roles say more
         self._spoke_last, self._is_trained = 0.0, False  # anybody, and whether the learner's last word was its end
         self.state: State | None = "training"  # None where it has ended, and how is not known
         self.env, self.preset, self.seed, self.total_steps = env, preset, seed, total_steps
@@ -50,7 +50,7 @@ class RunStatus:
         self.is_past = False  # whether newer words are there, and not taken in yet
         self.heard = "*"  # which roles speak all the time; of a baseline the launcher alone
         self._pace = Pace()
-        self._checkpoints: dict[int, int] = {}  # environment steps by update
+        self._checkpoints: dict[int, int] = {}  # agent steps by update
         self._counted, self._moved_at, self._spoke_at = (0, 0), 0.0, 0.0  # steps and updates, when they last grew
 
     @property
@@ -174,7 +174,7 @@ class RunStatus:
 
     @property
     def env_steps(self) -> int:
-        """Environment steps committed to the ring."""
+        """Agent steps committed to the ring."""
         if self.final_steps is not None:
             return self.final_steps
         steps = self.replay("env_steps", sum) or self.get("learner", "env_steps")
@@ -182,7 +182,7 @@ class RunStatus:
 
     @property
     def share_done(self) -> float:
-        """Environment steps over the run's total, 0 to 1."""
+        """Agent steps over the run's total, 0 to 1."""
         return min(1.0, self.env_steps / max(1, self.total_steps))
 
     @property
@@ -203,7 +203,7 @@ class RunStatus:
         return max(0, self.total_steps - self.env_steps) / rate
 
     def checkpoint_steps(self, update: int | None) -> int | None:
-        """Environment steps at the checkpoint of that update, or None where the learner has not said them."""
+        """Agent steps at the checkpoint of that update, or None where the learner has not said them."""
         return None if update is None else self._checkpoints.get(update)
 
     def replay(self, name: str, over: Callable[[list[float]], float]) -> float | None:

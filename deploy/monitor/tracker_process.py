@@ -33,10 +33,10 @@ class TrackedRun(Protocol):
     """A run in a tracker. Its methods may raise anything."""
 
     def log(self, values: dict[str, Any], env_steps: int) -> None:
-        """A row of numbers at an environment step."""
+        """A row of numbers at an agent step."""
 
     def log_video(self, video: Path, env_steps: int) -> None:
-        """An episode of the policy as it was at an environment step."""
+        """An episode of the policy as it was at an agent step."""
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Log the end, with ``env_steps``, and return when all has arrived."""

@@ -67,7 +67,7 @@ class LearnerRole(_Role):
     folder: Path = Path("checkpoints")
     """Where checkpoints go, and where it resumes from."""
     device: str = "cpu"
-    """cpu or cuda."""
+    """cpu, cuda or cuda:N."""
     secret_file: Path | None = None
     """File with the run's secret; by default RMC_SECRET holds it."""
     tls_folder: Path | None = None

@@ -22,7 +22,7 @@ class Evaluate:
     """Play deterministic episodes with a run's checkpoint, or with a policy file."""
 
     run: Positional[Path]
-    """The run's folder, or a policy file."""
+    """The run's folder, a policy file, or hf://owner/name."""
     episodes: int = 10
     """Episodes to play."""
     seconds: float = 0.0
@@ -43,7 +43,7 @@ class Export:
     """Write a policy as one file: policy.safetensors for load_policy, or ONNX for programs without torch."""
 
     run: Positional[Path]
-    """The run's folder, or a policy file."""
+    """The run's folder, a policy file, or hf://owner/name."""
     out: Path = Path("policy.onnx")
     """The file to write, which ends in .safetensors or .onnx."""
     checkpoint: Checkpoint = "latest"

@@ -84,7 +84,7 @@ def from_config(config: RunConfig, launch: LaunchOptions) -> Train:
 @dataclass(frozen=True)
 class Resume(Train):
     """Continue a run. Options that are not given keep their values. --help shows the basic options, --help-all all of
-    them; behind RUN they show the run's own values as defaults."""
+    them, with the defaults of robust; behind RUN they show the run's own values."""
 
     env: KnownEnvOptions
     run_dir: KnownRunDir = None

@@ -69,7 +69,7 @@ class Index:
 
 
 def newest_return(job: Job) -> tuple[float | None, int]:
-    """Of its newest evaluation that was not cut, and the environment steps so far."""
+    """Of its newest evaluation that was not cut, and the agent steps so far."""
     folder = RunFolder(job.folder)
     if not (folder.path / "config.json").exists():
         return None, 0

@@ -347,7 +347,7 @@ def test_the_learners_node_is_lost(endless: Run) -> None:
     assert where(endless, "learner") is not lost
     assert endless.newest("replay", "env_steps") >= steps
     assert checkpoint <= endless.newest("learner", "updates")
-    assert "is lost; begins empty at environment step" in site.head.run(f"cat {endless.folder}/logs/replay.log").stdout
+    assert "is lost; begins empty at agent step" in site.head.run(f"cat {endless.folder}/logs/replay.log").stdout
     endless.check_counters()
     note(test="learner's node lost", away_s=away, back_s=back, updates_before=updates, checkpoint=checkpoint)
 

@@ -56,7 +56,7 @@ def test_a_run_is_operated_for_a_week(tmp_path: Path) -> None:
     subprocess.run(["tar", "-xf", tmp_path / "week.tar.xz"], cwd=home, check=True)
     assert not (home / "runs" / "week" / "replay").exists()
     assert "return" in ran(home, "evaluate", "runs/week", "--episodes", "1")
-    lost = r"replay: the ring of \d+ windows is lost; begins empty at environment step \d+"
+    lost = r"replay: the ring of \d+ windows is lost; begins empty at agent step \d+"
     ran(home, *resume, "--total-steps", str(total + 200), warning=lost)
     assert (RunFolder(home / "runs" / "week").result() or {})["env_steps"] >= total + 200
 
