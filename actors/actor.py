@@ -81,7 +81,7 @@ class Actor:
         self._bus, self._clock, self._priority_fn = bus, clock, priority_fn
         self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, config.envs_per_actor, spec.missing)
         self._envs = EnvPool(make_env, config.envs_per_actor, spec, self.name, config.reward_scale)
-        self._means, self._rate, self._episodes, self._resends = Means(), Rate(), 0, 0
+        self._means, self._rate, self._episodes = Means(), Rate(), 0
         self._refused_weights = 0
         self._refused: Version | None = None  # the last policy that was
         self._total_steps = 0
@@ -93,13 +93,12 @@ class Actor:
 
     def restart(self) -> None:
         """Forget unfinished episodes and what was not sent, and begin a new epoch with new seeds and newest weights."""
-        self._resends += self._unacked.resends
-        self._start_epoch()
+        self._start_epoch(self._unacked.resends)
 
-    def _start_epoch(self) -> None:
+    def _start_epoch(self, resends: int = 0) -> None:
         ack = self._bus.ack(self._index)
         epoch = self._bus.take_epoch(self.name, floor=ack.id.epoch if ack else 0)
-        self._unacked = UnackedEntries(self._bus, self._index, epoch, self._spec)
+        self._unacked = UnackedEntries(self._bus, self._index, epoch, self._spec, resends)
         self._ack: Ack | None = None
         self._older_since = float("inf")
         self._version: Version | None = None
@@ -144,7 +143,7 @@ class Actor:
             "episodes": self._episodes,
             "weights_update": self._version.update if self._version else -1,
             "unacked_entries": len(self._unacked),
-            "resends": self._resends + self._unacked.resends,
+            "resends": self._unacked.resends,
             "broken_episodes": self._envs.broken,
             "refused_weights": self._refused_weights,
         }

@@ -23,9 +23,10 @@ class UnackedEntries:
     came back may have forgotten them. Explicit ids make repeats harmless.
     """
 
-    def __init__(self, bus: Bus, actor: int, epoch: int, spec: WindowSpec) -> None:
+    def __init__(self, bus: Bus, actor: int, epoch: int, spec: WindowSpec, resends: int = 0) -> None:
+        """``resends`` are those of the epochs before."""
         self._bus, self._actor, self._spec = bus, actor, spec
-        self.epoch, self.bytes, self.resends = epoch, 0, 0
+        self.epoch, self.bytes, self.resends = epoch, 0, resends
         self.committed_steps = 0  # agent steps that acknowledged entries carried
         self._hello = encode_hello(spec)
         self._kept: deque[_Kept] = deque()

@@ -117,6 +117,6 @@ def choose(algorithm: Algorithm, settings: Settings, env_id: str) -> Choice:
     row = _PPO_ROWS.get(body)
     if row is None:
         return Choice(far, normalize=True)
-    arguments = {name: type(value)(value) for name, value in zip(_PPO_COLUMNS, row, strict=True)}
+    arguments = dict(zip(_PPO_COLUMNS, row, strict=True))
     wide = body in _PPO_WIDE
     return Choice(arguments, dict(_WIDE) if wide else {}, relu=wide, normalize=True)

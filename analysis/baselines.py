@@ -100,7 +100,8 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
     if refused := next((path for path in changed if path not in MAY_CHANGE), None):
         was, now = changed[refused]
         fix = f"the run in {folder.path} has {was!r}; use that, or another --run-dir"
-        raise ConfigError("ENV" if refused == "env.id" else option(refused), now, fix)
+        name = {"env.id": "ENV", "algorithm": "ALGORITHM"}.get(refused) or option(refused)
+        raise ConfigError(name, now, fix)
     if there:
         folder.check_sizes(config.env.id, sizes)
         _initial_return(folder)

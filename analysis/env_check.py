@@ -3,6 +3,7 @@
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +17,7 @@ from rmc.common.agent_config import STD_FLOOR
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.describe import layout_of
 from rmc.common.env.faults import RAISED, describe_error
+from rmc.common.env.layout import EnvLayout
 from rmc.common.env.make import first_env, make_env
 from rmc.common.env.privileged import Privileged
 from rmc.common.env.process_state import changes
@@ -70,11 +72,12 @@ class Played:
 def check(config: EnvConfig, steps: int, console: Console) -> int:
     """Print facts, notes and faults; 0 where there is no fault, else 1. Raises ConfigError as ``rmc train`` would."""
     env, played = first_env(config), Played()
+    layout = layout_of(env, config, {}, privileged=False)
     stages: list[Callable[[], Iterable[str]]] = [
         lambda: _gymnasiums_notes(WatchedEnv(_users(env), config.id, config.env_timeout)),
         lambda: _guarded(lambda: played.play(env, steps, seed=0)),
         lambda: _nonsense(played),
-        lambda: _hints(env, played),
+        lambda: _hints(played, layout.time_limit),
         lambda: _repeated(env),
         lambda: _for_critics(env),
         lambda: _second(config),
@@ -84,7 +87,8 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
         lines += stages.pop(0)()
     if changed := changes():
         lines.append(f"note: it changes {', '.join(changed)} of its process; training keeps its own apart")
-    for line in [*_facts(env, played), _reach(env, config), *dict.fromkeys(lines)]:
+    reach = format_reach(WindowConfig().trained_steps, layout.time_limit)  # by default
+    for line in [*_facts(layout, played), reach, *dict.fromkeys(lines)]:
         console.print(line, soft_wrap=True)
     env.close()
     sound = not _faults(lines)
@@ -129,13 +133,8 @@ def _plain(text: str) -> str:
     return " ".join(text.replace("\x1b[33m", "").replace("\x1b[0m", "").removeprefix("WARN: ").split())
 
 
-def _time_limit(env: Env) -> int | None:
-    return env.spec.max_episode_steps if env.spec else None
-
-
-def _facts(env: Env, played: Played) -> Iterator[str]:
-    sizes = [space.shape[0] for space in (env.observation_space, env.action_space) if space.shape]
-    yield f"observations {sizes[0]}, actions {sizes[1]}, time limit {_time_limit(env) or 'none'}"
+def _facts(layout: EnvLayout, played: Played) -> Iterator[str]:
+    yield f"observations {layout.obs_dim}, actions {layout.action_dim}, time limit {layout.time_limit or 'none'}"
     if played.rewards:
         rewards = np.array(played.rewards)
         speed = len(rewards) / played.seconds
@@ -149,11 +148,6 @@ def _facts(env: Env, played: Played) -> Iterator[str]:
         yield f"{len(played.lengths)} episode{'s' * (len(played.lengths) != 1)} of {steps} steps, {ended}"
 
 
-def _reach(env: Env, config: EnvConfig) -> str:
-    """By default."""
-    return format_reach(WindowConfig().trained_steps, layout_of(env, config, {}, privileged=False).time_limit)
-
-
 def _nonsense(played: Played) -> Iterator[str]:
     if not np.isfinite(played.rewards).all():
         yield "fault: rewards are not finite; the episode ends a step before, and the environment is made anew"
@@ -162,7 +156,7 @@ def _nonsense(played: Played) -> Iterator[str]:
         yield f"fault: rewards reach {largest:.3g}, past what float32 holds (3e+38); scale them in the environment"
 
 
-def _hints(env: Env, played: Played) -> Iterator[str]:
+def _hints(played: Played, time_limit: int | None) -> Iterator[str]:
     observations, rewards = np.stack(played.observations), np.array(played.rewards)
     still = np.ptp(observations, axis=0) == 0.0
     faint = ~still & (observations.std(0, dtype=np.float64) < STD_FLOOR)
@@ -175,7 +169,7 @@ def _hints(env: Env, played: Played) -> Iterator[str]:
     yield from _reward_notes(np.abs(rewards))
     if not rewards.any():
         yield "note: no random step was rewarded; learning will need luck, or curiosity (--curiosity)"
-    if not played.lengths and not _time_limit(env):
+    if not played.lengths and not time_limit:
         yield "note: no episode ended; without a time limit an evaluation stops at 10 000 steps (--time-limit)"
 
 
@@ -209,10 +203,8 @@ def _for_critics(env: Env) -> Iterator[str]:
 def _second(config: EnvConfig) -> Iterator[str]:
     """Whether another one can be played while the first is there, as in training."""
     try:
-        env = make_env(config)
-        env.reset(seed=0)
-        env.step(np.zeros(env.action_space.shape or (), np.float32))
-        env.close()
+        with closing(make_env(config)) as env:
+            Played().play(env, 1, seed=0)  # as the first one stood it
     except Exception as error:
         fix = "take --actors 1 --envs-per-actor 1 --episodes 0"
         yield f"note: no second one can be beside it ({describe_error(error)}); {fix}"

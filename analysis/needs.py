@@ -32,6 +32,15 @@ class Need:
 
 
 @dataclass(frozen=True)
+class There:
+    """What a run that goes on has already."""
+
+    ring_bytes: int = 0
+    checkpoint_bytes: int = 0
+    env_steps: int = 0
+
+
+@dataclass(frozen=True)
 class Speed:
     """How fast a run goes once it is warm."""
 
@@ -63,17 +72,14 @@ def _slope(vitals: Vitals, role: str, name: str) -> float:
     return (after - before) / max(ended - began, 1e-9)
 
 
-def needs(config: RunConfig, trial: Trial, machine: Machine, ring_there: int = 0, env_steps: int = 0) -> list[Need]:
-    """All rows, in the order in which they are shown.
-
-    A run that goes on has so many bytes of its ring on the disk, and so many steps behind it.
-    """
+def needs(config: RunConfig, trial: Trial, machine: Machine, there: There = There()) -> list[Need]:
+    """All rows, in the order in which they are shown."""
     fast = speed(config, trial.records)
-    seconds = max(0, config.total_steps - env_steps) / fast.steps_per_s
+    seconds = max(0, config.total_steps - there.env_steps) / fast.steps_per_s
     at = f"{fast.steps_per_s:,.0f} steps/s, {fast.updates_per_s:,.1f} updates/s"
     return [
         *memory(config, trial.roles, machine),
-        *disk(config, trial, seconds, machine, ring_there),
+        *disk(config, trial, seconds, machine, there),
         *bandwidth(config, fast, machine),
         *handles(trial.roles, machine),
         threads(config, trial.records, machine),
@@ -98,11 +104,12 @@ def _role_memory(kind: str, each: list[int]) -> Need:
     return Need(f"memory, {kind}{count}", size_text(sum(each)))
 
 
-def disk(config: RunConfig, trial: Trial, seconds: float, machine: Machine, ring_there: int) -> list[Need]:
+def disk(config: RunConfig, trial: Trial, seconds: float, machine: Machine, there: There) -> list[Need]:
     """What is to come of the ring, the checkpoints, what is recorded until the end, and all."""
-    rows, kept = max(0, ring_bytes(config) - ring_there), config.learner.keep_checkpoints + KEPT_BESIDE
+    rows, kept = max(0, ring_bytes(config) - there.ring_bytes), config.learner.keep_checkpoints + KEPT_BESIDE
     count = config.total_steps // config.learner.checkpoint_steps + 1
-    saved, records = min(kept, count) * trial.checkpoint_bytes, int(trial.record_bytes_per_s * seconds)
+    saved = max(0, min(kept, count) * trial.checkpoint_bytes - there.checkpoint_bytes)
+    records = int(trial.record_bytes_per_s * seconds)
     free = max(0, machine.free_disk_bytes - DISK_RESERVE)
     return [
         Need("disk, ring", size_text(rows)),

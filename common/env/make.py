@@ -57,8 +57,9 @@ def make_env(config: EnvConfig, render: bool = False, privileged: bool = False) 
 
 
 def _says_parts(env: gym.Env[Any, Any]) -> bool:
-    """Whether it says which parts an observation has, all of it: a wrapper may have added to a body's own."""
-    return 0 < sum(structure(env).values()) == gym.spaces.flatdim(env.observation_space)
+    """Whether it says which parts an observation has, all of it, positions first: a wrapper may have added to them."""
+    told, size = structure(env), gym.spaces.flatdim(env.observation_space)
+    return next(iter(told), None) == "qpos" and 0 < told["qpos"] < sum(told.values()) == size
 
 
 def _make(registered: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, Any]:
@@ -197,7 +198,7 @@ def _redirect_mujoco_warnings() -> None:
     """MuJoCo's warnings go to our log, not to stderr and a MUJOCO_LOG.TXT in the working folder."""
     try:
         import mujoco
-    except ImportError:  # an environment of the user's own needs none
+    except Exception:  # not there, or MUJOCO_GL is wrong: an environment that needs it says so
         return
     if mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(_log_mujoco_warning)

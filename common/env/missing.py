@@ -37,6 +37,11 @@ class Missing(CorruptObservation):
         self._was = self._rng.random(self._chains) < now
         return self._was
 
+    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
+        missing = self.draw() if self._chains > 1 else bool(self.draw()[0])
+        info["missing"] = info.get("missing", False) | missing
+        return np.where(missing, np.float32(0.0), observation)
+
 
 class Flicker(Missing):
     """Whole observations become zeros; ``info["missing"]`` is a bool, or (O,) bools where the environment's is."""
@@ -45,11 +50,6 @@ class Flicker(Missing):
 
     def __init__(self, env: Env, probability: float, burst: float = 1.0) -> None:
         super().__init__(env, probability, burst, chains=1)
-
-    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
-        missing = bool(self.draw()[0])
-        info["missing"] = info.get("missing", False) | missing
-        return np.zeros_like(observation) if missing else observation
 
 
 class DropSensors(Missing):
@@ -60,8 +60,3 @@ class DropSensors(Missing):
     def __init__(self, env: Env, probability: float, burst: float = 1.0) -> None:
         assert env.observation_space.shape
         super().__init__(env, probability, burst, chains=env.observation_space.shape[0])
-
-    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
-        missing = self.draw()
-        info["missing"] = info.get("missing", False) | missing
-        return np.where(missing, np.float32(0.0), observation)

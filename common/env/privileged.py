@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rmc.common.env.spaces import array
+from rmc.common.env.spaces import array, check_finite
 from rmc.common.env.wrappers import Env, SeenWrapper
 from rmc.common.errors import EnvFault
 from rmc.common.window import Floats
@@ -38,8 +38,7 @@ class Privileged(SeenWrapper):
             raise EnvFault(f'the environment\'s info["privileged"] has shape {shape}, at first {self._shape}; {fix}')
         if given is None and not self._take_observation:
             return observation, info
-        numbers = np.array(observation if given is None else given, np.float32).ravel()
-        if not np.isfinite(numbers).all():
-            name = "observation" if given is None else 'info["privileged"]'
-            raise EnvFault(f"the environment's {name} is not finite")
+        with np.errstate(over="ignore"):
+            numbers = np.array(observation if given is None else given, np.float32).ravel()
+        check_finite("observation" if given is None else 'info["privileged"]', numbers)
         return observation, info | {"privileged": numbers}

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, find_highest_version
 
 from rmc.common.env.faults import RAISED, describe_error
 from rmc.common.errors import ConfigError
@@ -45,7 +45,8 @@ def entry_point(spec: EnvSpec) -> Callable[..., Any]:
 
 def _unknown(module: str, name: str) -> str:
     """That no such environment is registered, and which one may be meant."""
-    close = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
+    newest = [one.id for one in gym.registry.values() if one.version == find_highest_version(one.namespace, one.name)]
+    close = difflib.get_close_matches(name, newest, n=3, cutoff=0.5)
     fix = f"did you mean {', '.join(close)}?" if close else "use a gymnasium id or module:EnvId-v0"
     if close and not module:
         fix = f"{fix} One of your own is module:{name}"

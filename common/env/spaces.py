@@ -18,6 +18,7 @@ from rmc.common.errors import EnvFault
 LARGEST_ACTION = 1e9  # of an action space that means its bounds
 IMAGE_SIDE = 32  # pixels: what has two sides as long is taken for an image
 NUMBERS = "biuf"  # numpy's kinds of numbers
+LISTED = 10  # places that a fault names
 
 
 def space_fault(observation: gym.Space[Any], action: gym.Space[Any]) -> str | None:
@@ -57,7 +58,8 @@ def _numbers(box: gym.Space[Any], value: Any) -> NDArray[np.float32]:
     numbers = array("observation", value, "an array of numbers")
     if numbers.shape != box.shape and _sides(numbers.shape) != _sides(box.shape or ()):
         raise EnvFault(f"the environment's observation has shape {numbers.shape}, its space says {box.shape}")
-    return np.array(numbers, np.float32).ravel()  # a copy: some environments write into the same one again
+    with np.errstate(over="ignore"):  # what float32 does not hold becomes infinite, and is judged with the rest
+        return np.array(numbers, np.float32).ravel()  # a copy: some environments write into the same one again
 
 
 def array(name: str, value: Any, expected: str) -> NDArray[Any]:
@@ -69,6 +71,14 @@ def array(name: str, value: Any, expected: str) -> NDArray[Any]:
     if numbers.dtype.kind not in NUMBERS:
         raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}; return {expected}")
     return numbers
+
+
+def check_finite(name: str, numbers: NDArray[np.float32]) -> None:
+    """Raises EnvFault with the places of (N,) that are not."""
+    if not np.isfinite(numbers).all():
+        places = np.flatnonzero(~np.isfinite(numbers)).tolist()
+        where = f"{places[:LISTED]}{' and more' * (len(places) > LISTED)}"
+        raise EnvFault(f"the environment's {name} is not finite at {where}; return finite numbers that float32 holds")
 
 
 def _sides(shape: tuple[int, ...]) -> list[int]:

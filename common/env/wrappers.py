@@ -16,7 +16,7 @@ import numpy as np
 
 from rmc.common.env.faults import call_env
 from rmc.common.env.layout import ActionScale
-from rmc.common.env.spaces import array, bounds, vector
+from rmc.common.env.spaces import array, bounds, check_finite, vector
 from rmc.common.errors import EnvFault
 from rmc.common.window import BoolArray, Floats
 
@@ -67,12 +67,11 @@ class RescaledEnv(gym.Wrapper[Floats, Floats, Any, Any]):
     def _vector(self, observation: Any) -> Floats:
         """(O,). Raises EnvFault here, before a wrapper hides, delays or blanks it: a broken simulator is broken now."""
         numbers = vector(self.raw_observation_space, observation)
-        if not np.isfinite(numbers).all():
-            raise EnvFault("the environment's observation is not finite")
+        check_finite("observation", numbers)
         return numbers
 
     def _own(self, info: Any) -> dict[str, Any]:
-        own = _own(info, math.prod(self.observation_space.shape or ()))
+        own = _plain_info(info, math.prod(self.observation_space.shape or ()))
         is_array = isinstance(own.get("missing"), np.ndarray)
         if self._by_number is None:
             self._by_number = is_array
@@ -107,7 +106,12 @@ def _number(name: str, value: Any, expected: str = "a number") -> float:
 
 
 def _bool(name: str, value: Any) -> bool:
-    return value if isinstance(value, bool) else bool(_number(name, value, "a bool"))
+    if isinstance(value, bool):
+        return value
+    number = _number(name, value, "a bool")
+    if number not in (0.0, 1.0):
+        raise EnvFault(f"the environment's {name} is {number:g}; return a bool")
+    return bool(number)
 
 
 def _missing(value: Any, size: int) -> bool | BoolArray:
@@ -123,7 +127,7 @@ def _missing(value: Any, size: int) -> bool | BoolArray:
     return flags.astype(np.bool_)
 
 
-def _own(info: Any, size: int) -> dict[str, Any]:
+def _plain_info(info: Any, size: int) -> dict[str, Any]:
     """A copy of ``info``, what is missing as a bool or (O,) bools, also under the name that it had in 0.1."""
     if not isinstance(info, dict):
         raise EnvFault(f"the environment's info is {reprlib.repr(info)}; return a dict, {{}} if it says nothing")

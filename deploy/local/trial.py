@@ -70,7 +70,10 @@ def run_trial(config: RunConfig, device: str, stop: StopSignal) -> Trial:
         records = list(folder.records())
         seconds = records[-1]["time"] - records[0]["time"] if records else 0.0
         return Trial(
-            uses, records, _checkpoint_bytes(folder), _size(folder.metrics, *folder.event_files()) / max(seconds, 1.0)
+            uses,
+            records,
+            _checkpoint_bytes(folder),
+            disk_bytes(folder.metrics, *folder.event_files()) / max(seconds, 1.0),
         )
 
 
@@ -161,9 +164,10 @@ def _peak_bytes(pid: int) -> int:
 def _checkpoint_bytes(folder: RunFolder) -> int:
     """Of the largest."""
     checkpoints = CheckpointFolder(folder.checkpoints)
-    return max((_size(checkpoints.path(number)) for number in checkpoints.numbers()), default=0)
+    return max((disk_bytes(checkpoints.path(number)) for number in checkpoints.numbers()), default=0)
 
 
-def _size(*paths: Path) -> int:
+def disk_bytes(*paths: Path) -> int:
+    """Of files, and of all files below folders."""
     files = [file for path in paths for file in (path.rglob("*") if path.is_dir() else [path])]
     return sum(file.stat().st_size for file in files if file.is_file())

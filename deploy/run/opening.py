@@ -15,7 +15,7 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.option_names import changes, option
-from rmc.deploy.run.starts import begun_with, note_start
+from rmc.deploy.run.starts import begun_with, format_begun, note_start
 from rmc.deploy.run.tracking import choose_tracking, keep_tracking
 from rmc.deploy.run.validation import validate_windows
 
@@ -92,8 +92,8 @@ def open_run(
             initial = warm_start.prepare(config, options.init_from, options.init_parts)
     if options.run_dir is None or options.if_exists == "new":
         folder = new_folder(folder.path)
-    elif not there and has_more_than_a_start(folder):
-        raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
+    elif not there:
+        check_free(folder)
     make(folder)
     folder.lock.take()
     try:
@@ -163,6 +163,12 @@ def make(folder: RunFolder) -> None:
         raise _creation_error(folder.path, error) from None
 
 
+def check_free(folder: RunFolder) -> None:
+    """Raises ConfigError where something else is at its path."""
+    if has_more_than_a_start(folder):
+        raise ConfigError("--run-dir", str(folder.path), "is there and is no run's folder; give another one")
+
+
 def has_more_than_a_start(folder: RunFolder) -> bool:
     """Whether something is at its path that a start without a config does not leave, one that was killed early on."""
     if not folder.path.is_dir():
@@ -210,7 +216,7 @@ def _check_changes(folder: RunFolder, before: RunConfig, config: RunConfig) -> N
 def _check_begun(folder: RunFolder, options: LaunchOptions) -> None:
     """Raises ConfigError where it is to begin with other weights than it did."""
     if options.init_from is not None and begun_with(folder).get("asked") != [options.init_from, options.init_parts]:
-        fix = f"the run in {folder.path} has begun, and not with that; leave it, or take another --run-dir"
+        fix = f"the run in {folder.path} began {format_begun(folder)}; leave it, or take another --run-dir"
         raise ConfigError("--init-from", options.init_from, fix)
 
 

@@ -89,6 +89,12 @@ def begun_with(folder: RunFolder) -> dict[str, Any]:
     return next((start.init_from for start in starts(folder) if start.init_from is not None), {})
 
 
+def format_begun(folder: RunFolder) -> str:
+    """The options, as they were typed, with which the run began."""
+    asked = begun_with(folder).get("asked")
+    return "with --init-from {} --init-parts {}".format(*asked) if asked else "with nothing of another"
+
+
 def resume_command(folder: RunFolder) -> str:
     """What to type in a shell to continue a run."""
     return f"rmc resume {shlex.quote(str(folder.path))}"

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import logging
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -29,8 +28,6 @@ from rmc.common.env.config import RANGES, check_range
 from rmc.common.errors import ConfigError
 from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor.view import terminal
-
-log = logging.getLogger(__name__)
 
 
 def evaluate(command: run_options.Evaluate) -> int:

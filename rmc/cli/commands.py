@@ -19,8 +19,6 @@ from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.starts import format_starts
 
-log = logging.getLogger(__name__)
-
 
 def train(command: train_options.Train) -> int:
     warn_of_password(command.redis_url or "")

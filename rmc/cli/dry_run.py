@@ -6,10 +6,10 @@ from rich.console import Console
 from rich.table import Table
 
 from rmc.analysis.doctor import examine
-from rmc.analysis.needs import Need, needs
+from rmc.analysis.needs import Need, There, needs
 from rmc.cli.signals import signals_caught
 from rmc.common.errors import ConfigError
-from rmc.deploy.local.trial import TRAINED_SECONDS, run_trial, trial_config
+from rmc.deploy.local.trial import TRAINED_SECONDS, disk_bytes, run_trial, trial_config
 from rmc.deploy.monitor.recorded import recorded_status
 from rmc.deploy.monitor.table import plain_table
 from rmc.deploy.redis.connect import connect
@@ -18,7 +18,7 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.host import this_machine
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import taken_up
+from rmc.deploy.run.opening import check_free, taken_up
 from rmc.deploy.run.preflight import check_learner, check_port, ring_bytes_there
 from rmc.deploy.run.tracking import choose_tracking
 from rmc.deploy.run.validation import validate, validate_launch, validate_windows
@@ -45,7 +45,7 @@ def dry_run(config: RunConfig, options: LaunchOptions, console: Console) -> int:
     machine = this_machine((options.run_dir or Path("runs")).resolve())
     with signals_caught() as stop:
         measured = run_trial(trial, options.device, stop)
-    rows = needs(config, measured, machine, ring_bytes_there(config, options), _steps_made(options))
+    rows = needs(config, measured, machine, _there_already(config, options))
     console.print(_table(rows))
     for finding in examine(measured.records, config):
         console.print(str(finding), soft_wrap=True)
@@ -62,7 +62,10 @@ def _check_start(config: RunConfig, options: LaunchOptions) -> None:
         connect(options.redis_url, "check")
     if (folder := _there(options)) is not None:
         taken_up(folder, config, options)
-    elif options.init_from is not None:
+        return
+    if options.run_dir is not None and options.if_exists != "new":
+        check_free(RunFolder(options.run_dir))
+    if options.init_from is not None:
         from rmc.deploy.run import warm_start  # imports torch
 
         warm_start.prepare(config, options.init_from, options.init_parts)
@@ -73,9 +76,11 @@ def _there(options: LaunchOptions) -> RunFolder | None:
     return RunFolder(options.run_dir) if options.run_dir is not None and options.goes_on else None
 
 
-def _steps_made(options: LaunchOptions) -> int:
+def _there_already(config: RunConfig, options: LaunchOptions) -> There:
     folder = _there(options)
-    return recorded_status(folder).env_steps if folder is not None else 0
+    if folder is None:
+        return There()
+    return There(ring_bytes_there(config, options), disk_bytes(folder.checkpoints), recorded_status(folder).env_steps)
 
 
 def _table(rows: list[Need]) -> Table:

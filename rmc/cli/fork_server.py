@@ -7,11 +7,13 @@ log gives the process number of a new role, a process number gives its exit stat
 """
 
 import gc
+import importlib
 import os
 import signal
 import socket
 import sys
 import traceback
+from contextlib import suppress
 from typing import Any
 
 import msgpack
@@ -61,14 +63,10 @@ def _forked(requests: socket.socket, request: dict[str, Any], log: int) -> int:
 
 def _import_all() -> None:
     """What the roles import, and what gymnasium imports when it makes one of MuJoCo's environments."""
-    import gymnasium.envs.mujoco.mujoco_env
-
-    import rmc.cli.role_commands
-    import rmc.deploy.local.actor_process
-
-    assert rmc.cli.role_commands
-    assert rmc.deploy.local.actor_process
-    assert gymnasium.envs.mujoco.mujoco_env
+    with suppress(Exception):  # MUJOCO_GL may be wrong: an environment that needs MuJoCo says so
+        importlib.import_module("gymnasium.envs.mujoco.mujoco_env")
+    for module in ("rmc.cli.role_commands", "rmc.deploy.local.actor_process"):
+        importlib.import_module(module)
     gc.collect()
     gc.freeze()  # the collector does not write to these pages, so that they stay shared
 

@@ -149,9 +149,18 @@ def _parsed(words: list[str], defaults: dict[str, Any]) -> Any:
         tyro.cli, kinds, prog="rmc", description=DESCRIPTION, args=words, config=FLAT, registry=PRIMITIVES
     )
     if words[:1] == ["sweep"]:  # what it does not know, rmc train may
+        _check_sweep_begins(words[1:])
         command, others = read(return_unknown_args=True)
         return dataclasses.replace(command, train_words=tuple(others))
     return read()
+
+
+def _check_sweep_begins(words: list[str]) -> None:
+    """Raises ConfigError where an option of rmc train comes first: whether a value follows it is not known."""
+    first = words[0].partition("=")[0].replace("_", "-") if words else ""
+    own = {word.replace("_", "-") for word in option_names(COMMANDS["sweep"][0])}
+    if first.startswith("--") and first not in HELP and first.removeprefix("--").removeprefix("no-") not in own:
+        raise ConfigError("ENV|SPEC.toml", first, "give it first; options of rmc train follow it")
 
 
 def renamed(words: list[str]) -> list[str]:

@@ -37,6 +37,14 @@ class _Role:
 
 
 @dataclass(frozen=True)
+class _SecretRole(_Role):
+    secret_file: Path | None = None
+    """File with the run's secret; by default RMC_SECRET holds it."""
+    tls_folder: Path | None = None
+    """Folder with the run's certificate, if replay servers and learner are to encrypt what they say."""
+
+
+@dataclass(frozen=True)
 class ActorRole(_Role):
     """Run one actor of a registered run in this process."""
 
@@ -45,7 +53,7 @@ class ActorRole(_Role):
 
 
 @dataclass(frozen=True)
-class ReplayRole(_Role):
+class ReplayRole(_SecretRole):
     """Run the replay server of a registered run in this process."""
 
     folder: Path = Path("replay")
@@ -54,24 +62,16 @@ class ReplayRole(_Role):
     """Which of the run's replay servers, from 0 on."""
     listen: str = "tcp:127.0.0.1:0"
     """Where the learner connects to: unix:PATH or tcp:HOST:PORT, port 0 for a free one."""
-    secret_file: Path | None = None
-    """File with the run's secret; by default RMC_SECRET holds it."""
-    tls_folder: Path | None = None
-    """Folder with the run's certificate, if replay servers and learner are to encrypt what they say."""
 
 
 @dataclass(frozen=True)
-class LearnerRole(_Role):
+class LearnerRole(_SecretRole):
     """Run the learner of a registered run in this process."""
 
     folder: Path = Path("checkpoints")
     """Where checkpoints go, and where it resumes from."""
     device: str = "cpu"
     """cpu, cuda or cuda:N."""
-    secret_file: Path | None = None
-    """File with the run's secret; by default RMC_SECRET holds it."""
-    tls_folder: Path | None = None
-    """Folder with the run's certificate, if replay servers and learner are to encrypt what they say."""
 
 
 @dataclass(frozen=True)

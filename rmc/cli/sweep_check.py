@@ -24,7 +24,6 @@ from rmc.sweep.spec import Range, Spec, check_name
 RESERVED = (
     "run_dir", "if_exists", "redis_url", "ray_address", "all_cpus", "tls", "metrics_port", "metrics_host", "dry_run",
 )  # fmt: skip
-LENGTH = "--total-steps"
 FILES = ("--config", "--init-from")  # that the nodes of a cluster do not have
 
 
@@ -56,12 +55,11 @@ def check_values(spec: Spec, on_this_machine: bool) -> None:
             is_integer(name, read_job(Job(Path(), ("train", spec.env, *spec.words), 0))[0])
     if option("config") in given and (seed := parser.parse(["train", spec.env, *spec.words]).seed):
         raise ConfigError("--seed", seed, "a sweep has several: give --seeds, and leave it out of that file")
-    ends = {name: [value.low, value.high] if isinstance(value, Range) else value for name, value in ranges.items()}
     for part, values in (("options", {name: [value] for name, value in spec.options.items()}), ("grid", spec.grid)):
         for name, tried in values.items():
             for value in tried:
                 _check(f"{part}.{name}", value, spec, option_words(name, value))
-    for name, tried in ends.items():
+    for name, tried in (spec.search.ends() if spec.search is not None else {}).items():
         for value in tried:
             _check(f"search.{name}", value, spec, option_words(name, value))
 
@@ -94,7 +92,7 @@ def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:
         config = dataclasses.replace(alike.config, seed=job.seed)
         config.__dict__["layout"] = alike.config.layout  # the environment is made once
         validate(config)
-        checked.append(Checked(with_length(job, config), config, alike.options))
+        checked.append(Checked(as_planned(job, config, alike.options), config, alike.options))
     return checked
 
 
@@ -104,11 +102,15 @@ def read_job(job: Job) -> tuple[RunConfig, LaunchOptions]:
     return command.config(), command.launch_options()
 
 
-def with_length(job: Job, config: RunConfig) -> Job:
-    """A run that says how long it is: one that goes on would be as long as before."""
-    if any(word.partition("=")[0] == LENGTH for word in job.words):
-        return job
-    return dataclasses.replace(job, words=(*job.words, LENGTH, str(config.total_steps)))
+def as_planned(job: Job, config: RunConfig, options: LaunchOptions) -> Job:
+    """A run that says its length and what it takes of a machine: one that goes on would have what it had."""
+    planned = {
+        "--total-steps": config.total_steps, "--actors": config.actors, "--threads": config.learner.threads,
+        "--device": options.device, "--launcher": options.launcher,
+    }  # fmt: skip
+    said = {word.partition("=")[0].replace("_", "-") for word in job.words}
+    unsaid = [word for name, value in planned.items() if name not in said for word in (name, str(value))]
+    return dataclasses.replace(job, words=(*job.words, *unsaid))
 
 
 def _checked(job: Job, on_this_machine: bool) -> Checked:

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from rmc.sweep.spec import Range, Search, Spec, read_grid, read_ranges, read_see
 from rmc.sweep.table import result_table, run_line
 
 WIDEST = 1_000  # characters of a table's line
+MOST_CORNERS = 64  # of a search, which are checked
 log = logging.getLogger(__name__)
 
 
@@ -84,10 +86,12 @@ def default_folder(what: str) -> Path:
 
 
 def corner_jobs(spec: Spec, search: Search, folder: Path) -> list[Job]:
-    """Runs at a search's ends, and with each of its choices, to be checked."""
-    ends = {name: [one.low, one.high] if isinstance(one, Range) else one for name, one in search.ranges.items()}
+    """Runs with each of a search's choices, and at its corners, to be checked."""
+    ends = search.ends()
     count = max(map(len, ends.values()))
-    points = [{name: values[min(at, len(values) - 1)] for name, values in ends.items()} for at in range(count)]
+    each = [{name: values[min(at, len(values) - 1)] for name, values in ends.items()} for at in range(count)]
+    corners = product(*((values[0], values[-1]) for values in ends.values()))
+    points = each + [dict(zip(ends, values, strict=True)) for values in islice(corners, MOST_CORNERS)]
     return [make_job(spec, folder / f"{TRIAL}{at}", values, spec.seeds[0]) for at, values in enumerate(points)]
 
 
@@ -126,7 +130,7 @@ def search_work(spec: Spec, search: Search, config: RunConfig, index: Index, fol
 
     def make(name: str, values: dict[str, Any]) -> Job:
         job = make_job(spec, folder / name, values, spec.seeds[0])
-        return sweep_check.with_length(job, sweep_check.read_job(job)[0])
+        return sweep_check.as_planned(job, *sweep_check.read_job(job))
 
     def finished(job: Job) -> bool:
         return is_finished(job, *sweep_check.read_job(job))

@@ -11,7 +11,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import SAME_AGENT
 from rmc.deploy.run.option_names import flat, option, option_words
-from rmc.deploy.run.starts import begun_with
+from rmc.deploy.run.starts import begun_with, format_begun
 from rmc.sweep.job import Job, run_name
 from rmc.sweep.pool import Ending
 from rmc.sweep.spec import Spec
@@ -39,18 +39,13 @@ def is_finished(job: Job, config: RunConfig, options: LaunchOptions) -> bool:
     for path in now:
         if path not in SAME_AGENT and was.get(path) != now[path]:
             fix = f"the run in {job.folder} has {was.get(path)!r}; use that, or another --sweep-dir"
-            raise ConfigError(option(path), now[path], fix)
-    began = begun_with(folder)
+            raise ConfigError("seeds" if path == "seed" else option(path), now[path], fix)
     asked = None if options.init_from is None else [options.init_from, options.init_parts]
-    if began.get("asked") != asked:
-        fix = f"the run in {job.folder} began {_with(began)}; use that, or another --sweep-dir"
+    if begun_with(folder).get("asked") != asked:
+        fix = f"the run in {job.folder} began {format_begun(folder)}; use that, or another --sweep-dir"
         raise ConfigError("--init-from", options.init_from, fix)
     result = folder.result()
     return result is not None and result["env_steps"] >= config.total_steps
-
-
-def _with(began: dict[str, Any]) -> str:
-    return "with {parts} of {run}".format(**began) if began else "with nothing of another"
 
 
 class Grid:

@@ -27,9 +27,14 @@ class Job:
         return self.folder.name
 
     @property
+    def is_trial(self) -> bool:
+        """Of a search."""
+        return self.name.startswith(TRIAL)
+
+    @property
     def title(self) -> str:
         """What it is, for a line."""
-        last = self.name if self.name.startswith(TRIAL) else f"seed {self.seed}"
+        last = self.name if self.is_trial else f"seed {self.seed}"
         return ", ".join([*(f"{name} {value_text(value)}" for name, value in self.values.items()), last])
 
     @property

@@ -128,7 +128,7 @@ def _end(at_work: list[_AtWork]) -> None:
             for one in at_work:
                 one.stop()
             time.sleep(LOOK_SECONDS)
-    finally:  # of a second Ctrl-C, or a cluster that is gone
+    finally:  # of a cluster that is gone
         for one in at_work:
             one.run.kill()
 

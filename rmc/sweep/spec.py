@@ -52,6 +52,10 @@ class Search:
     sampler_seed: int = 0
     prune: bool = True
 
+    def ends(self) -> dict[str, list[Any]]:
+        """The values to be checked: both ends of a range, or all choices."""
+        return {name: [one.low, one.high] if isinstance(one, Range) else one for name, one in self.ranges.items()}
+
 
 @dataclass(frozen=True)
 class Spec:
@@ -111,13 +115,14 @@ def check_name(place: str, name: str, value: Any, names: Set[str] = NAMES) -> No
     if name in OWN:
         raise ConfigError(place, told, "every run has its own; give env and seeds")
     if name not in names:
-        hint = did_you_mean(name, names, "; rmc train --help lists them")
+        hint = did_you_mean(name, names, "; rmc train --help-all lists them")
         raise ConfigError(place, told, f"no option that a sweep's runs take{hint}")
     for one in value if isinstance(value, list) else [value]:
         if name == "env_kwargs" and isinstance(one, dict):
             check_kwargs(one)
-    if name == "launcher" and (value if isinstance(value, str) else "") not in RUN_LAUNCHERS:
-        raise ConfigError(place, value, f"a run's is {' or '.join(RUN_LAUNCHERS)}; --launcher ray spreads whole runs")
+        if name == "launcher" and one not in RUN_LAUNCHERS:
+            fix = f"a run's is {' or '.join(RUN_LAUNCHERS)}; --launcher ray spreads whole runs"
+            raise ConfigError(place, one, fix)
 
 
 def read_spec(path: Path, words: Sequence[str]) -> Spec:

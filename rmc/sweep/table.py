@@ -13,12 +13,12 @@ def result_table(jobs: Sequence[Job], index: Index) -> Table:
     """A row for each point of the grid, or each trial; the return is over finished runs alone."""
     points: dict[str, list[Job]] = {}
     for job in jobs:
-        points.setdefault(job.name if job.name.startswith(TRIAL) else repr(job.values), []).append(job)
+        points.setdefault(job.name if job.is_trial else repr(job.values), []).append(job)
     names = list(jobs[0].values)
     rows = sorted((_row(runs, index, names) for runs in points.values()), key=lambda row: -row[0])
     table = Table(box=None, pad_edge=False)
     whole = all(not cells[-1] for _, cells in rows)
-    columns = ["trial" if jobs[0].name.startswith(TRIAL) else "", *names, "seeds", "return", "not finished"]
+    columns = ["trial" if jobs[0].is_trial else "", *names, "seeds", "return", "not finished"]
     shown_at = [at for at, name in enumerate(columns) if name and not (whole and name == "not finished")]
     for at in shown_at:
         table.add_column(columns[at], justify="right", no_wrap=True)
@@ -35,7 +35,7 @@ def _row(runs: list[Job], index: Index, names: list[str]) -> tuple[float, list[s
     deviation = f" ± {np.std(returns, ddof=1):,.1f}" if len(returns) > 1 else ""
     others = [index.state(job) for job in runs if index.state(job) != "finished"]
     counts = ", ".join(f"{others.count(state)} {state}" for state in dict.fromkeys(others))
-    is_trial = runs[0].name.startswith(TRIAL)  # whose values were drawn, with all their digits
+    is_trial = runs[0].is_trial  # whose values were drawn, with all their digits
     drawn = (runs[0].values[name] for name in names)  # trials of another command may have another order
     values = (f"{one:.4g}" if is_trial and isinstance(one, float) else value_text(one) for one in drawn)
     text = f"{mean:,.1f}{deviation}" if returns else "-"

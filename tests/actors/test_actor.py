@@ -8,6 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import gymnasium as gym
 import numpy as np
@@ -277,6 +278,23 @@ def test_same_seed_same_bits() -> None:
 
     blob = publish(MemoryBus(), 5)
     assert played() == played()
+
+
+def test_what_is_sent_again_is_counted_once_however_often_a_restart_fails() -> None:
+    bus = MemoryBus()
+    actor, reader = begun(bus)
+    play(actor, reader, 200, final=False)
+    actor._unacked.send_again()
+    before = actor.metrics()["resends"]
+    assert before > 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bus, "take_epoch", Mock(side_effect=BusUnavailable("gone")))
+        for _ in range(3):
+            with pytest.raises(BusUnavailable):
+                actor.restart()
+            assert actor.metrics()["resends"] == before
+    actor.restart()
+    assert actor.metrics()["resends"] == before
 
 
 def test_restart_begins_a_new_epoch_without_what_was_open() -> None:

@@ -71,6 +71,14 @@ class Still(Odd):
         return np.array([0.1, 0.3, 9.81], np.float32)
 
 
+class Normed(Odd):
+    """Divides by its action's size."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        with np.errstate(invalid="ignore"):
+            return np.full(3, action[0] / abs(action[0]), np.float32), 1.0, False, False, {}
+
+
 class Spent(Odd):
     """Has a level for one seed alone."""
 
@@ -108,6 +116,7 @@ gym.register("Mended-v0", entry_point=mended)
 gym.register("Untold-v0", entry_point=Untold)
 gym.register("Spent-v0", entry_point=Spent)
 gym.register("Late-v0", entry_point=Late)
+gym.register("Normed-v0", entry_point=Normed)
 gym.register("Unrewarded-v0", entry_point=Unrewarded)
 
 
@@ -190,6 +199,18 @@ def test_a_fault_at_another_seed_is_one_line(capsys: pytest.CaptureFixture[str])
     assert status == 1
     assert "fault: the environment's reset raises RuntimeError: no level has this seed" in text
     assert "gave other observations" not in text
+
+
+def test_a_second_one_is_tried_with_an_action_that_the_first_one_stood(capsys: pytest.CaptureFixture[str]) -> None:
+    status, text = checked("Normed-v0", capsys, "--steps", "50")
+    assert status == 0
+    assert "no second one" not in text
+
+
+def test_times_are_the_agents_steps(capsys: pytest.CaptureFixture[str]) -> None:
+    text = checked("Pendulum-v1", capsys, "--steps", "100", "--action-repeat", "4")[1]
+    assert "time limit 50\n" in text
+    assert "2 episodes of 50 steps" in text
 
 
 def test_what_cannot_be_made_is_one_line(capsys):

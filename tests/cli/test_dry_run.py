@@ -12,7 +12,7 @@ import psutil
 import pytest
 from rich.filesize import decimal as size_text
 
-from rmc.analysis.needs import Need, needs, speed
+from rmc.analysis.needs import Need, There, needs, speed
 from rmc.cli import dry_run as cli_dry_run
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
@@ -105,11 +105,13 @@ def test_a_short_run_keeps_no_more_checkpoints_than_it_makes() -> None:
 
 
 def test_a_run_that_goes_on_needs_what_is_to_come() -> None:
-    trial, ring = Trial({"learner": RoleUse(1, 1, 1)}, records(), 0, 0.0), ring_bytes(CONFIG)
+    trial, ring = Trial({"learner": RoleUse(1, 1, 1)}, records(), 1_000_000, 0.0), ring_bytes(CONFIG)
     before, after = (
-        {row.what: row.needs for row in needs(CONFIG, trial, MACHINE, *there)} for there in ((), (ring, 1_000))
+        {row.what: row.needs for row in needs(CONFIG, trial, MACHINE, there)}
+        for there in (There(), There(ring, 3_000_000, 1_000))
     )
     assert (before["disk, ring"], after["disk, ring"]) == (size_text(ring), size_text(0))
+    assert [rows["disk, 5 checkpoints"] for rows in (before, after)] == ["5.0 MB", "2.0 MB"]
     assert [rows["time to the end"].split(" at")[0] for rows in (before, after)] == [
         duration(CONFIG.total_steps / 60), duration((CONFIG.total_steps - 1_000) / 60)
     ]  # fmt: skip
@@ -183,6 +185,17 @@ def test_a_ring_that_is_too_large_is_marked_and_the_status_is_1(
     assert re.search(r"^memory, all .* DOES NOT FIT$", output, re.MULTILINE)
     assert output.splitlines()[-1] == "does not fit: memory, all, disk, all"
     assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_of_something_else_is_refused_as_a_start_would(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "thesis.tex").write_text("")
+    assert main.run([*TRAIN, "--dry-run", "--run-dir", str(tmp_path)]) == 2
+    assert capsys.readouterr() == (
+        "",
+        f"rmc: --run-dir='{tmp_path}': is there and is no run's folder; give another one\n",
+    )
 
 
 def test_a_trial_needs_processes(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import re
 import subprocess
 import sys
 from dataclasses import asdict, replace
@@ -79,6 +81,31 @@ def test_what_an_environment_calls_the_parts_of_its_observation(
     assert [part["name"] for part in json.loads(json.dumps(asdict(layout)))["observations"]] == names
 
 
+@pytest.mark.parametrize("hide", ["positions", "velocities"])
+@pytest.mark.parametrize(
+    "told", [{"a": 1, "b": 2}, {"qpos": 3}, {"qvel": 1, "qpos": 2}, {"qpos": 0, "qvel": 3}], ids=str
+)
+def test_parts_are_hidden_where_positions_come_first_and_more_follows(
+    told: dict[str, int], hide: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(OddSpaces, "observation_structure", told, raising=False)
+    config = replace(odd("OddParts-v0", VECTOR, Box(-1.0, 1.0, (2,))), hide=hide)
+    with pytest.raises(ConfigError, match=rf"^ENV='OddParts-v0': it does not say which observations are {hide}; "):
+        env_layout(config)
+
+
+def test_a_wrong_mujoco_gl_ends_only_what_needs_mujoco() -> None:
+    code = """
+from rmc.cli import fork_server, main
+fork_server._import_all()
+print([main.run(["check-env", env, "--steps", "10"]) for env in ("Pendulum-v1", "InvertedPendulum-v5")])
+"""
+    environment = {**os.environ, "MUJOCO_GL": "nonsense"}
+    told = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=100)
+    assert told.stdout.splitlines()[-1] == "[0, 2]", told.stdout + told.stderr
+    assert re.fullmatch(r"rmc: ENV='InvertedPendulum-v5': .*MUJOCO_GL: nonsense.*\n", told.stderr)
+
+
 def test_mujoco_environment() -> None:
     layout = env_layout(EnvConfig("HalfCheetah-v5"))
     assert (layout.obs_dim, layout.action_dim, layout.time_limit) == (17, 6, 1000)
@@ -152,6 +179,7 @@ def test_the_outermost_actions_are_within_the_bounds(bound: float, dtype: type) 
     ("config", "says"),
     [
         (EnvConfig("HalfCheeta-v5"), "did you mean HalfCheetah-v5"),
+        (EnvConfig("HalfCheetah"), "did you mean HalfCheetah-v5? One of your own"),
         (EnvConfig("Qxzzy-v9"), "no such environment"),
         (EnvConfig("no_such_module:Thing-v0"), "No module named 'no_such_module'"),
         (EnvConfig("CartPole-v1"), "actions are Discrete"),

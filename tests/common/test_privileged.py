@@ -84,7 +84,7 @@ def test_without_the_option_what_it_gives_under_that_name_is_its_own() -> None:
     [
         ([1.0], None, "has shape None, at first (1,); return it in one shape, at each reset and step"),
         ([1.0], [1.0, 2.0], "has shape (2,), at first (1,); return it in one shape, at each reset and step"),
-        ([1.0], [np.nan], "is not finite"),
+        ([1.0], [np.nan], "is not finite at [0]; return finite numbers that float32 holds"),
         ([1.0], "high", "is 'high'; return an array of numbers"),
     ],
 )

@@ -154,7 +154,9 @@ def test_a_numbered_checkpoint_and_the_history(source: RunFolder, tmp_path: Path
     folder = begin(OTHER, tmp_path / "run", source, "policy", f":{numbers[0]}")
     assert format_starts(folder) == f"1 start; began with policy of {source.path}, update {numbers[0]}"
     begin(OTHER, folder.path, source, "policy", f":{numbers[0]}")  # the same words again go on
-    with pytest.raises(ConfigError, match=r"--init-from='.*': the run in .* has begun, and not with that"):
+    with pytest.raises(
+        ConfigError, match=r"--init-from='.*': the run in .* began with --init-from .* --init-parts policy; leave"
+    ):
         begin(OTHER, folder.path, source, "all")
     assert format_starts(folder).startswith("2 starts; began with policy of ")
 

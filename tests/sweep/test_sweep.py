@@ -15,17 +15,19 @@ import psutil
 import pytest
 from rich.console import Console
 
+from rmc.cli import parser
 from rmc.cli.main import run
-from rmc.cli.sweep_check import Checked, check_jobs, read_job
-from rmc.cli.sweep_command import grid_work
+from rmc.cli.sweep_check import Checked, as_planned, check_jobs, check_values, read_job
+from rmc.cli.sweep_command import grid_work, read_sweep
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.run import config as run_config
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.starts import note_start
 from rmc.sweep import local_runs, pool, room
-from rmc.sweep.grid import is_finished
+from rmc.sweep.grid import grid_jobs, is_finished
 from rmc.sweep.index import Index
 from rmc.sweep.job import Job
 from rmc.sweep.pool import drop_replay
@@ -214,6 +216,40 @@ def test_runs_that_began_with_nothing_are_no_results_of_a_warm_start(tmp_path: P
     assert is_finished(job, config, options)
     with pytest.raises(ConfigError, match=r"^--init-from='x': the run in .*seed=0 began with nothing of another; use"):
         is_finished(job, config, dataclasses.replace(options, init_from="x"))
+
+
+def test_the_start_that_runs_began_with_is_named_as_it_was_typed(tmp_path: Path) -> None:
+    job = made(tmp_path / "sweep" / "seed=0")
+    config, options = read_job(job)
+    origin = {"run": "/elsewhere/first", "checkpoint": 7, "parts": "all", "asked": ["runs/first", "all"]}
+    note_start(RunFolder(job.folder), {}, options, origin)
+    assert is_finished(job, config, dataclasses.replace(options, init_from="runs/first"))
+    with pytest.raises(ConfigError, match=r"began with --init-from runs/first --init-parts all; use that, or another"):
+        is_finished(job, config, dataclasses.replace(options, init_from="./runs/first"))
+
+
+def test_a_run_that_goes_on_takes_what_the_sweep_planned_and_not_what_it_had(tmp_path: Path) -> None:
+    job = made(tmp_path / "sweep" / "seed=0")
+    folder = RunFolder(job.folder)
+    config, options = read_job(job)
+    had = dataclasses.replace(config, actors=4, learner=dataclasses.replace(config.learner, threads=8))
+    folder.write_config(had)
+    note_start(folder, {}, LaunchOptions(folder.path, launcher="lockstep", device="cuda"), None)
+    planned = as_planned(job, config, options)
+    command = parser.parse(planned.command(job.folder))
+    assert (command.config(), command.launcher, command.device) == (config, "local", "cpu")
+    said = dataclasses.replace(job, words=(*job.words, "--actors=2", "--total_steps", "9000"))
+    assert as_planned(said, config, options).words.count("--actors") == 0
+    assert "--total-steps" not in as_planned(said, config, options).words
+
+
+def test_a_grid_of_launchers_is_one_of_runs(tmp_path: Path) -> None:
+    spec = read_sweep(
+        parser.parse(["sweep", "InvertedPendulum-v5", "--preset", "debug", "--grid", "launcher=local,lockstep"])
+    )
+    check_values(spec, on_this_machine=True)
+    launchers = [read_job(job)[1].launcher for job in grid_jobs(spec, tmp_path)]
+    assert launchers == ["local", "lockstep"]
 
 
 def test_a_killed_sweeps_runs_are_not_told_as_running_and_tables_are_not_cut(tmp_path: Path) -> None:
