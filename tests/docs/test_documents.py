@@ -147,7 +147,8 @@ def test_the_python_api_runs(tmp_path: Path) -> None:
 @pytest.mark.timeout(300)
 def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "custom-environments.md").read_text()
-    for file, code in zip(("shuttle", "instruments"), re.findall(r"```python\n(.*?)```", page, re.DOTALL), strict=True):
+    codes = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    for file, code in zip(("shuttle", "scaled", "instruments"), codes, strict=True):
         (tmp_path / f"{file}.py").write_text(code)
     commands = re.findall(r"^rmc .*$", page, re.MULTILINE)
     assert [command.split()[1] for command in commands] == ["check-env", "train", "evaluate", "train"]
@@ -157,6 +158,9 @@ def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Pat
         done = rmc(*command.split()[1:], *shorter, cwd=tmp_path, timeout=280)
         assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
         names.append(done.stdout)
+    wrapped = rmc("check-env", "scaled:Scaled-v0", cwd=tmp_path)
+    assert "time limit 200" in wrapped.stdout
+    assert wrapped.stdout.endswith("it can be trained on\n")
     assert "time limit 100" in names[0]
     assert names[0].endswith("it can be trained on\n")
     assert "note" not in names[0]
