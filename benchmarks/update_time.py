@@ -37,7 +37,9 @@ OTHER = "losses, autograd, Python"
 BY_FUNCTION = {  # the first that a stack has, from its outermost frame on
     "Adam, rounding": {"optimizers.py:step", "optimizer.py:wrapper", "rounded.py:bf16"},
     "gradient's norm": {"clip_grad.py:get_total_norm", "clip_grad.py:_get_total_norm"},
-    "targets, averages": {"update.py:after_model_step", "update.py:after_value_step", "policy_average.py:update"},
+    "targets, averages": {
+        "update.py:after_model_step", "update.py:after_actor_critic_step", "policy_average.py:update",
+    },
     "batches, priorities": {
         "replay_client.py:sample", "replay_client.py:update_priorities", "batch.py:view_batch", "learner.py:_flush",
     },

@@ -1,8 +1,9 @@
 """The agent's networks: memory, world model, imputer, policy, temperature; critics are in ``common/critic.py``.
 
-Shapes: B batch, T time, O observation, A action, H hidden, E embedding, Z = H, O or H + O head input, M flags of what
-is missing (1 for a whole frame, or O), P privileged numbers, which critics alone read.
-Equations are in ``learner/losses.py``; here is only what maps inputs to outputs.
+Shapes: B batch, T time, O observation, A action, H hidden, S state, E embedding, Z = H, O or H + O head input, M flags
+of what is missing (1 for a whole frame, or O), P privileged numbers, which critics alone read.
+Equations are in ``learner/losses.py``; here is only what maps inputs to outputs. What must be fast is written again:
+``learner/fused.py`` for bfloat16 on a CPU, ``actors/policy_runner.py`` for acting; tests compare them with this.
 """
 
 import math
@@ -273,14 +274,12 @@ class Agent(nn.Module):
         self, observation: Tensor, missing: Tensor, prev_action: Tensor, state: Tensor
     ) -> tuple[MemoryOutput, Tensor, Tensor]:
         """The memory along a sequence; what it read, (B, T, O), missing frames filled; the state after, (B, S)."""
-        seen = observation
         if self.may_impute(missing):
-            seen, after = self.impute(observation, missing, prev_action, state)
-        remembered: MemoryOutput = self.memory(seen, missing, prev_action, state)
-        if seen is observation:
-            last_frame = seen[:, -1, : state.shape[1] - self.config.hidden]
-            after = torch.cat([remembered.hidden[:, -1], last_frame], 1)
-        return remembered, seen, after
+            filled, after = self.impute(observation, missing, prev_action, state)
+            return self.memory(filled, missing, prev_action, state), filled, after
+        remembered: MemoryOutput = self.memory(observation, missing, prev_action, state)
+        last_frame = observation[:, -1, : state.shape[1] - self.config.hidden]
+        return remembered, observation, torch.cat([remembered.hidden[:, -1], last_frame], 1)
 
     def may_impute(self, missing: Tensor) -> bool:
         """Whether there may be anything to fill; a GPU would have to wait to be asked, an export cannot ask."""

@@ -59,5 +59,5 @@ class AgentConfig:
         return skip_size + (self.hidden if self.head_input != "observation" else 0)
 
     def state_size(self, obs_dim: int) -> int:
-        """S, numbers that an actor carries from step to step, and stores: h, and what was last seen where it fills."""
+        """S, numbers that an actor carries from step to step, and stores: h, and the last frame where it fills."""
         return self.hidden + self.impute_missing * obs_dim

@@ -16,7 +16,7 @@ MOMENTUM = 0.01  # of the running statistics: a batch's share in them
 
 
 class StackedLinear(nn.Module):
-    """Two Linear layers side by side as one batched product: x (2, N, in) -> (2, N, out)."""
+    """Two Linear layers side by side as one batched product: x (1 or 2, N, in) -> (2, N, out)."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -31,7 +31,7 @@ class StackedLinear(nn.Module):
 class BatchNorm(nn.Module):
     """Each unit minus its mean, over its standard deviation; where asked, times a gain, plus an offset."""
 
-    mean: Tensor  # (S, 1, K), running
+    mean: Tensor  # (nets, 1, K), running
     variance: Tensor
 
     def __init__(self, nets: int, size: int, affine: bool) -> None:
@@ -42,7 +42,7 @@ class BatchNorm(nn.Module):
         self.offset = nn.Parameter(torch.zeros(nets, 1, size)) if affine else None
 
     def forward(self, x: Tensor, share: Tensor | None = None) -> Tensor:
-        """(S, N, K) -> the same in float32, by the running statistics; or by those of x, which move the running ones.
+        """(nets, N, K) -> the same in float32, by the running statistics, or by those of x, which move them.
 
         ``share`` (N,) is each row's in them; they add up to 1.
         """
@@ -74,7 +74,7 @@ class TwinQ(nn.Module):
         self.norms = nn.ModuleList(norms if config.critic_batch_norm else [])
 
     def forward(self, features: Tensor, action: Tensor, m: Tensor | None = None) -> Tensor:
-        """(B, T, Z), (B, T, A) -> (2, B, T) in float32.
+        """(B, T, Z + P), (B, T, A) -> (2, B, T) in float32.
 
         Given the mask m (B, T), batch norm takes the statistics of these steps, where they are real.
         """
@@ -99,5 +99,5 @@ def shares(m: Tensor) -> Tensor:
 
 
 def critic_input(z: Tensor, privileged: Tensor) -> Tensor:
-    """What critics read: (B, T, Z), beside it (B, T, P) normalised."""
+    """What critics read: (B, T, Z), (B, T, P) normalised -> (B, T, Z + P)."""
     return torch.cat([z, privileged.to(z.dtype)], dim=-1) if privileged.shape[-1] else z

@@ -7,8 +7,8 @@ A window is a row of a structured dtype, laid out as ``[burn_in | train | 1 boot
 say what is real: observations ``first <= t <= last`` and steps ``first <= t < last``. The last
 observation (and the bootstrap one) is real but starts no step. Burn-in is all real or all padding, so
 ``first`` is either 0 or ``burn_in``; everything outside is zero. ``state`` is the recurrent state *before*
-observation ``first``: the GRU's, and where missing frames are filled what was last seen, normalised. ``prev_action`` is
-the action before it.
+observation ``first``: the GRU's, and where missing frames are filled the last one, filled and normalised.
+``prev_action`` is the action before it.
 
 Integers are signed because torch views them in place (see ``learner/batch.py``).
 """

@@ -97,11 +97,6 @@ def longest_steps(raw: Tensor, spec: WindowSpec) -> int:
     return min(spec.steps, spec.burn_in + size)
 
 
-def update_steps(raw: Tensor, spec: WindowSpec, number: int) -> int:
-    """Steps that update ``number`` runs over: all of a window in a run's first: one too large ends at once."""
-    return spec.steps if number == 1 else longest_steps(raw, spec)
-
-
 def has_missing(raw: Tensor, spec: WindowSpec) -> bool:
     """Whether a frame of (B, row bytes) on the host is missing."""
     return bool(_field(raw, spec, "missing").any())

@@ -127,8 +127,8 @@ class DeviceUpdate:
             self._work, self._copy, self.in_flight = self._replay, CopiesAhead([self._raw, self._importance]), 1
 
     def __call__(self, raw: Tensor, importance: Tensor, beta: float, number: int) -> list[UpdateResult]:
-        """(B, row bytes) uint8 without padding, (B,) float32, and the update's number; its result, which the next call
-        overwrites.
+        """(B, row bytes) uint8 whose padding is zero, (B,) float32, and the update's number; its result, which the next
+        call overwrites.
 
         On a GPU this only launches. ``raw`` may be written again once the update's priorities are on the host.
         """
@@ -162,13 +162,13 @@ class DeviceUpdate:
         model_losses, model = update.model_pass(batch)
         self._beside.wait_stream(current)
         with torch.cuda.stream(self._beside):
-            value_losses, value = update.value_pass(batch, model, self._beta)
-            value_norm = update.step(update.optimizers[1:], value_losses.values())
-            update.after_value_step(value)
+            actor_critic_losses, actor_critic = update.actor_critic_pass(batch, model, self._beta)
+            actor_critic_norm = update.step(update.optimizers[1:], actor_critic_losses.values())
+            update.after_actor_critic_step(actor_critic)
         model_norm = update.step(update.optimizers[:1], model_losses.values())
         update.after_model_step(model)
         current.wait_stream(self._beside)
-        return update.result(batch, model, value, torch.hypot(model_norm, value_norm))
+        return update.result(batch, model, actor_critic, torch.hypot(model_norm, actor_critic_norm))
 
     def _replay(self, plan: Plan) -> UpdateResult:
         """Each plan has a graph of its own."""

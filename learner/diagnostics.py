@@ -21,11 +21,11 @@ SLICE = 4  # windows of a batch that are looked at
 
 
 def model_metrics(
-    of_losses: dict[str, Tensor], hidden_change: Tensor, curiosity: Tensor, terminated: Tensor, m: Tensor,
+    of_losses: dict[str, Tensor], change: Tensor, curiosity: Tensor, terminated: Tensor, m: Tensor,
     norm: Literal["l1", "l2"],
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Scalars of the model's pass; ``hidden_change`` (B, L_t, H) is what it predicts, the others (B, L_t)."""
-    unmoved = losses.model_error(torch.zeros_like(hidden_change), hidden_change, norm)
+    """Scalars of the model's pass; ``change`` of h (B, L_t, H) is what it should predict, the others (B, L_t)."""
+    unmoved = losses.model_error(torch.zeros_like(change), change, norm)
     no_change = losses.model_loss(unmoved, terminated, m)
     return of_losses | {
         "model_unexplained": of_losses["model_loss"] / no_change.clamp(min=1e-8),
@@ -33,7 +33,7 @@ def model_metrics(
     }
 
 
-def value_metrics(
+def actor_critic_metrics(
     of_losses: dict[str, Tensor], alpha: Tensor, log_pi: Tensor, q: Tensor, td_error: Tensor, i: Tensor, r: Tensor,
     m: Tensor, beta: Tensor,
 ) -> dict[str, Tensor]:  # fmt: skip
@@ -53,7 +53,7 @@ def value_metrics(
 def unexplained_change(predicted: Tensor, change: Tensor, m: Tensor) -> Tensor:
     """(O,): mean size of the error over that of the change itself, by observation dimension; 1 is "no change".
 
-    ``m`` (B, T, M), M is 1 or O.
+    ``m`` (B, L_t, M), the others (B, L_t, O).
     """
     return relative_l1_error(*((m * x.abs()).sum((0, 1)) for x in (predicted - change, change)))
 

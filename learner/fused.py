@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from rmc.common.agent import Agent
+from rmc.common.agent import Agent, Float32Linear
 from rmc.common.agent_config import NORMALIZED_CLIP
 from rmc.learner import kernels
 from rmc.learner.fused_heads import FusedHead, FusedTwinQ, relu_layer
@@ -22,7 +22,9 @@ ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
 def fuse(agent: Agent) -> None:
-    """Swap an agent's class and parts in place; parameters and their names stay."""
+    """Swap an agent's class and parts in place; parameters and their names stay. All know ReLU alone."""
+    nets = (agent.memory.embed, agent.world_model.net, agent.policy.net, getattr(agent.next_frame, "net", ()))
+    assert {type(layer) for net in nets for layer in net} <= {nn.Linear, Float32Linear, nn.ReLU}
     agent.__class__ = FusedAgent
     agent.memory.gru = _as(FusedGRU, agent.memory.gru)
     agent.world_model.net = _as(FusedHead, agent.world_model.net)
@@ -90,8 +92,8 @@ def _impute(
         state[:, :size].to(BF16),
         np.empty((len(state), 4 * size), np.float32),
     )
-    seen, before = observation.clone(), state[:, size:]
-    by_step = (x.transpose(0, 1) for x in (seen, missing, prev_action.to(BF16), inputs))
+    filled, before = observation.clone(), state[:, size:]
+    by_step = (x.transpose(0, 1) for x in (filled, missing, prev_action.to(BF16), inputs))
     for o, was_missing, a, x in zip(*by_step, strict=True):
         if was_missing.any():
             second = relu_layer(relu_layer(torch.cat([low, before.to(BF16), a], 1), w1, b1), w2, b2)
@@ -101,7 +103,7 @@ def _impute(
         gi, gh = torch.mm(relu_layer(x.contiguous(), w_embed, b_embed), wi), torch.mm(low, wh)
         kernels.gru_step(bits(gi), bits(gh), bi, bh, h, gate_cache, h, bits(low))
         before = o
-    return seen, torch.cat([torch.from_numpy(h), before], 1)
+    return filled, torch.cat([torch.from_numpy(h), before], 1)
 
 
 class _GRU(torch.autograd.Function):

@@ -39,7 +39,7 @@ class FusedTwinQ(Rounded, TwinQ):
         return [layer.weight for layer in self.layers[:-1] if isinstance(layer, StackedLinear)]
 
     def forward(self, features: Tensor, action: Tensor, m: Tensor | None = None) -> Tensor:
-        """(B, T, Z), (B, T, A) -> (2, B, T) in float32; given m (B, T), normalised by these steps."""
+        """(B, T, Z + P), (B, T, A) -> (2, B, T) in float32; given m (B, T), normalised by these steps."""
         if not applies(features):
             return super().forward(features, action, m)
         stacks = [layer for layer in self.layers if isinstance(layer, StackedLinear)]

@@ -151,17 +151,17 @@ class Learner:
         return True
 
     def _learn(self, sample: Sample) -> None:
-        rows, values = sample.rows, sample.weights
+        rows = sample.rows
         assert rows is not None
-        assert values is not None
+        assert sample.weights is not None
         clear_padding(rows, self.spec)
         self._largest_reward = max(self._largest_reward, float(np.abs(rows["reward"]).max()))
-        weights = importance_weights(values, self.config.importance_exponent)
+        importance = importance_weights(sample.weights, self.config.importance_exponent)
         raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
         self._drawn.append(Drawn.of(rows, self.spec))
         number = self.updates + len(self._drawn)
         beta = self.update.config.beta(self.env_steps)
-        for updated in self._runner(raw, torch.from_numpy(weights), beta, number):
+        for updated in self._runner(raw, torch.from_numpy(importance), beta, number):
             self._finish(updated)
         if number % self.config.publish_updates == 0 or needs_weights(number):
             self._finish_pending()

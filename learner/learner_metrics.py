@@ -57,7 +57,8 @@ class LearnerMetrics:
             rank, deviation = latent_rank(updated.hidden[updated.observed])
             self._add({"latent_rank": rank, "latent_deviation": deviation})
             self._unexplained = [round(share, 4) for share in updated.observation_unexplained.tolist()]
-            self._measure_staleness(drawn)
+            if self._agent.config.head_input != "observation":
+                self._measure_staleness(drawn)
 
     def _measure_staleness(self, drawn: Drawn) -> None:
         """How far stored states are from what today's weights would remember."""

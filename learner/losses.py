@@ -18,7 +18,7 @@ NORM_EPS = 1e-12  # keeps the root's gradient finite at zero
 
 
 def masked_mean(x: Tensor, m: Tensor) -> Tensor:
-    """sum(m * x) / sum(m) over (B, T); 0 where nothing is real."""
+    """sum(m * x) / sum(m) over (B, T), or (B, T, M); 0 where nothing is real."""
     return (m * x).sum() / m.sum().clamp(min=1.0)
 
 
@@ -105,7 +105,7 @@ def grounding_loss(
 
 
 def observation_loss(expected: Tensor, observation: Tensor, seen: Tensor, m: Tensor) -> Tensor:
-    """L1 of o_{t+1} (B, T, O), mean over what is ``seen`` (B, T, M); alone it trains what imputes."""
+    """L1 of o_{t+1} (B, T, O), mean over what is ``seen`` (B, T, M). Alone it is ``fill_loss``, the imputer's."""
     by_flag = (expected - observation).abs().reshape(*seen.shape, -1).mean(-1)
     return masked_mean(by_flag, m.unsqueeze(-1) * seen)
 

@@ -94,7 +94,7 @@ def make_adam(agent: Agent, config: UpdateConfig, *parts: str) -> torch.optim.Ad
 
 
 def by_optimizer(saved: list[dict[str, Any]], optimizers: list[torch.optim.Adam]) -> list[dict[str, Any]]:
-    """The states of the optimizers; version 0.1.0 saved one for all parts, in the same order."""
+    """The states of the optimizers; checkpoints of before there were two have one for all parts, in the same order."""
     if len(saved) == len(optimizers):
         return saved
     if len(saved) != 1:

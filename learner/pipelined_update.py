@@ -28,7 +28,7 @@ from rmc.common.window import WindowSpec
 from rmc.learner.batch import Batch, Plan, view_batch
 from rmc.learner.config import MODEL_PROCESS
 from rmc.learner.optimizers import begin_moments
-from rmc.learner.update import MODEL_PARTS, VALUE_PARTS, JointUpdate, ModelPass, UpdateResult
+from rmc.learner.update import ACTOR_CRITIC_PARTS, MODEL_PARTS, JointUpdate, ModelPass, UpdateResult
 
 AHEAD = 2  # batches that the model's half may be ahead
 REQUEST = struct.Struct("qqq???")  # an update's number, the threads that it takes, its plan
@@ -77,7 +77,7 @@ class PipelinedUpdate:
         self._pipe: socket.socket | None = None
 
     def __call__(self, raw: Tensor, importance: Tensor, beta: float, number: int) -> list[UpdateResult]:
-        """(B, row bytes) uint8 without padding, (B,) float32, and the update's number, one more than that of the
+        """(B, row bytes) uint8, whose padding is zero, (B,) float32, and the update's number, one more than that of the
         call before; results, the oldest first.
 
         What it returns is overwritten by a later call. Raises RmcError where the other process has ended.
@@ -144,11 +144,11 @@ class PipelinedUpdate:
         (slot, number, plan), update = self._pending.popleft(), self._update
         batch = view_batch(slot.raw, slot.importance, self._spec, plan)
         model = slot.model_of(batch)
-        loss_values, value = update.value_pass(batch, model, slot.beta)
+        loss_values, actor_critic = update.actor_critic_pass(batch, model, slot.beta)
         norm = update.step(update.optimizers[1:], loss_values.values())
-        update.after_value_step(value)
-        update.average.update(number, VALUE_PARTS)
-        return update.result(batch, model, value, torch.hypot(norm, slot.norm))
+        update.after_actor_critic_step(actor_critic)
+        update.average.update(number, ACTOR_CRITIC_PARTS)
+        return update.result(batch, model, actor_critic, torch.hypot(norm, slot.norm))
 
     def _start(self) -> None:
         """Share what both halves touch, and fork; before it, nothing may have run on several threads."""

@@ -27,8 +27,8 @@ class PolicyAverage:
         if self._values and updates % MOVE_UPDATES == 0:
             over, acting = min(self._updates, updates / 10) / MOVE_UPDATES, self._agent.acting()
             names = [name for name in self._values if name.startswith(parts)]
-            averaged, newest = ([source[name] for name in names] for source in (self._values, {**acting}))
-            torch._foreach_lerp_(averaged, newest, 1.0 / max(1.0, over))
+            newest: list[Tensor] = [acting[name] for name in names]
+            torch._foreach_lerp_([self._values[name] for name in names], newest, 1.0 / max(1.0, over))
 
     def tensors(self, parts: tuple[str, ...]) -> Iterator[Tensor]:
         """The tensors whose names begin so, to be moved elsewhere in memory."""

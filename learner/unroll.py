@@ -31,10 +31,9 @@ def unroll(memory: Memory, o: Tensor, batch: Batch, hidden: Tensor | None = None
 @torch.no_grad()
 def _burned_in(memory: Memory, o: Tensor, batch: Batch) -> Tensor:
     """(B, H), the state before the first trained step."""
-    n = batch.burn_in
+    n, hidden = batch.burn_in, batch.state[:, : memory.gru.hidden_size]
     if not n:
-        return batch.state
-    hidden = batch.state[:, : memory.gru.hidden_size]
+        return hidden
     burned = memory(o[:, :n], batch.missing[:, :n], batch.prev_action[:, :n], hidden).hidden[:, -1].float()
     torch.clear_autocast_cache()  # older torch would go on with these casts, which carry no gradient
     return torch.where(batch.burned_in.unsqueeze(1), burned, hidden)

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from rmc.common.agent import Agent, Memory, MemoryOutput, Prediction, squashed_sample
+from rmc.common.agent import Agent, MemoryOutput, Prediction, squashed_sample
 from rmc.common.critic import critic_input
 from rmc.common.window import WindowSpec
 from rmc.learner import losses
-from rmc.learner.batch import Batch, Plan, has_missing, update_steps
+from rmc.learner.batch import Batch, Plan, has_missing, longest_steps
 from rmc.learner.config import UpdateConfig
-from rmc.learner.diagnostics import model_metrics, unexplained_change, value_metrics
+from rmc.learner.diagnostics import actor_critic_metrics, model_metrics, unexplained_change
 from rmc.learner.fused import fuse
 from rmc.learner.optimizers import by_optimizer, make_adam, polyak_update
 from rmc.learner.policy_average import PolicyAverage
@@ -29,7 +29,7 @@ from rmc.learner.unroll import impute_and_unroll, unroll
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 MODEL_PARTS = ("memory", "world_model", "next_frame")
-VALUE_PARTS = ("critic", "policy", "log_alpha")
+ACTOR_CRITIC_PARTS = ("critic", "policy", "log_alpha")
 IMPUTER_UPDATES = 8  # updates for one of the imputer's until a frame is missing: no loss reads it before
 TRAINS_MEMORY = {  # the paper's table 1
     1: {"model", "value"},
@@ -54,7 +54,7 @@ class ModelPass(NamedTuple):
     metrics: dict[str, Tensor]  # scalars
 
 
-class ValuePass(NamedTuple):
+class ActorCriticPass(NamedTuple):
     """What critics, policy and temperature make of it."""
 
     priorities: Tensor  # (B,)
@@ -84,7 +84,7 @@ class JointUpdate:
         self.agent, self.config, self.bf16 = agent, config, bf16
         self.target_critic = None if agent.config.critic_batch_norm else _target_copy(agent.critic)
         has_target = "ema" in (config.latent_target, config.target_memory)
-        self.target_memory = _target_copy(agent.memory) if has_target else None
+        self.ema_memory = _target_copy(agent.memory) if has_target else None
         self.average = PolicyAverage(agent, config.policy_ema_updates)
         self.optimizers = self._make_optimizers()
         self.generator = torch.Generator(device).manual_seed(seed)
@@ -94,21 +94,21 @@ class JointUpdate:
         self.policy_loss = torch.zeros((), device=device)  # the policy's last
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
-        return [make_adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, VALUE_PARTS)]
+        return [make_adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, ACTOR_CRITIC_PARTS)]
 
     def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
         """One update from a Batch; ``beta`` is a scalar tensor."""
-        loss_values, model, value = self.forward(batch, beta)
+        loss_values, model, actor_critic = self.forward(batch, beta)
         norm = self.step(self.optimizers, loss_values.values())
         self.after_model_step(model)
-        self.after_value_step(value)
-        return self.result(batch, model, value, norm)
+        self.after_actor_critic_step(actor_critic)
+        return self.result(batch, model, actor_critic, norm)
 
-    def forward(self, batch: Batch, beta: Tensor) -> tuple[Losses, ModelPass, ValuePass]:
+    def forward(self, batch: Batch, beta: Tensor) -> tuple[Losses, ModelPass, ActorCriticPass]:
         """Every loss from the parameters as they stand, in the order of the paper's section 3."""
         model_losses, model = self.model_pass(batch)
-        value_losses, value = self.value_pass(batch, model, beta)
-        return model_losses | value_losses, model, value
+        actor_critic_losses, actor_critic = self.actor_critic_pass(batch, model, beta)
+        return model_losses | actor_critic_losses, model, actor_critic
 
     def model_pass(self, batch: Batch) -> tuple[Losses, ModelPass]:
         """Memory, prediction and curiosity; reads nothing of critics, policy and temperature."""
@@ -118,29 +118,33 @@ class JointUpdate:
             o = agent.normalizer(batch.observation, batch.missing)
         with self._autocast():
             # Memory: h_t from the stored state, burned in without gradient
-            o, memory = impute_and_unroll(agent, o, batch)
-            z = self._to_bf16(agent.features(memory))
+            o, remembered = impute_and_unroll(agent, o, batch)
+            z = self._to_bf16(agent.features(remembered))
 
             # Prediction, and curiosity from its error
-            target = memory if self.target_memory is None else self._unroll(self.target_memory, o, batch)
-            latent = (target if c.latent_target == "ema" else memory).hidden.detach().float()
+            target = remembered
+            if self.ema_memory is not None:
+                with torch.no_grad():
+                    target = unroll(self.ema_memory, o, batch)
+            latent = (target if c.latent_target == "ema" else remembered).hidden.detach().float()
             prediction = agent.world_model((z if "model" in TRAINS_MEMORY[c.scheme] else z.detach())[:, :-1], a)
             change = latent[:, 1:] - latent[:, :-1]
             error = losses.model_error(prediction.hidden_change.float(), change, c.model_norm)
             i, curiosity_variance = self._scaled(losses.curiosity(error, d, m), m)
             next_z = (self._to_bf16(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:].detach()
         loss_values = {"model_loss": losses.model_loss(error, d, m)}
-        imputer_losses = self._imputer_losses(o, memory, batch, m)
+        o = o[:, batch.trained]
+        imputer_losses = self._imputer_losses(o, remembered, batch, m)
         grounding_loss, unexplained = self._grounding_loss(o, prediction, batch, m)
         loss_values |= imputer_losses | grounding_loss
         metrics = model_metrics(detached(loss_values), change, i, d, m, c.model_norm)
         fill_loss = detached(imputer_losses).get("fill_loss", self.fill_loss)
         if agent.next_frame is not None:
             metrics["fill_loss"] = fill_loss
-        hidden = memory.hidden.detach()
+        hidden = remembered.hidden.detach()
         return loss_values, ModelPass(z, next_z, i, curiosity_variance, fill_loss, hidden, unexplained, metrics)
 
-    def value_pass(self, batch: Batch, model: ModelPass, beta: Tensor) -> tuple[Losses, ValuePass]:
+    def actor_critic_pass(self, batch: Batch, model: ModelPass, beta: Tensor) -> tuple[Losses, ActorCriticPass]:
         """Intuition: one policy sample for every step serves both the target and the policy loss."""
         agent, c, z = self.agent, self.config, model.z
         a, r, d, m = _trained(batch)
@@ -167,13 +171,15 @@ class JointUpdate:
         if batch.plan.trains_policy:
             loss_values["policy_loss"] = losses.policy_loss(log_pi, self._frozen_q(*proposed), alpha, m)
         reported = {"policy_loss": self.policy_loss.clone()} | detached(loss_values)
-        metrics = value_metrics(reported, alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m, beta)
-        return loss_values, ValuePass(losses.priority(td_error, c.eta, m), metrics)
+        metrics = actor_critic_metrics(
+            reported, alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m, beta
+        )
+        return loss_values, ActorCriticPass(losses.priority(td_error, c.eta, m), metrics)
 
     def _values(
         self, taken: tuple[Tensor, Tensor], following: tuple[Tensor, Tensor], m: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Q of what was taken, (h_t, a_t), and of what follows, (h_{t+1}, a'), without gradient: (2, B, T) each.
+        """Q of what was taken, (h_t, a_t), and of what follows, (h_{t+1}, a'), without gradient: (2, B, L_t) each.
 
         The latter is the target critics'. With batch norm one pass gives both, and there are no targets (CrossQ, arXiv
         1902.05605).
@@ -193,40 +199,40 @@ class JointUpdate:
             q: Tensor = functional_call(self.agent.critic, frozen, (read, action))
         return q[0] if self.config.policy_q == "first" else q.min(0).values
 
-    def result(self, batch: Batch, model: ModelPass, value: ValuePass, norm: Tensor) -> UpdateResult:
+    def result(self, batch: Batch, model: ModelPass, actor_critic: ActorCriticPass, norm: Tensor) -> UpdateResult:
         """What an update gives back of its passes; ``norm`` is the gradient's."""
-        metrics = model.metrics | value.metrics | {"grad_norm": norm}
+        metrics = model.metrics | actor_critic.metrics | {"grad_norm": norm}
         observed = batch.observation_valid[:, batch.trained]
-        return UpdateResult(value.priorities, metrics, model.hidden, observed, model.observation_unexplained)
+        return UpdateResult(actor_critic.priorities, metrics, model.hidden, observed, model.observation_unexplained)
 
     def plan(self, raw: Tensor, spec: WindowSpec, number: int) -> Plan:
         """Of update ``number``, from its (B, row bytes) on the host.
 
+        A run's first is of whole windows, so that one too large for the machine ends at once.
         The imputer trains at every ``IMPUTER_UPDATES``-th until a frame was missing, then at every one.
         """
-        steps, trains_policy = update_steps(raw, spec, number), number % self.config.policy_delay == 0
+        steps = spec.steps if number == 1 else longest_steps(raw, spec)
+        trains_policy = number % self.config.policy_delay == 0
         if self.agent.next_frame is None:
             return Plan(steps, False, False, trains_policy)
-        fills = has_missing(raw, spec)
-        self.was_missing |= fills
-        return Plan(steps, fills, bool(self.was_missing) or number % IMPUTER_UPDATES == 1, trains_policy)
+        imputes = has_missing(raw, spec)
+        self.was_missing |= imputes
+        return Plan(steps, imputes, bool(self.was_missing) or number % IMPUTER_UPDATES == 1, trains_policy)
 
-    def _imputer_losses(self, o: Tensor, memory: MemoryOutput, batch: Batch, m: Tensor) -> Losses:
-        """The imputer's, where it is configured and its turn."""
-        imputer, steps = self.agent.next_frame, batch.trained
+    def _imputer_losses(self, o: Tensor, remembered: MemoryOutput, batch: Batch, m: Tensor) -> Losses:
+        """The imputer's, where it is configured and its turn; o (B, L_t + 1, O)."""
+        imputer, now, after = self.agent.next_frame, o[:, :-1], o[:, 1:]
         if imputer is None or not batch.plan.trains_imputer:
             return {}
         with self._autocast():
-            now, after, a = o[:, steps][:, :-1], o[:, steps][:, 1:], batch.action[:, steps]
-            expected = imputer(self._to_bf16(memory.hidden.detach()[:, :-1]), now, a)
-        return {"fill_loss": losses.observation_loss(expected, after, _seen(batch)[:, steps][:, 1:], m)}
+            expected = imputer(self._to_bf16(remembered.hidden.detach()[:, :-1]), now, batch.action[:, batch.trained])
+        return {"fill_loss": losses.observation_loss(expected, after, _seen(batch)[:, 1:], m)}
 
     def _grounding_loss(self, o: Tensor, prediction: Prediction, batch: Batch, m: Tensor) -> tuple[Losses, Tensor]:
-        """The loss of predicted observations, where configured, and what the world model leaves unexplained."""
+        """Of predicted observations, o (B, L_t + 1, O), and rewards, where configured; what is left unexplained."""
         if not self.agent.config.grounding:
             return {}, o.new_zeros(0)
-        steps = batch.trained
-        r, seen, now, after = batch.reward[:, steps], _seen(batch)[:, steps], o[:, steps][:, :-1], o[:, steps][:, 1:]
+        r, seen, now, after = batch.reward[:, batch.trained], _seen(batch), o[:, :-1], o[:, 1:]
         predicted, both = now + prediction.observation_change.float(), seen[:, 1:] * seen[:, :-1]
         grounded = seen[:, 1:] if self.agent.config.impute_missing else both
         loss = losses.grounding_loss(predicted, after, prediction.reward.float(), r, grounded, m)
@@ -240,12 +246,8 @@ class JointUpdate:
         """What all heads read, rounded once for all where their products are in bfloat16."""
         return z.bfloat16() if self.bf16 else z
 
-    @torch.no_grad()
-    def _unroll(self, target: Memory, o: Tensor, batch: Batch) -> MemoryOutput:
-        return unroll(target, o, batch)
-
     def _noise_like(self, x: Tensor, cut: int) -> Tensor:
-        """(B, T, A) standard normal. That of the steps cut off is drawn, too: cut or not, a batch teaches the same."""
+        """(B, L_t + 1, A) standard normal; also drawn for what is cut off: cut or not, a batch teaches the same."""
         rows, steps, size = x.shape
         return torch.randn(rows, steps + cut, size, generator=self.generator, device=x.device)[:, :steps]
 
@@ -259,7 +261,7 @@ class JointUpdate:
         return i / (running / weight).sqrt().clamp(min=1e-6), moved
 
     def step(self, optimizers: Sequence[torch.optim.Adam], loss_values: Iterable[Tensor]) -> Tensor:
-        """Backward from the losses' sum, clip, Adam; returns the norm of what they move by, before clipping."""
+        """Backward from the losses' sum, clip, Adam; returns the gradients' norm, before clipping."""
         parameters = [parameter for one in optimizers for group in one.param_groups for parameter in group["params"]]
         for parameter in parameters:
             parameter.grad = None
@@ -274,14 +276,14 @@ class JointUpdate:
 
     def after_model_step(self, model: ModelPass) -> None:
         """What follows the memory's step: its target by Polyak, the running variance, the imputer's last loss."""
-        if self.target_memory is not None:
-            polyak_update(self.target_memory, self.agent.memory, 1.0 - self.config.polyak)
+        if self.ema_memory is not None:
+            polyak_update(self.ema_memory, self.agent.memory, 1.0 - self.config.polyak)
         self.curiosity_variance.copy_(model.curiosity_variance)
         self.fill_loss.copy_(model.fill_loss)
 
-    def after_value_step(self, value: ValuePass) -> None:
+    def after_actor_critic_step(self, actor_critic: ActorCriticPass) -> None:
         """What follows the critics' step: their targets by Polyak, the policy's last loss."""
-        self.policy_loss.copy_(value.metrics["policy_loss"])
+        self.policy_loss.copy_(actor_critic.metrics["policy_loss"])
         if self.target_critic is not None:
             polyak_update(self.target_critic, self.agent.critic, 1.0 - self.config.polyak)
 
@@ -290,7 +292,7 @@ class JointUpdate:
         return {
             "agent": self.agent.state_dict(),
             "target_critic": self.target_critic.state_dict() if self.target_critic is not None else {},
-            "target_memory": self.target_memory.state_dict() if self.target_memory is not None else {},
+            "target_memory": self.ema_memory.state_dict() if self.ema_memory is not None else {},
             "average": self.average.state_dict(),
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "curiosity_variance": self.curiosity_variance,
@@ -305,8 +307,8 @@ class JointUpdate:
         self.agent.load_state_dict(state["agent"])
         if self.target_critic is not None:
             self.target_critic.load_state_dict(state["target_critic"])
-        if self.target_memory is not None:
-            self.target_memory.load_state_dict(state["target_memory"])
+        if self.ema_memory is not None:
+            self.ema_memory.load_state_dict(state["target_memory"])
         self.average.load_state_dict(state["average"])
         for optimizer, saved in zip(self.optimizers, by_optimizer(state["optimizers"], self.optimizers), strict=True):
             own = [{name: group[name] for name in ("lr", "capturable")} for group in optimizer.param_groups]
@@ -351,5 +353,5 @@ def detached(values: Losses) -> Losses:
 
 
 def _seen(batch: Batch) -> Tensor:
-    """(B, T + 1, M) float: the observation is real, and not missing."""
-    return (batch.observation_valid.unsqueeze(-1) & ~batch.missing).float()
+    """(B, L_t + 1, M) float: the observation is real, and not missing."""
+    return (batch.observation_valid.unsqueeze(-1) & ~batch.missing)[:, batch.trained].float()

@@ -37,23 +37,24 @@ class AlternateUpdate(JointUpdate):
         return super().plan(raw, spec, number)._replace(trains_imputer=self.agent.next_frame is not None)
 
     def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
-        """One round from a Batch. Each metric is from its own stage's forward; priorities from the critics'."""
+        """One round from a Batch. Each loss is from its own stage's forward, all else from the critics'."""
         metrics: dict[str, Tensor] = {}
         norms = []
         for optimizer, (part, names) in zip(self.optimizers, self._stages(), strict=True):
             if part == "policy" and not batch.plan.trains_policy:
                 continue
-            loss_values, model, value = self.forward(batch, beta)
+            loss_values, model, actor_critic = self.forward(batch, beta)
+            assert loss_values.keys() <= {name for _, stage in self._STAGES for name in stage}, "a loss without a stage"
             stage_losses = {name: loss for name, loss in loss_values.items() if name in names}
             norms.append(self.step([optimizer], stage_losses.values()))
             metrics |= detached(stage_losses)
             if part == "critic":
-                of_critics = model, value
-        model, value = of_critics
-        value = value._replace(metrics=value.metrics | metrics)
+                of_critics = model, actor_critic
+        model, actor_critic = of_critics
+        actor_critic = actor_critic._replace(metrics=actor_critic.metrics | metrics)
         self.after_model_step(model)
-        self.after_value_step(value)
-        return self.result(batch, model, value, torch.stack(norms).norm())
+        self.after_actor_critic_step(actor_critic)
+        return self.result(batch, model, actor_critic, torch.stack(norms).norm())
 
 
 def make_update(agent: Agent, config: UpdateConfig, seed: int, bf16: bool = False) -> JointUpdate:

@@ -112,8 +112,8 @@ def _begun(config: RunConfig, state: dict[str, Any], parts: InitParts, averages:
     update = make_update(initial_agent(config.window_spec(), config.agent, config.seed), config.update, config.seed)
     weights = {name: value for name, value in state["agent"].items() if name.startswith(PARTS[parts])}
     update.agent.load_state_dict(update.agent.state_dict() | weights)
-    if update.target_memory is not None:
-        update.target_memory.load_state_dict(update.agent.memory.state_dict())
+    if update.ema_memory is not None:
+        update.ema_memory.load_state_dict(update.agent.memory.state_dict())
     if update.target_critic is not None:
         critic = state["target_critic"] if parts == "all" else update.agent.critic.state_dict()
         update.target_critic.load_state_dict(critic)

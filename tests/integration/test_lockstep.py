@@ -14,8 +14,8 @@ from rmc.common.process.role import StopSignal
 from rmc.deploy.local.lockstep import Lockstep, train
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.presets import debug
-from rmc.learner.batch import update_steps
 from rmc.learner.config import LearnerConfig
+from rmc.learner.update import JointUpdate
 from rmc.replay_server.config import ReplayConfig
 
 CONFIG = dataclasses.replace(
@@ -115,10 +115,14 @@ def test_the_ratio_and_the_total_are_kept(straight):
 
 def test_batches_that_are_cut_give_the_same_bits_across_a_stop(tmp_path, monkeypatch):
     """Whole episodes as windows: most end early, so that updates run over a part of them."""
-    lengths = []
-    monkeypatch.setattr(
-        "rmc.learner.update.update_steps", lambda *given: lengths.append(update_steps(*given)) or lengths[-1]
-    )
+    lengths, planned = [], JointUpdate.plan
+
+    def plan(*given):
+        made = planned(*given)
+        lengths.append(made.steps)
+        return made
+
+    monkeypatch.setattr(JointUpdate, "plan", plan)
     actor = dataclasses.replace(CONFIG.actor, state_strategy="episode")
     config = dataclasses.replace(CONFIG, env=EnvConfig("InvertedPendulum-v5", time_limit=100), actor=actor)
     straight = trained(config, tmp_path / "straight")

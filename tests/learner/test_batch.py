@@ -10,7 +10,6 @@ from rmc.learner.batch import (
     has_missing,
     importance_weights,
     longest_steps,
-    update_steps,
     view_batch,
 )
 from tests.learner.rows import BY_NUMBER, LONG, SPEC, random_rows, spoil_padding, to_batch
@@ -86,8 +85,6 @@ def test_the_longest_window_rounded_up_says_where_a_batch_ends(trained: int, rou
     rows = random_rows(5, spec=LONG, longest=trained)
     raw = torch.from_numpy(rows.view("u1").reshape(len(rows), -1))
     assert longest_steps(raw, LONG) == LONG.burn_in + rounded
-    assert update_steps(raw, LONG, 2) == LONG.burn_in + rounded
-    assert update_steps(raw, LONG, 1) == LONG.steps
 
 
 def test_windows_of_the_usual_length_are_never_cut() -> None:

@@ -104,7 +104,7 @@ def test_nothing_in_an_update_waits_for_the_host(order, config, monkeypatch):
     """On the device "meta", which has no values: whatever asks for one fails."""
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # meta has none
     update = make(order, config=config)
-    for module in (update.agent, update.target_critic, update.target_memory):
+    for module in (update.agent, update.target_critic, update.ema_memory):
         if module is not None:
             module.to("meta")
     update.curiosity_variance = update.curiosity_variance.to("meta")
@@ -198,7 +198,7 @@ def noted(work, note):
 def test_halves_at_once_are_the_update(cuda, monkeypatch):
     """On a GPU in two streams, which meet before the result is read."""
     plain, update = (make("apart", config=IMPUTING) for _ in range(2))
-    for name in ("model_pass", "value_pass", "step"):
+    for name in ("model_pass", "actor_critic_pass", "step"):
         monkeypatch.setattr(update, name, noted(getattr(update, name), getattr(cuda, name)))
     one_by_one, at_once = (DeviceUpdate(one, SPEC, BATCH) for one in (plain, update))
     at_once._beside, at_once._work = cuda.beside, at_once._halves_at_once
@@ -210,8 +210,8 @@ def test_halves_at_once_are_the_update(cuda, monkeypatch):
         assert torch.equal(result.priorities, expected.priorities)
         torch.testing.assert_close(result.metrics, expected.metrics)
         assert cuda.mock_calls == [
-            call.model_pass(), call.beside.wait_stream(cuda.current), call.value_pass(), call.step(), call.step(),
-            call.current.wait_stream(cuda.beside),
+            call.model_pass(), call.beside.wait_stream(cuda.current), call.actor_critic_pass(), call.step(),
+            call.step(), call.current.wait_stream(cuda.beside),
         ]  # fmt: skip
     assert all(map(torch.equal, update.agent.state_dict().values(), plain.agent.state_dict().values()))
 

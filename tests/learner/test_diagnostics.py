@@ -9,7 +9,7 @@ import torch
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.window import Rows, WindowSpec
-from rmc.learner.diagnostics import measurable, staleness, value_metrics
+from rmc.learner.diagnostics import actor_critic_metrics, measurable, staleness
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=4, train=5)
 UNBURNED = WindowSpec(obs_dim=3, action_dim=2, state=8, burn_in=0, train=5)
@@ -134,7 +134,7 @@ def test_what_is_said_of_values_is_of_real_steps_alone() -> None:
     log_pi, td_error, i, reward, first, second = torch.randn(6, 2, 3, generator=torch.Generator().manual_seed(0))
     q, i = torch.stack([first, second]), i.abs() * m
     alpha, beta, of_losses = torch.tensor(0.2), torch.tensor(0.3), {"q_loss": torch.tensor(3.0)}
-    metrics = value_metrics(of_losses, alpha, log_pi, q, td_error, i, reward, m, beta)
+    metrics = actor_critic_metrics(of_losses, alpha, log_pi, q, td_error, i, reward, m, beta)
     said = {name: value.item() for name, value in metrics.items()}
     real = [(0, 0), (0, 1), (1, 0)]
     curious, earned = (sum(float(x[at].abs()) for at in real) for x in (i, reward))

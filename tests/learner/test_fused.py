@@ -134,6 +134,14 @@ def test_without_autocast_they_are_the_plain_ones_to_the_bit(pair, part):
     assert all(torch.equal(actual[name], value) for name, value in expected.items())
 
 
+@pytest.mark.parametrize("net", ["memory.embed", "world_model.net", "next_frame.net", "policy.net"])
+def test_a_layer_that_the_fused_networks_do_not_know_is_an_error(net):
+    changed = Agent(3, 2, CONFIG)
+    changed.get_submodule(net)[1] = torch.nn.Tanh()
+    with pytest.raises(AssertionError):
+        fuse(changed)
+
+
 def test_parameters_keep_their_names_and_values(pair):
     plain, fused = pair
     assert isinstance(fused.memory.gru, FusedGRU)

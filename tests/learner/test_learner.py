@@ -338,7 +338,7 @@ def test_what_broke_amid_an_update_is_not_saved(setting, monkeypatch):
     for _ in range(3):
         setting.learner.step()
     saved = setting.learner.checkpoints.numbers()
-    monkeypatch.setattr(setting.learner.update, "value_pass", lambda *_: 1 / 0)
+    monkeypatch.setattr(setting.learner.update, "actor_critic_pass", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         step_for_long(setting)
     assert setting.learner.updates > 0

@@ -21,14 +21,16 @@ OF_MEMORY = {"model_unexplained", "latent_rank", "latent_deviation"}
 class NoEpisodes:
     """A replay whose episodes are overwritten."""
 
+    asked = 0
+
     def episode(self, serial: int) -> None:
-        return None
+        NoEpisodes.asked += 1
 
 
 def measured(config: AgentConfig, acted: list[int]) -> dict[str, Any]:
     """Of one update, taken for two, from windows of policies of these updates."""
     agent, rows = Agent(SPEC.obs_dim, SPEC.action_dim, config), random_rows(len(acted))
-    rows["weights_update"] = acted
+    rows["weights_update"], rows["episode_step"] = acted, SPEC.burn_in + 1
     metrics = LearnerMetrics(agent, SPEC, NoEpisodes())  # type: ignore[arg-type]
     updated = make_update(agent, UpdateConfig(scheme=2), 3)(to_batch(rows), torch.tensor(0.0))
     for number in (METRICS_UPDATES, INSIGHT_UPDATES + 1):
@@ -38,8 +40,10 @@ def measured(config: AgentConfig, acted: list[int]) -> dict[str, Any]:
 
 @pytest.mark.parametrize(("head_input", "said"), [("hidden", OF_MEMORY), ("observation", set())])
 def test_without_a_memory_nothing_is_said_of_it(head_input: Any, said: set[str]) -> None:
-    metrics = measured(dataclasses.replace(PAPER, head_input=head_input), [0, 0, 0, 0])
+    asked = NoEpisodes.asked
+    metrics = measured(dataclasses.replace(PAPER, head_input=head_input), [0] * 40)
     assert metrics.keys() & OF_MEMORY == said
+    assert (NoEpisodes.asked > asked) == bool(said)  # for staleness
     assert "model_loss" in metrics
 
 

@@ -92,7 +92,7 @@ def test_after_updates_every_copy_is_its_weight_rounded(order):
     config = UpdateConfig(update_order=order, target_memory="ema")
     network = AgentConfig(hidden=SPEC.state, embedding=8, heads=(16, 12))
     update = make_update(Agent(SPEC.obs_dim, SPEC.action_dim, network), config, 0, bf16=True)
-    modules, batch = (update.agent, update.target_critic, update.target_memory), to_batch(random_rows(8))
+    modules, batch = (update.agent, update.target_critic, update.ema_memory), to_batch(random_rows(8))
     begin = copy.deepcopy(update.state_dict())
     for number in range(4):
         if number == 2:

@@ -42,8 +42,8 @@ def test_no_gradient_of_an_output_leads_to_it_but_of_the_critics(scheme: int) ->
     model_losses, model = update.model_pass(batch)
     mean, log_std = update.agent.policy(model.z)
     blind = [*model_losses.values(), model.z, model.hidden, model.curiosity, mean, log_std]
-    value_losses = update.value_pass(batch, model, torch.tensor(0.5))[0]
-    outputs = {"blind": blind, "seeing": [value_losses["q_loss"], value_losses["policy_loss"]]}
+    actor_critic_losses = update.actor_critic_pass(batch, model, torch.tensor(0.5))[0]
+    outputs = {"blind": blind, "seeing": [actor_critic_losses["q_loss"], actor_critic_losses["policy_loss"]]}
     reached = {name: [reaches(output, batch.privileged) for output in some] for name, some in outputs.items()}
     assert reached == {"blind": [False] * len(blind), "seeing": [True, True]}
 

@@ -10,7 +10,7 @@ import torch
 from rmc.common.agent import Agent, Normalizer
 from rmc.common.agent_config import AgentConfig
 from rmc.learner import losses
-from rmc.learner.batch import clear_padding, view_batch
+from rmc.learner.batch import clear_padding, longest_steps, view_batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.unroll import unroll
 from rmc.learner.update import TRAINS_MEMORY, JointUpdate, UpdateResult
@@ -155,7 +155,7 @@ def test_targets_follow_by_polyak_alone():
     for name, value in update.target_critic.state_dict().items():
         online = update.agent.critic.state_dict()[name]
         torch.testing.assert_close(value, 0.9 * before[name] + 0.1 * online)
-    targets = [*update.target_critic.parameters(), *update.target_memory.parameters()]
+    targets = [*update.target_critic.parameters(), *update.ema_memory.parameters()]
     assert all(p.grad is None for p in targets)
 
 
@@ -321,6 +321,28 @@ def test_the_policy_waits_for_its_turn_and_nothing_else_does(order):
     assert said[2] == said[3] == said[4] != said[5]
 
 
+def test_a_runs_first_update_is_of_whole_windows_so_that_too_large_ones_end_at_once() -> None:
+    update, long = make(ROBUST), dataclasses.replace(SPEC, train=60)
+    raw = torch.from_numpy(random_rows(8, spec=long, longest=10).view("u1").reshape(8, -1))
+    steps = [update.plan(raw, long, number).steps for number in (1, 2)]
+    assert steps == [long.steps, longest_steps(raw, long)]
+    assert steps[0] > steps[1]
+
+
+@pytest.mark.parametrize("half", ["model_pass", "actor_critic_pass"])
+def test_a_loss_that_no_stage_takes_is_an_error(half: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    update = make(ROBUST, update_order="alternate")
+    made = getattr(update, half)
+
+    def with_another(*given: object) -> object:
+        of_losses, passed = made(*given)
+        return of_losses | {"weight_loss": update.agent.log_alpha.square()}, passed
+
+    monkeypatch.setattr(update, half, with_another)
+    with pytest.raises(AssertionError, match="a loss without a stage"):
+        update(to_batch(random_rows(8)), BETA)
+
+
 def test_an_update_without_the_policys_turn_is_the_update_without_its_loss():
     without, whole = make(ROBUST, scheme=3, policy_delay=2), make(ROBUST, scheme=3)
     raw = torch.from_numpy(random_rows(8).view("u1").reshape(8, -1))
@@ -335,7 +357,7 @@ def test_both_targets_come_back_as_they_were():
     for seed in range(3):
         before(to_batch(random_rows(8, seed)), BETA)
     after.load_state_dict(copy.deepcopy(before.state_dict()))
-    for part in ("target_critic", "target_memory"):
+    for part in ("target_critic", "ema_memory"):
         ours, theirs = getattr(after, part).state_dict(), getattr(before, part).state_dict()
         assert all(torch.equal(ours[name], value) for name, value in theirs.items()), part
     a, b = (update(to_batch(random_rows(8, 3)), BETA) for update in (before, after))
