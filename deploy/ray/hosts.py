@@ -29,6 +29,7 @@ LOST_SECONDS = 120.0  # within which a role's host may be lost for good twice
 PATIENCE_SECONDS = 120.0  # of a role that starts while launcher and Redis are being started again
 CLOSE_SECONDS, CLEAR_SECONDS = 10.0, 5.0  # for hosts to end, and to remove what is left on their nodes
 NOTICE_SECONDS = 2.0  # for them to hear that the run ends
+HEAR_SECONDS = 0.05  # between looks for an answer
 log = logging.getLogger(__name__)
 
 
@@ -132,7 +133,8 @@ class Hosts:
             raise RoleDied(f"the host of {one.name} could not be held:\n{one.dead}")
 
     def end(self, one: RoleHandle) -> None:
-        """At once; its CPU is free for others."""
+        """With what its environments have started; its CPU is free for others."""
+        _wait([one.handle.close.remote()] if one.running else [], CLOSE_SECONDS)
         ray.kill(one.handle, no_restart=True)
         self._handles.pop(one.name)
 
@@ -163,16 +165,23 @@ class Hosts:
     # -- the end --------------------------------------------------------------------------------------
 
     def tell_stop(self) -> None:
-        """That the run ends: what ends now is not started again."""
+        """That the run ends: what ends now is not started again. A new launcher hears first who runs."""
+        deadline = time.monotonic() + NOTICE_SECONDS
+        while any(one.report is None for one in self._handles.values()) and time.monotonic() < deadline:
+            self._ask_all()
+            time.sleep(HEAR_SECONDS)
         told = [one.handle.stopping.remote(True) for one in self._handles.values() if one.running]
         _wait(told, NOTICE_SECONDS)
 
     def all_ended(self) -> bool:
         """Whether no role runs, and what each left is put away, as last heard; they are asked again."""
+        self._ask_all()
+        return not any(one.awaited for one in self._handles.values())
+
+    def _ask_all(self) -> None:
         for one in self._handles.values():
             with suppress(RoleDied):
                 one.ask(self._folder.logs)
-        return not any(one.awaited for one in self._handles.values())
 
     def close(self, over: bool, saving: float) -> None:
         """End all; of a run that is ``over`` nothing is left on the nodes. ``saving``: seconds of a checkpoint."""

@@ -3,6 +3,7 @@
 import logging
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -16,9 +17,11 @@ except ImportError as missing:
 
     raise ConfigError("--launcher", "ray", f"Ray is not installed; {how_to_install('ray')}") from missing
 
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError, first_line, last_line
 from rmc.deploy.local.role_command import launcher_command
 from rmc.deploy.local.role_environment import working_folder
+from rmc.deploy.local.supervisor import HELD_SECONDS
 from rmc.deploy.ray.head import check_head
 from rmc.deploy.ray.launcher_actor import LauncherActor
 from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name
@@ -28,6 +31,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions, users_path
 
 BEGIN_SECONDS = 60.0  # of the launcher's host
+CLOSE_SECONDS, LOOK_SECONDS = 10.0, 0.2  # for it to end, and between looks
 
 
 @contextmanager
@@ -46,6 +50,8 @@ def joined(address: str, cpus: int | None = None) -> Iterator[None]:
     except (OSError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
         fix = f"no Ray cluster answers ({first_line(error)}); start one with ray start --head, or take local"
         raise ConfigError("--ray-address", address, fix) from None
+    except SystemExit:  # Ray's own handler of SIGTERM
+        raise KeyboardInterrupt from None
     finally:
         os.umask(mask)
         for number, handler in handlers.items():  # Ray takes SIGTERM for itself
@@ -89,7 +95,7 @@ def _created(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> An
     command = launcher_command(str(folder.path), context.gcs_address, options)
     actor = ray.remote(LauncherActor).options(
         name=actor_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
-        max_concurrency=1, scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
+        scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
     )  # fmt: skip
     task = Task(folder.name, folder.identity(), command, users_path(), {}, working_folder())
     try:
@@ -106,6 +112,13 @@ def check_not_there(folder: RunFolder) -> None:
 
 def _is_trained(folder: RunFolder) -> ConfigError:
     return ConfigError("--run-dir", str(folder.path), "this run is being trained; rmc attach watches it")
+
+
+def wait_gone(folder: RunFolder) -> None:
+    """Until the launcher's host has ended what its launcher left: the learner may still save."""
+    deadline = time.monotonic() + CheckpointFolder(folder.checkpoints).patience(HELD_SECONDS) + CLOSE_SECONDS
+    while is_there(folder) and time.monotonic() < deadline:
+        time.sleep(LOOK_SECONDS)
 
 
 def is_there(folder: RunFolder) -> bool:

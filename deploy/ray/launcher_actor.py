@@ -12,8 +12,9 @@ import ray
 from ray.util.placement_group import placement_group_table, remove_placement_group
 
 from rmc.common.checkpoint import CheckpointFolder
+from rmc.common.errors import RmcError
 from rmc.common.whole_file import write_whole
-from rmc.deploy.local.supervisor import QUICK_DEATHS, QUICK_SECONDS
+from rmc.deploy.local.supervisor import HELD_SECONDS, QUICK_DEATHS, QUICK_SECONDS
 from rmc.deploy.monitor import attach
 from rmc.deploy.monitor.recorded import recorded_status
 from rmc.deploy.ray.role_actor import NAMESPACE, RoleActor, Task, actor_name
@@ -46,8 +47,13 @@ class LauncherActor(RoleActor):
     def __init__(self, task: Task, folder: str, keep: int) -> None:
         self._folder, self._asked_to_end = Path(folder), False
         self._checkpoints = CheckpointFolder(self._folder / "checkpoints", keep)
-        self._claim = self._folder / "learner-at"  # the node and the incarnation of the host that holds the learner
-        super().__init__(task)
+        self._claim = self._folder / "learner-at"  # the address and the incarnation of the learner's host
+        try:
+            super().__init__(task)
+        except (OSError, RuntimeError):  # a full disk, or no process to be had now: nobody else places this host again
+            if ray.get_runtime_context().was_current_actor_reconstructed:
+                os._exit(1)
+            raise
 
     def log_folder(self) -> Path:
         return self._folder / "logs"
@@ -67,47 +73,54 @@ class LauncherActor(RoleActor):
 
     def flush_artifacts(self) -> None:
         """End all that the run still has on the cluster, whatever its launcher left, and this host."""
-        run = actor_name(self._task.run, "")
-        own = ray.get_runtime_context().current_actor
+        try:
+            self._end_left()
+        finally:
+            ray.kill(ray.get_runtime_context().current_actor, no_restart=True)
+
+    def _end_left(self) -> None:
+        """The roles cleanly: what the learner saves comes here."""
+        run, hosts = actor_name(self._task.run, ""), []
         for actor in ray.util.list_named_actors(all_namespaces=True):
-            if (
-                actor["namespace"] == NAMESPACE
-                and actor["name"].startswith(run)
-                and not actor["name"].endswith("launcher")
-            ):
+            name, ours = actor["name"], actor["namespace"] == NAMESPACE
+            if ours and name.startswith(run) and not name.endswith("launcher"):
                 with suppress(ValueError):
-                    ray.kill(ray.get_actor(actor["name"], NAMESPACE), no_restart=True)
+                    hosts.append(ray.get_actor(name, NAMESPACE))
+        if closing := [host.close.remote() for host in hosts]:
+            ray.wait(closing, num_returns=len(closing), timeout=self._checkpoints.patience(HELD_SECONDS))
+        for host in hosts:
+            ray.kill(host, no_restart=True)
         groups = [group["name"] for group in placement_group_table().values() if group["state"] != "REMOVED"]
         for name in filter(lambda name: name.startswith(run), groups):
             with suppress(ValueError):
                 remove_placement_group(ray.util.get_placement_group(name))
-        ray.kill(own, no_restart=True)
 
     def summary(self) -> ClusterRunSummary:
         """How the run is. Raises ConfigError where its folder is damaged."""
         folder = RunFolder(self._folder)
         status, past_starts = recorded_status(folder, LISTED_BYTES), starts(folder)
         heard = status.speaking()
-        at = self._claim.read_text().split()[:1] if "learner" in heard else []
-        address = next((node["NodeManagerAddress"] for node in ray.nodes() if node["NodeID"] in at), None)
+        address = self._claim.read_text().split()[0] if "learner" in heard else None
         actors = sum(role.startswith("actor-") for role in heard)
         since = past_starts[-1].time if past_starts else None
         place = socket.gethostname(), str(folder.path)
         return ClusterRunSummary(status.env, status.env_steps, status.total_steps, address, actors, since, *place)
 
     def end(self) -> float:
-        """Ask the run's launcher to end it cleanly; the seconds that this may take."""
+        """Ask the run's launcher to end it cleanly; the seconds that this may take. Raises RmcError where that died."""
+        if self._status is not None:
+            raise RmcError("the launcher has died, and is started again")
         self._asked_to_end = True  # one that still imports dies of the signal
         if self._role.pid is not None:
             with suppress(ProcessLookupError):  # it has just ended
                 os.kill(self._role.pid, signal.SIGTERM)
         return attach.STOP_SECONDS + self._checkpoints.patience(0.0)
 
-    def claim(self, incarnation: str, node: str) -> bool:
+    def claim(self, incarnation: str, address: str) -> bool:
         """Be the host of the learner: no other's checkpoints are taken from now on. Whether the last was there, too."""
         before = self._claim.read_text().split() if self._claim.exists() else []
-        write_whole(self._claim, f"{node} {incarnation}".encode())
-        return before[:1] == [node]
+        write_whole(self._claim, f"{address} {incarnation}".encode())
+        return before[:1] == [address]
 
     def archive(self, incarnation: str, number: int, files: dict[str, bytes], took: float) -> None:
         """Keep a checkpoint, and how long the learner took to save, if it comes from the learner's present host."""

@@ -25,9 +25,9 @@ class LearnerActor(RoleActor):
     """The learner's: brings the newest checkpoint from the head before, and takes every new one there."""
 
     def prepare(self) -> None:
-        folder, place = self.scratch / "checkpoints", ray.get_runtime_context().get_node_id()
+        folder = self.scratch / "checkpoints"
         self._folder = CheckpointFolder(folder)
-        launcher, was_here = self._claim(place)
+        launcher, was_here = self._claim(ray.util.get_node_ip_address())  # its id is another after each start of Ray
         if not was_here:
             shutil.rmtree(folder, ignore_errors=True)  # of an earlier stay on this node: the run has gone on elsewhere
         local = self._folder.latest()
@@ -42,13 +42,13 @@ class LearnerActor(RoleActor):
         self._epoch: int = ray.get(launcher.last_epoch.remote())
         self._folder.note_epoch(max(self._epoch, self._folder.last_epoch()))
 
-    def _claim(self, place: str) -> tuple[Any, bool]:
+    def _claim(self, address: str) -> tuple[Any, bool]:
         """The launcher, and whether the learner was here before."""
         deadline = time.monotonic() + CLAIM_SECONDS
         while True:
             try:
                 launcher = self._launcher()
-                return launcher, ray.get(launcher.claim.remote(self._incarnation, place))
+                return launcher, ray.get(launcher.claim.remote(self._incarnation, address))
             except AWAY:
                 if time.monotonic() > deadline:
                     raise

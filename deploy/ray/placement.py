@@ -37,14 +37,14 @@ def learner_cpus(config: RunConfig) -> int:
     return max(1, config.learner.threads)
 
 
-def reserved_cpus(config: RunConfig) -> float:
+def reserved_cpus(config: RunConfig) -> int:
     """CPUs of everything but the actors."""
-    return sum(need["CPU"] for need in groups(config, "cpu").values())
+    return int(sum(need["CPU"] for need in groups(config, "cpu").values()))
 
 
 def groups(config: RunConfig, device: str) -> dict[str, dict[str, float]]:
     """What a node must hold for the learner and who is beside it, and for each of several replay servers."""
-    learner = {"CPU": float(ceil(learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS))}
+    learner = {"CPU": learner_cpus(config) + EVALUATOR_CPUS + REPLAY_CPUS}
     if device.startswith("cuda"):
         learner["GPU"] = 1.0
     shards = config.shards() if config.replay.replay_shards > 1 else ()
@@ -56,10 +56,10 @@ def check_room(config: RunConfig, device: str) -> None:
     need = groups(config, device)[LEARNER]
     if not any(node["Alive"] and holds(node, need) for node in ray.nodes()):
         resources = ", ".join(f"{amount:g} {name}" for name, amount in need.items())
-        fix = (
-            f"no node of the cluster has {resources}, which the learner and what is beside it take; start one that has"
-        )
-        raise ConfigError("--device", device, fix)
+        fault = f"no node of the cluster has {resources}, which the learner and what is beside it take"
+        if "GPU" in need and not any(node["Alive"] and node["Resources"].get("GPU") for node in ray.nodes()):
+            raise ConfigError("--device", device, f"{fault}; take cpu, or start one that has")
+        raise ConfigError("--threads", config.learner.threads, f"{fault}; take fewer, or start one that has")
 
 
 def actors_that_fit(config: RunConfig) -> int:
@@ -73,7 +73,7 @@ def actors_that_fit(config: RunConfig) -> int:
                 "--launcher", "ray", f"{free} and a run needs {need:g}; start more nodes, or end other runs"
             )
         time.sleep(0.2)
-    return whole_shares(free_cpus() - int(reserved_cpus(config)), config)
+    return whole_shares(free_cpus() - reserved_cpus(config), config)
 
 
 def free_cpus() -> int:

@@ -5,7 +5,6 @@ import os
 import signal
 from collections.abc import Callable
 from contextlib import suppress
-from math import ceil
 
 from rich.console import Console
 
@@ -35,7 +34,7 @@ def train(
     """
     validate(config)
     validate_launch(config, options)
-    enough = max(cores(), ceil(placement.reserved_cpus(config)) + config.actors)  # of a cluster of our own
+    enough = max(cores(), placement.reserved_cpus(config) + config.actors)  # of a cluster of our own
     with launcher.joined(options.ray_address, enough):
         return _watched(config, options, console, callback)
 
@@ -60,6 +59,7 @@ def _watched(
         console.print(note, soft_wrap=True)
     with signals_caught(hangup=False) as stop:
         attach.watch(folder, console, _passes_on(stop, folder), callback)
+        launcher.wait_gone(folder)
     return folder, print_end(folder, console)
 
 

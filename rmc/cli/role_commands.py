@@ -3,10 +3,9 @@
 import dataclasses
 import logging
 import os
-import signal
 import sys
 
-from rmc.cli import training
+from rmc.cli import signals, training
 from rmc.cli.role_options import ActorRole, EvaluatorRole, LauncherRole, ReplayRole, Role
 from rmc.common.bus.redis_url import warn_of_password
 from rmc.common.errors import ConfigError
@@ -51,7 +50,7 @@ def _play(role: ActorRole | EvaluatorRole, connection: RunConnection) -> int:
 def launch(command: LauncherRole) -> int:
     """Be the launcher of a run on Ray."""
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends it cleanly while no role is there yet, too
+    signals.interrupt()  # SIGTERM ends it cleanly while no role is there yet, too
     folder = RunFolder(command.run)
     config = folder.config()
     folder.lock.take()

@@ -3,6 +3,7 @@
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any
 
 from rmc.common.process.role import StopSignal
@@ -25,9 +26,21 @@ def interrupt() -> dict[signal.Signals, Any]:
     before.pop(signal.SIGINT, None)
     if before.get(signal.SIGHUP) == signal.SIG_IGN:  # nohup does so
         del before[signal.SIGHUP]
-    for number in before:
-        signal.signal(number, signal.default_int_handler)
+    for number, handler in before.items():
+        if not isinstance(handler, Interrupt):
+            signal.signal(number, Interrupt())
     return before
+
+
+class Interrupt:
+    """A handler that raises KeyboardInterrupt; it was ``heard`` though a library swallows that, amid its import."""
+
+    def __init__(self) -> None:
+        self.heard = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        self.heard = True
+        signal.default_int_handler(number, frame)
 
 
 def handlers() -> dict[signal.Signals, Any]:
@@ -42,6 +55,8 @@ def signals_caught(hangup: bool = True) -> Iterator[StopSignal]:
     before = handlers()
     stop = StopSignal()
     stop.install()
+    if any(isinstance(handler, Interrupt) and handler.heard for handler in before.values()):
+        stop.request()
     ignored = before.get(signal.SIGHUP, signal.SIG_IGN) == signal.SIG_IGN  # nohup does so: the terminal may close
     if hangup and not ignored:
         signal.signal(signal.SIGHUP, lambda *_: stop.request())

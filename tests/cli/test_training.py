@@ -1,5 +1,6 @@
 """What rmc train does around the roles."""
 
+import contextlib
 import io
 import json
 import signal
@@ -155,6 +156,17 @@ def test_a_stop_signal_amid_the_evaluations_stops_the_run(folder, monkeypatch):
             assert conducted(folder) == STOPPED_STATUS
         assert folder.lock.ended() == STOPPED_STATUS
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_a_stop_signal_that_a_librarys_import_swallows_is_not_lost(folder, monkeypatch):
+    def swallowed(*_):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        return {"eval_return_mean": 0.0, "eval_return_std": 0.0, "eval_episodes": 1}
+
+    monkeypatch.setattr(training, "_before", swallowed)
+    monkeypatch.setattr(training, "_launch", lambda *given: not given[-1].requested)
+    assert conducted(folder) == STOPPED_STATUS
 
 
 def test_a_run_that_goes_on_knows_its_steps_before_a_role_speaks(folder, monkeypatch):

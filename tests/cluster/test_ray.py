@@ -169,8 +169,14 @@ def test_a_killed_launcher_and_a_role_that_somebody_ended_come_back(nodes: Clust
         os.kill(replay, signal.SIGTERM)  # it ends cleanly, though nobody wants the run to end
         training.wait_for(lambda: _pids(f"rmc.cli.main role replay --run={folder.name}") not in ([], [replay]))
         training.wait_for_updates(100)
-        training.interrupt()
+        again = folder.lock.trainer()
+        assert again is not None
+        os.kill(again, signal.SIGKILL)
+        training.wait_for(lambda: folder.lock.trainer() not in (None, again))
+        updates = training.newest("learner", "updates")
+        training.interrupt()  # the new launcher has heard of no role yet
     assert training.process.returncode == 130
+    assert max(int(path.name) for path in folder.checkpoints.glob("[0-9]*")) >= updates
     assert ring(folder.path).exists()  # it may go on from there
 
 
@@ -192,7 +198,7 @@ def test_freed_cpus_go_to_the_learner_that_lost_its_node(nodes: Cluster, tmp_pat
             assert other.newest("launcher", "not_running") == "actor-1 actor-2"
 
             before = _learner_node(one)
-            lost = next(node for node in nodes.worker_nodes if node.node_id in before)
+            lost = next(node for node in nodes.worker_nodes if node.node_ip_address in before)
             gone = time.time()
             nodes.remove_node(lost, allow_graceful=False)
             one.wait_for(lambda: _learner_node(one) not in ([], before))
@@ -224,7 +230,7 @@ def test_actors_make_room_for_a_replay_server_and_a_run_goes_on_where_its_rings_
         before = _rings(folder)
         assert len(set(before.values())) == 2
         (learner,) = _learner_node(training)
-        role, address = next((role, address) for role, address in before.items() if at[address].node_id != learner)
+        role, address = next((role, address) for role, address in before.items() if address != learner)
         nodes.remove_node(at[address], allow_graceful=False)
         training.wait_for(lambda: _rings(folder)[role] != address)
         assert f"no node has room for {role}; actor-" in (folder / "logs" / "launcher.log").read_text()
@@ -247,7 +253,7 @@ def _rings(folder: Path) -> dict[str, str]:
 
 
 def _learner_node(run: Training) -> list[str]:
-    """Ray's id of it; none while that is being written."""
+    """Its address; none while that is being written."""
     return (run.folder / "learner-at").read_text().split()[:1]
 
 

@@ -196,6 +196,63 @@ def test_a_second_start_is_told_that_the_run_is_trained(folder: RunFolder, monke
     assert (held, folder.lock.trainer()) == ([True], None)
 
 
+class Host:
+    """Of a role, with what it was asked; it answers the first report after three looks."""
+
+    def __init__(self, asked: list[str]) -> None:
+        self.report, self.looks, self.running = None, 0, False
+        self.handle = SimpleNamespace(
+            **{name: SimpleNamespace(remote=partial(self._note, asked, name)) for name in ("stopping", "close")}
+        )
+        self.name, self.awaited = "learner", False
+
+    def _note(self, asked: list[str], name: str, *_: object) -> str:
+        asked.append(name)
+        return name
+
+    def ask(self, _: Path) -> None:
+        self.looks += 1
+        if self.looks == 3:
+            self.report, self.running, self.awaited = object(), True, True
+
+
+def test_a_launcher_that_has_just_begun_tells_living_roles_that_the_run_ends(
+    hosts: Hosts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[str]()
+    hosts._handles["learner"] = Host(asked)  # type: ignore[assignment]
+    monkeypatch.setattr(ray_hosts.ray, "wait", lambda *_, **__: None)
+    hosts.tell_stop()
+    assert asked == ["stopping"]
+    assert not hosts.all_ended()
+
+
+def test_an_actor_that_makes_room_ends_with_what_its_environments_started(
+    hosts: Hosts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[str]()
+    monkeypatch.setattr(
+        ray_hosts.ray, "wait", lambda replies, **_: asked.extend(f"waited for {one}" for one in replies)
+    )
+    monkeypatch.setattr(ray_hosts.ray, "kill", lambda *_, **__: asked.append("kill"))
+    for running in (True, False):
+        one: Any = Host(asked)
+        one.running = running
+        hosts._handles["learner"] = one
+        hosts.end(one)
+    assert asked == ["close", "waited for close", "kill", "kill"]
+    assert not hosts._handles
+
+
+def test_sigterm_while_ray_is_joined_stops_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def init(**_: object) -> None:
+        raise SystemExit(15)
+
+    monkeypatch.setattr(ray_launcher.ray, "init", init)
+    with pytest.raises(KeyboardInterrupt), ray_launcher.joined("local"):
+        pass
+
+
 def test_a_launcher_may_lose_its_working_folder(hosts: Hosts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
     remote = SimpleNamespace(options=lambda **_: SimpleNamespace(remote=made.append))

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +18,7 @@ import pytest
 pytest.importorskip("ray")
 
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.errors import CheckpointError
+from rmc.common.errors import CheckpointError, RmcError
 from rmc.deploy.local import supervisor
 from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.ray import launcher_actor, learner_actor, role_actor
@@ -157,11 +158,16 @@ class Learner(LearnerActor):
 def test_a_launcher_that_still_imports_when_it_is_to_end_is_not_started_again(tmp_path: Path) -> None:
     launcher = LauncherActor.__new__(LauncherActor)
     launcher._folder, launcher._checkpoints, launcher._asked_to_end = tmp_path, CheckpointFolder(tmp_path), False
+    launcher._status = None
     with subprocess.Popen(["sleep", "60"]) as role:
         launcher._role = role  # type: ignore[assignment]
         assert not launcher.is_final_exit(-signal.SIGKILL)
         launcher.end()
         assert launcher.is_final_exit(role.wait(10))
+    launcher._status, launcher._asked_to_end = -signal.SIGKILL, False
+    with pytest.raises(RmcError, match="is started again"):  # and asked again: the next one hears it
+        launcher.end()
+    assert not launcher._asked_to_end
 
 
 def test_a_learner_that_saves_for_long_is_not_killed(
@@ -195,21 +201,69 @@ def test_a_damaged_checkpoint_holds_no_newer_one_back(tmp_path: Path, monkeypatc
         learner._bring()
 
 
-def test_what_a_launcher_leaves_is_ended_but_no_other_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("again", "statuses"), [(True, [1]), (False, [])])
+def test_a_launchers_host_that_can_start_no_process_is_tried_again_where_ray_has_started_it_again(
+    again: bool, statuses: list[int], ends: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def begin(*_: object) -> None:
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr(RoleActor, "__init__", begin)
+    context = SimpleNamespace(was_current_actor_reconstructed=again)
+    monkeypatch.setattr(launcher_actor.ray, "get_runtime_context", lambda: context)
+    with pytest.raises(BlockingIOError):  # its creator hears of it
+        LauncherActor(Task("r", "r", RoleCommand("launcher", ()), {}, {}, ""), str(tmp_path), 1)
+    assert ends == statuses
+
+
+def test_the_learners_last_machine_is_known_after_a_start_of_ray(tmp_path: Path) -> None:
+    launcher = LauncherActor.__new__(LauncherActor)
+    launcher._claim = tmp_path / "learner-at"
+    assert [launcher.claim(one, "10.0.0.2") for one in ("a", "b")] == [False, True]
+    assert not launcher.claim("c", "10.0.0.3")
+    assert launcher._holds("c")
+
+
+def test_an_end_in_order_that_nobody_asked_for_is_a_death(
+    program: Path, ends: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    program.write_text("#!/bin/sh\nexit 0\n")
+    host = RoleActor(Task("test-run", "test-run", RoleCommand("actor-0", ("actor",)), {}, {}, str(tmp_path)))
+    wait_until(lambda: ends)
+    assert host.report("", 0).status == 1
+    host.clear()
+
+
+def test_what_a_launcher_leaves_is_ended_but_no_other_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     names = ["r:learner", "r:replay-0", "r:replay-1", "other:replay-0"]
     monkeypatch.setattr(launcher_actor, "actor_name", lambda run, role: f"{run}:{role}")
     table = {name: {"name": name, "state": "CREATED"} for name in names} | {"": {"name": "r:x", "state": "REMOVED"}}
-    removed, ray = list[str](), launcher_actor.ray
+    removed, ray, done = list[str](), launcher_actor.ray, list[str]()
+    hosts = {name: SimpleNamespace(close=SimpleNamespace(remote=partial(str, f"close {name}"))) for name in names}
+    named = [{"name": name, "namespace": role_actor.NAMESPACE} for name in (*names, "r:launcher")]
+    named.append({"name": "r:evaluator", "namespace": "theirs"})
     monkeypatch.setattr(launcher_actor, "placement_group_table", lambda: table)
     monkeypatch.setattr(launcher_actor, "remove_placement_group", removed.append)
     monkeypatch.setattr(ray.util, "get_placement_group", lambda name: name)
-    monkeypatch.setattr(ray.util, "list_named_actors", lambda all_namespaces: [])
-    monkeypatch.setattr(ray, "get_runtime_context", lambda: SimpleNamespace(current_actor=None))
-    monkeypatch.setattr(ray, "kill", lambda *_, **__: None)
+    monkeypatch.setattr(ray.util, "list_named_actors", lambda all_namespaces: named)
+    monkeypatch.setattr(ray, "get_actor", lambda name, _: hosts[name])
+    monkeypatch.setattr(ray, "get_runtime_context", lambda: SimpleNamespace(current_actor="launcher"))
+    monkeypatch.setattr(ray, "wait", lambda replies, **_: done.extend(replies))
+    kill = {id(host): f"kill {name}" for name, host in hosts.items()}
+    monkeypatch.setattr(ray, "kill", lambda host, **_: done.append(kill.get(id(host), f"kill {host}")))
     launcher = LauncherActor.__new__(LauncherActor)
-    launcher._task = Task("r", "r", RoleCommand("launcher", ()), {}, {}, "")
+    launcher._task, launcher._checkpoints = (
+        Task("r", "r", RoleCommand("launcher", ()), {}, {}, ""),
+        CheckpointFolder(tmp_path),
+    )
     launcher.flush_artifacts()
     assert removed == names[:3]
+    assert done == [*(f"close {name}" for name in names[:3]), *(f"kill {name}" for name in names[:3]), "kill launcher"]
+    monkeypatch.setattr(ray, "wait", lambda *_, **__: 1 / 0)
+    done.clear()
+    with pytest.raises(ZeroDivisionError):
+        launcher.flush_artifacts()
+    assert done == ["kill launcher"]  # it would hold the run's name
 
 
 def test_a_head_without_room_is_waited_for_unless_the_run_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
