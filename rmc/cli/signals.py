@@ -26,9 +26,8 @@ def interrupt() -> dict[signal.Signals, Any]:
     before.pop(signal.SIGINT, None)
     if before.get(signal.SIGHUP) == signal.SIG_IGN:  # nohup does so
         del before[signal.SIGHUP]
-    for number, handler in before.items():
-        if not isinstance(handler, Interrupt):
-            signal.signal(number, Interrupt())
+    for number in before:
+        signal.signal(number, Interrupt())  # another run of this process has heard nothing yet
     return before
 
 

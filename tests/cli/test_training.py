@@ -16,6 +16,7 @@ from rich.console import Console
 from rmc.analysis import evaluation
 from rmc.cli import main, training
 from rmc.cli.ending import print_end
+from rmc.cli.signals import signals_interrupt
 from rmc.cli.training import conduct
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import STOPPED_STATUS, RoleDied
@@ -159,14 +160,19 @@ def test_a_stop_signal_amid_the_evaluations_stops_the_run(folder, monkeypatch):
 
 
 def test_a_stop_signal_that_a_librarys_import_swallows_is_not_lost(folder, monkeypatch):
+    played = {"eval_return_mean": 0.0, "eval_return_std": 0.0, "eval_episodes": 1}
+
     def swallowed(*_):
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
-        return {"eval_return_mean": 0.0, "eval_return_std": 0.0, "eval_episodes": 1}
+        return played
 
     monkeypatch.setattr(training, "_before", swallowed)
     monkeypatch.setattr(training, "_launch", lambda *given: not given[-1].requested)
-    assert conducted(folder) == STOPPED_STATUS
+    with signals_interrupt():  # as ``rmc`` has it for all of its process
+        assert conducted(folder) == STOPPED_STATUS
+        monkeypatch.setattr(training, "_before", lambda *_: played)
+        assert conducted(folder) == 0  # another run has heard nothing
 
 
 def test_a_run_that_goes_on_knows_its_steps_before_a_role_speaks(folder, monkeypatch):
