@@ -44,6 +44,11 @@ def fork_actor(shared: ForkServer, log: Path, index: str, **environment: str) ->
     return fork(shared, log, "role", "actor", "--run", "x", "--index", index, **environment)
 
 
+def test_a_wrong_mujoco_gl_ends_no_fork_server() -> None:
+    command = [sys.executable, "-c", "from rmc.cli import fork_server; fork_server._import_all()"]
+    subprocess.run(command, env={**os.environ, "MUJOCO_GL": "nonsense"}, timeout=100, check=True)
+
+
 def test_it_is_rmc_with_its_words(shared: ForkServer, tmp_path: Path) -> None:
     role = fork_actor(shared, tmp_path / "log", "0", RMC_REDIS_URL="unix:///nowhere", RMC_PATIENCE="0")
     assert role.wait(20) == 2
