@@ -216,12 +216,26 @@ def test_a_launchers_host_that_can_start_no_process_is_tried_again_where_ray_has
     assert ends == statuses
 
 
-def test_the_learners_last_machine_is_known_after_a_start_of_ray(tmp_path: Path) -> None:
-    launcher = LauncherActor.__new__(LauncherActor)
-    launcher._claim = tmp_path / "learner-at"
-    assert [launcher.claim(one, "10.0.0.2") for one in ("a", "b")] == [False, True]
-    assert not launcher.claim("c", "10.0.0.3")
-    assert launcher._holds("c")
+@pytest.mark.parametrize("was_here", [True, False])
+def test_a_learners_own_checkpoints_outlive_a_start_of_ray_on_its_machine(
+    was_here: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray's id of a node is another then, its address is not."""
+    head = LauncherActor.__new__(LauncherActor)
+    head._claim, head._checkpoints = tmp_path / "learner-at", CheckpointFolder(tmp_path / "head")
+    head.claim("before", "10.0.0.2" if was_here else "10.0.0.3")
+    learner, asks = LearnerActor.__new__(LearnerActor), ("claim", "newest", "numbers", "last_epoch")
+    learner.scratch, learner._incarnation = tmp_path, "now"
+    CheckpointFolder(tmp_path / "checkpoints").save(7, {"state": b"whole"})
+    remote = SimpleNamespace(**{name: SimpleNamespace(remote=getattr(head, name)) for name in asks})
+    monkeypatch.setattr(learner, "_launcher", lambda: remote)
+    monkeypatch.setattr(learner_actor.ray, "get", lambda reply: reply)
+    monkeypatch.setattr(learner_actor.ray.util, "get_node_ip_address", lambda: "10.0.0.2")
+    monkeypatch.setattr(
+        learner_actor.ray, "get_runtime_context", lambda: SimpleNamespace(get_node_id=lambda: os.urandom(8).hex())
+    )
+    learner.prepare()
+    assert learner._folder.numbers() == ([7] if was_here else [])
 
 
 def test_an_end_in_order_that_nobody_asked_for_is_a_death(
