@@ -8,7 +8,7 @@ from typing import Any
 import ray
 
 from rmc.common.errors import ConfigError, last_line
-from rmc.common.whole_file import NO_ROOM
+from rmc.common.whole_file import NO_ROOM, write_whole
 from rmc.sweep.job import Job
 from rmc.sweep.local_runs import last_log_line
 from rmc.sweep.node_run import NodeRun
@@ -69,7 +69,7 @@ class RayRun:
     def __init__(self, runs: RayRuns, job: Job, needs: dict[str, Any]) -> None:
         self._runs, self._job, self._lost = runs, job, ""
         self._log = job.log.read_bytes() if job.log.exists() else b""
-        brought = pack(job.folder, {}) if job.folder.exists() else Parcel([], {}, b"")
+        brought = pack(job.folder, {}) if job.folder.exists() else Parcel()
         words = on_reserved_cores(job.words)
         self._actor = ray.remote(NodeRun).options(**needs).remote(words, job.name, brought, os.getcwd())
         self._stamps: Stamps = brought.stamps  # of its files, those that are here
@@ -96,7 +96,7 @@ class RayRun:
                 if error.errno not in NO_ROOM:
                     raise
                 return None  # the next look takes the same answer, once there is room
-            self._copy_at = now + len(parcel.tar) / BYTES_PER_SECOND
+            self._copy_at = now + parcel.bytes / BYTES_PER_SECOND
         self._pending, self._look_at = None, now + LOOK_SECONDS
         return None if status is None else self._end(status)
 
@@ -104,7 +104,7 @@ class RayRun:
         unpack(parcel, self._job.folder, self._stamps)
         self._stamps = parcel.stamps
         self._job.log.parent.mkdir(parents=True, exist_ok=True)
-        self._job.log.write_bytes(self._log + log)
+        write_whole(self._job.log, self._log + log)
 
     def _end(self, status: int) -> int:
         ray.kill(self._actor)

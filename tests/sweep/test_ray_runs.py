@@ -1,11 +1,8 @@
 """Whole runs on a Ray of this machine: their folders come here without the ring, and go on from there."""
 
-import dataclasses
 import errno
-import io
 import os
 import shutil
-import tarfile
 import tempfile
 import time
 import types
@@ -124,10 +121,8 @@ def test_a_copy_is_like_the_folder_and_only_what_changed_is_sent(tmp_path: Path)
     unpack(later, copy, parcel.stamps)
     assert _content(copy) == {"checkpoints/2/policy": "one", "metrics.jsonl": "first\nsecond\n", "secret": "s"}
     assert (copy / "events").is_dir()
-    with tarfile.open(fileobj=io.BytesIO(later.tar)) as tar:
-        assert sorted(tar.getnames()) == ["checkpoints/2/policy", "metrics.jsonl"]
-    with tarfile.open(fileobj=io.BytesIO(pack(source, later.stamps).tar)) as tar:
-        assert tar.getnames() == []
+    assert sorted(later.files) == ["checkpoints/2/policy", "metrics.jsonl"]
+    assert pack(source, later.stamps).files == {}
 
 
 def test_the_lock_of_who_trains_there_and_no_ring_is_sent(tmp_path: Path) -> None:
@@ -140,25 +135,23 @@ def test_the_lock_of_who_trains_there_and_no_ring_is_sent(tmp_path: Path) -> Non
     assert list(pack(tmp_path, {}).stamps) == [".lock"]
 
 
-def test_before_python_3_11_4_it_is_unpacked_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Debian 12's has no filter for archives."""
-    source, whole = tmp_path / "source", tarfile.TarFile.extractall
-    (source / "logs").mkdir(parents=True)
-    (source / "logs" / "learner.log").write_text("said")
+def test_a_kill_while_a_copy_is_written_leaves_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, copy = tmp_path / "source", tmp_path / "copy"
+    source.mkdir()
+    (source / "metrics.jsonl").write_text("first\n")
+    before = pack(source, {})
+    unpack(before, copy, {})
+    (source / "metrics.jsonl").write_text("first\nsecond\n")
 
-    def old(tar: tarfile.TarFile, path: Path, members: list[tarfile.TarInfo] | None = None) -> None:
-        whole(tar, path, members, filter="fully_trusted")
+    def cut(path: Path, content: bytes) -> int:
+        with path.open("wb") as file:
+            file.write(content[:3])
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr(tarfile.TarFile, "extractall", old)
-    monkeypatch.delattr(tarfile, "data_filter")
-    parcel, content = pack(source, {}), io.BytesIO()
-    with tarfile.open(fileobj=io.BytesIO(parcel.tar)) as tar, tarfile.open(fileobj=content, mode="w") as longer:
-        longer.addfile(tar.getmembers()[0], io.BytesIO(b"said"))
-        for outside in ("../outside", f"{tmp_path}/outside"):
-            longer.addfile(tarfile.TarInfo(outside))
-    unpack(dataclasses.replace(parcel, tar=content.getvalue()), tmp_path / "copy", {})
-    assert _content(tmp_path / "copy") == {"logs/learner.log": "said"}
-    assert not (tmp_path / "outside").exists()
+    monkeypatch.setattr(Path, "write_bytes", cut)
+    with pytest.raises(KeyboardInterrupt):
+        unpack(pack(source, before.stamps), copy, before.stamps)
+    assert _content(copy) == {"metrics.jsonl": "first\n"}
 
 
 def test_a_full_disk_here_is_waited_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,8 +186,7 @@ def test_a_copy_that_goes_back_is_not_sent_again(tmp_path: Path) -> None:
         (source / str(number)).touch()
         os.utime(source / str(number), ns=(0, 1_795_000_000_123_456_789 + 7_001_003 * number))
     unpack(pack(source, {}), copy, {})
-    with tarfile.open(fileobj=io.BytesIO(pack(copy, pack(source, {}).stamps).tar)) as tar:
-        assert tar.getnames() == []
+    assert pack(copy, pack(source, {}).stamps).files == {}
 
 
 def test_folders_may_vanish_as_they_are_packed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
