@@ -120,10 +120,12 @@ class LiveRun:
     def _found(self) -> dict[str, Any]:
         """Raises OSError where a file goes meanwhile."""
         status, over = status_json(self._folder, self._status), self._status.is_over
+        main = main_metrics(self._status)
         return {
             **{name: status[name] for name in SHOWN},
             "fault": "",
             "time": time_and_eta(status["elapsed_s"], status["eta_s"], over),
+            **{name: main.get(MAIN + name) for name in ("env_steps_per_s", "updates_per_s")},
             "redis_away": bool(self._status.get("launcher", "redis_away_s")) and not over,
             "roles": self._roles(),
             "events": sorted([*self._starts(), *self._events], key=lambda event: event["time"]),

@@ -15,11 +15,11 @@ from rmc.deploy.monitor.recorded import Callback, catch_up, empty_status, take_s
 from rmc.deploy.monitor.view import View
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
-from rmc.deploy.run.starts import resume_command
+from rmc.deploy.run.starts import last_launch, resume_command
 from rmc.deploy.run.state import run_state
 
 LOOK_SECONDS = 0.2
-AWAY_SECONDS = 30.0  # a launcher on Ray that was killed begins again within that
+AWAY_SECONDS = 30.0  # a launcher on Ray begins within that, and again where it was killed
 STOP_SECONDS = 60.0
 
 
@@ -56,7 +56,7 @@ class LauncherGone:
 
 def launcher_pid(folder: RunFolder) -> int:
     """The launcher's process. Raises ConfigError where nobody trains this run."""
-    comes_back = (folder.path / "learner-at").exists() and folder.lock.ended() is None  # on Ray, where it was killed
+    comes_back = folder.lock.ended() is None and last_launch(folder).launcher == "ray"  # or has not begun yet
     deadline = time.monotonic() + AWAY_SECONDS * comes_back
     while (trainer := folder.lock.trainer()) is None:
         if time.monotonic() >= deadline:

@@ -125,6 +125,12 @@ class _Server(socketserver.ThreadingMixIn, WSGIServer):
         self._free = threading.Semaphore(MOST_CLIENTS)
         super().__init__(*where)
 
+    def server_bind(self) -> None:
+        """Without asking for its host's name, which nobody reads, and which may take as long as DNS does."""
+        socketserver.TCPServer.server_bind(self)
+        self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
+        self.setup_environ()
+
     def verify_request(self, request: Any, client_address: Any) -> bool:  # noqa: ARG002
         """Whether there is room for one more; else it is hung up on."""
         return self._free.acquire(blocking=False)

@@ -90,9 +90,14 @@ def _open_events(folder: Path, hparams: Iterable[Summary]) -> int:
         old.rename(folder / old.name)
     name = f"events.out.tfevents.{now:010.0f}.{socket.gethostname()}.{os.getpid()}.{time.monotonic_ns()}"
     handle = os.open(folder / name, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
-    _append(handle, _framed(Event(wall_time=now, file_version="brain.Event:2")))
-    for summary in hparams:
-        _append(handle, _framed(Event(wall_time=now, summary=summary)))
+    try:
+        _append(handle, _framed(Event(wall_time=now, file_version="brain.Event:2")))
+        for summary in hparams:
+            _append(handle, _framed(Event(wall_time=now, summary=summary)))
+    except OSError:  # the next try takes another name
+        os.close(handle)
+        (folder / name).unlink(missing_ok=True)
+        raise
     return handle
 
 

@@ -1,1 +1,6 @@
 """A run on a Ray cluster: placement, role actors, supervision."""
+
+import os
+
+# read when ray is imported: else its own handler of SIGTERM ends a process that saves by SIGABRT after three seconds
+os.environ.setdefault("RAY_DISABLE_FAILURE_SIGNAL_HANDLER", "1")

@@ -99,6 +99,7 @@ def open_run(
     try:
         check(folder)
         if not there:
+            _check_still_new(folder)
             forget_start(folder)
         if initial is not None:  # before there is a config, without which it is no run
             CheckpointFolder(folder.checkpoints).save(0, initial.files)
@@ -180,6 +181,12 @@ def has_more_than_a_start(folder: RunFolder) -> bool:
     initial = {file for path in kept for file in path.glob("*")}
     files = {path for path in folder.path.rglob("*") if path.is_symlink() or not path.is_dir()}
     return not files <= initial | {folder.path / name for name in LEFT}
+
+
+def _check_still_new(folder: RunFolder) -> None:
+    """Raises ConfigError where another start has made a run there since that was looked at."""
+    if (folder.path / "config.json").exists():
+        raise ConfigError("--run-dir", str(folder.path), "another start has just made it; start again to continue it")
 
 
 def forget_start(folder: RunFolder) -> None:

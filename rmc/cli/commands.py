@@ -10,7 +10,6 @@ from rmc.analysis.doctor import examine_run
 from rmc.cli import run_options, train_options, training
 from rmc.cli.dry_run import dry_run
 from rmc.cli.ending import print_end
-from rmc.common.bus.redis_url import warn_of_password
 from rmc.common.extra import check_installed
 from rmc.deploy.monitor import attach as attachment
 from rmc.deploy.monitor.recorded import recorded_status, status_json
@@ -21,7 +20,6 @@ from rmc.deploy.run.starts import format_starts
 
 
 def train(command: train_options.Train) -> int:
-    warn_of_password(command.redis_url or "")
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     if command.dry_run:
         return dry_run(command.config(), command.launch_options(), terminal())

@@ -56,9 +56,9 @@ def option_values(option: str, words: Sequence[str]) -> list[str]:
     """What an option is given, in its order, as ``--option VALUE`` or ``--option=VALUE``."""
     pairs = itertools.zip_longest(words, words[1:])
     found = (
-        after if word == option else word.removeprefix(f"{option}=")
+        word.partition("=")[2] if "=" in word else after
         for word, after in pairs
-        if word.partition("=")[0] == option
+        if word.partition("=")[0].replace("_", "-") == option
     )
     return [value for value in found if value is not None]
 

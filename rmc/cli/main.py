@@ -123,7 +123,8 @@ def _say_version() -> int:
 
 def _parse_and_run(words: list[str]) -> int:
     from rmc.cli import parser
-    from rmc.common.bus.redis_url import without_passwords
+    from rmc.cli.config_file import option_values
+    from rmc.common.bus.redis_url import warn_of_password, without_passwords
     from rmc.deploy.local.role_environment import SECRET_VARIABLE, URL_VARIABLE
 
     if words[:1] != ["role"]:  # they are a role's alone: no environment, and nothing that it starts, is to inherit them
@@ -138,6 +139,8 @@ def _parse_and_run(words: list[str]) -> int:
         if not ending.code:  # --help
             return 0
         return _complain(_complaint([without_passwords(word) for word in words]), CONFIG_STATUS)
+    for url in option_values("--redis-url", words):  # one in a file is not seen in ps
+        warn_of_password(url)
     return parser.ACTIONS[type(command)](command)
 
 

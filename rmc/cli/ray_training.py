@@ -28,7 +28,8 @@ from rmc.deploy.run.validation import validate, validate_launch
 def train(
     config: RunConfig, options: LaunchOptions, console: Console, callback: Callback | None
 ) -> tuple[RunFolder, int]:
-    """Hand a run to a launcher on the cluster's head, and watch it; Ctrl-C ends the run, a closed terminal does not.
+    """Hand a run to a launcher on the cluster's head, and watch it; Ctrl-C ends the run; a closed terminal does so
+    only where the cluster is this process's own.
 
     The run's folder, and its exit status.
     """
@@ -53,11 +54,11 @@ def _watched(
     check_machine(config, options)
     place_for_sockets()
     folder = open_run(config, options, launcher.check_not_there)
-    launcher.launch(config, folder, options)
-    console.print(f"run folder {folder.path}", soft_wrap=True)
-    if note := reach_note(config):
-        console.print(note, soft_wrap=True)
-    with signals_caught(hangup=False) as stop:
+    with signals_caught(hangup=options.ray_address == "local") as stop:  # only a cluster of our own ends with us
+        launcher.launch(config, folder, options)
+        console.print(f"run folder {folder.path}", soft_wrap=True)
+        if note := reach_note(config):
+            console.print(note, soft_wrap=True)
         attach.watch(folder, console, _passes_on(stop, folder), callback)
         launcher.wait_gone(folder)
     return folder, print_end(folder, console)

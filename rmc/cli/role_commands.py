@@ -7,7 +7,6 @@ import sys
 
 from rmc.cli import signals, training
 from rmc.cli.role_options import ActorRole, EvaluatorRole, LauncherRole, ReplayRole, Role
-from rmc.common.bus.redis_url import warn_of_password
 from rmc.common.errors import ConfigError
 from rmc.deploy.local.role_environment import SECRET_VARIABLE, URL_VARIABLE
 from rmc.deploy.local.role_process import RunConnection
@@ -23,7 +22,6 @@ def run_role(command: Role) -> int:
     role = command.role
     if isinstance(role, LauncherRole):
         return launch(role)
-    warn_of_password(role.redis_url)
     url = role.redis_url or given_url
     if not url:
         raise ConfigError("--redis-url", url, f"say where the run's Redis is, or set {URL_VARIABLE}")
@@ -53,7 +51,7 @@ def launch(command: LauncherRole) -> int:
     signals.interrupt()  # SIGTERM ends it cleanly while no role is there yet, too
     folder = RunFolder(command.run)
     config = folder.config()
-    folder.lock.take()
     named = {item.name: getattr(command, item.name) for item in dataclasses.fields(command) if item.name != "run"}
     launch_options = LaunchOptions(folder.path, launcher="ray", **named)
+    folder.lock.take()
     return training.conduct(config, folder, launch_options, terminal(400))

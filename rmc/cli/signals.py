@@ -11,7 +11,7 @@ from rmc.common.process.role import StopSignal
 
 @contextmanager
 def signals_interrupt() -> Iterator[None]:
-    """SIGTERM and a closed terminal are KeyboardInterrupt, as SIGINT is, for as long as this lasts."""
+    """SIGTERM, SIGINT and a closed terminal are KeyboardInterrupt for as long as this lasts."""
     before = interrupt()
     try:
         yield
@@ -22,10 +22,7 @@ def signals_interrupt() -> Iterator[None]:
 
 def interrupt() -> dict[signal.Signals, Any]:
     """The same from now on; the handlers before."""
-    before = handlers()
-    before.pop(signal.SIGINT, None)
-    if before.get(signal.SIGHUP) == signal.SIG_IGN:  # nohup does so
-        del before[signal.SIGHUP]
+    before = {number: handler for number, handler in handlers().items() if handler != signal.SIG_IGN}  # as nohup does
     for number in before:
         signal.signal(number, Interrupt())  # another run of this process has heard nothing yet
     return before

@@ -70,6 +70,9 @@ def conduct(
     with signals_interrupt():
         try:
             return _conduct(config, folder, options, console, callback)
+        except KeyboardInterrupt:  # before the first word: who waits for its end hears that it was stopped
+            folder.lock.release(STOPPED_STATUS)
+            raise
         except Exception as error:  # whoever comes back to a closed terminal finds it there
             if options.launcher != "ray":  # on Ray all that is printed goes there
                 Output.keep(f"{error}\n" if isinstance(error, RmcError) else traceback.format_exc())
@@ -126,7 +129,7 @@ def _trained(config: RunConfig, folder: RunFolder, options: LaunchOptions, monit
     try:
         # before and after, nothing runs that Ctrl-C could not end at once
         with signals_caught() as stop, _metrics_served(folder, monitor, options):
-            return _launch(config, folder, options, monitor, stop)
+            return _launch(config, folder, options, monitor, stop) and not stop.requested
     finally:
         monitor.close()
 
@@ -178,7 +181,7 @@ def _launch(config: RunConfig, folder: RunFolder, options: LaunchOptions, monito
 
     torch.set_num_threads(config.learner.threads or 1)  # the bits may depend on it, so it must not on the machine
     lockstep.train(config, folder.path, monitor.watch, stop, options.device)
-    return not stop.requested
+    return True
 
 
 def _before(config: RunConfig, folder: RunFolder, seconds: float, console: Console) -> dict[str, Any]:

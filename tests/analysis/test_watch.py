@@ -177,6 +177,18 @@ def test_a_run_made_anew_in_its_folder_shows_nothing_of_the_old_one(folder: RunF
     assert b'"whole":true' in watch_server.EventStream([live])._everything()  # a page may have missed it
 
 
+def test_rates_are_the_newest_ones_of_a_long_run_too(folder: RunFolder) -> None:
+    """A point of a long run's curve is a mean over minutes."""
+    live = LiveRun("run", folder.path)
+    for step in range(3 * POINTS + 2):
+        say(folder, "learner", env_steps=step, updates_per_s=50.0)
+    say(folder, "learner", env_steps=3 * POINTS, updates_per_s=2.0)
+    found = live.look() or {}
+    assert found["updates_per_s"] == 2.0
+    assert found["env_steps_per_s"] is None
+    assert found["curves"]["updates_per_s"][1][-1][1] > 10.0
+
+
 def test_a_page_without_news_is_told_that_its_server_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watch_server, "PING_SECONDS", 0.01)
 

@@ -247,6 +247,13 @@ def test_a_password_on_the_command_line_is_warned_of_once(words: list[str], logi
     assert "hush" not in done.stderr + done.stdout
 
 
+def test_a_password_in_a_file_of_options_is_not_warned_of(tmp_path: Path) -> None:
+    """No process list shows it."""
+    (tmp_path / "run.toml").write_text('redis_url = "redis://:hush@localhost:1"')
+    done = rmc(*DEBUG, "--config", str(tmp_path / "run.toml"), env=os.environ | {"RMC_PATIENCE": "0"})
+    assert done.stderr.splitlines()[0].startswith("rmc: --redis-url='redis://localhost:1': no Redis answers there")
+
+
 def test_a_redis_beside_ray_is_refused_without_its_password() -> None:
     """Where the check is made: to get there from the command line takes a cluster."""
     placement = LaunchOptions(None, "fail", launcher="ray", redis_url="redis://user:hush@localhost:1")

@@ -159,12 +159,13 @@ def test_a_stop_signal_amid_the_evaluations_stops_the_run(folder, monkeypatch):
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_a_stop_signal_that_a_librarys_import_swallows_is_not_lost(folder, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_stop_signal_that_a_librarys_import_swallows_is_not_lost(number, folder, monkeypatch):
     played = {"eval_return_mean": 0.0, "eval_return_std": 0.0, "eval_episodes": 1}
 
     def swallowed(*_):
         with contextlib.suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(number)
         return played
 
     monkeypatch.setattr(training, "_before", swallowed)
@@ -173,6 +174,34 @@ def test_a_stop_signal_that_a_librarys_import_swallows_is_not_lost(folder, monke
         assert conducted(folder) == STOPPED_STATUS
         monkeypatch.setattr(training, "_before", lambda *_: played)
         assert conducted(folder) == 0  # another run has heard nothing
+
+
+def test_a_stop_signal_before_the_first_word_stops_the_run(folder, monkeypatch):
+    """Who waits for the lock hears that it was stopped, not that it was killed."""
+    monkeypatch.setattr(training, "_conduct", lambda *_: signal.raise_signal(signal.SIGTERM))
+    with pytest.raises(KeyboardInterrupt):
+        conducted(folder)
+    assert folder.lock.ended() == STOPPED_STATUS
+
+
+def test_a_stop_signal_as_the_roles_end_leaves_out_the_last_evaluation(folder, monkeypatch):
+    def ends(*given):
+        given[-1].request()
+        return True
+
+    monkeypatch.setattr(training, "_launch", ends)
+    monkeypatch.setattr(training, "_result", lambda *_: pytest.fail("it was evaluated"))
+    assert conducted(folder) == STOPPED_STATUS
+
+
+def test_an_ignored_signal_stays_ignored():
+    """As a shell does with Ctrl-C of what it starts by &."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with signals_interrupt():
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_run_that_goes_on_knows_its_steps_before_a_role_speaks(folder, monkeypatch):

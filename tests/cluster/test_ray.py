@@ -4,6 +4,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 import tempfile
 import time
 import urllib.request
@@ -23,6 +25,25 @@ from tests.integration.running import ENVIRONMENT, Training, free_port
 from tests.processes import matching
 from tests.waiting import wait_until
 
+JOINS = """
+import os, signal, time
+from rmc.deploy.ray import launcher
+
+init = launcher.ray.init
+
+def signalled(**options):
+    init(**options)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+launcher.ray.init = signalled
+try:
+    with launcher.joined("local", 1):
+        pass
+except KeyboardInterrupt:
+    print("interrupted")
+time.sleep(4.0)
+print("saved")
+"""
 ENDLESS = ("--total-steps", "10000000", "--replay-ratio", "8")
 
 
@@ -65,6 +86,12 @@ def test_a_run_on_a_ray_of_its_own(tmp_path: Path) -> None:
         assert training.records(role), role
     assert (folder / "checkpoints" / "best.json").exists()
     assert {path.name for path in (folder / "logs").iterdir()} >= {"launcher.log", "learner.log", "replay.log"}
+
+
+def test_sigterm_while_ray_is_joined_leaves_a_process_that_can_save() -> None:
+    """Ray's own handler would end it by SIGABRT after three seconds."""
+    done = subprocess.run([sys.executable, "-c", JOINS], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "interrupted\nsaved\n"), done.stderr
 
 
 @pytest.mark.long

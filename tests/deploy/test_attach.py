@@ -16,11 +16,13 @@ import pytest
 from rich.console import Console
 
 from rmc.common.errors import ConfigError
-from rmc.deploy.monitor import run_status, view
+from rmc.deploy.monitor import attach, run_status, view
 from rmc.deploy.monitor.attach import launcher_pid, stop, watch
 from rmc.deploy.monitor.notices import notices
 from rmc.deploy.monitor.recorded import empty_status, recorded_status, take_start
 from rmc.deploy.run.folder import RESULT, RunFolder
+from rmc.deploy.run.launch_options import Launcher, LaunchOptions
+from rmc.deploy.run.starts import note_start
 
 HOLDER = """
 import sys, time
@@ -126,6 +128,19 @@ def test_nobody_to_stop_is_said(folder: RunFolder, tmp_path: Path) -> None:
         stop(folder)
     with pytest.raises(ConfigError, match=r"no config\.json there"):
         stop(RunFolder(tmp_path))
+
+
+@pytest.mark.parametrize("launcher", ["local", "ray"])
+def test_a_launcher_on_ray_is_waited_for_where_it_begins(
+    launcher: Launcher, folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It locks the folder once all is imported on the head."""
+    monkeypatch.setattr(attach, "AWAY_SECONDS", 0.5)
+    note_start(folder, {}, LaunchOptions(folder.path, launcher=launcher), None)
+    began = time.monotonic()
+    with pytest.raises(ConfigError, match="nobody trains it now"):
+        launcher_pid(folder)
+    assert (time.monotonic() - began >= 0.5) == (launcher == "ray")
 
 
 def test_a_finished_run_is_said_to_be(folder: RunFolder) -> None:

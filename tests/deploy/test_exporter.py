@@ -162,6 +162,13 @@ def test_a_second_start_is_not_told_of_the_port_that_the_first_one_has(
     assert capsys.readouterr().err == f"rmc: --run-dir='{folder.path}': this run is being trained; stop it first\n"
 
 
+def test_nobodys_name_is_looked_up(status: RunStatus, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no DNS answers that takes as long as its patience."""
+    monkeypatch.setattr(socket, "getfqdn", lambda *_: pytest.fail("it was"))
+    with exporter.served(status, "first", LaunchOptions(None, metrics_port=port, metrics_host="0.0.0.0")):
+        assert "rmc_" in scraped(port)
+
+
 @pytest.mark.parametrize("options", [{}, {"metrics_port": 9464, "metrics_host": "0.0.0.0", "tls": True}])
 def test_a_launcher_on_ray_is_told(options: dict[str, Any]) -> None:
     command = parser.parse(list(launcher_command("run", "head:1", LaunchOptions(None, **options)).words))

@@ -42,6 +42,25 @@ def test_a_full_disk_is_told_once_and_over_once(
     assert len(list(folder.path.glob("events.*"))) == 1  # which goes on, too
 
 
+def test_events_that_find_no_room_leave_no_file(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics_log, "RETRY_SECONDS", 0.0)
+    kept, write, handles = MetricsLog(folder, {}), metrics_log.os.write, len(os.listdir("/proc/self/fd"))
+    room = [False]
+
+    def full(file: int, content: bytes) -> int:
+        return write(file, content if content.startswith(b"{") or room[0] else b"")
+
+    monkeypatch.setattr(metrics_log.os, "write", full)
+    for number in range(3):
+        kept.write({"role": "learner", "x": number}, 0, {})
+    assert not list(folder.path.glob("events.*"))
+    assert len(os.listdir("/proc/self/fd")) == handles
+    room[0] = True
+    kept.write({"role": "learner", "x": 3}, 0, {})
+    kept.close()
+    assert len(list(folder.path.glob("events.*"))) == 1
+
+
 def test_no_half_of_a_line_is_left(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     kept, write = MetricsLog(folder, {}), metrics_log.os.write
     kept.write({"role": "learner", "x": 1}, 0, {})

@@ -10,7 +10,7 @@ import pytest
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run import metrics_tail
+from rmc.deploy.run import metrics_tail, opening
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
@@ -82,6 +82,26 @@ def test_a_start_that_is_refused_once_it_has_the_lock_writes_nothing(folder: Run
     with pytest.raises(ConfigError, match="is being trained"):
         open_run(dataclasses.replace(CONFIG, total_steps=9_000), LaunchOptions(folder.path), check=refuse)
     assert (folder.config(), len(starts(folder)), folder.lock.trainer()) == (CONFIG, 1, None)
+
+
+def test_of_two_starts_of_a_new_folder_the_later_one_removes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options, free = LaunchOptions(tmp_path / "run"), opening.check_free
+
+    def other(folder: RunFolder) -> None:
+        free(folder)
+        monkeypatch.setattr(opening, "check_free", free)
+        first = open_run(CONFIG, options)
+        CheckpointFolder(first.checkpoints).save(500, {"learner.pt": b"trained"})
+        first.lock.release(130)
+
+    monkeypatch.setattr(opening, "check_free", other)
+    with pytest.raises(ConfigError, match="another start has just made it; start again to continue it"):
+        open_run(CONFIG, options)
+    there = RunFolder(tmp_path / "run")
+    assert CheckpointFolder(there.checkpoints).numbers() == [500]
+    assert (there.lock.trainer(), there.lock.ended()) == (None, 130)
 
 
 @pytest.mark.parametrize(("status", "state"), [(1, "failed"), (130, "stopped")])
