@@ -79,7 +79,7 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
     columns = min(COLUMNS, len(groups))
     rows = -(-len(groups) // columns)
     agents = list(dict.fromkeys(agent for runs in groups.values() for agent in runs))
-    names = [textwrap.fill(_named(agent, groups), LEGEND_WIDTH) for agent in agents]
+    names = [textwrap.fill(_named(agent, groups, by), LEGEND_WIDTH) for agent in agents]
     legend = LEGEND_LINE * sum(name.count("\n") + 1 for name in names) / columns
     figure = Figure(figsize=(1.0 + 5.0 * columns, 0.6 + 3.3 * rows + legend), layout="constrained")
     panels = list(figure.subplots(rows, columns, squeeze=False).flat)
@@ -88,21 +88,23 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
         for agent, runs in by_agent.items():
             color = f"C{agents.index(agent) % 10}"
             handles.setdefault(agent, draw_agent(panel, [curve(run, by) for run in runs], color))
-        panel.set_title(env)
+        panel.set_title(env, parse_math=False)
         panel.set_xlabel(LABELS[by])
         panel.locator_params(axis="x", nbins=5)  # more would run into each other
         panel.set_ylabel("return")
         panel.grid(alpha=0.3)
     for panel in panels[len(groups) :]:
         panel.set_axis_off()
-    figure.legend(handles.values(), names, loc="outside lower center", ncols=columns)
+    shown = figure.legend(handles.values(), names, loc="outside lower center", ncols=columns)
+    for text in shown.get_texts():
+        text.set_parse_math(False)
     figure.savefig(out, dpi=110)
 
 
 def draw_agent(panel: Any, curves: list[Line], color: str) -> Any:
     """Few runs as a line each, more as their mean and its interval where all have been; a line for the legend."""
-    low, high = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
-    if len(curves) < ENOUGH_SEEDS or low >= high:
+    low, high = _shared(curves)
+    if not _has_band(curves):
         style: Any = {"color": color, "linewidth": 1.2, "alpha": 0.8, "marker": "o", "markersize": 2.5}
         lines = [panel.plot(*one, **style)[0] for one in curves]
         return lines[0]
@@ -114,10 +116,21 @@ def draw_agent(panel: Any, curves: list[Line], color: str) -> Any:
     return line
 
 
-def _named(agent: str, groups: Groups) -> str:
-    counts = [len(by_agent[agent]) for by_agent in groups.values() if agent in by_agent]
-    fewest, most = min(counts), max(counts)
-    how = "interquartile mean, 95 %" if fewest >= ENOUGH_SEEDS else "each a line"
+def _shared(curves: list[Line]) -> tuple[float, float]:
+    """Where all runs have been: from, to."""
+    return max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
+
+
+def _has_band(curves: list[Line]) -> bool:
+    low, high = _shared(curves)
+    return len(curves) >= ENOUGH_SEEDS and low < high
+
+
+def _named(agent: str, groups: Groups, by: Axis) -> str:
+    drawn = [by_agent[agent] for by_agent in groups.values() if agent in by_agent]
+    fewest, most = min(map(len, drawn)), max(map(len, drawn))
+    banded = all(_has_band([curve(run, by) for run in runs]) for runs in drawn)
+    how = "interquartile mean, 95 %" if banded else "each a line"
     seeds = f"{fewest}" if fewest == most else f"{fewest} to {most}"
     return f"{agent} ({seeds} seed{'s' * (most > 1)}, {how})"
 
@@ -159,16 +172,21 @@ def _returns(runs: list[History]) -> str:
     scores = last_returns(runs)
     if len(runs) >= ENOUGH_SEEDS:
         low, high = interval(interquartile_mean, scores)
-        return f"{return_text(interquartile_mean(scores))} [{return_text(low)}, {return_text(high)}]"
-    return f"{return_text(scores.mean())} ({', '.join(map(return_text, scores[:, 0]))})"
+        return f"{return_text(_centre(scores))} [{return_text(low)}, {return_text(high)}]"
+    return f"{return_text(_centre(scores))} ({', '.join(map(return_text, scores[:, 0]))})"
+
+
+def _centre(scores: Scores) -> float:
+    """(R, 1) -> the return that is shown of R runs."""
+    return interquartile_mean(scores) if len(scores) >= ENOUGH_SEEDS else float(scores.mean())
 
 
 def _beside(runs: list[History], reference: list[History]) -> list[str]:
-    """The mean return scaled so that the reference's is 1 and an untrained agent's 0; the chance to beat it."""
+    """The return that is shown, scaled: the reference's is 1, an untrained agent's 0; the chance to beat it."""
     initial = [run.initial_return for run in reference if run.initial_return is not None]
     if not reference:
         return ["", ""]
     scores, others = last_returns(runs), last_returns(reference)
-    low, high = (np.mean(initial) if initial else np.nan), others.mean()
-    share = f"{((scores - low) / (high - low)).mean():.2f}" if initial and high != low else ""
+    low, high = (np.mean(initial) if initial else np.nan), _centre(others)
+    share = f"{(_centre(scores) - low) / (high - low):.2f}" if initial and high != low else ""
     return [share, f"{probability_of_improvement(scores, others):.2f}"]

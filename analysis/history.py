@@ -95,7 +95,7 @@ def _of_line(raw: dict[str, Any], place: str) -> History:
     numbers += [] if history.initial_return is None else [history.initial_return]
     numbers += [value for one in history.evaluations for value in dataclasses.astuple(one)]
     texts = history.agent, history.env, history.commit
-    named = all(isinstance(text, str) for text in texts) and isinstance(history.finished, bool)
+    named = all(isinstance(text, str) and text.isprintable() for text in texts) and isinstance(history.finished, bool)
     if not (history.evaluations and all(map(is_finite, numbers)) and named):
         fix = "not a history (its evaluations, numbers and names); fix the line, or remove it"
         raise ConfigError("RUNS", place, fix)

@@ -68,7 +68,7 @@ def _draw_probes(of: list[Probe], axis: "Axes") -> None:
     ):
         lengths = [max(value, LEAST_R2) for value in values]
         axis.barh([place + offset for place in places], lengths, 0.4, color=colour, label=label)
-    axis.set_yticks(list(places), [one.name for one in of])
+    axis.set_yticks(list(places), [one.name for one in of], parse_math=False)
     axis.invert_yaxis()
     axis.set_xlim(LEAST_R2 if any(min(one.from_memory, one.from_newest) < 0.0 for one in of) else 0.0, 1.0)
     axis.set_xlabel("R² of what is hidden, read linearly")

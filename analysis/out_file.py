@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from rmc.common.errors import ConfigError
+from rmc.common.whole_file import temporary_path
 
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 
@@ -15,10 +16,11 @@ def check_writable(name: str, path: Path, suffixes: tuple[str, ...]) -> None:
         raise ConfigError(name, str(path), f"is a folder; give a file in it, like {path / f'out{suffixes[0]}'}")
     if path.suffix.lower() not in suffixes:
         raise ConfigError(name, str(path), f"give a name that ends in {' or '.join(suffixes)}")
-    there = path.exists()
     try:
-        path.open("ab").close()
-        if not there:
-            path.resolve().unlink()  # of a link, what it leads to
+        for one in (path, temporary_path(path)):  # it is whole before it has its name
+            there = one.exists()
+            one.open("ab").close()
+            if not there:
+                one.resolve().unlink()  # of a link, what it leads to
     except OSError as error:
         raise ConfigError(name, str(path), f"cannot be written ({error.strerror}); give another") from None

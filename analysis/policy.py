@@ -13,7 +13,7 @@ Shapes: N episodes side by side, O observation, A action, S state, M flags of wh
 import reprlib
 from numbers import Integral
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal, get_args, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,7 +30,7 @@ from rmc.common.process import watchdog
 from rmc.common.window import BoolArray, Floats
 
 Units = Literal["agent", "environment"]
-UNITS = ("agent", "environment")
+UNITS = get_args(Units)
 
 
 def load_policy(source: str | Path, checkpoint: str = "latest", seed: int = 0) -> "Policy":
@@ -89,15 +89,21 @@ class Policy:
         self,
         observation: ArrayLike,
         missing: bool | BoolArray = ...,
+        *,
         explore: bool = ...,
         units: Literal["agent"] = ...,
     ) -> Floats: ...
     @overload
     def act(
-        self, observation: ArrayLike, missing: bool | BoolArray = ..., explore: bool = ..., *, units: Units
+        self, observation: ArrayLike, missing: bool | BoolArray = ..., *, explore: bool = ..., units: Units
     ) -> NDArray[Any]: ...
     def act(
-        self, observation: ArrayLike, missing: bool | BoolArray = False, explore: bool = False, units: Units = "agent"
+        self,
+        observation: ArrayLike,
+        missing: bool | BoolArray = False,
+        *,
+        explore: bool = False,
+        units: Units = "agent",
     ) -> NDArray[Any]:
         """(O,) -> (A,) or (N, O) -> (N, A): the policy's mean, or a sample of it.
 
@@ -150,7 +156,13 @@ class Policy:
         """
         raw = self._numbers(observation)
         rows, one = self._rows(raw), raw.ndim == 1
-        absent = self._absent(np.array(missing, bool), rows, one)
+        try:
+            flags = np.array(missing, bool)
+        except ValueError:  # rows of several lengths
+            raise ConfigError(
+                "missing", reprlib.repr(missing), f"give one, or one for each of {len(rows)} rows"
+            ) from None
+        absent = self._absent(flags, rows, one)
         odd = ~np.isfinite(rows) & ~absent
         if odd.any():
             if not self.header.agent.impute_missing:
@@ -176,7 +188,7 @@ class Policy:
         try:
             with np.errstate(over="ignore"):  # infinity, which is judged later
                 raw = np.asarray(observation, np.float32)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, RuntimeError):  # torch raises the last for a tensor with a gradient
             fix = f"give {self.header.obs_dim} numbers, as policy.make_env() or gymnasium.spaces.flatten does"
             raise ConfigError("observation", reprlib.repr(observation), fix) from None
         as_environment = raw.shape == self.header.layout.observations[0].shape and raw.size == self.header.obs_dim

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass, replace
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ from rmc.analysis import hub
 from rmc.common.agent import Agent
 from rmc.common.bus.metrics_record import is_complete, is_finite
 from rmc.common.checkpoint import POLICY, PROGRESS
+from rmc.common.env.config import check_env_config, check_range
 from rmc.common.errors import ConfigError, MessageError, first_line, one_line
 from rmc.common.policy_header import METADATA_KEY, PolicyHeader
 from rmc.common.user_path import user_path
-from rmc.deploy.monitor.recorded import empty_status
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import from_dict
 from rmc.deploy.run.folder import RunFolder
@@ -112,11 +113,25 @@ def _header(facts: Any) -> PolicyHeader:
         raise MessageError("newer policy", fix)
     try:
         header = from_dict(PolicyHeader, migrated(facts) | {"format": FORMAT}, "")
+        _check_facts(header)
     except ConfigError as error:
         raise MessageError("header of another version", f"RMC {wrote} wrote it; {error}") from None
     if header.sizes() != sizes:
         raise MessageError("damaged header", f"its sizes are {sizes!r}, its parts make {header.sizes()}; copy it again")
     return header
+
+
+def _check_facts(header: PolicyHeader) -> None:
+    """Raises ConfigError for what no run of ours writes: it is shown, and played by."""
+    check_env_config(header.env)
+    for name in ("seed", "env_steps", "updates", "eval_episodes"):
+        check_range(name, getattr(header, name), (0, 2**63 - 1), Integral)
+    for name in ("eval_return_mean", "eval_return_std"):
+        value = getattr(header, name)
+        if not (value is None or is_finite(value)):
+            raise ConfigError(name, value, "must be finite")
+    if not header.preset.isprintable():
+        raise ConfigError("preset", header.preset, "must be of characters that can be seen")
 
 
 def _difference(header: PolicyHeader, shapes: dict[str, tuple[int, ...]]) -> str:
@@ -151,13 +166,13 @@ def _of_run(folder: RunFolder, checkpoint: str) -> PolicyFile:
             raise MessageError("no policy", f"it holds no {POLICY}")
         has_header = _shapes(files[POLICY]) and _facts(files[POLICY]) is not None
         policy = decode(files[POLICY]) if has_header else _of_older_run(folder, files)
-        if policy.header.env.id != empty_status(folder).env:
+        settings = folder.settings().get("env")
+        if not isinstance(settings, dict) or policy.header.env.id != settings.get("id"):
             raise MessageError("weights", f"not a policy of this run (but of {policy.header.env.id})")
     except MessageError as error:
         raise ConfigError("--checkpoint", checkpoint, f"{error}; use another") from None
     policy = replace(policy, header=_evaluated(policy.header, folder))
-    settings = folder.settings().get("env")
-    seconds = settings.get("env_timeout") if isinstance(settings, dict) else None  # a resume may have changed it
+    seconds = settings.get("env_timeout")  # a resume may have changed it
     return policy.with_timeout(seconds) if is_finite(seconds) and seconds > 0 else policy
 
 
@@ -183,9 +198,9 @@ def _evaluated(header: PolicyHeader, folder: RunFolder) -> PolicyHeader:
     records = [result] if result and result["updates"] == header.updates and is_complete(result) else []
     if not records:
         records = MetricsTail(folder.metrics).take()
-        records = [record for record in records if record.get("eval_update") == header.updates]
+        records = [one for one in records if one.get("eval_update") == header.updates and is_complete(one)]
     played: dict[str, Any] = records[-1] if records else {}
-    if not is_complete(played) or not all(is_finite(played.get(f"eval_{name}")) for name in EVALUATED):
+    if not all(is_finite(played.get(f"eval_{name}")) for name in EVALUATED):
         return header
     mean, deviation, episodes = (played[f"eval_{name}"] for name in EVALUATED)
     return replace(header, eval_return_mean=mean, eval_return_std=deviation, eval_episodes=episodes)

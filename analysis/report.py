@@ -121,7 +121,10 @@ def differences(runs: Sequence[ReportRun]) -> dict[str, Any]:
     paths = list(dict.fromkeys(path for run in runs for path in run.options))
     values = {path: [run.options[path] for run in runs if path in run.options] for path in paths}
     differing = [path for path, settings in values.items() if any(one != settings[0] for one in settings)]
-    rows = [[path, *(words(run.options[path]) if path in run.options else "-" for run in runs)] for path in differing]
+    rows = [
+        [option(path), *(words(run.options[path]) if path in run.options else "-" for run in runs)]
+        for path in differing
+    ]
     note = "Options that are not alike in all runs that have them." if rows else "All options are alike."
     return {"columns": [run.name for run in runs], "rows": rows, "note": note}
 

@@ -49,7 +49,11 @@ def film(run: ReportRun, checkpoint: str) -> Medium:
             out, policy = Path(place) / "episode.mp4", load_policy(run.folder.path, checkpoint)
             video.prepare(config.env, out)
             total = video.record(policy, config.env, config.seed, out, LONGEST_FILM)
-            return Medium(run.name, data_uri(out.read_bytes(), "video/mp4"), f"return {total:,.1f}")
+            return Medium(
+                run.name,
+                data_uri(out.read_bytes(), "video/mp4"),
+                f"return {total:,.1f} over its first {LONGEST_FILM:,} steps at most",
+            )
     except RmcError as error:
         return Medium(run.name, note=f"No video: {_why(error)}.")
 

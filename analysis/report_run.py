@@ -1,6 +1,8 @@
 """A run as a report shows it: what it is, how far it is, its evaluations and records."""
 
-from dataclasses import dataclass
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from rmc.analysis.vitals import Record
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.monitor.recorded import recorded_status
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
 from rmc.deploy.run.option_names import changes, flat
@@ -31,15 +34,17 @@ class ReportRun:
     """One run, read once."""
 
     folder: RunFolder
+    name: str
     about: About
     history: History | None  # None before the first evaluation
     records: list[Record]  # what is drawn of them
     options: dict[str, Any]
     state: State
+    env_steps: int  # so far
 
     @staticmethod
     def read(path: Path) -> "ReportRun":
-        """From its folder. Raises ConfigError where it is none."""
+        """From its folder, by whose name it is called. Raises ConfigError where it is none."""
         folder = RunFolder(path)
         about = history.describe(path)
         timed = (record for record in folder.records() if is_finite(record.get("time")))
@@ -49,17 +54,16 @@ class ReportRun:
         except ConfigError:
             folder.result()  # damaged, it is an error; a missing evaluation is none
             past = None
-        return ReportRun(folder, about, past, records, flat(folder.settings()), run_state(folder))
-
-    @property
-    def name(self) -> str:
-        """The folder's."""
-        return self.folder.path.name
-
-    @property
-    def env_steps(self) -> int:
-        """So far."""
-        return int(max((value for _, value in self._metric("learner", "env_steps")), default=0.0))
+        return ReportRun(
+            folder,
+            folder.path.name,
+            about,
+            past,
+            records,
+            flat(folder.settings()),
+            run_state(folder),
+            recorded_status(folder).env_steps,
+        )
 
     @property
     def findings(self) -> list[str]:
@@ -104,3 +108,9 @@ class ReportRun:
         return [
             max(0.0, wall - (began - at)) if at < began else float(one) for at, one in zip(times, seconds, strict=True)
         ]
+
+
+def told_apart(runs: Sequence[ReportRun]) -> list[ReportRun]:
+    """Each called by its path from the folder that holds them all."""
+    base = os.path.commonpath([run.folder.path.parent for run in runs])
+    return [replace(run, name=str(run.folder.path.relative_to(base))) for run in runs]

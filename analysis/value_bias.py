@@ -18,7 +18,7 @@ HORIZONS = 3.0  # of 1 / (1 - gamma) steps, left out at a cut: 5 % of a return i
 
 @dataclass(frozen=True)
 class ValueBias:
-    """Means over steps of deterministic episodes, in scaled rewards."""
+    """Means over steps of deterministic episodes, in the environment's rewards."""
 
     expected: float  # Q of the action taken, mean of both critics
     came: float  # discounted rewards and entropy bonuses, as Q counts them
@@ -26,7 +26,7 @@ class ValueBias:
 
 
 @torch.no_grad()
-def value_bias(agent: Agent, episodes: list[Episode], gamma: float) -> ValueBias | None:
+def value_bias(agent: Agent, episodes: list[Episode], gamma: float, reward_scale: float = 1.0) -> ValueBias | None:
     """Of all steps whose return is known; None where there is none. Curiosity is not counted."""
     expected, came = [], []
     for episode in episodes:
@@ -38,7 +38,10 @@ def value_bias(agent: Agent, episodes: list[Episode], gamma: float) -> ValueBias
         expected.append(q[:known])
         came.append(returns[:known])
     steps = sum(map(len, expected))
-    return ValueBias(float(torch.cat(expected).mean()), float(torch.cat(came).mean()), steps) if steps else None
+    if not steps:
+        return None
+    mean_q, mean_return = (float(torch.cat(values).mean()) / reward_scale for values in (expected, came))
+    return ValueBias(mean_q, mean_return, steps)
 
 
 def _bonus(agent: Agent, features: Tensor) -> Tensor:

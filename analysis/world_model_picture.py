@@ -65,10 +65,10 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
 
 
 @torch.no_grad()
-def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> Insight:
+def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1", reward_scale: float = 1.0) -> Insight:
     """Everything from one pass over the episode, and open-loop rollouts from each of its steps.
 
-    ``norm`` is that of the world model's error.
+    ``norm`` is that of the world model's error. Rewards are told as the environment gives them.
     """
     memory, seen = unroll_episode(agent, episode)
     prediction = agent.world_model(agent.features(memory)[:, :-1], episode.action)
@@ -78,8 +78,8 @@ def look(agent: Agent, episode: Episode, norm: Literal["l1", "l2"] = "l1") -> In
     return Insight(
         real=real.numpy(),
         curiosity=model_error(prediction.hidden_change[0], latent_change, norm).numpy(),
-        reward=episode.reward.numpy(),
-        predicted_reward=prediction.reward[0].numpy(),
+        reward=(episode.reward / reward_scale).numpy(),
+        predicted_reward=(prediction.reward[0] / reward_scale).numpy(),
         ahead={horizon: predicted.numpy() for horizon, predicted in ahead.items()},
         unexplained=relative_l1_error(*_error(ahead[1], episode, 1)).numpy(),
         open_loop=_open_loop_errors(ahead, episode),
@@ -126,10 +126,11 @@ def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, MemoryInsig
     config, agent, number = _grounded(folder, checkpoint)
     with closing(Player(folder, agent, config, number)) as player:
         episodes, hidden = player.several(), player.hidden_parts()
-    insight = look(agent, episodes[0], config.update.model_norm)
+    scale = config.actor.reward_scale
+    insight = look(agent, episodes[0], config.update.model_norm, scale)
     memory = examine_memory(agent, episodes, hidden)
     draw(insight, _title(config), out, memory)
-    value = value_bias(agent, episodes, config.update.gamma) if config.update.n_step == 1 else None
+    value = value_bias(agent, episodes, config.update.gamma, scale) if config.update.n_step == 1 else None
     return insight, memory, value
 
 
@@ -137,7 +138,7 @@ def inspect_to(folder: RunFolder, checkpoint: str, out: BinaryIO) -> Insight:
     """Play one episode, look, and write the picture as PNG to what is like a file. Raises ConfigError."""
     config, agent, number = _grounded(folder, checkpoint)
     with closing(Player(folder, agent, config, number)) as player:
-        insight = look(agent, player.play(), config.update.model_norm)
+        insight = look(agent, player.play(), config.update.model_norm, config.actor.reward_scale)
     draw(insight, _title(config), out)
     return insight
 
@@ -183,5 +184,5 @@ def draw(insight: Insight, title: str, out: Path | BinaryIO, memory: MemoryInsig
     axes[-1].set_ylabel("reward")
     axes[-1].set_xlabel("step of the episode")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(insight.ahead) + 1)
-    figure.suptitle(f"{title}: the world model against one episode (observations normalised)")
+    figure.suptitle(f"{title}: the world model against one episode (observations normalised)", parse_math=False)
     figure.savefig(out, dpi=110)

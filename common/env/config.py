@@ -56,6 +56,11 @@ class EnvConfig:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keywords that the environment is made with, like goal=1.5 map=maze pose=[0,1]: numbers, words, JSON."""
 
+    def __post_init__(self) -> None:
+        """Raises ConfigError for an id that a terminal would obey: strangers' files have one."""
+        if not str(self.id).isprintable():
+            raise ConfigError("ENV", self.id, "give an id of characters that can be seen")
+
     def takes_away(self) -> bool:
         """Whether any option takes something from the observation."""
         missing = self.flicker or self.drop_sensors

@@ -18,7 +18,7 @@ from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
 from rmc.analysis.policy_file import PolicyFile, read_policy
 from rmc.analysis.report import check_report, write_report
-from rmc.analysis.report_run import ReportRun
+from rmc.analysis.report_run import ReportRun, told_apart
 from rmc.analysis.run_evaluation import MOST_EPISODES, check_baselines, evaluate_run, is_baseline
 from rmc.analysis.run_paths import each_readable
 from rmc.cli import run_options
@@ -165,7 +165,7 @@ def _histories(paths: Sequence[Path]) -> list[history.History]:
 
 def report(command: run_options.Report) -> int:
     check_report(command.out)
-    runs = each_readable(command.runs, lambda path: ReportRun.read(path.resolve()))
+    runs = told_apart(each_readable(command.runs, lambda path: ReportRun.read(path.resolve())))
     write_report(runs, command.out, command.video)
     size = command.out.stat().st_size
     terminal().print(f"{command.out}: {len(runs)} run{'s' * (len(runs) > 1)}, {size / 1e6:.1f} MB", soft_wrap=True)

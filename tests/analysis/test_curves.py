@@ -119,6 +119,22 @@ def test_a_warm_start_is_another_agent(tmp_path: Path) -> None:
     assert warm.split()[-2:] == ["3.00", "1.00"]
 
 
+def test_a_scaled_return_is_of_the_return_beside_it() -> None:
+    """From five seeds on that is the interquartile mean."""
+    best = [history_of("best", seed=seed, last=1000.0) for seed in range(5)]
+    other = [history_of("other", seed=seed, last=last) for seed, last in enumerate([1000.0] * 4 + [-4000.0])]
+    text = shown(curves.tables(curves.grouped([*best, *other]), "best"))
+    (line,) = (line.split() for line in text.splitlines() if line.startswith("other"))
+    assert (line[2], line[-2]) == ("1,000", "1.00")
+
+
+def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
+    """A dollar begins no mathematics."""
+    runs = [history_of("RMC --init-from a$^$b:1", "of$_$mine:Env-v0")]
+    curves.draw(curves.grouped(runs), "env_steps", tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 5_000
+
+
 def test_what_a_resume_changed_is_another_agent(tmp_path: Path) -> None:
     """Not so what never trained, and what makes no other agent."""
     changed = [
@@ -216,7 +232,7 @@ def test_a_run_counts_once_and_what_differs_is_told_apart(tmp_path):
     text = shown(curves.tables(groups, None))
     for cells in ("4  100 (100, 100, 100, 100)", "1                 300 (300)", "9,001 to 9,002", "1, 1 unfinished"):
         assert cells in text
-    assert curves._named("RMC, 3,000 steps", groups) == "RMC, 3,000 steps (4 seeds, each a line)"
+    assert curves._named("RMC, 3,000 steps", groups, "env_steps") == "RMC, 3,000 steps (4 seeds, each a line)"
 
 
 def test_runs_a_little_longer_are_as_long():
@@ -302,6 +318,10 @@ def test_few_seeds_are_lines_and_many_a_band(tmp_path):
     panel = Figure().subplots()
     curves.draw_agent(panel, [(np.array([float(place)]), np.array([7.0])) for place in range(5)], "C0")  # apart
     assert ([line.get_marker() for line in panel.lines], len(panel.collections)) == (["o"] * 5, 0)
+    apart = [dataclasses.replace(history_of("X", seed=seed, initial=None), evaluations=[]) for seed in range(5)]
+    apart = [dataclasses.replace(run, evaluations=history_of().evaluations[:1]) for run in apart]
+    assert "each a line" in curves._named("X", curves.grouped(apart), "env_steps")
+    assert "interquartile mean" in curves._named("RMC", groups, "env_steps")
     curves.draw(groups, "updates", tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 10_000
 
@@ -411,4 +431,4 @@ def test_bad_input_is_one_line_that_names_the_fault(words, fault, tmp_path, caps
 )
 def test_the_legend_says_how_many_seeds_its_panels_have(counts, label):
     groups = {f"env {i}": {"RMC": [history_of(seed=seed) for seed in range(count)]} for i, count in enumerate(counts)}
-    assert curves._named("RMC", groups) == f"RMC ({label})"
+    assert curves._named("RMC", groups, "env_steps") == f"RMC ({label})"

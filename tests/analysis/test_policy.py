@@ -188,14 +188,6 @@ def test_two_that_act_at_once_leave_the_callers_threads_as_they_were() -> None:
         torch.set_num_threads(before)
 
 
-def test_an_observation_in_the_environments_own_shape_is_one(tmp_path: Path) -> None:
-    folder = make_run(tmp_path / "run", AGENTS["paper"], "tests.odd_envs:Row-v0")
-    policy, own = load_policy(folder.path), np.zeros((1, 2), np.float32)
-    assert policy.act(own).shape == (1,)
-    policy.reset()
-    assert policy.act(np.zeros(2)).shape == (1,)
-
-
 def test_a_reset_forgets_and_keeps_the_networks(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, frames = load_policy(run.path), np.random.default_rng(0).normal(size=(3, 3))
     first = [policy.act(frame) for frame in frames]
@@ -272,7 +264,10 @@ def test_a_frame_that_is_not_finite_is_missing_or_refused(run: RunFolder, odd: f
     ("observations", "says"),
     [
         ([np.ones(1), np.ones(4), 1.0, np.ones((2, 4)), np.ones((0, 3)), np.ones((1, 1, 3)), None], r"'of .*\(3,\)"),
-        ([{"x": [1.0]}, (np.ones(3), {}), "text", [[1.0], [1.0, 2.0]]], ".*: give 3 numbers, as policy.make_env"),
+        (
+            [{"x": [1.0]}, torch.ones(3, requires_grad=True), "text", [[1.0], [1.0, 2.0]]],
+            ".*: give 3 numbers, as policy.make_env",
+        ),
     ],
 )
 def test_what_is_no_observation_is_refused(tmp_path: Path, observations: list[Any], says: str) -> None:
@@ -282,11 +277,17 @@ def test_what_is_no_observation_is_refused(tmp_path: Path, observations: list[An
             policy.act(observation)
 
 
-def test_an_observation_may_have_the_environments_own_shape(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", AGENTS["robust"], "tests.odd_envs:Column-v0").path
-    column = np.array([[0.1], [0.2]], np.float32)
-    assert (load_policy(run).act(column) == load_policy(run).act(column.ravel())).all()
-    assert load_policy(run).act(column).ndim == 1
+def test_flags_of_several_lengths_are_refused(run: RunFolder) -> None:
+    with pytest.raises(ConfigError, match=r"missing=.*: give one, or one for each of 1 rows"):
+        load_policy(run.path).act(np.ones(3), [[True], [True, False]])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("env", "shape"), [("Column-v0", (2, 1)), ("Row-v0", (1, 2))])
+def test_an_observation_may_have_the_environments_own_shape(env: str, shape: tuple[int, int], tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", AGENTS["robust"], f"tests.odd_envs:{env}").path
+    own = np.array([0.1, 0.2], np.float32).reshape(shape)
+    assert (load_policy(run).act(own) == load_policy(run).act(own.ravel())).all()
+    assert load_policy(run).act(own).ndim == 1
 
 
 def test_exploring_actions_vary_and_are_seeded(run: RunFolder) -> None:
@@ -336,6 +337,8 @@ def test_export_says_what_is_wrong_in_one_line(
     assert "none was evaluated whole yet" in complaint([*words, "--checkpoint", "best"], capsys)
     assert "use latest, best or one of [7]" in complaint([*words, "--checkpoint", "²"], capsys)
     assert "cannot be written" in complaint([*words, "--out", "/proc/policy.onnx"], capsys)
+    (tmp_path / ".policy.onnx").mkdir()  # in the way of what has that name until it is whole
+    assert f"'{tmp_path}/policy.onnx': cannot" in complaint([*words, "--out", str(tmp_path / "policy.onnx")], capsys)
     there = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "onnxscript" else there(name))
     assert "pip install -e '.[onnx]' in /" in complaint(words, capsys)

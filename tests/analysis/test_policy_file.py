@@ -118,8 +118,9 @@ def test_the_return_is_that_of_the_checkpoint(tmp_path: Path, result: bool) -> N
         with run.metrics.open("a") as lines:
             lines.write(json.dumps(record | {"eval_episodes": 5}) + "\n")
     if not result:
-        with run.metrics.open("a") as lines:  # of another checkpoint
-            lines.write(json.dumps(record | {"eval_episodes": 1, "eval_cut": 1}) + "\n")
+        with run.metrics.open("a") as lines:  # by an evaluator that was started again
+            cut = record | {"eval_update": 7, "eval_return_mean": -9.0, "eval_episodes": 1, "eval_cut": 1}
+            lines.write(json.dumps(cut) + "\n")
     if result:
         played = {"eval_return_mean": -4.0, "eval_return_std": 0.25, "eval_episodes": 10, "initial_return_mean": 0.0}
         run.write_result(played | {"env_steps": 70, "updates": 7, "wall_s": 1.0})
@@ -262,6 +263,12 @@ def _set(*path: Any, value: Any) -> Callable[[dict[str, Any]], None]:
         (_set("agent", "heads", value=[10, "9"]), "header of another version: RMC 0.1.0 wrote it; agent.heads='9'"),
         (_set("agent", "rotary", value=True), "agent.rotary=True: no such option in this version"),
         (_set("env", value=3), "env=3: must be an object"),
+        (_set("env", "id", value="a\x1b[31m"), "ENV='a\\x1b[31m': give an id of characters that can be seen"),
+        (_set("env", "flicker", value=7.0), "--flicker=7.0: take a number from 0 to 1"),
+        (_set("preset", value="\x1b]0;owned\x07"), "preset='\\x1b]0;owned\\x07': must be of characters"),
+        (_set("seed", value=-5), "seed=-5: take a whole number from 0"),
+        (_set("env_steps", value=-1), "env_steps=-1: take a whole number from 0"),
+        (_set("eval_return_mean", value=float("nan")), "eval_return_mean=nan: must be finite"),
         (lambda facts: [facts], "is no object; copy it again"),
     ],
 )

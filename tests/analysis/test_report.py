@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rmc.analysis import doctor, report, video
+from rmc.analysis import doctor, report, report_run, video
 from rmc.analysis.curves import HEADINGS
 from rmc.analysis.history import Evaluation, History
 from rmc.analysis.report_run import DRAWN, ReportRun
@@ -126,7 +126,7 @@ def test_a_browser_shows_it_without_a_network(
     assert "Report of 2 runs" in text
     for heading in ("Returns", "The newest policy", "World-model rollouts", "How each run went", "Config differences"):
         assert f"<h2>{heading}</h2>" in text
-    assert re.search(r"<code>total_steps</code></td><td>2 000</td><td>1 600</td>", text)
+    assert re.search(r"<code>--total-steps</code></td><td>2 000</td><td>1 600</td>", text)
     assert '<p class="finding">learner-bound: actors waited' in text
     films = text.count("<video")
     assert films == 1 or "No video: nothing here can render" in text
@@ -145,6 +145,20 @@ def test_the_table_is_of_all_runs_of_an_agent(trained: Path, other: Path) -> Non
     runs = [ReportRun.read(path) for path in (trained, other)]
     assert {run.about.agent for run in runs} == {"RMC debug --replay-ratio 64.0"}
     assert len(report.newest(runs)) == 1  # of an agent one policy is played
+
+
+def test_runs_of_one_name_are_told_apart(trained: Path, tmp_path: Path) -> None:
+    for place in ("a", "b"):
+        shutil.copytree(trained, tmp_path / place / "run")
+    runs = report_run.told_apart([ReportRun.read(tmp_path / place / "run") for place in ("a", "b")])
+    assert [run.name for run in runs] == ["a/run", "b/run"]
+    assert report_run.told_apart(runs[:1])[0].name == "run"
+
+
+def test_a_finished_run_without_metrics_has_its_steps(trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    (tmp_path / "run" / "metrics.jsonl").unlink()
+    assert ReportRun.read(tmp_path / "run").env_steps == json.loads((trained / "result.json").read_text())["env_steps"]
 
 
 def test_of_a_record_what_is_drawn_is_kept_and_findings_are_the_doctors(trained: Path) -> None:
@@ -331,6 +345,6 @@ def test_differences_are_those_that_matter() -> None:
         [Run("a", seed=0, gamma=0.9, heads=[4, 2]), Run("b", seed=1, gamma=0.9), Run("c", seed=1)]
     )  # type: ignore[list-item]
     assert table["columns"] == ["a", "b", "c"]
-    assert table["rows"] == [["seed", "0", "1", "1"]]
+    assert table["rows"] == [["--seed", "0", "1", "1"]]
     alike = report.differences([Run("a", seed=0), Run("b", seed=0)])  # type: ignore[list-item]
     assert (alike["rows"], alike["note"]) == ([], "All options are alike.")

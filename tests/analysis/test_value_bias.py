@@ -43,6 +43,13 @@ def test_of_a_terminated_episode_all_steps_count(agent: Agent, episode: Episode)
         assert found.expected == pytest.approx(ReplayedEpisode(agent, episode).outputs[1].mean().item(), rel=1e-5)
 
 
+def test_both_are_told_as_the_environment_gives_rewards(agent: Agent, episode: Episode) -> None:
+    scaled, told = (value_bias(agent, [episode], gamma=0.5, reward_scale=scale) for scale in (1.0, 0.01))
+    assert scaled is not None
+    assert told is not None
+    assert (told.expected, told.came) == pytest.approx((100.0 * scaled.expected, 100.0 * scaled.came))
+
+
 def test_of_one_that_was_cut_the_last_steps_are_left_out(agent: Agent, episode: Episode) -> None:
     cut = dataclasses.replace(episode, terminated=False)
     assert value_bias(agent, [cut], gamma=0.99) is value_bias(agent, [cut], gamma=1.0) is None
