@@ -145,12 +145,12 @@ class CheckpointFolder:
             files = {name: (path / name).read_bytes() for name in digests}
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise CheckpointError(f"checkpoint {path}: unreadable ({error})") from None
+        if manifest == _manifest(number, files):
+            return files
         for name, content in files.items():
             if hashlib.sha256(content).hexdigest() != digests[name]:
                 raise CheckpointError(f"checkpoint {path}: {name} does not match its manifest")
-        if manifest != _manifest(number, files):
-            raise CheckpointError(f"checkpoint {path}: {MANIFEST} is not as it was written")
-        return files
+        raise CheckpointError(f"checkpoint {path}: {MANIFEST} is not as it was written")
 
     def latest(self) -> tuple[int, dict[str, bytes]] | None:
         """The newest valid checkpoint; damaged ones are named in the log and passed over."""

@@ -9,7 +9,6 @@ queue behind batches.
 """
 
 import logging
-import os
 import ssl
 from collections.abc import Callable
 from contextlib import suppress
@@ -72,7 +71,7 @@ class ReplayClient:
         self._answer = memoryview(bytearray(max(EPISODE_BYTES, spec.dtype.itemsize, 3 * 8 * spec.statistics)))
         self._turn = self._in_flight = 0
         self._last = EMPTY_SAMPLE
-        self._may_share = not pinned and hasattr(os, "memfd_create")
+        self._may_share = not pinned
         self._shared: SharedBatches | None = None
         self._batches: ReplayConnection | None = None
         self._control: ReplayConnection | None = None

@@ -7,6 +7,7 @@ Rings of config format 1 end before the replay ratio. D numbers have statistics,
 The copy with the larger valid sequence is the present state; a torn write only spoils the older one.
 """
 
+import math
 import struct
 import zlib
 from dataclasses import dataclass, field
@@ -19,6 +20,7 @@ from rmc.common.bus.protocol import EntryId
 from rmc.common.errors import ConfigError
 
 MAX_STREAMS = 4096
+MOST = 2**62  # of a counter that a bus has kept: who adds to it must not overflow
 _HEADER = struct.Struct("<QII")
 _COUNTERS = struct.Struct("<10qdqq")  # the integers of Progress in order, largest priority, statistics count, streams
 _STREAM_BYTES = 4 * 8
@@ -123,11 +125,15 @@ def decode_progress(payload: bytes, statistics: int, counts: int) -> Progress:
 
 
 def decode_published(published: bytes, statistics: int, counts: int) -> Progress | None:
-    """``Progress.publish`` as a bus has kept it; None where it is damaged or not of such observations."""
+    """``Progress.publish`` as a bus has kept it; None where it is damaged, or no ring of such observations says it."""
     payload = published[_CRC.size :]
     if not crc_matches(published) or len(payload) < _COUNTERS.size:
         return None
-    streams = _COUNTERS.unpack_from(payload)[-1]
+    *counters, max_priority, observations, streams = _COUNTERS.unpack_from(payload)
+    in_range = all(0 <= count <= MOST for count in (*counters, observations)) and 0 <= streams <= MAX_STREAMS
+    valid_from, next_serial, *_ = counters
+    if not (in_range and valid_from <= next_serial and math.isfinite(max_priority) and max_priority > 0.0):
+        return None
     size = _COUNTERS.size + 16 * statistics + streams * _STREAM_BYTES
     without_ratio = [size] if counts == 1 else []
     if len(payload) not in [*without_ratio, size + _RATIO.size + 8 * (counts - 1)]:

@@ -20,12 +20,12 @@ def listen(address: str) -> tuple[socket.socket, Path | None, str]:
         if scheme == "unix":
             return _listen_unix(Path(rest)), Path(rest), address
         host, _, port = rest.rpartition(":")
-        if scheme == "tcp" and host and port.isdigit() and int(port) < 65536:
+        if scheme == "tcp" and host and port.isdecimal() and int(port) < 65536:
             listener = socket.create_server((host, int(port)), backlog=BACKLOG)
             listener.setblocking(False)
             return listener, None, f"tcp:{host}:{listener.getsockname()[1]}"
-    except OSError as error:
-        in_use = error.errno == errno.EADDRINUSE
+    except (OSError, ValueError) as error:  # the latter for a path with a NUL
+        in_use = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
         fix = "the port is taken; choose another, or 0 for a free one" if in_use else f"cannot listen there ({error})"
         raise ConfigError("replay address", address, fix) from None
     raise ConfigError("replay address", address, "want unix:PATH or tcp:HOST:PORT")

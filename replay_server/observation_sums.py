@@ -63,7 +63,7 @@ def observation_sums(rows: Rows, spec: WindowSpec, known: ObservationStatistics)
     parts = [("observation", spec.obs_dim, rows["missing"])]
     if spec.privileged:
         parts.append(("privileged", spec.privileged, np.zeros((len(rows), spec.observations, 1), np.uint8)))
-    new, last = np.minimum(rows["new_observations"], rows["last"] + 1), rows["last"]
+    new, last = rows["new_observations"], rows["last"]
     floats = rows.view(np.float32).reshape(len(rows), spec.dtype.itemsize // 4)
     assert spec.dtype.fields is not None
     low, high = _plausible(known)

@@ -252,7 +252,8 @@ class SocketServer:
         self._server.update_priorities(serials, np.frombuffer(frame.body, np.float32, count, 8 * count))
 
     def _refuse(self, connection: ClientConnection, reason: str, detail: str, fenced: bool = False) -> None:
-        log.warning("replay socket: a client was refused: %s", detail)
+        if connection.authenticated or not self.refused[reason]:  # strangers could fill the disk by the log
+            log.warning("replay socket: a client was refused: %s", detail)
         self.refused[reason] += 1
         shown = {"fenced": proof(self._secret, b"fenced", connection.nonce, connection.challenge)} if fenced else {}
         with contextlib.suppress(OSError):  # it may have gone already

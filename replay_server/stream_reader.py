@@ -22,6 +22,7 @@ DISCOVERY_ROUNDS = 100  # rounds between looks for actors beyond those the run w
 BEFORE_ALL = EntryId(0, -1)
 LARGEST = EntryId(2**31 - 1, 2**40)  # of each number; a row can say no larger epoch, and no incarnation sends more
 SKIPPED = 1 << 20  # entries of an incarnation that Redis can have lost at once
+MOST_ASKED = 3  # times that an actor sends the same again, until what is missing counts as lost
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,9 @@ class StreamReader:
         self.refused: Counter[str] = Counter()  # dead letters by reason
         self.gaps = 0  # places where an entry's number does not follow its predecessor's
         self._gaps_after: dict[int, EntryId] = {}  # past which entry an actor's last one was found
-        self._resends: dict[int, EntryId] = {}  # past which entry an actor was asked to send again
+        self._resends: dict[
+            int, tuple[EntryId, int]
+        ] = {}  # past which entry an actor was asked to send again, how often
         self._actors = {actor for actor in range(actors) if shard.owns(actor)}
         self._rounds = 0
         self._entry_bytes = ROUND_BYTES  # the largest entry of the last round that had any
@@ -59,7 +62,8 @@ class StreamReader:
 
     def sends_again(self, actor: int, before: EntryId) -> None:
         """An actor's stream was dropped, so that it sends again what came after that entry."""
-        self._resends[actor] = before
+        asked, times = self._resends.get(actor, (before, 0))
+        self._resends[actor] = before, times * (asked == before) + 1
 
     def _cursors(self, positions: Mapping[int, StreamPosition]) -> dict[int, EntryId]:
         return {actor: positions[actor].id if actor in positions else BEFORE_ALL for actor in self._actors}
@@ -116,8 +120,8 @@ class StreamReader:
     def _lacks_entries(self, before: EntryId, entry: Entry) -> bool:
         """Whether Redis has lost what comes between, and its actor may still have it.
 
-        It has not where it was asked before, nor where the ring does not know this incarnation at all: what is missing
-        then was trimmed after another ring's commit.
+        It has not where it was asked often: Redis may have lost again what came. Nor where the ring does not know this
+        incarnation at all: what is missing then was trimmed after another ring's commit.
         """
         same_epoch = entry.id.epoch == before.epoch
         if entry.id.seq == (before.seq + 1 if same_epoch else 0):
@@ -125,7 +129,8 @@ class StreamReader:
         if self._gaps_after.get(entry.actor) != before:  # else it is still open
             self._gaps_after[entry.actor] = before
             self.gaps += 1
-        return same_epoch and self._resends.get(entry.actor) != before
+        asked, times = self._resends.get(entry.actor, (before, 0))
+        return same_epoch and (asked != before or times < MOST_ASKED)
 
     def _decode(self, entry: Entry) -> Rows | None:
         try:

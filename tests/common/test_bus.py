@@ -23,7 +23,7 @@ from rmc.common.bus.protocol import (
     ReplayOwner,
     Version,
 )
-from rmc.common.bus.redis_bus import RECORDS_READ, RedisBus
+from rmc.common.bus.redis_bus import DEAD_LETTERS_KEPT, RECORDS_READ, RedisBus
 from rmc.common.bus.weight_store import PIECE_BYTES, UNPUBLISHED_SECONDS
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from rmc.common.process.role import StopSignal
@@ -278,6 +278,9 @@ def test_what_is_no_record_is_left_out_and_a_flood_is_trimmed(redis_url):
         pipe.execute()
     bus.records({"actor-0": "0"})
     assert client.xlen(key) <= 1.1 * METRICS_KEPT
+    for seq in range(3 * DEAD_LETTERS_KEPT):
+        bus.dead_letter(Entry(0, EntryId(1, seq), b""), "crc")
+    assert client.xlen(bus.key("dead")) <= 1.1 * DEAD_LETTERS_KEPT
 
 
 @pytest.mark.parametrize("value", [b"a b c d", b"1 2 3", b"1 2 3 4 5", b"1 2 3 \xff", b"9" * 40, b"1 2 3 4.0", b"\x00"])

@@ -1,11 +1,13 @@
 """The ring: what was committed is there, whole and once, wherever the process was killed."""
 
 import dataclasses
+import math
 import shutil
 import struct
 import tempfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -199,6 +201,27 @@ def test_counts_by_number_survive_the_round_trip_and_fit_into_a_record() -> None
     assert decode_published(progress.publish(), size, counts) is not None
     assert decode_published(progress.publish(), size, 1) is None  # of other windows
     assert decode_published(Progress(size, 1).publish(), size, counts) is None
+
+
+@pytest.mark.parametrize(
+    "senseless",
+    [
+        {"next_serial": -7}, {"replay_epoch": 2**63 - 1}, {"max_priority": math.nan}, {"max_priority": 0.0},
+        {"valid_from": 9, "next_serial": 8}, {"observations": np.array([-1])},
+    ],
+)  # fmt: skip
+def test_counters_that_no_ring_says_are_damaged(senseless: dict[str, Any]) -> None:
+    """Whoever can write to the run's Redis can give them a right checksum."""
+    assert decode_published(Progress(3, 1, next_serial=8).publish(), 3, 1) is not None
+    assert decode_published(Progress(3, 1, **senseless).publish(), 3, 1) is None
+
+
+def test_a_negative_number_of_streams_is_damaged() -> None:
+    payload = bytearray(Progress(3, 1).encode())
+    streams = len(payload) - 6 * 8 - 8 - 8  # before the sums and the ratio
+    assert struct.unpack_from("<q", payload, streams) == (0,)
+    struct.pack_into("<q", payload, streams, -1)
+    assert decode_published(struct.pack("<I", zlib.crc32(payload)) + payload, 3, 1) is None
 
 
 @pytest.mark.parametrize("missing", ["missing", "blank"])

@@ -464,6 +464,21 @@ def test_a_thousand_strangers_stop_no_batch(serve: Serve) -> None:
         assert served.sockets.refused.total() > 900
 
 
+def test_strangers_do_not_fill_the_log(serve: Serve, caplog: pytest.LogCaptureFixture) -> None:
+    """The same of each is said once, and counted; what authenticated clients do is always said."""
+    served = serve()
+    for count in range(1, 4):
+        with closing(served.stranger()) as raw:
+            raw.sendall(b"x" * 100)
+            wait_until(lambda count=count: served.sockets.refused["version"] == count, 5.0)
+    assert caplog.text.count("a client was refused") == 1
+    for count in range(1, 3):
+        with closing(served.connect()) as liar:
+            liar._socket.sendall(encode_frame(Kind.SHARE, {"batch_size": 0}))
+            wait_until(lambda count=count: served.sockets.refused["batch-size"] == count, 5.0)
+    assert caplog.text.count("a client was refused") == 3
+
+
 def test_a_client_of_other_windows_is_told(serve: Serve) -> None:
     served = serve()
     with pytest.raises(MessageError, match="fingerprint"):
@@ -517,7 +532,16 @@ def test_it_listens_on_the_interface_named_alone(serve: Serve) -> None:
 
 
 @pytest.mark.parametrize(
-    "address", ["r.sock", "tcp:host", "tcp:127.0.0.1:99999", "tcp:192.0.2.1:0", "unix:/no/such/r.sock"]
+    "address",
+    [
+        "r.sock",
+        "tcp:host",
+        "tcp:127.0.0.1:99999",
+        "tcp:192.0.2.1:0",
+        "tcp:localhost:²",
+        "unix:a\0b",
+        "unix:/no/such/r.sock",
+    ],
 )
 def test_an_address_that_cannot_be_listened_on(address: str) -> None:
     with pytest.raises(ConfigError, match="replay address"):
