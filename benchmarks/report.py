@@ -64,12 +64,15 @@ def line(rows: list[dict[str, Any]]) -> str:
     return f"| {first['name']} | {ours} | {beside} | {_ceiling(first)} | {first['day']} |"
 
 
+def table() -> str:
+    """All of it, between its two marks."""
+    return f"{BEGIN}\n{HEAD}" + "\n".join(map(line, newest().values())) + f"\n{END}"
+
+
 def main() -> None:
     text = PAGE.read_text()
-    before, rest = text.split(BEGIN)
-    after = rest.split(END)[1]
-    table = HEAD + "\n".join(map(line, newest().values()))
-    PAGE.write_text(f"{before}{BEGIN}\n{table}\n{END}{after}")
+    before, after = text.partition(BEGIN)[0], text.partition(END)[2]
+    PAGE.write_text(before + table() + after)
 
 
 if __name__ == "__main__":

@@ -101,7 +101,7 @@ class _Requests(BaseHTTPRequestHandler):
         owner, name, *rest = self.path.strip("/").removeprefix("api/models/").split("/")
         files = self.server.repos.get(f"{owner}/{name}")
         if files is None:
-            return self._refuse(404, "RepoNotFound")
+            return self._refuse(403, "GatedRepo") if owner == "gated" else self._refuse(404, "RepoNotFound")
         if not rest:
             return self._json({"id": f"{owner}/{name}"})
         resolve, revision, file = rest

@@ -127,6 +127,7 @@ WRONG = [
     ),
     (["push", "nothing", "me/x"], TOKEN, "RUN='nothing': cannot be read"),
     (["pull", "me/nothing"], "", "REPO='me/nothing': no such repository, or a private one"),
+    (["pull", "gated/x"], "", "REPO='gated/x': it wants to be asked; do so at http://127.0.0.1:"),
     (["pull", "me/empty"], "", "REPO='me/empty': it holds no policy.safetensors"),
     (["pull", "me/empty", "--revision", "v9"], "", "--revision='v9': me/empty has no such revision; leave it"),
     (["pull", "me/other"], "", "no policy: its metadata has no rmc.policy"),

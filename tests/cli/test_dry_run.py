@@ -5,6 +5,7 @@ import os
 import re
 import signal
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +151,7 @@ def seen_memory(run: Training) -> dict[str, int]:
                 most[kind] = max(most.get(kind, 0), process.memory_full_info().pss)
         except psutil.Error:
             continue
+        time.sleep(0.1)
     return most
 
 
@@ -160,9 +162,9 @@ def test_estimates_are_what_a_real_run_takes(tmp_path: Path) -> None:
     assert (output.returncode, output.stderr) == (0, ""), output.stdout + output.stderr
     assert output.stdout.splitlines()[-1] == "it fits"
     assert not (tmp_path / "planned").exists()
-    run = Training(tmp_path / "real")
-    held = seen_memory(run)
-    assert run.process.returncode == 0, run.text()
+    with Training(tmp_path / "real") as run:
+        held = seen_memory(run)
+        assert run.process.returncode == 0, run.text()
     for role in ("learner", "replay", "actor", "evaluator"):
         assert bytes_of(output.stdout, f"memory, {role}") == pytest.approx(held[role], rel=MEMORY_TOLERANCE), role
     ring = (tmp_path / "real" / "replay" / "ring").stat().st_size

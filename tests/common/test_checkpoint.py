@@ -82,16 +82,19 @@ def test_the_one_just_written_is_kept_where_newer_ones_lie(tmp_path):
     assert folder.load(15) == FILES
 
 
-@pytest.mark.parametrize("place", range(0, 160, 3))
-def test_every_byte_of_a_manifest_counts(tmp_path, place):
+def test_every_byte_of_a_manifest_counts(tmp_path):
     folder = CheckpointFolder(tmp_path)
     folder.save(1, FILES)
     manifest = folder.path(1) / "manifest.json"
-    content = bytearray(manifest.read_bytes())
-    content[place] ^= 1 << place % 8
-    manifest.write_bytes(content)
-    with pytest.raises(CheckpointError, match="000000001"):
-        folder.load(1)
+    whole = manifest.read_bytes()
+    for place in range(len(whole)):
+        content = bytearray(whole)
+        content[place] ^= 1 << place % 8
+        manifest.write_bytes(content)
+        with pytest.raises(CheckpointError, match="000000001"):
+            folder.load(1)
+    manifest.write_bytes(whole)
+    assert folder.load(1) == FILES
 
 
 def test_one_without_room_leaves_nothing(tmp_path):

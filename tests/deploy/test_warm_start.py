@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -217,12 +218,15 @@ def test_what_does_not_fit_is_one_line_and_leaves_no_folder(
     assert not (tmp_path / "run").exists()
 
 
-def test_how_gates_would_have_started_says_nothing(source: RunFolder, tmp_path: Path) -> None:
-    begin(with_value(OTHER, "agent.gate_init", "chrono"), tmp_path / "run", source)
-
-
-def test_grounding_says_nothing_of_a_policy(source: RunFolder, tmp_path: Path) -> None:
-    begin(with_value(OTHER, "agent.grounding", False), tmp_path / "run", source, "policy")
+@pytest.mark.parametrize(
+    ("path", "value", "parts"), [("agent.gate_init", "chrono", "all"), ("agent.grounding", False, "policy")]
+)
+def test_what_makes_no_difference_to_the_parts_says_nothing(
+    path: str, value: Any, parts: InitParts, source: RunFolder, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """How gates would have started; grounding, for a policy."""
+    begin(with_value(OTHER, path, value), tmp_path / "run", source, parts)
+    assert not caplog.records
 
 
 def test_a_state_that_is_cut_is_one_line(source: RunFolder, tmp_path: Path) -> None:

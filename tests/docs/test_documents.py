@@ -5,10 +5,12 @@ import re
 import shlex
 import subprocess
 import sys
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
 
+from benchmarks import report
 from docs import fault_table, generate, results_page
 from rmc.cli import main
 from rmc.cli.parser import COMMANDS, parse
@@ -102,11 +104,27 @@ def test_the_tests_that_security_names_exist() -> None:
     assert not [name for name in named if not (ROOT / name).exists()]
 
 
-def test_its_make_targets_exist() -> None:
+def test_the_measured_figures_are_in_their_page() -> None:
+    assert report.table() in report.PAGE.read_text(), "run python -m benchmarks.report"
+
+
+def test_every_option_of_training_is_in_its_page() -> None:
+    page, text = (ROOT / "docs" / "configuration.md").read_text(), rmc("train", "--help-all").stdout
+    options = {
+        flag for flag in re.findall(r"(--[a-z][a-z-]+)", text) if not flag.startswith(("--no-", "--help", "--config"))
+    }
+    assert len(options) > 80
+    assert [flag for flag in sorted(options) if f"`{flag}`" not in page] == []
+
+
+def test_their_make_targets_exist() -> None:
     makefile = (ROOT / "Makefile").read_text()
-    targets = re.findall(r"make (\w+)", README)
-    assert {"demo", "test", "env"} <= set(targets)
-    assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
+    rules = re.findall(r"^([a-z%-]+)(?: [a-z%-]+)*:", makefile, re.MULTILINE)
+    text = "".join(page.read_text() for page in [*PAGES, ROOT / "CONTRIBUTING.md"])
+    targets = set(re.findall(r"`make ([a-z][a-z-]*)|^make ([a-z][a-z-]*)", text, re.MULTILINE))
+    named = {first or second for first, second in targets}
+    assert {"demo", "test", "env", "test-long"} <= named
+    assert [one for one in sorted(named) if not any(fnmatch(one, rule.replace("%", "*")) for rule in rules)] == []
 
 
 @pytest.mark.timeout(300)

@@ -75,6 +75,7 @@ def client(bus: RedisBus, redis_url: str, run_name: str, tmp_path: Path) -> Iter
 def draw_everything(client: ReplayClient, steps: int) -> np.ndarray:
     """All windows of at least so many steps, by serial, as batches brought them."""
     windows: dict[int, np.void] = {}
+    drawn_steps = 0
     deadline = time.monotonic() + SECONDS
     while time.monotonic() < deadline:
         sample = client.sample(BATCH)

@@ -89,6 +89,8 @@ def assert_same_updates(sizes: WindowSpec, agent: AgentConfig, options: dict[str
         rows, importance = random_rows(4, turn, spec), np.linspace(0.3, 1.0, 4).astype(np.float32)
         expected, priorities = plain(rows, importance, BETA)
         result = update(to_batch(rows, spec, importance), torch.tensor(BETA))
+        trained = {NAMES["G"]: agent.grounding, NAMES["F"]: agent.impute_missing}
+        assert result.metrics.keys() >= {name for name in NAMES.values() if trained.get(name, True)}
         for name, value in expected.items():
             if NAMES[name] in result.metrics:
                 assert result.metrics[NAMES[name]].item() == pytest.approx(value, rel=2e-3, abs=1e-4), (turn, name)

@@ -29,4 +29,4 @@ def make(tmp_path: Path, bus: MemoryBus) -> Iterator[Make]:
 
     yield build
     for server in servers:
-        server._store.lock >= 0 and close(server)
+        close(server)

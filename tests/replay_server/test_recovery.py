@@ -59,12 +59,12 @@ def check(store: ReplayStore, acked: list[int], sent: list[int]) -> None:
         if len(own):
             expected = make_rows(len(own), marks[0])
             assert np.array_equal(own["observation"], expected["observation"])
-    recreate_env = SumTree(CAPACITY)
+    rebuilt = SumTree(CAPACITY)
     leaves = np.zeros(CAPACITY)
     leaves[serials % CAPACITY] = store.priorities[serials % CAPACITY].astype(float) ** 0.6
-    recreate_env.rebuild(leaves)
-    assert np.array_equal(store.tree._nodes, recreate_env._nodes)
-    assert np.isclose(recreate_env.total, leaves.sum())
+    rebuilt.rebuild(leaves)
+    assert np.array_equal(store.tree._nodes, rebuilt._nodes)
+    assert np.isclose(rebuilt.total, leaves.sum())
 
 
 def draw_until(client: ReplayClient, end: float, rng: np.random.Generator) -> int:

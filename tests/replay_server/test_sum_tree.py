@@ -30,14 +30,14 @@ def test_against_brute_force(data: st.DataObject) -> None:
 @given(st.integers(1, 70), st.integers(0, 2**32 - 1))
 def test_one_rebuilt_has_the_same_bits(capacity: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    tree, recreate_env = SumTree(capacity), SumTree(capacity)
+    tree, rebuilt = SumTree(capacity), SumTree(capacity)
     for _ in range(5):
         tree.set(rng.integers(0, capacity, 20), rng.exponential(size=20) * (rng.random(20) < 0.7))
-    recreate_env.rebuild(tree.values(np.arange(capacity)))
-    assert tree.total == recreate_env.total
+    rebuilt.rebuild(tree.values(np.arange(capacity)))
+    assert tree.total == rebuilt.total
     if tree.total > 0:
         drawn = tree.sample(64, np.random.default_rng(seed))
-        assert np.array_equal(drawn, recreate_env.sample(64, np.random.default_rng(seed)))
+        assert np.array_equal(drawn, rebuilt.sample(64, np.random.default_rng(seed)))
         assert (tree.values(drawn) > 0).all()
 
 

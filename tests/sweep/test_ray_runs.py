@@ -13,12 +13,13 @@ from typing import Any
 import psutil
 import pytest
 
+from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
 from rmc.sweep import ray_runs
 from rmc.sweep.job import Job
 from rmc.sweep.node_run import _is_abandoned
 from rmc.sweep.parcel import pack, unpack
-from rmc.sweep.ray_runs import RayRun, on_reserved_cores
+from rmc.sweep.ray_runs import RayRun, RayRuns, on_reserved_cores
 from tests.cluster.test_ray import leaves_nothing_behind
 from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
 
@@ -80,7 +81,19 @@ def _processes() -> Iterator[psutil.Process]:
             yield one
 
 
-def test_a_node_that_is_too_small_and_a_cluster_that_is_not_there_are_one_line(tmp_path: Path) -> None:
+def test_nodes_hold_as_many_runs_as_fit_and_one_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = [(True, 5.0, 8e9), (True, 2.0, 1e9), (False, 64.0, 64e9)]  # whether it is there, its CPUs, its memory
+    has = [{"Alive": alive, "Resources": {"CPU": cpus, "memory": memory}} for alive, cpus, memory in nodes]
+    monkeypatch.setattr(ray_runs.ray, "nodes", lambda: has)
+    assert RayRuns(2, 1_000_000_000, 0, 0).capacity() == 3
+    assert RayRuns(2, 2_000_000_000, 0, 0).capacity() == 2
+    assert RayRuns(2, 2_000_000_000, 0, at_once=1).capacity() == 1
+    for needs in ((6, 1_000, 0), (1, 9_000_000_000, 0), (1, 1_000, 1)):
+        with pytest.raises(ConfigError, match=r"no node of the cluster has .*, which a run takes; start one that has"):
+            RayRuns(*needs, at_once=0)
+
+
+def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     spec = str(write_spec(tmp_path))
     with Sweeping(tmp_path / "sweep", spec, "--launcher", "ray") as sweep:
         assert sweep.finish() == 2
