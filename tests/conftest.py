@@ -24,7 +24,6 @@ PATIENT = (  # tests that only compute
 )  # fmt: skip
 LONG = "integration/", "sweep/", "docs/", "faults/", "cli/", "packaging/"  # with trainings of their own
 NICENESS = 10
-SHARED_MEMORY = Path("/dev/shm")
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch starts its threads: small products only, few cores
 TEMPORARY = tempfile.mkdtemp(prefix="rmct-")  # so that what other runs on this machine leave is not taken for ours
@@ -37,7 +36,6 @@ from rmc.deploy.redis.server import RedisServer  # noqa: E402
 
 hypothesis.settings.register_profile("unhurried", deadline=None)  # a core is shared
 hypothesis.settings.load_profile("unhurried")
-BEFORE = pytest.StashKey[set[str]]()
 
 
 @pytest.fixture(scope="session")
@@ -86,19 +84,6 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
             os.setpriority(os.PRIO_PROCESS, 0, usual)
 
 
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """Look at the shared memory that is there already."""
-    session.stash[BEFORE] = _shared_memory()
-
-
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Fails a session that leaves shared memory; which test it was, nobody can tell where two run at once."""
-    left = _shared_memory() - session.stash[BEFORE]
-    if left and not WORKER:
-        print(f"left behind: {sorted(left)}")
-        session.exitstatus = pytest.ExitCode.TESTS_FAILED
-
-
 def pytest_unconfigure() -> None:
     """The session's temporary folder goes with it."""
     shutil.rmtree(TEMPORARY, ignore_errors=True)
@@ -124,11 +109,7 @@ def run_name(request: pytest.FixtureRequest) -> str:
 def _left_over() -> set[str]:
     children = {f"process {child.pid} {' '.join(child.cmdline()[:6])}" for child in _running_children()}
     temporary = {str(path) for path in Path(tempfile.gettempdir()).glob("rmc-sockets-*")}
-    return children | temporary | (set() if WORKER else _shared_memory())
-
-
-def _shared_memory() -> set[str]:
-    return {str(path) for path in SHARED_MEMORY.glob("*")}
+    return children | temporary
 
 
 def _running_children() -> list[psutil.Process]:
@@ -151,7 +132,7 @@ def no_environment_has_changed_the_process(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.fixture(autouse=True)
 def leaves_nothing_behind(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Fails a test after which a process, a run's temporary folder or shared memory is left."""
+    """Fails a test after which a process or a run's temporary folder is left."""
     if "redis_url" in request.fixturenames:
         request.getfixturevalue("redis_url")  # the session's server starts before the first look
     before = _left_over()
