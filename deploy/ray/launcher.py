@@ -80,7 +80,7 @@ def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None
         folder.lock.release()  # for the launcher: another start finds the actor's name
     try:
         ray.get(host.numbers.remote(), timeout=BEGIN_SECONDS)
-    except BaseException as error:  # Ctrl-C, too
+    except BaseException as error:  # a closed terminal, too
         ray.kill(host, no_restart=True)  # it must not begin once nobody expects it
         if not isinstance(error, ray.exceptions.RayError):
             raise

@@ -28,10 +28,9 @@ from rmc.deploy.run.validation import validate, validate_launch
 def train(
     config: RunConfig, options: LaunchOptions, console: Console, callback: Callback | None
 ) -> tuple[RunFolder, int]:
-    """Hand a run to a launcher on the cluster's head, and watch it; Ctrl-C ends the run; a closed terminal does so
-    only where the cluster is this process's own.
+    """Hand a run to a launcher on the cluster's head, and watch it; the run's folder, and its exit status.
 
-    The run's folder, and its exit status.
+    Ctrl-C ends the run, a closed terminal only where the cluster is this process's own.
     """
     validate(config)
     validate_launch(config, options)
