@@ -19,7 +19,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import to_json
 from rmc.deploy.run.presets import memory, robust
-from tests.cli.test_main import complaint
+from tests.command import complaint
 
 
 def history_of(agent="RMC", env="HalfCheetah-v5", seed=0, last=100.0, initial: float | None = 0.0) -> History:

@@ -8,7 +8,7 @@ import pytest
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.presets import debug
-from tests.analysis.test_policy import run_of
+from tests.runs import run_of
 
 
 def test_a_policy_is_evaluated_with_its_sensors_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,8 +17,8 @@ from rmc.analysis.policy_file import decode
 from rmc.cli import main
 from rmc.common.errors import ConfigError
 from tests.analysis.hub_stub import TOKEN, Hub
-from tests.analysis.test_policy import AGENTS, make_run
-from tests.cli.test_main import complaint
+from tests.command import complaint
+from tests.runs import AGENTS, make_run
 
 Call = Callable[..., subprocess.CompletedProcess[str]]
 

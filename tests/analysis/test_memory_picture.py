@@ -23,8 +23,8 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
-from tests.analysis.test_policy import AGENTS, run_of
 from tests.memory_env import MemoryEnv
+from tests.runs import AGENTS, run_of
 
 PLAIN = AgentConfig(hidden=4, embedding=0, heads=(10, 9))
 MEMORY = RunConfig(env=EnvConfig("tests.memory_env:Memory12-v0"), preset="debug", agent=PLAIN)

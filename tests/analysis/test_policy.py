@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-import io
 import json
 import pickle
 import subprocess
@@ -28,64 +27,19 @@ from rmc.analysis.policy import load_policy
 from rmc.analysis.policy_file import read_policy
 from rmc.analysis.run_evaluation import evaluate_run
 from rmc.cli import analysis_commands, main
-from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
-from rmc.common.checkpoint import STATE, CheckpointFolder
+from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
-from tests.cli.test_main import complaint
-
-AGENTS = {
-    "robust": AgentConfig(
-        hidden=16, embedding=12, heads=(10, 9), head_input="hidden+observation", normalize_observations=True
-    ),
-    "plain": AgentConfig(hidden=16, embedding=12, heads=(10, 9)),
-    "observation beside": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="hidden+observation"),
-    "without a memory": AgentConfig(hidden=16, embedding=12, heads=(10, 9), head_input="observation"),
-    "filling blanks": AgentConfig(
-        hidden=16, embedding=12, heads=(10, 9), normalize_observations=True, impute_missing=True
-    ),
-    "paper": AgentConfig(hidden=16, embedding=0, heads=(10, 9), grounding=False),
-}
+from tests.command import complaint
+from tests.runs import AGENTS, make_run
 
 
 @pytest.fixture(params=AGENTS)
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
     return make_run(tmp_path / "run", AGENTS[request.param], "Pendulum-v1", flicker=0.2)
-
-
-def make_run(
-    path: Path,
-    agent_config: AgentConfig,
-    env: str,
-    flicker: float = 0.0,
-    env_kwargs: dict[str, Any] | None = None,
-    header: bool = True,
-) -> RunFolder:
-    """``run_of`` these and the preset debug."""
-    env_config = EnvConfig(env, flicker=flicker, env_kwargs=env_kwargs or {})
-    return run_of(path, dataclasses.replace(debug(env_config), agent=agent_config), header)
-
-
-def run_of(path: Path, config: RunConfig, header: bool = True) -> RunFolder:
-    """A run's folder with one checkpoint of an agent that was never trained; without ``header`` as of RMC 0.1.0."""
-    folder, spec = open_run(config, LaunchOptions(path, "fail")), config.window_spec()
-    folder.lock.release()
-    torch.manual_seed(0)
-    agent = Agent(spec.obs_dim, spec.action_dim, config.agent)
-    agent.normalizer.freeze(torch.tensor(10), torch.full((spec.obs_dim,), 2.0), torch.full((spec.obs_dim,), 30.0))
-    progress = {"updates": 7, "env_steps": 70}
-    metadata = dataclasses.replace(config.policy_header(), **progress).metadata() if header else None
-    policy, state = save(agent.policy_weights(), metadata), io.BytesIO()
-    torch.save({"agent": agent.state_dict()}, state)
-    files = {"policy.safetensors": policy, "progress.json": json.dumps(progress).encode(), STATE: state.getvalue()}
-    CheckpointFolder(folder.checkpoints).save(7, files)
-    return folder
 
 
 def test_a_loop_of_ones_own_gives_what_an_evaluation_gives(run: RunFolder) -> None:

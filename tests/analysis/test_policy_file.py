@@ -21,8 +21,8 @@ from rmc.common.env.spaces import parts
 from rmc.common.errors import ConfigError
 from rmc.common.policy_header import METADATA_KEY
 from rmc.deploy.run.folder import RunFolder
-from tests.analysis.test_policy import AGENTS, make_run
-from tests.cli.test_main import complaint
+from tests.command import complaint
+from tests.runs import AGENTS, make_run
 
 
 class Joints(gym.Env[Any, Any]):

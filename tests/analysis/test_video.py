@@ -21,9 +21,8 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
 from rmc.common.errors import ConfigError, RmcError
 from rmc.common.whole_file import temporary_path
-from tests.analysis.test_policy import AGENTS, make_run
-from tests.cli.test_main import complaint
-from tests.command import rmc
+from tests.command import complaint, rmc
+from tests.runs import AGENTS, make_run
 
 MOVES = """
 import os

@@ -34,8 +34,8 @@ from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.starts import note_start
 from tests.analysis.browser import opened
-from tests.cli.test_main import complaint
-from tests.command import COMMAND
+from tests.command import COMMAND, complaint
+from tests.runs import untrained
 from tests.waiting import wait_until
 
 PAGES, STREAM_SECONDS = 100, 4.0
@@ -201,7 +201,7 @@ def test_a_page_without_news_is_told_that_its_server_is_there(monkeypatch: pytes
 
 def test_runs_stand_side_by_side_with_their_newest_picture_and_video(serve: Serve, tmp_path: Path) -> None:
     for name in ("one", "two"):
-        open_run(CONFIG, LaunchOptions(tmp_path / "runs" / name, "fail")).lock.release(130)
+        untrained(tmp_path / "runs" / name, CONFIG, status=130)
     one = tmp_path / "runs" / "one"
     (one / "videos").mkdir()
     imsave(one / "inspect.png", np.zeros((8, 12)))
@@ -446,7 +446,7 @@ def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch, capsys:
 def test_a_run_that_cannot_be_read_is_told_and_the_others_are_shown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    open_run(CONFIG, LaunchOptions(tmp_path / "runs" / "good", "fail")).lock.release(130)
+    untrained(tmp_path / "runs" / "good", CONFIG, status=130)
     (tmp_path / "runs" / "newer" / "checkpoints").mkdir(parents=True)
     (tmp_path / "runs" / "newer" / "config.json").write_text('{"format": 999}')
     shown: list[LiveRun] = []

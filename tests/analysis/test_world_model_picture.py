@@ -19,9 +19,9 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.presets import debug
-from tests.analysis.test_policy import AGENTS, run_of
-from tests.cli.test_main import complaint
+from tests.command import complaint
 from tests.hostile import hostile_state
+from tests.runs import AGENTS, run_of
 
 
 @pytest.fixture(params=["robust", "plain", "filling blanks"])

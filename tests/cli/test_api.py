@@ -23,8 +23,8 @@ from rmc.cli.signals import signals_caught, signals_interrupt
 from rmc.common.errors import STOPPED_STATUS
 from rmc.deploy.run.config import checked, to_json
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import PATH_VARIABLE, LaunchOptions
-from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.launch_options import PATH_VARIABLE
+from tests.runs import untrained
 
 CONFIG = rmc.presets.debug("InvertedPendulum-v5")
 
@@ -129,7 +129,7 @@ def test_arguments_of_another_kind_are_refused() -> None:
 
 def test_a_tilde_is_the_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
-    open_run(CONFIG, LaunchOptions(tmp_path / "run", "fail")).lock.release()
+    untrained(tmp_path / "run", CONFIG)
     with pytest.raises(rmc.ConfigError, match=rf"^--run-dir='{tmp_path}/run': is there already"):
         rmc.train(CONFIG, "~/run", if_exists="fail")
     with pytest.raises(rmc.ConfigError, match=f"^RUN='{tmp_path}/none': no config.json there"):

@@ -22,8 +22,8 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from tests import habits
-from tests.analysis.test_policy import AGENTS, make_run
-from tests.cli.test_main import complaint
+from tests.command import complaint
+from tests.runs import AGENTS, make_run, untrained
 
 WANTS = "tests.habits:Wants-v0"
 SLIDE = "tests.habits:Slide-v0"
@@ -107,7 +107,7 @@ def test_an_environment_whose_actions_have_other_bounds_is_named(
         assert f"{says}; undo that, or train another run" in complaint([*words, str(run.path)], capsys)
     with pytest.raises(ConfigError, match="now has the highest actions"):
         load_policy(kept.path).make_env()
-    open_run(kept.config(), LaunchOptions(kept.path)).lock.release()
+    untrained(kept.path, kept.config())
     monkeypatch.undo()
     with pytest.raises(ConfigError, match=r"the highest actions \[1.0, 1.0\], the run was trained with \[1.0, 5.0\]"):
         open_run(kept.config(), LaunchOptions(kept.path))
@@ -115,8 +115,7 @@ def test_an_environment_whose_actions_have_other_bounds_is_named(
 
 def test_a_run_keeps_its_number_of_flags(tmp_path: Path) -> None:
     config = debug(EnvConfig("Pendulum-v1", drop_sensors=0.2))
-    run = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
-    run.lock.release()
+    run = untrained(tmp_path / "run", config)
     run.write_sizes({"observations": 3, "flags of what is missing": 1})  # and nothing of actions, as an older version
     with pytest.raises(ConfigError, match="now has 3 flags of what is missing, the run was trained with 1"):
         open_run(config, LaunchOptions(run.path))
@@ -125,8 +124,7 @@ def test_a_run_keeps_its_number_of_flags(tmp_path: Path) -> None:
 def test_a_run_of_whole_episodes_keeps_their_length(tmp_path: Path) -> None:
     config = debug(EnvConfig("InvertedPendulum-v5"))
     config = dataclasses.replace(config, actor=dataclasses.replace(config.actor, state_strategy="episode"))
-    run = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
-    run.lock.release()
+    run = untrained(tmp_path / "run", config)
     run.write_sizes(config.sizes() | {"steps an episode": 500})
     with pytest.raises(ConfigError, match="now has 1000 steps an episode, the run was trained with 500"):
         open_run(config, LaunchOptions(run.path))

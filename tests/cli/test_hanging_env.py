@@ -10,8 +10,8 @@ import pytest
 from rmc.common.env.config import EnvConfig
 from rmc.common.process.watchdog import HUNG_STATUS
 from rmc.deploy.run.presets import debug
-from tests.analysis.test_policy import run_of
 from tests.command import rmc
+from tests.runs import run_of
 
 ENV = "tests.hanging_env:HangsAsTold-v0"
 LINE = r"rmc: ENV='{}': {} has not returned for {} s \(hanging_env\.py, line \d+\); fix it, or raise --env-timeout\n"

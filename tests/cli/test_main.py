@@ -26,7 +26,8 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug, paper
-from tests.command import rmc
+from tests.command import complaint, rmc
+from tests.runs import untrained
 
 PENDULUM = "InvertedPendulum-v5"
 DEBUG = ["train", PENDULUM, "--preset", "debug"]
@@ -102,17 +103,6 @@ def flags(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
 def test_the_flags_are_these(command: str, expected: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     options = flags(command, capsys)
     assert {flag for flag in options if not flag.startswith("--no-")} == set(expected)
-
-
-def complaint(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line of a command that must end with status 2 and say nothing else."""
-    assert main.run(words) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    lines = captured.err.splitlines()
-    assert len(lines) == 1, captured.err
-    assert lines[0].startswith("rmc: ")
-    return lines[0]
 
 
 @pytest.mark.parametrize(
@@ -331,9 +321,7 @@ def test_without_a_temporary_folder_nothing_starts(
 
 
 def opened_run(folder: Path) -> RunFolder:
-    run = open_run(debug(EnvConfig(PENDULUM)), LaunchOptions(folder, "fail"))
-    run.lock.release()
-    return run
+    return untrained(folder, debug(EnvConfig(PENDULUM)))
 
 
 @pytest.mark.parametrize(
@@ -437,7 +425,7 @@ def test_a_runs_folder_is_its_owners_alone_until_they_open_it(tmp_path: Path) ->
     run = opened_run(tmp_path / "run")
     assert [stat.S_IMODE(path.stat().st_mode) for path in (run.path, run.secret_file)] == [0o700, 0o600]
     run.path.chmod(0o750)
-    open_run(run.config(), LaunchOptions(run.path)).lock.release()
+    untrained(run.path, run.config())
     assert stat.S_IMODE(run.path.stat().st_mode) == 0o750
 
 

@@ -17,7 +17,7 @@ from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.option_names import flat
 from rmc.deploy.run.preflight import check_port
 from rmc.deploy.run.presets import debug, preset_config
-from tests.cli.test_main import complaint
+from tests.command import complaint
 
 PENDULUM = "InvertedPendulum-v5"
 

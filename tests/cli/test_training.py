@@ -22,8 +22,8 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import STOPPED_STATUS, RoleDied
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
-from tests.analysis.test_policy import AGENTS, make_run
 from tests.counting_env import CountingEnv
+from tests.runs import AGENTS, make_run
 
 TRAINS_AND_GOES_ON = """
 import sys

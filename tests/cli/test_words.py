@@ -8,7 +8,8 @@ import pytest
 from rmc.cli import main, parser
 from rmc.cli.primitives import read_whole
 from rmc.common.errors import ConfigError
-from tests.cli.test_main import PENDULUM, complaint, flags
+from tests.cli.test_main import PENDULUM, flags
+from tests.command import complaint
 
 FILE = """
 env = "InvertedPendulum-v5"

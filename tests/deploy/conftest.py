@@ -6,11 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import open_run
-from rmc.deploy.run.presets import debug
+from tests.runs import untrained
 
 
 @pytest.fixture
@@ -25,6 +22,4 @@ def handlers() -> Iterator[None]:
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
     """A run's that nobody trains."""
-    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
-    run.lock.release()
-    return run
+    return untrained(tmp_path / "run")

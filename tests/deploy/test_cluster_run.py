@@ -12,7 +12,6 @@ import pytest
 
 pytest.importorskip("ray")
 
-from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusUnavailable, ConfigError, RoleDied
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local.role_command import RoleCommand
@@ -26,8 +25,7 @@ from rmc.deploy.ray.role_actor import RoleActor
 from rmc.deploy.ray.run import ClusterRun
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import open_run
-from rmc.deploy.run.presets import debug
+from tests.runs import untrained
 
 
 class Handle(SimpleNamespace):
@@ -124,8 +122,7 @@ def test_a_note_of_a_port_that_is_damaged_is_none(folder: RunFolder, damaged: st
 @pytest.fixture
 def hosts(tmp_path: Path) -> Hosts:
     """Of a run that has none yet."""
-    folder: RunFolder = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
-    folder.lock.release()
+    folder = untrained(tmp_path / "run")
     return Hosts(folder, "cpu", False, lambda role: f"redis://{role}")
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from rmc.deploy.run.folder import RunFolder
-from tests.analysis.test_policy import AGENTS, make_run
 from tests.deploy.test_attach import holder
 from tests.deploy.test_folder import let_others_pass
+from tests.runs import AGENTS, make_run
 
 NOBODY = 65534
 COLLEAGUE = """

@@ -33,7 +33,8 @@ from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.opening import make, open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.state import run_state
-from tests.cli.test_main import complaint
+from tests.command import complaint
+from tests.runs import untrained
 
 
 def test_a_run_that_is_renamed_is_known_but_a_copy_is_another(tmp_path: Path) -> None:
@@ -410,14 +411,13 @@ def test_a_newer_damaged_checkpoint_is_told_where_the_run_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     config = debug(EnvConfig("Pendulum-v1"))
-    folder = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
-    folder.lock.release()
+    folder = untrained(tmp_path / "run", config)
     checkpoints = CheckpointFolder(folder.checkpoints)
     for update in (10, 20, 30):
         checkpoints.save(update, {"state": b"x"})
     for update in (20, 30):
         (checkpoints.path(update) / "state").write_bytes(b"y")
-    open_run(config, LaunchOptions(tmp_path / "run")).lock.release()
+    untrained(tmp_path / "run", config)
     messages = [record.getMessage() for record in caplog.records]
     assert len(messages) == 3
     assert all("does not match its manifest; it is passed over" in text for text in messages[:2])

@@ -37,6 +37,7 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
+from tests.runs import untrained
 from tests.waiting import wait_until
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
@@ -49,8 +50,7 @@ def config() -> RunConfig:
 
 @pytest.fixture
 def monitor(config: RunConfig, tmp_path: Path) -> Monitor:
-    folder = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
-    folder.lock.release()
+    folder = untrained(tmp_path / "run", config)
     return Monitor(folder, config, Console(quiet=True, force_terminal=False))
 
 
@@ -195,8 +195,7 @@ def test_tensorboard_has_the_main_metrics_and_the_options_under_the_runs_name(
 
 
 def test_events_of_earlier_versions_join_the_runs_own(config: RunConfig, tmp_path: Path) -> None:
-    folder = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
-    folder.lock.release()
+    folder = untrained(tmp_path / "run", config)
     (folder.path / "events").mkdir()
     (folder.path / "events" / "events.out.tfevents.1.host").write_bytes(b"")
     Monitor(folder, config, Console(quiet=True)).close()
@@ -205,8 +204,7 @@ def test_events_of_earlier_versions_join_the_runs_own(config: RunConfig, tmp_pat
 
 
 def test_evaluations_of_earlier_starts_are_known(config: RunConfig, tmp_path: Path) -> None:
-    folder = open_run(config, LaunchOptions(tmp_path / "run", "fail"))
-    folder.lock.release()
+    folder = untrained(tmp_path / "run", config)
     scores = (3.0, 9.0, 5.0)
     evaluations = [{"role": "evaluator", "time": 1.0, "eval_return_mean": score, "eval_update": 3} for score in scores]
     folder.metrics.write_text("".join(json.dumps(record) + "\n" for record in evaluations))

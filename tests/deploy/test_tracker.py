@@ -19,17 +19,14 @@ from mlflow import MlflowClient
 
 from rmc.analysis.evaluation import initial_policy
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.env.config import EnvConfig
 from rmc.deploy.monitor import tracker as tracker_module
 from rmc.deploy.monitor.films import Film, Films
 from rmc.deploy.monitor.tracker import Tracker, start_tracker
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import open_run
-from rmc.deploy.run.presets import debug
 from rmc.deploy.run.tracking import Tracking, keep_tracking, kept_tracking
 from tests import wandb_file
 from tests.processes import alive
+from tests.runs import untrained
 from tests.waiting import wait_until
 
 CLOSED = "http://127.0.0.1:9"  # no service of anyone's
@@ -43,9 +40,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
     monkeypatch.setenv("WANDB_BASE_URL", CLOSED)
     monkeypatch.setenv("HOME", str(tmp_path))  # where a login would be
     monkeypatch.delenv("WANDB_API_KEY", raising=False)
-    run = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "first", "fail"))
-    run.lock.release()
-    return run
+    return untrained(tmp_path / "first")
 
 
 def started(folder: RunFolder, name: Any, video_every: int = 0) -> Tracker:

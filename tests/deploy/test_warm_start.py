@@ -28,6 +28,7 @@ from rmc.deploy.run.run_lock import RunLock
 from rmc.deploy.run.starts import format_starts
 from tests.deploy.test_config import with_value
 from tests.integration.test_lockstep import trained
+from tests.runs import untrained
 
 ENV = EnvConfig("InvertedPendulum-v5")
 CONFIG = dataclasses.replace(
@@ -230,8 +231,7 @@ def test_what_makes_no_difference_to_the_parts_says_nothing(
 
 
 def test_a_state_that_is_cut_is_one_line(source: RunFolder, tmp_path: Path) -> None:
-    copied = open_run(CONFIG, LaunchOptions(tmp_path / "copied", "fail"))
-    copied.lock.release()
+    copied = untrained(tmp_path / "copied", CONFIG)
     progress = json.dumps({"updates": 5, "env_steps": 50}).encode()
     CheckpointFolder(copied.checkpoints).save(5, {"learner.pt": b"PK", "progress.json": progress})
     message = r"--init-from='.*copied': its checkpoint 5 cannot be used \(.+\); use another"

@@ -19,11 +19,10 @@ from rmc.common import agent, critic
 from rmc.common.env import missing
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run import presets
-from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import open_run
 from rmc.learner import diagnostics, losses, update, update_order
 from tests.command import rmc
 from tests.docs.running import LOCKSTEP
+from tests.runs import untrained
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -206,7 +205,7 @@ def test_the_commands_of_all_pages_can_be_parsed(tmp_path: Path, monkeypatch: py
     """Those in blocks, whatever stands before and after them in their line."""
     monkeypatch.chdir(tmp_path)
     for name in ("first", "week"):  # that are resumed
-        open_run(presets.debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(Path("runs", name))).lock.release()
+        untrained(Path("runs", name), presets.debug(EnvConfig("InvertedPendulum-v5")))
     text = "".join(page.read_text() for page in PAGES)
     Path("agent.toml").write_text(text.split("```toml\n")[1].split("```")[0])
     blocks = "\n".join(re.findall(r"```\w*\n(.*?)```", text, re.DOTALL)).replace("\\\n", "")

@@ -19,7 +19,7 @@ from rmc.sweep.index import Index
 from rmc.sweep.job import Job
 from rmc.sweep.pool import Ending
 from rmc.sweep.spec import Range, Search, Spec, read_spec
-from tests.cli.test_main import complaint
+from tests.command import complaint
 from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
 
 TABLE = (

@@ -24,7 +24,6 @@ from rmc.common.process.role import StopSignal
 from rmc.deploy.run import config as run_config
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.starts import note_start
 from rmc.sweep import local_runs, pool, room
 from rmc.sweep.grid import grid_jobs, is_finished
@@ -32,8 +31,9 @@ from rmc.sweep.index import Index
 from rmc.sweep.job import Job
 from rmc.sweep.pool import drop_replay
 from rmc.sweep.table import result_table
-from tests.cli.test_main import complaint
+from tests.command import complaint
 from tests.processes import alive
+from tests.runs import untrained
 from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
 from tests.waiting import wait_until
 
@@ -323,8 +323,7 @@ def made(folder: Path, gamma: float = 0.99) -> Job:
     words = ("train", "InvertedPendulum-v5", "--preset", "debug", "--gamma", str(gamma), "--seed", "0")
     job = Job(folder, words, 0, {"gamma": gamma})
     config = read_job(job)[0]
-    run_folder = open_run(config, LaunchOptions(folder, "fail"))
-    run_folder.lock.release()
+    run_folder = untrained(folder, config)
     result = {"updates": 1, "wall_s": 1.0, "eval_return_mean": 12_345.6, "eval_return_std": 0.0, "eval_episodes": 1}
     run_folder.write_result({**result, "env_steps": config.total_steps, "initial_return_mean": 0.0})
     return job
