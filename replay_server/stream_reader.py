@@ -42,9 +42,7 @@ class StreamReader:
         self.refused: Counter[str] = Counter()  # dead letters by reason
         self.gaps = 0  # places where an entry's number does not follow its predecessor's
         self._gaps_after: dict[int, EntryId] = {}  # past which entry an actor's last one was found
-        self._resends: dict[
-            int, tuple[EntryId, int]
-        ] = {}  # past which entry an actor was asked to send again, how often
+        self._resends: dict[int, tuple[EntryId, int]] = {}  # past which entry an actor was asked again, how often
         self._actors = {actor for actor in range(actors) if shard.owns(actor)}
         self._rounds = 0
         self._entry_bytes = ROUND_BYTES  # the largest entry of the last round that had any
