@@ -47,7 +47,7 @@ class PriorityFn(Protocol):
 
 
 def environment_seed(run_seed: int, actor: int, epoch: int, env: int) -> int:
-    """A seed that no other environment, actor or restart of the run has; 31 bits, as every environment takes."""
+    """A seed that hardly any other environment, actor or restart of the run has; 31 bits, as environments take."""
     text = f"{run_seed} {actor} {epoch} {env}".encode()
     return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "big") >> 33
 
@@ -102,7 +102,7 @@ class Actor:
         self._ack: Ack | None = None
         self._older_since = float("inf")
         self._version: Version | None = None
-        self._steps = 0
+        self._epoch_steps = 0
         self._refresh_at = self._config.refresh_steps
         self._next_poll = self._chunk_due = float("-inf")
         self._resend_at = self._clock() + RESEND_SECONDS
@@ -138,7 +138,7 @@ class Actor:
     def metrics(self) -> dict[str, Any]:
         """Flat metrics since the last call; episode means only where an episode ended."""
         record: dict[str, Any] = {
-            "env_steps": self._steps,
+            "env_steps": self._total_steps,
             "steps_per_s": self._rate.take(self._total_steps),
             "episodes": self._episodes,
             "weights_update": self._version.update if self._version else -1,
@@ -158,7 +158,7 @@ class Actor:
     # Waiting: weights, credit, acknowledgements
 
     def _may_step(self) -> bool:
-        if self._version is not None and self._steps >= self._refresh_at:
+        if self._version is not None and self._epoch_steps >= self._refresh_at:
             self._refresh_weights()
         self._waiting_for = self._obstacle()
         if self._waiting_for and self._clock() >= self._next_poll:
@@ -173,7 +173,7 @@ class Actor:
             return "weights"
         if self._unacked.bytes >= self._config.unacked_bytes:
             return "acknowledgements"
-        if self._ack is None or self._steps >= self._ack.granted_steps:
+        if self._ack is None or self._epoch_steps >= self._ack.granted_steps:
             return "the end" if self._ack and self._ack.final else "credit"
         return ""
 
@@ -187,7 +187,7 @@ class Actor:
 
     def _refresh_weights(self) -> None:
         newest = self._bus.latest_version()
-        self._refresh_at = self._steps + self._config.refresh_steps
+        self._refresh_at = self._epoch_steps + self._config.refresh_steps
         if newest is None or newest in (self._version, self._refused):
             return
         if self._version is not None and newest.epoch == self._version.epoch:
@@ -261,11 +261,12 @@ class Actor:
         given, faults = self._envs.step(action)
         for i in faults:
             self._builder.end_before(i)
-            self._steps -= 1
+            self._epoch_steps -= 1
+            self._total_steps -= 1
         scaled = given._replace(reward=self._config.reward_scale * given.reward)
         ended = self._builder.add(action, state, self._version.update, scaled)
         self._next_poll = float("-inf")
-        self._steps += n
+        self._epoch_steps += n
         self._total_steps += n
         self._returns += given.reward
         self._lengths += 1

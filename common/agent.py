@@ -19,7 +19,10 @@ from rmc.common.window import WindowSpec
 
 
 class Normalizer(nn.Module):
-    """(o - mean) / std by the statistics it was given last, or o itself where that is off; what is missing is zero."""
+    """(o - mean) / std by the statistics it was given last, within ±10, or o itself where that is off.
+
+    What is missing is zero.
+    """
 
     mean: Tensor
     std: Tensor
@@ -256,7 +259,7 @@ class Agent(nn.Module):
         """What is missing of o_t becomes what is expected from (h_{t-1}, o_{t-1}, a_{t-1}), o_{t-1} filled itself.
 
         (B, T, O) normalised, (B, T, M) bool, (B, T, A), (B, S) the state before the first step -> (B, T, O) and the
-        state after the last. No gradient. Until an episode's first frame is seen it is zeros, the mean.
+        state after the last, within ±10. No gradient. Until an episode's first frame is seen it is zeros, the mean.
         """
         assert self.next_frame is not None
         hidden, last_frame = state[:, : self.config.hidden], state[:, self.config.hidden :]

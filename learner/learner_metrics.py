@@ -19,7 +19,9 @@ from rmc.learner.update import UpdateResult
 
 METRICS_UPDATES = 20  # updates between looks at the update's metrics: each look waits for the device
 INSIGHT_UPDATES = 500  # updates between looks at what takes longer: the latent's rank and the states' staleness
-OF_MEMORY = {"model_unexplained", "latent_rank", "latent_deviation"}  # metrics of h
+OF_MEMORY = {  # metrics of h
+    "model_loss", "model_unexplained", "curiosity_mean", "curiosity_share", "latent_rank", "latent_deviation",
+}  # fmt: skip
 
 
 class Drawn(NamedTuple):
@@ -52,7 +54,7 @@ class LearnerMetrics:
         """After an update."""
         if update % METRICS_UPDATES == 0:
             age = np.maximum(update - drawn.weights_update, 0)  # below 0 is of updates that a kill undid
-            self._add({"sample_age_mean": age.mean(), "sample_age_max": age.max(), **updated.metrics})
+            self._add({"sample_age_mean": age.mean(), **updated.metrics})
         if needs_weights(update):
             rank, deviation = latent_rank(updated.hidden[updated.observed])
             self._add({"latent_rank": rank, "latent_deviation": deviation})

@@ -235,7 +235,10 @@ class Delay(SeenWrapper):
 
 
 class FrameStack(SeenWrapper):
-    """The newest observations side by side, oldest first; the first one of an episode stands for those before it."""
+    """The newest observations side by side, oldest first; the first one of an episode stands for those before it.
+
+    What is missing is zeros: a stack has no flags.
+    """
 
     def __init__(self, env: Env, frames: int) -> None:
         super().__init__(env)
@@ -248,6 +251,7 @@ class FrameStack(SeenWrapper):
         return super().reset(seed=seed, options=options)
 
     def seen(self, observation: Floats, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
+        observation = np.where(info.get("missing", False), np.float32(0), observation)
         self._frames.extend([observation] * (1 if self._frames else self._frames.maxlen or 1))
         return np.concatenate(self._frames), info | {"missing": False}
 

@@ -49,7 +49,7 @@ class RunConfig:
 
     env: EnvConfig
     """The environment."""
-    preset: Preset = "robust"
+    preset: Preset
     """Where the other options' defaults come from."""
     seed: int = 0
     """Seed of networks, environments, noise and sampling."""

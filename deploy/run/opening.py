@@ -17,7 +17,7 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.option_names import changes, option
 from rmc.deploy.run.starts import begun_with, format_begun, note_start
 from rmc.deploy.run.tracking import choose_tracking, keep_tracking
-from rmc.deploy.run.validation import validate_windows
+from rmc.deploy.run.validation import validate_new
 
 SAME_AGENT = {  # what a run that goes on may have otherwise, and learns the same
     "total_steps",
@@ -85,7 +85,7 @@ def open_run(
     if there:
         before = taken_up(folder, config, options)
     else:
-        validate_windows(config)
+        validate_new(config)
         if options.init_from is not None:
             from rmc.deploy.run import warm_start  # imports torch
 

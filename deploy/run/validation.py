@@ -100,8 +100,8 @@ def _validate_actors(config: RunConfig) -> None:
         raise ConfigError("--stride", config.actor.stride, "an episode is one window; leave it, or use burn-in")
 
 
-def validate_windows(config: RunConfig) -> None:
-    """Raises ConfigError for steps of a window that its strategy has no use for. A run that has begun may have them."""
+def validate_new(config: RunConfig) -> None:
+    """Raises ConfigError for what a new run would have no use for. A run that has begun may have it."""
     window, default, strategy = config.window, WindowConfig(), config.actor.state_strategy
     if strategy == "episode" and window.trained_steps != default.trained_steps:
         fix = "an episode is one window; leave it, or take --state-strategy burn-in"
@@ -109,6 +109,12 @@ def validate_windows(config: RunConfig) -> None:
     if strategy != "burn-in" and window.burn_in not in (0, default.burn_in):
         fix = f"--state-strategy {strategy} has no burn-in; leave it, or take --state-strategy burn-in"
         raise ConfigError("--burn-in", window.burn_in, fix)
+    if config.agent.missing_flag and config.agent.head_input == "observation":
+        raise ConfigError(
+            "--missing-flag", True, "the memory reads it, and --head-input observation has none; leave it"
+        )
+    if config.env.flicker_burst > 1.0 and not (config.env.flicker or config.env.drop_sensors):
+        raise ConfigError("--flicker-burst", config.env.flicker_burst, "nothing is missing; give --flicker, too")
 
 
 def validate_launch(config: RunConfig, options: LaunchOptions) -> None:

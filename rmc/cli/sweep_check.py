@@ -17,7 +17,7 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.option_names import flat, option, option_words
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.tracking import choose_tracking
-from rmc.deploy.run.validation import validate, validate_launch, validate_windows
+from rmc.deploy.run.validation import validate, validate_launch, validate_new
 from rmc.sweep.job import Job
 from rmc.sweep.spec import Range, Spec, check_name
 
@@ -118,7 +118,7 @@ def _checked(job: Job, on_this_machine: bool) -> Checked:
     _check_file(command)
     config, options = command.config(), dataclasses.replace(command.launch_options(), run_dir=job.folder)
     validate(config)
-    validate_windows(config)
+    validate_new(config)
     validate_launch(config, options)
     if on_this_machine:
         check_machine(config, options)

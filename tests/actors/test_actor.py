@@ -300,8 +300,9 @@ def test_what_is_sent_again_is_counted_once_however_often_a_restart_fails() -> N
 def test_restart_begins_a_new_epoch_without_what_was_open() -> None:
     actor, reader = begun(MemoryBus())
     play(actor, reader, 300, final=False)
+    played = actor.metrics()["env_steps"]
     actor.restart()
-    assert actor.metrics()["env_steps"] == 0
+    assert actor.metrics()["env_steps"] == played >= 300  # those of all its epochs
     assert (actor.step(), actor.waiting_for()) == (False, "credit")  # it has the weights again, its credit is old
     play(actor, reader, 300)
     rows = reader.rows()

@@ -156,6 +156,28 @@ def test_an_environment_may_write_into_the_array_that_it_gave() -> None:
     assert (before.tolist(), seen) == ([0, 0, 0], [[0, 0, 1], [0, 1, 2], [1, 2, 3]])
 
 
+class LastReading(gym.Env[Any, Any]):
+    """Gives the number that it says is missing all the same."""
+
+    observation_space, action_space = gym.spaces.Box(-99, 99, (2,)), gym.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return np.array([1, 2], np.float32), {"missing": np.array([False, False])}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return np.array([7, 8], np.float32), 0.0, False, False, {"missing": np.array([True, False])}
+
+
+gym.register("LastReading-v0", entry_point=LastReading)
+
+
+def test_a_stack_holds_zeros_for_what_is_missing() -> None:
+    env = make_env(EnvConfig("LastReading-v0", frame_stack=2))
+    env.reset(seed=0)
+    observation, _, _, _, info = env.step(np.zeros(1, np.float32))
+    assert (observation.tolist(), info["missing"]) == ([1, 2, 0, 8], False)
+
+
 class Parts(gym.Env[Any, Any]):
     """A Dict of boxes."""
 

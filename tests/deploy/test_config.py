@@ -15,7 +15,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import Preset, RunConfig, from_json, to_json
 from rmc.deploy.run.option_names import flat, option
 from rmc.deploy.run.presets import debug, memory, paper, preset_config, robust
-from rmc.deploy.run.validation import validate, validate_windows
+from rmc.deploy.run.validation import validate, validate_new
 
 ENV = EnvConfig("InvertedPendulum-v5")
 NAMES: list[Preset] = ["robust", "memory", "paper", "debug"]
@@ -129,13 +129,20 @@ def test_values_that_do_not_go_together_are_refused() -> None:
         validate(with_value(with_value(config, "actor.stride", 5), "actor.state_strategy", "episode"))
     longer = with_value(config, "window.trained_steps", 100)
     with pytest.raises(ConfigError, match="--trained-steps=100: an episode is one window"):
-        validate_windows(with_value(longer, "actor.state_strategy", "episode"))
-    validate_windows(longer)
+        validate_new(with_value(longer, "actor.state_strategy", "episode"))
+    validate_new(longer)
     for strategy in ("episode", "zero", "stored"):
         burnt = with_value(with_value(config, "window.burn_in", 40), "actor.state_strategy", strategy)
         with pytest.raises(ConfigError, match=f"--burn-in=40: --state-strategy {strategy} has no burn-in"):
-            validate_windows(burnt)
+            validate_new(burnt)
         validate(burnt)  # a run that has it goes on
+    flagged = with_value(with_value(config, "agent.missing_flag", True), "agent.head_input", "observation")
+    for idle, name in ((flagged, "missing-flag"), (with_value(config, "env.flicker_burst", 5.0), "flicker-burst")):
+        with pytest.raises(ConfigError, match=f"--{name}=.*; (leave it|give --flicker)"):
+            validate_new(idle)
+        validate(idle)
+    for used in ("env.flicker", "env.drop_sensors"):
+        validate_new(with_value(with_value(config, "env.flicker_burst", 5.0), used, 0.3))
     with pytest.raises(ConfigError, match="--missing-flag"):
         validate(with_value(with_value(config, "agent.missing_flag", True), "env.frame_stack", 2))
     with pytest.raises(ConfigError, match=r"--impute-missing=True: .*--normalize-observations; .*--no-impute-missing"):

@@ -96,7 +96,7 @@ def test_staleness_is_measured(strategy: str, stages: set[str], tmp_path: Path) 
     assert all(0.0 <= value < 10.0 for value in stale.values())
     if strategy == "zero":
         assert stale["stale_state_stored"] == pytest.approx(1.0)
-    assert metrics["sample_age_max"] >= metrics["sample_age_mean"] >= 0.0
+    assert metrics["sample_age_mean"] >= 0.0
 
 
 def test_initial_priorities_need_priorities() -> None:
