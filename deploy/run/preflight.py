@@ -13,7 +13,6 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import existing_parent, free_memory, memory_limit
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.replay_server import ring
 
 DISK_RESERVE = 256 << 20  # bytes left for checkpoints, metrics and logs
 
@@ -60,6 +59,8 @@ def check_learner(config: RunConfig, device: str) -> None:
 
 def ring_bytes(config: RunConfig) -> int:
     """Of the rings of all replay servers, on disk and mapped. Makes an environment once."""
+    from rmc.replay_server import ring  # imports numba
+
     shards = config.replay.replay_shards
     return shards * ring.file_bytes(config.window_spec(), -(-config.replay.capacity // shards))
 

@@ -31,7 +31,7 @@ def only_basic(command: Any, names: Set[str]) -> Any:
         elif name not in names:
             default = dataclasses.field(default_factory=functools.partial(_same, value))
             changed.append((name, Annotated[hints[name], tyro.conf.Suppress], default))
-    shown = dataclasses.make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True)
+    shown = dataclasses.make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True, kw_only=True)
     shown.__doc__ = kind.__doc__
     return shown(**values)
 

@@ -26,7 +26,7 @@ from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.policy import load_policy
 from rmc.analysis.policy_file import read_policy
 from rmc.analysis.run_evaluation import evaluate_run
-from rmc.cli import analysis_commands, main
+from rmc.cli import main, policy_commands
 from rmc.common.agent_config import AgentConfig
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
@@ -178,7 +178,7 @@ def test_all_probabilities_are_played_by_one_policy(
         checkpoints.save(8, files | {"policy.safetensors": policy, "progress.json": progress})
         return played
 
-    monkeypatch.setattr(analysis_commands, "evaluate_run", evaluate_and_save)
+    monkeypatch.setattr(policy_commands, "evaluate_run", evaluate_and_save)
     assert main.run(["evaluate", str(run.path), "--episodes", "1", "--flicker", "0", "0.5", "--json"]) == 0
     assert [json.loads(line)["updates"] for line in capsys.readouterr().out.splitlines()] == [7, 7]
 

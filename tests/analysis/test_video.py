@@ -13,7 +13,7 @@ import psutil
 import pytest
 from imageio_ffmpeg import count_frames_and_secs, get_ffmpeg_exe
 
-from rmc.analysis import video
+from rmc.analysis import rendering, video
 from rmc.analysis.policy import load_policy
 from rmc.analysis.video import _follow
 from rmc.cli import main
@@ -144,8 +144,8 @@ def test_what_stands_in_the_way_is_one_line(tmp_path: Path, capsys: pytest.Captu
 def test_a_backend_that_hangs_is_passed_over_and_named(tmp_path: Path, capsys, monkeypatch) -> None:
     folder = str(make_run(tmp_path / "run", AGENTS["robust"], "InvertedPendulum-v5").path)
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(video, "PROBE", "import time; time.sleep(60)")
-    monkeypatch.setattr(video, "PROBE_SECONDS", 0.2)
+    monkeypatch.setattr(rendering, "PROBE", "import time; time.sleep(60)")
+    monkeypatch.setattr(rendering, "PROBE_SECONDS", 0.2)
     out = tmp_path / "episode.mp4"
     words = ["evaluate", folder, "--episodes", "1", "--video", str(out), "--env-timeout", "0.1"]
     line = complaint(words, capsys)
@@ -159,7 +159,7 @@ def test_what_was_chosen_for_one_video_is_not_taken_for_the_users_choice(tmp_pat
     def probed(backend: str, env: EnvConfig) -> tuple[int, str]:
         return int(env.id == "HalfCheetah-v5" and backend != "osmesa"), "no display"
 
-    monkeypatch.setattr(video, "_probed", probed)
+    monkeypatch.setattr(rendering, "_probed", probed)
     for env, backend in (("Pendulum-v1", "egl"), ("HalfCheetah-v5", "osmesa")):
         video.prepare(EnvConfig(env), tmp_path / "episode.mp4")
         assert os.environ["MUJOCO_GL"] == backend
