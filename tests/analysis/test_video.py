@@ -39,7 +39,7 @@ gymnasium.register("Moves-v0", Draws)
 def chosen_backend(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """What a video's test chooses to draw with is no other test's."""
     before = os.environ.get("MUJOCO_GL")
-    monkeypatch.setattr(video, "_own_choice", "")
+    monkeypatch.setattr(rendering, "_own_choice", "")
     yield
     monkeypatch.undo()
     os.environ.pop("MUJOCO_GL", None)

@@ -11,7 +11,7 @@ import sys
 from rmc.cli import main
 
 status = main.run(sys.argv[1:])
-print("IMPORTED", *(name for name in ("torch", "tyro") if name in sys.modules))
+print("IMPORTED", *(name for name in ("torch", "numba", "tyro") if name in sys.modules))
 sys.exit(status)
 """
 
@@ -30,7 +30,13 @@ def test_help_imports_no_torch(tmp_path: Path) -> None:
     done, imported = rmc(tmp_path, "--help")
     assert done.returncode == 0, done.stderr
     assert "check-env" in done.stdout
-    assert "torch" not in imported
+    assert imported == {"tyro"}
+
+
+def test_checking_an_environment_imports_no_torch(tmp_path: Path) -> None:
+    done, imported = rmc(tmp_path, "check-env", "Pendulum-v1", "--steps", "10")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert imported == {"tyro"}
 
 
 @pytest.mark.parametrize("words", [["train", "--batch-size", "0"], ["sweep", "--grid", "batch_size=1,0"]])
@@ -48,7 +54,10 @@ def test_the_version_imports_nothing(tmp_path: Path) -> None:
     assert imported == set()
 
 
-@pytest.mark.parametrize("module", ["rmc.deploy.local.replay_process", "rmc.deploy.run.folder"])
+@pytest.mark.parametrize(
+    "module",
+    ["rmc.deploy.local.replay_process", "rmc.deploy.run.folder", "rmc.cli.analysis_commands", "rmc.analysis.rendering"],
+)
 def test_what_needs_no_network_imports_no_torch(module: str, tmp_path: Path) -> None:
     code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)

@@ -149,7 +149,7 @@ def test_the_python_api_runs(tmp_path: Path) -> None:
     assert all(len(block.strip().splitlines()) <= 6 for block in blocks)
     code = "\n".join(blocks)
     for printed, shorter in (
-        ('train(config, "runs/first"', 'train(dataclasses.replace(config, total_steps=700), "runs/first"'),
+        ('train(config, "runs/first"', 'train(config := dataclasses.replace(config, total_steps=700), "runs/first"'),
         ("callback=stop_when_good", "callback=stop_when_good, launcher='lockstep'"),
         ("total_steps=4500,", "total_steps=900, launcher='lockstep',"),
     ):

@@ -26,8 +26,9 @@ from tests.faults.slow_learner import SLOWER, judged
 from tests.faults.soak import soaked
 from tests.faults.witness import went_back
 
-OPTIONS = (*ROOMY, "--checkpoint-steps", "1000")  # none is evicted before all is judged
-FULL = ("--capacity", "300")  # windows
+SOON = "--publish-updates", "2", "--threads", "1"  # all go on once actors have newer weights
+OPTIONS = (*ROOMY, *SOON, "--checkpoint-steps", "1000")  # none is evicted before all is judged
+FULL = (*SOON, "--capacity", "300")  # windows
 EARLY_RATIO = 0.1  # off its own, as a share
 MOST_GROWTH = 0.05  # of a role's memory within seconds
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="hooks of a fork server, small disks, memory by /proc")

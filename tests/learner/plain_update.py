@@ -5,7 +5,7 @@ Slow, in float32, without batches, masks or padding: a reference for ``learner/u
 
 import copy
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -147,9 +147,9 @@ class PlainUpdate:
         )
         sums: dict[str, list[Tensor]] = {name: [] for name in ("M", "observation", "reward", "F", "V", "P", "T")}
         errors = []  # of every window, by step
-        joint = self.joint_values(rows, noise) if agent.config.critic_batch_norm else {}
-        for b, row in enumerate(rows):
-            online, target = self.unroll(agent.memory, row), self.unroll(self.target_memory, row)
+        known = [(self.unroll(agent.memory, row), self.unroll(self.target_memory, row)) for row in rows]
+        joint = self.joint_values(rows, known, noise) if agent.config.critic_batch_norm else {}
+        for b, (row, (online, target)) in enumerate(zip(rows, known, strict=True)):
             latent = target if c.latent_target == "ema" else online
             window = {}
             for t in range(self.burn_in, int(row["last"])):
@@ -178,8 +178,7 @@ class PlainUpdate:
             errors.append(window)
         i, variance = self.scaled(errors)
         priorities = []
-        for b, row in enumerate(rows):
-            online, target = self.unroll(agent.memory, row), self.unroll(self.target_memory, row)
+        for b, (row, (online, target)) in enumerate(zip(rows, known, strict=True)):
             td_errors = []
             for t in range(self.burn_in, int(row["last"])):
                 next_q = {step: values[1] for (window, step), values in joint.items() if window == b}
@@ -193,11 +192,12 @@ class PlainUpdate:
         mean["G"] = mean.pop("observation") + mean.pop("reward")
         return mean, priorities, variance
 
-    def joint_values(self, rows: np.ndarray, noise: Tensor) -> dict[tuple[int, int], tuple[Tensor, Tensor]]:
+    def joint_values(
+        self, rows: np.ndarray, known: list[Any], noise: Tensor
+    ) -> dict[tuple[int, int], tuple[Tensor, Tensor]]:
         """By window and step, Q of it and of the next, all normalised together."""
         steps, now, after = [], [], []
-        for b, row in enumerate(rows):
-            online, target = self.unroll(self.agent.memory, row), self.unroll(self.target_memory, row)
+        for b, (row, (online, target)) in enumerate(zip(rows, known, strict=True)):
             for t in range(self.burn_in, int(row["last"])):
                 read = self.critics_z(row, t, self.reaching("V", self.z(online[t])))
                 now.append(torch.cat([read, torch.tensor(row["action"][t])]))

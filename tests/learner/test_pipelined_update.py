@@ -52,19 +52,19 @@ def test_it_is_the_same_update(agent, bf16, spec):
     plain, update = make(agent, bf16, spec), make(agent, bf16, spec)
     in_turn, apart = DeviceUpdate(plain, spec, BATCH), PipelinedUpdate(update, spec, BATCH)
     expected, actual = [], []
-    for step in range(1, 41):
+    for step in range(1, 25):
         number = 200 + step  # where an average is over some
         longest = (3, 20, 60, 40)[step % 4] if spec is LONG else None
         # what imputes is trained at some updates, then at all
-        raw, importance = host_batch(step, missing=step > 20, spec=spec, longest=longest)
+        raw, importance = host_batch(step, missing=step > 12, spec=spec, longest=longest)
         for updated, results in ((in_turn, expected), (apart, actual)):
             results += copy.deepcopy(updated(raw, importance, 0.1 * step, number))
-        if step % 15 == 0:  # as before weights are read
+        if step % 9 == 0:  # as before weights are read
             actual += copy.deepcopy(apart.drain())
             torch.testing.assert_close(update.agent.state_dict(), plain.agent.state_dict(), rtol=0, atol=0)
     actual += copy.deepcopy(apart.drain())
     apart.close()
-    assert len(actual) == len(expected) == 40
+    assert len(actual) == len(expected) == 24
     for one, other in zip(actual, expected, strict=True):
         assert torch.equal(one.priorities, other.priorities)
         assert torch.equal(one.hidden, other.hidden)

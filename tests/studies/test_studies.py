@@ -32,6 +32,8 @@ def test_every_run_is_one_that_rmc_takes(name, scale):
     assert imported.name == name
     jobs = imported.jobs(scale)
     assert len({job.folder for job in jobs}) == len(jobs)
+    if scale == "smoke":  # the same words, but for its sizes
+        jobs = jobs[:1]
     seen = set()
     for job in jobs:
         assert job.words[job.words.index("--seed") + 1] == str(job.seed)
